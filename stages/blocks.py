@@ -112,7 +112,8 @@ def _unasked_limit(division: Division, train: TrainConfig, device: Device, repor
     if not division.is_near or train.max_memory_bytes or device.name == "cuda":
         return 0
     report.note(
-        f"too few photos for blocks: one training, within {division.limit_bytes / 1e9:.1f} GB of this machine's memory"
+        f"too few photos for blocks: trained as one, within {division.limit_bytes / 1e9:.1f} GB of this machine's "
+        "memory"
     )
     return division.limit_bytes
 
@@ -153,6 +154,6 @@ def _tell(division: Division, train: TrainConfig, limit_bytes: int, report: Repo
     if division.cap < train.max_gaussians:
         report.warning(
             f"{limit_bytes / 1e9:.2f} GB hold {division.cap:,} Gaussians in {division.blocks} blocks, fewer "
-            f"than the {train.max_gaussians:,} of train.max_gaussians; of so few photos there are no more blocks.",
-            hint="Give more with --max-memory for a finer model.",
+            f"than the {train.max_gaussians:,} of train.max_gaussians; there are too few photos for more blocks.",
+            hint="For a finer model, give more with --max-memory.",
         )

@@ -25,7 +25,7 @@ from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_sp
 
 
 def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `model.ply`, the trained model's own bytes where nothing is removed, and `cleaned.json`.
+    """Write `model.ply`, the trained model's own bytes where cleaning is switched off, and `cleaned.json`.
 
     Raises:
         SplatpipeError: if a file is missing or broken.
@@ -33,7 +33,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     """
     trained, model = inputs["train.model"], out / "model.ply"
     if not config.enabled:
-        report.progress(1, 1, "nothing is removed", "steps")
+        report.progress(1, 1, "cleaning is switched off", "steps")
         shutil.copyfile(trained, model)
         write_json(out / "cleaned.json", {"removed": {}})
         return {"removed": 0}

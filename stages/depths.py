@@ -22,7 +22,7 @@ def run(config: DepthsConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     maps, search = out / "maps", out / "search"
     shutil.rmtree(maps, ignore_errors=True)
     if not config.enabled:
-        report.progress(1, 1, "no depths are looked for", "steps")
+        report.progress(1, 1, "no depth maps are made", "steps")
         return keep_depth_maps(maps, [])
     search.mkdir(exist_ok=True)
     dataset = inputs["undistort.dataset"]

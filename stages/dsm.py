@@ -26,12 +26,12 @@ def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summa
     if surface is None:
         report.progress(1, 1, "nothing is made", "steps")
         if config.enabled:
-            report.note("There are no depths in metres, so there is no surface model, and nothing made from one.")
+            report.note("There are no depths in metres, so there is no surface model and no product that needs one.")
         return {"cells": 0}
     site = measure_extent(surface.depths, surface.finer, surface.area, inputs.machine.threads)
     if site is None:
         report.progress(1, 1, "nothing is made", "steps")
-        report.warning("No place is seen well by three photos, so there is no surface model.")
+        report.warning("No part of the scene is seen well by three photos, so there is no surface model.")
         return {"cells": 0}
     cell_m = config.cell_m or max(CELL_GSD, surface.finer) * site.gsd_m
     save_site(out / "site.json", site, cell_m)

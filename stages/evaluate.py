@@ -54,7 +54,7 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     folder.mkdir(parents=True, exist_ok=True)
     if not chosen:
         report.warning(
-            "No photo was held out, so no likeness is measured; floaters are looked for in training photos.",
+            "No photo was held out, so image quality is not measured; floaters are measured in training photos.",
             hint="Set split.every or split.views to hold some out.",
         )
 

@@ -71,7 +71,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         dome = sky_dome(sky, model.select(model.finite()), np.array([camera.centre() for camera in cameras]))
         plain_ply.write(out / "sky/sky.ply", Scene(in_world(dome, frame), facts))
     elif config.sky:
-        report.warning("There is no sky to hand over.", hint="It takes train.sky=model, and photos that show the sky.")
+        report.warning("There is no sky to export.", hint="It needs train.sky=model, and photos that show the sky.")
     gaussians, within = inside_first(in_world(model, frame), area)
     del model  # the next is as large, and what follows wants room
     bounded = bounded_comments(within, len(gaussians))

@@ -65,14 +65,14 @@ def _check(photo_list: PhotoList, counts: list[int], report: Reporter) -> None:
     poor = [photo.name for photo, count in zip(photo_list.photos, counts, strict=True) if count < LEAST_KEYPOINTS]
     if len(counts) - len(poor) < 2:
         raise SplatpipeError(
-            "The photos show too little texture: there are hardly any keypoints in them.",
-            hint="Check that they are sharp and well exposed, and that masks leave enough of them.",
+            "The photos have too little texture: they have hardly any keypoints.",
+            hint="Check that they are sharp and well exposed, and that masks leave enough of each photo.",
         )
     if poor:
         report.warning(
             f"{len(poor)} of {len(counts)} photos have hardly any keypoints and cannot be placed: {', '.join(poor[:5])}"
             + ("…" if len(poor) > 5 else ""),
-            hint="They are blurred, blank or masked.",
+            hint="They are probably blurred, blank or masked.",
         )
 
 

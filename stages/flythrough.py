@@ -24,7 +24,8 @@ def run(config: FlythroughConfig, inputs: Inputs, out: Path, report: Reporter) -
         return {"frames": 0}
     if 0.0 < inputs.settings["train.time_budget_s"] < FILM_FROM_BUDGET_S:
         report.note(
-            f"A time budget below {FILM_FROM_BUDGET_S / 60:.0f} minutes has no film; splatpipe render makes one."
+            f"A time budget below {FILM_FROM_BUDGET_S / 60:.0f} minutes leaves out the film; make one with "
+            "splatpipe render."
         )
         return {"frames": 0}
     frames = max(1, round(config.seconds * config.fps))
@@ -33,7 +34,7 @@ def run(config: FlythroughConfig, inputs: Inputs, out: Path, report: Reporter) -
         try:
             route = photo_film(scene.capture, frames, config.seconds)
         except UsageError as error:
-            report.warning(f"There is no film: {error.message}", hint="Try: splatpipe render OUT --path orbit")
+            report.warning(f"No film was made: {error.message}", hint="Try: splatpipe render OUT --path orbit")
             return {"frames": 0}
         cameras = cameras_along(route, scene.lens(config.film_size), scene.capture.up)
         file = FilmFile(folder / "flythrough.webm", config.fps)

@@ -80,7 +80,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         except NoPlaceError as error:
             frame = str(error) if isinstance(frame, str) else frame
             report.warning(
-                f"Control cannot place the model: {error}.", "Mark more control points, each in several photos."
+                f"Control cannot georeference the model: {error}.", "Mark more control points, each in several photos."
             )
     if controlled is not None:
         frame = controlled.frame
@@ -90,7 +90,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     elif scale is not None and isinstance(frame, Frame):
         compare(frame, scale, report)
     if isinstance(frame, str):
-        report.warning(f"Arbitrary scale: {frame}.", "Lengths and heights in this result have no unit.")
+        report.warning(f"Arbitrary scale: {frame}.", "Lengths and heights in this result are not in metres.")
         frame = arbitrary_frame(model, positions, frame)
     frame = _declared(frame, config, controlled)
     save_frame(frame, out / "frame.json")
@@ -186,7 +186,7 @@ def _tell_heights(tables: JSON, report: Reporter) -> None:
     if tables["control"] is None and check is not None and abs(check["mean_m"][2] or 0.0) > DATUM_STEP_M:
         report.warning(
             f"The check points' heights differ from the positions' by {check['mean_m'][2]:+.1f} m on average.",
-            "They may be in another vertical datum. Control points with heights would tell the offset.",
+            "They may be in another vertical datum. Control points with heights would determine the offset.",
         )
 
 

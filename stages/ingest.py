@@ -134,16 +134,16 @@ def _require_photos(
     more = f"\n  … and {len(left_out) - NAMES_SHOWN} more" if len(left_out) > NAMES_SHOWN else ""
     if photos:
         message = f"There is only one usable photo in {folder}: {printable(photos[0].name)}."
-        hint = "A reconstruction needs many overlapping photos of one place, at least two."
+        hint = "A reconstruction needs many overlapping photos of the same scene, at least two."
     elif left_out:
         message = f"None of the {len(left_out)} pictures in {folder} can be used."
         hint = "Give JPEG, PNG or TIFF photos."
     elif scan.others:
         message = f"There are no photos in {folder}, only {scan.others} other file{'s' if scan.others > 1 else ''}."
-        hint = "Name the folder that has the JPEG, PNG or TIFF photos."
+        hint = "Give the folder that has the JPEG, PNG or TIFF photos."
     else:
         message = f"The folder {folder} is empty."
-        hint = "Name the folder that has the JPEG, PNG or TIFF photos."
+        hint = "Give the folder that has the JPEG, PNG or TIFF photos."
     raise SplatpipeError(message + (f" Left out:{listing}{more}" if left_out else ""), hint=hint)
 
 
@@ -183,14 +183,14 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
     report.note(f"{path.name}: positions of {len(places.by_name)} of {len(photos)} photos, in {places.note}.")
     if places.unknown:
         report.warning(
-            f"{path.name} names photos that are not there, or twice: {some(places.unknown)}.",
+            f"{path.name} names photos that are missing, or names them twice: {some(places.unknown)}.",
             "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
         )
     others = [photo.name for photo in photos if photo.name not in places.by_name and photo.exif.gps is not None]
     if others:
         report.warning(
-            f"{path.name} does not name {some(others)}: their own positions count, as a flight of its own.",
-            "Add them to the file if it has better ones.",
+            f"{path.name} does not name {some(others)}: their own positions are used, as a separate flight.",
+            "Add better positions for them to the file, if you have any.",
         )
     both = [(places.by_name[photo.name], photo.exif.gps) for photo in photos if photo.name in places.by_name]
     known = [(place, gps) for place, gps in both if gps is not None and is_on_earth(gps.latitude, gps.longitude)]
@@ -199,7 +199,7 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
     )
     if apart > FAR_M:
         report.warning(
-            f"{path.name} places the photos {apart / 1000.0:,.1f} km from where they say themselves.",
+            f"{path.name} places the photos {apart / 1000.0:,.1f} km from their own positions.",
             "Check its CRS (the zone, too), and that east or longitude comes first; or set ingest.positions=none.",
         )
     return places.by_name
@@ -223,12 +223,12 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
 def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:
     if refused:
         report.warning(
-            f"The calibrated focal length in {some(refused)} is far from what lens and sensor give; it is not used.",
-            "Was the picture cropped or resized, or its metadata copied?",
+            f"The calibrated focal length in {some(refused)} is far from the value of lens and sensor; it is not used.",
+            "Was the photo cropped or resized, or its metadata copied?",
         )
     unknown = sum(group.photos for group in groups if not group.has_prior)
     if unknown:
         report.warning(
-            f"Nothing is known of the focal length of {unknown} photos; calibration has to find it.",
-            "Photos as the camera wrote them, with their EXIF, give a better result.",
+            f"The focal length of {unknown} photos is unknown; it must be calibrated from scratch.",
+            "Original photos, with their EXIF, give a better result.",
         )

@@ -43,7 +43,7 @@ def run(config: MatchesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         inliers = write_verified(work, features, out / "database.db")
     if not any(inliers.values()):
         raise SplatpipeError(
-            f"No two of the {len(photos)} photos show the same thing from different places.",
+            f"No two of the {len(photos)} photos overlap and were taken from different positions.",
             hint="Photos must overlap, by two thirds at best, and be sharp."
             + ("" if pairing == "exhaustive" else " Or try --set matches.pairing=exhaustive."),
         )

@@ -34,9 +34,9 @@ class LineConfig(StageConfig):
         "train.exposure": {"bilateral": "affine"},
     }
     gone: ClassVar[Mapping[str, str]] = {
-        **{old: f"It is called {new}." for old, new in renamed.items()},
+        **{old: f"It is now called {new}." for old, new in renamed.items()},
         **{f"train.{name}": hint for name, hint in GONE_OF_TRAIN.items()},
-        "initialize.dense_points": "50,000 points are added at most.",
+        "initialize.dense_points": "At most 50,000 points are added.",
     }
 
     ingest: IngestConfig = IngestConfig()

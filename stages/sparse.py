@@ -143,17 +143,18 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
         if elsewhere:
             report.warning(
                 f"{len(elsewhere)} photos form another model that could not be joined: {some(elsewhere)}.",
-                hint="They show another place, or the overlap with the others is missing.",
+                hint="They show another scene, or do not overlap with the others.",
             )
     alone = sorted(set(left).difference(*summary["other_models"]))
     if alone:
         report.warning(f"{len(alone)} of {summary['photos']} photos could not be placed: {some(alone)}.")
     for reason in summary["verdict"]["reasons"]:
         if reason["kind"] != "placed":  # is told above, by name
-            bad = "The cameras are bad: " if reason["level"] == "bad" else ""
+            bad = "The camera poses are unreliable: " if reason["level"] == "bad" else ""
             report.warning(f"{bad}{reason['text']}", reason["hint"])
     if any(row.get("focal_held") for row in summary["tried"] if row["chosen"]):
         report.warning(
-            "Photos of flat ground from one height cannot tell the focal length: it is held to 3 % of the metadata's.",
-            hint="Add oblique photos, or a second height, for heights to be trusted.",
+            "Photos of flat ground from one height cannot determine the focal length: it is kept within 3 % of the "
+            "metadata's.",
+            hint="Add oblique photos, or a second flying height, for reliable heights.",
         )

@@ -41,7 +41,7 @@ def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) 
     maps, rendered = out / "maps", out / "rendered"
     shutil.rmtree(maps, ignore_errors=True)
     if not config.enabled:
-        report.progress(1, 1, "nothing is rendered", "steps")
+        report.progress(1, 1, "not requested", "steps")
         return keep_depth_maps(maps, [])
     gaussians, render = _model(inputs, out, report)
     options, _ = as_trained(inputs["train.rendering"], gaussians)
@@ -67,7 +67,9 @@ def _model(inputs: Inputs, out: Path, report: Reporter) -> tuple[Gaussians, Rend
     The flattened copy, whose mean depths are better than its medians; the splat itself where it was trained in blocks.
     """
     if is_in_blocks(inputs["blocks.plan"]):
-        report.note("trained in blocks, whose Gaussians no training holds at once: depths are the splat's as it is")
+        report.note(
+            "trained in blocks, which cannot be flattened together: depths are rendered from the splat as it is"
+        )
         return read_splat(inputs["clean.model"]), render_depth
     trained = TrainedParts(
         inputs["clean.model"],

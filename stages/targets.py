@@ -29,7 +29,7 @@ def run(config: TargetsConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     wanted = load_wanted(inputs["control.points"])
     if not wanted or not config.search:
         save_finds((), out / "targets.json")
-        report.progress(1, 1, "no targets are looked for", "steps")
+        report.progress(1, 1, "there are no targets to detect", "steps")
         return {"photos": 0, "coded": 0, "quadrants": 0}
     photos = load_photo_list(inputs["ingest.photos"]).by_name()
     model = read_model(inputs["sparse.model"], photos)
@@ -41,7 +41,7 @@ def run(config: TargetsConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         items = [(photos[name], windows[name]) for name in sorted(windows)]
         for number, finds in enumerate(ordered_map(work, items, inputs.machine.threads), 1):
             found += finds
-            report.progress(number, len(items), "looking for targets", "photos")
+            report.progress(number, len(items), "detecting targets", "photos")
     save_finds(found, out / "targets.json")
     coded = sum(find.number is not None for find in found)
     return {"photos": len(items), "coded": coded, "quadrants": len(found) - coded}

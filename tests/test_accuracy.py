@@ -283,6 +283,6 @@ def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixt
     flights = [{"flight": 0, "offset_m": [0.001, 0.0, -47.002]}, {"flight": 1, "offset_m": [0.001, 0.0, 0.002]}]
     show_accuracy({"tables": {"gps": {**check, "flights": flights}}}, [])
     told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Positions of")]
-    assert told == ["Positions of flight 1: all together east +0.001, north +0.000, up -47.002 m off."]
+    assert told == ["Positions of flight 1: common offset east +0.001, north +0.000, up -47.002 m."]
     show_accuracy({}, [])
     assert capsys.readouterr().err == ""

@@ -261,7 +261,7 @@ def test_a_job_without_room_does_not_begin_and_a_hopeless_one_is_not_begun_again
     (house,) = BatchMonitor(call).state().captures
     assert (house.state, house.tries) == ("failed", 1) and "GB free" in house.reason
     assert not (tmp_path / "house").exists() and not (call.folder / "marker").exists()
-    assert any("does not begin" in said for said in call_warnings(call, large))
+    assert any("will not start" in said for said in call_warnings(call, large))
     call.stop_file.touch()
     assert run_job(call, "ingest") == 143
 
@@ -343,7 +343,7 @@ def test_a_stopped_batch_tells_of_itself_alone_and_waits_for_no_notice(
         driver.run(0)
     assert (tmp_path / "told").read_text() == f"stopped,{tmp_path.name}\n"
     assert [line for line in said if "--notify" in line] == [
-        f"The --notify command did not end within {STOPPED_NOTICE_S:.0f} s and was ended."
+        f"The --notify command did not end within {STOPPED_NOTICE_S:.0f} s and was killed."
     ]
 
 

@@ -94,34 +94,38 @@ def test_a_list_gives_each_capture_its_options_and_paths_from_its_own_folder(
     ("name", "text", "message"),
     [
         ("a.toml", "[[capture]]\nphotos = 'x'\n[[capture]]\nphotos = 'y'\nname = 'X'\n", 'Two captures are called "X"'),
-        ("a.toml", "[[capture]]\nphotos = 'x'\nname = '../x'\n", "cannot be the name"),
-        ("a.toml", "[[capture]]\nphotos = 'x'\nname = '.batch'\n", "cannot be the name"),
-        ("a.toml", "[[capture]]\nphotos = 'x'\nname = 'Batch.HTML'\n", "cannot be the name"),
-        ("a.toml", "[[capture]]\nphotos = 'x'\nname = 'a\\u202eb'\n", "cannot be the name"),
-        ("a.toml", f"[[capture]]\nphotos = 'x'\nname = '{'n' * 101}'\n", "cannot be the name"),
-        ("a.toml", "[[capture]]\nname = 'x'\n", "names no photos"),
-        ("a.toml", "[[capture]]\nphotos = 3\n", "photos is no text"),
-        ("a.toml", "[[capture]]\nphotos = 'x'\nset = {a = 1}\n", "set is no list"),
+        ("a.toml", "[[capture]]\nphotos = 'x'\nname = '../x'\n", "cannot be used as the name"),
+        ("a.toml", "[[capture]]\nphotos = 'x'\nname = '.batch'\n", "cannot be used as the name"),
+        ("a.toml", "[[capture]]\nphotos = 'x'\nname = 'Batch.HTML'\n", "cannot be used as the name"),
+        ("a.toml", "[[capture]]\nphotos = 'x'\nname = 'a\\u202eb'\n", "cannot be used as the name"),
+        ("a.toml", f"[[capture]]\nphotos = 'x'\nname = '{'n' * 101}'\n", "cannot be used as the name"),
+        ("a.toml", "[[capture]]\nname = 'x'\n", "has no photos"),
+        ("a.toml", "[[capture]]\nphotos = 3\n", "photos is not a string"),
+        ("a.toml", "[[capture]]\nphotos = 'x'\nset = {a = 1}\n", "set is not a list"),
         ("a.toml", "[[capture]]\nphotos = 'x'\npresets = 'high'\n", 'no "presets"'),
         ("a.toml", "capture = 'x'\n", "no tables"),
-        ("a.toml", "", "names no capture"),
+        ("a.toml", "", "contains no captures"),
         ("a.toml", "[[capture]\n", "not valid TOML"),
         ("a.toml", "a = " + "[" * 100_000, "not valid TOML"),
         ("a.toml", "#" * (MAX_LIST_BYTES + 1), "too large"),
         ("a.toml", f"a = {'1' * 5000}\n", "not valid TOML"),
-        ("a.toml", "[[capture]]\nphotos = 'x'\n[[capture]]\nphotos = '~nobody-here/x'\n", "no path"),
-        ("a.toml", '[[capture]]\nphotos = "a\\u0000b"\n', "no path"),
+        (
+            "a.toml",
+            "[[capture]]\nphotos = 'x'\n[[capture]]\nphotos = '~nobody-here/x'\n",
+            "cannot be expanded to a path",
+        ),
+        ("a.toml", '[[capture]]\nphotos = "a\\u0000b"\n', "cannot be expanded to a path"),
         (
             "a.toml",
             "[[capture]]\nphotos = 'x'\nname = '\u00e9'\n[[capture]]\nphotos = 'y'\nname = 'e\u0301'\n",
             "Two captures",
         ),
         ("a.csv", "name,photo\nx,y\n", 'unknown column "photo"'),
-        ("a.csv", "name,preset\nx,y\n", "none with photos"),
-        ("a.csv", "photos,photos\nx,y\n", "a column twice"),
+        ("a.csv", "name,preset\nx,y\n", "no photos column"),
+        ("a.csv", "photos,photos\nx,y\n", "a duplicate column"),
         ("a.csv", "photos,preset\nx,high,8G\n", "more cells"),
-        ("a.csv", "photos,preset\n,high\n", "names no photos"),
-        ("a.csv", 'photos,preset\n"x,high\n', "no CSV"),
+        ("a.csv", "photos,preset\n,high\n", "has no photos"),
+        ("a.csv", 'photos,preset\n"x,high\n', "not valid CSV"),
         ("a.csv", "photos\n" + "\n".join(f"p{at}" for at in range(MAX_CAPTURES + 1)), "2,001 captures"),
         ("a.csv", "photos\n" + "x\n" * (MAX_CAPTURES + 200), "more than"),
         ("a.csv", "photos\nx\0y\n", "no plain text"),
@@ -142,7 +146,7 @@ def test_no_list_and_no_text_are_refused(tmp_path: Path) -> None:
         read_captures(tmp_path / "none", tmp_path / "out")
     for name in ("a.toml", "a.csv"):
         (tmp_path / name).write_bytes(b"\xff\xfe\x00p\x80")
-        with pytest.raises(UsageError, match=r"no UTF-8 text|not valid TOML"):
+        with pytest.raises(UsageError, match=r"not UTF-8 text|not valid TOML"):
             read_captures(tmp_path / name, tmp_path / "out")
 
 
@@ -152,4 +156,6 @@ def test_a_path_that_can_be_none_is_its_captures_own_trouble(tmp_path: Path, col
     told = f'config = "{path}"' if column == "config" else f'set = ["{column}={path}"]'
     (tmp_path / "a.toml").write_text(f'[[capture]]\nphotos = "x"\n{told}\n[[capture]]\nphotos = "y"\n')
     wrong, right = read_captures(tmp_path / "a.toml", tmp_path / "out")
-    assert wrong.trouble is not None and "no path" in wrong.trouble.message and right.trouble is None
+    assert (
+        wrong.trouble is not None and "cannot be expanded to a path" in wrong.trouble.message and right.trouble is None
+    )

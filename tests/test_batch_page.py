@@ -62,7 +62,7 @@ def test_a_card_a_capture_fits_the_screen_and_asks_for_nothing(
     cards = watched.page.locator(".capture")
     assert cards.locator("h2").all_inner_texts() == ["lund", "seneca", "field", "church", "roof", "copr"]
     said = words(watched)
-    assert "At work: 2 of 6 captures finished, 1 failed" in said and "About 1.7 h to go" in said
+    assert "Running: 2 of 6 captures finished, 1 failed" in said and "About 1.7 h to go" in said
     assert "81.00 GB are free on the disk; what is still to run takes about 9.00 GB" in said
     assert "Only 3 of 29 photos could be placed. Add overlap." in said and "Mind the disk." in said
     assert "Running in matches 23 %, about 1.5 h left" in said
@@ -130,7 +130,7 @@ def test_pause_stops_the_refresh(tmp_path: Path, open_page: Callable) -> None:
     watched.page.get_by_role("button", name="Pause").click()
     watched.page.wait_for_timeout(4500)
     assert loads == []
-    watched.page.get_by_role("button", name="Go on refreshing").click()
+    watched.page.get_by_role("button", name="Resume refreshing").click()
     watched.page.wait_for_event("load")
 
 
@@ -151,7 +151,7 @@ def test_a_page_that_nobody_renews_says_so_itself(tmp_path: Path, open_page: Cal
     write_page(batch(CaptureState("one", "running"), as_of_s=time.time() - STALE_S - 30.0), path)
     watched = open_page(path.as_uri())
     expect(watched.page.locator("[data-silent]")).to_be_visible()
-    assert "(1 min ago)" in words(watched) and "The same command goes on" in words(watched)
+    assert "(1 min ago)" in words(watched) and "Repeat the command to resume" in words(watched)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_a_page_that_nobody_renews_says_so_itself(tmp_path: Path, open_page: Cal
         (("done", "stopped", "waiting"), {"exit_code": 130}, "doubt", "Stopped: 1 of 3 captures finished"),
         (("done", "waiting"), {"exit_code": 4, "message": "The disk is full."}, "bad",
          "Ended early: 1 of 2 captures finished"),
-        ((), {"exit_code": 0}, "doubt", "There was no capture to work on"),
+        ((), {"exit_code": 0}, "doubt", "There were no captures to process"),
     ],
 )  # fmt: skip
 def test_the_headline_tells_how_it_ended(

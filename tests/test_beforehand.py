@@ -29,7 +29,7 @@ def test_a_limit_that_no_training_keeps_to_is_refused_before_anything_is_done(tm
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(tmp_path / "out")]
     command += ["--device", "cpu", "--max-memory", "500M"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 4 and "No training keeps to 0.50 GB" in done.stderr and "at least" in done.stderr
+    assert done.returncode == 4 and "Training does not fit in 0.50 GB" in done.stderr and "at least" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -56,7 +56,7 @@ def test_a_run_says_what_it_takes_and_what_memory_leaves_out(tmp_path: Path) -> 
     assert "GB of memory" in told and "GB of disk" in told and "memory holds" not in told
     least = least_memory_bytes(LineConfig())
     tight = request(tmp_path, "standard", max_memory_bytes=least)
-    assert "the memory holds" in forecast_text(tight) and "the photos ask for more" in forecast_text(tight)
+    assert "the memory holds" in forecast_text(tight) and "the photos would support more" in forecast_text(tight)
     assert forecast_text(request(tmp_path, "preview", time_budget_s=600.0)).endswith("GB of disk.")
 
 

@@ -166,16 +166,19 @@ def ring_of(vertices: int) -> list[list[float]]:
 
 
 HOSTILE: dict[str, tuple[Any, str]] = {
-    "nothing": ("", "no GeoJSON"),
-    "a list": ([1, 2], "no GeoJSON"),
-    "no text": ("\udcff\x00", "no GeoJSON"),
-    "a tower": ("[" * 200_000, "no GeoJSON"),
+    "nothing": ("", "not valid GeoJSON"),
+    "a list": ([1, 2], "not valid GeoJSON"),
+    "no text": ("\udcff\x00", "not valid GeoJSON"),
+    "a tower": ("[" * 200_000, "not valid GeoJSON"),
     "a tower of numbers": ('{"type": "Polygon", "coordinates": ' + "[" * 900 + "]" * 900 + "}", "no list|no number"),
-    "a long number": ('{"type": "Polygon", "coordinates": [[[' + "9" * 5000 + ", 1]]]}", "no GeoJSON"),
-    "NaN": ('{"type": "Polygon", "coordinates": [[[NaN, 1], [2, 1], [2, 2]]]}', "no GeoJSON"),
-    "infinity": ('{"type": "Polygon", "coordinates": [[[1e999, 1], [2, 1], [2, 2]]]}', "no number of this earth"),
-    "a truth": ('{"type": "Polygon", "coordinates": [[[true, 1], [2, 1], [2, 2]]]}', "no number of this earth"),
-    "a text": ('{"type": "Polygon", "coordinates": [[["13", 1], [2, 1], [2, 2]]]}', "no number of this earth"),
+    "a long number": ('{"type": "Polygon", "coordinates": [[[' + "9" * 5000 + ", 1]]]}", "not valid GeoJSON"),
+    "NaN": ('{"type": "Polygon", "coordinates": [[[NaN, 1], [2, 1], [2, 2]]]}', "not valid GeoJSON"),
+    "infinity": (
+        '{"type": "Polygon", "coordinates": [[[1e999, 1], [2, 1], [2, 2]]]}',
+        "coordinate that is out of range",
+    ),
+    "a truth": ('{"type": "Polygon", "coordinates": [[[true, 1], [2, 1], [2, 2]]]}', "coordinate that is out of range"),
+    "a text": ('{"type": "Polygon", "coordinates": [[["13", 1], [2, 1], [2, 2]]]}', "coordinate that is out of range"),
     "one coordinate": ('{"type": "Polygon", "coordinates": [[[1], [2, 1], [2, 2]]]}', "two coordinates"),
     "a line": ({"type": "Polygon", "coordinates": [[[1, 1], [2, 2], [1, 1]]]}, "without an area"),
     "flat": ({"type": "Polygon", "coordinates": [[[1, 1], [2, 2], [3, 3], [1, 1]]]}, "without an area"),
@@ -183,7 +186,7 @@ HOSTILE: dict[str, tuple[Any, str]] = {
     "points alone": ({"type": "Point", "coordinates": [1, 2]}, "no polygon"),
     "no features": ({"type": "FeatureCollection", "features": []}, "no polygon"),
     "features of none": ({"type": "FeatureCollection"}, "no list"),
-    "another kind": ({"type": "Topology", "objects": {}}, "no type that is known"),
+    "another kind": ({"type": "Topology", "objects": {}}, "an unknown type"),
     "deep": (
         '{"type": "GeometryCollection", "geometries": [' * 20 + "]}" * 20,
         "collections within collections",
@@ -264,7 +267,7 @@ def test_a_few_points_inside_are_told(tmp_path: Path) -> None:
 def test_a_boundary_elsewhere_is_refused_with_the_way_to_it(
     tmp_path: Path, offset: tuple[float, float], told: str
 ) -> None:
-    with pytest.raises(SplatpipeError, match="Nothing of the capture lies inside") as caught:
+    with pytest.raises(SplatpipeError, match="No part of the capture lies inside") as caught:
         laid(tmp_path, polygon(metres, OUTLINE + np.array(offset)))
     assert told in caught.value.message and "UTM zone 33N" in caught.value.hint
     assert "georef.boundary=none" in caught.value.hint
@@ -272,7 +275,7 @@ def test_a_boundary_elsewhere_is_refused_with_the_way_to_it(
 
 def test_swapped_coordinates_are_recognised(tmp_path: Path) -> None:
     swapped = {"type": "Polygon", "coordinates": [[[y, x] for x, y in degrees(OUTLINE)]]}
-    with pytest.raises(SplatpipeError, match="Nothing of the capture") as caught:
+    with pytest.raises(SplatpipeError, match="No part of the capture") as caught:
         laid(tmp_path, swapped)
     assert "swapped" in caught.value.hint
 
@@ -286,7 +289,7 @@ def test_a_model_without_coordinates_takes_no_boundary(tmp_path: Path) -> None:
 
 def test_projected_numbers_need_a_projected_run(tmp_path: Path) -> None:
     frame = Frame("enu", WORLD_FROM_MODEL, FRAME.origin, crs="EPSG:4326")
-    with pytest.raises(SplatpipeError, match="names no CRS, and its coordinates are no degrees"):
+    with pytest.raises(SplatpipeError, match="states no CRS, and its coordinates are not degrees"):
         laid(tmp_path, polygon(metres, OUTLINE), frame)
 
 
@@ -322,9 +325,9 @@ def test_the_preflight_tells_what_a_run_would_stumble_over(tmp_path: Path, state
     assert told(polygon(degrees, OUTLINE)) == told(polygon(metres, OUTLINE)) == []
     assert told(polygon(degrees, 1000.0 * OUTLINE)) == []  # around all of it
     assert "9.0 km north" in told(polygon(degrees, np.add(OUTLINE, (0.0, 9000.0))))[0][1]
-    assert "no GeoJSON" in told("{")[0][1]
+    assert "not valid GeoJSON" in told("{")[0][1]
     assert told(polygon(degrees, OUTLINE[[0, 2, 1, 3]]))[0][0] == "boundary-crossing"
-    assert "without positions" in told(polygon(degrees, OUTLINE), ())[0][1]
+    assert "have no positions" in told(polygon(degrees, OUTLINE), ())[0][1]
     assert told(polygon(degrees, OUTLINE), (), controlled=True) == []
 
 

@@ -277,7 +277,7 @@ def test_a_budget_is_planned_told_and_ends_the_training(scene: Path, tmp_path: P
     assert summary["planned_iterations"] == plan.options.iterations
     assert 0 < summary["iterations"] <= plan.last_iteration
     assert recorder.notes[0] == plan.described() and "5 s budget" in recorder.notes[0]
-    assert summary["iterations"] >= plan.options.iterations or "its time is up" in recorder.notes[1]
+    assert summary["iterations"] >= plan.options.iterations or "time budget used up" in recorder.notes[1]
     assert len(read_splat(tmp_path / "model.ply")) == summary["gaussians"] > 0
 
 
@@ -345,7 +345,7 @@ def test_the_deadline_ends_after_a_whole_iteration_that_is_as_without_it(
     trained(scene, tmp_path / "whole", plan, monkeypatch)
     short = TrainingPlan(**{**vars(plan), "train_seconds": 1e-9})
     recorder = trained(scene, tmp_path / "short", short, monkeypatch)
-    assert "its time is up after 1 of 60 planned iterations" in recorder.notes[-1]
+    assert "time budget used up after 1 of 60 planned iterations" in recorder.notes[-1]
     curve = json.loads((tmp_path / "short/history.json").read_text())["curve"]
     assert [point["iteration"] for point in curve] == [1]
     assert len(read_splat(tmp_path / "short/model.ply")) == plan.initial_gaussians
@@ -383,7 +383,7 @@ def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused
     count = len(read_splat(scene / "init.ply"))
     return_free_heap()  # of the tests before, which the plan would not count
     config = tiny_scene.plain(iterations=10, max_memory_bytes=resident_bytes() + FIXED_BYTES // 2)
-    with pytest.raises(MachineError, match="of them already") as raised:
+    with pytest.raises(MachineError, match="GB already") as raised:
         train.run(config, make_inputs(scene), tmp_path, tiny_scene.Recorder())
     assert "--max-memory at least" in raised.value.hint
     assert not (tmp_path / "plan.json").exists()
@@ -420,7 +420,7 @@ def test_little_memory_takes_smaller_windows_before_it_refuses(monkeypatch: pyte
     tight = limited.of(plan.options.model_copy(update={"max_memory_bytes": least}))
     assert memory.within_memory(tight, 5000, tiny_scene.Recorder()).window_pixels == SMALLEST_WINDOW
     refused = limited.of(plan.options.model_copy(update={"max_memory_bytes": FIXED_BYTES + of_one}))
-    with pytest.raises(MachineError, match="need room") as raised:
+    with pytest.raises(MachineError, match="need memory") as raised:
         memory.within_memory(refused, 5000, tiny_scene.Recorder())
     assert "at least" in raised.value.hint
 

@@ -150,7 +150,7 @@ def test_a_film_goes_round_the_house_and_not_through_it() -> None:
     assert_smooth(route)
     outside = np.abs(route.places) - [4.0, 4.0, 6.0]
     assert np.maximum(outside, 0.0).max(axis=1).min() > 3.0
-    with pytest.raises(UsageError, match="free way"):
+    with pytest.raises(UsageError, match="free space"):
         film([one[4], other[4]])
 
 

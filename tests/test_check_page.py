@@ -112,7 +112,7 @@ def test_it_fits_the_screen_and_asks_for_nothing(
     assert (watched.requests, watched.errors) == ([], [])
     assert watched.page.evaluate("document.documentElement.scrollWidth") <= width
     said = words(watched)
-    assert said.index("This capture cannot be reconstructed as it is") < said.index("Two strips lie too far apart.")
+    assert said.index("This capture cannot be reconstructed as it stands") < said.index("Two strips lie too far apart.")
     assert "41 % as sharp as its neighbours" in said and "−1.6 EV" in said and "cannot be read" in said
     assert "8.3 h" in said and "17 h" in said and "9.80 GB" in said and "It lacks 1.8 GB of memory." in said
     assert watched.page.locator(".verdict li").count() == watched.page.locator("article.finding-card").count() == 4
@@ -144,7 +144,7 @@ def test_the_map_marks_gaps_orphans_doubts_and_control_where_they_are(
     assert np.allclose(np.subtract(frame.point((1.0, 0.0)), frame.point((0.0, 1.0))), (scale, scale), atol=1.01)
     assert drawn.locator(".gap").count() == 1 and drawn.locator(".gap-number").text_content() == "1"
     far = drawn.locator(".control.poor title")
-    assert "P03" in str(far.text_content()) and "beyond it" in str(far.text_content())
+    assert "P03" in str(far.text_content()) and "outside it" in str(far.text_content())
     assert 0.0 < preflight.control[0].position_m[0] < frame.metres  # what lies far out does not shrink the rest
     assert drawn.locator("text", has_text="P0").count() == 3
     pairs = watched.page.locator(".layer-pairs")
@@ -190,7 +190,7 @@ def test_without_positions_the_photos_stand_in_a_ring(
     watched = open_page(path.as_uri(), width=390, height=844, touch=True)
     assert (watched.requests, watched.errors) == ([], [])
     assert watched.page.evaluate("document.documentElement.scrollWidth") <= 390
-    assert "No photo says where it was taken" in words(watched) and "Nothing stands in the way" in words(watched)
+    assert "No photo has a position" in words(watched) and "No problems found" in words(watched)
     assert watched.page.locator(".drawn .photo").count() == len(demo_names)
     assert watched.page.locator(".layer-overlap").count() == watched.page.locator(".drawn .scale").count() == 0
     assert watched.page.locator(".drawn .photo.orphan").count() == 1
@@ -295,11 +295,11 @@ def test_names_on_the_map_do_not_cover_each_other() -> None:
 @pytest.mark.parametrize(
     ("severities", "level", "headline"),
     [
-        ((), "good", "Nothing stands in the way"),
-        (("note",), "good", "Nothing stands in the way"),
-        (("warning", "note"), "doubt", "One point to see to before you leave"),
-        (("warning", "warning"), "doubt", "2 points to see to before you leave"),
-        (("error", "warning"), "bad", "This capture cannot be reconstructed as it is"),
+        ((), "good", "No problems found"),
+        (("note",), "good", "No problems found"),
+        (("warning", "note"), "doubt", "One point to resolve before you leave"),
+        (("warning", "warning"), "doubt", "2 points to resolve before you leave"),
+        (("error", "warning"), "bad", "This capture cannot be reconstructed as it stands"),
     ],
 )
 def test_the_verdict_is_that_of_the_worst_finding(severities: tuple[str, ...], level: str, headline: str) -> None:
@@ -317,4 +317,4 @@ def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
 
 def test_a_folder_without_a_photo_still_has_a_page() -> None:
     page = check_page(grid(Path("/nowhere"), [], components=(), left_out=(LeftOutPhoto("a.jpg", "is no picture"),)))
-    assert "There is no photo to work with" in page and "<svg" not in page
+    assert "There are no usable photos" in page and "<svg" not in page

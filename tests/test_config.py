@@ -83,8 +83,8 @@ def test_the_line_is_whole() -> None:
         ({"train": {"iterations": -5}}, "train.iterations = -5"),
         ({"train": {"iterations": "many"}}, "train.iterations = 'many'"),
         ({"train": 5}, "train = 5"),
-        ({"evaluate": {"every": 4}}, "no option evaluate.every any more. It is called split.every."),
-        ({"evaluate": {"views": "a"}}, "no option evaluate.views any more. It is called split.views."),
+        ({"evaluate": {"every": 4}}, "no option evaluate.every any more. It is now called split.every."),
+        ({"evaluate": {"views": "a"}}, "no option evaluate.views any more. It is now called split.views."),
         ({"features": {"extractor": "aliked"}}, "features.extractor = 'aliked'"),
     ],
 )
@@ -99,9 +99,9 @@ def test_a_configuration_of_another_version_is_told_each_reason_once() -> None:
     with pytest.raises(UsageError) as caught:
         resolve(LineConfig, [old])
     told = caught.value.message
-    assert "There are no options train.lr_means, train.lr_sh any more. This is decided by constants now" in told
-    assert "There is no option train.sh_limit any more. No gain" in told
-    assert "train.spread_weight any more. It is called train.distortion_weight." in told
+    assert "There are no options train.lr_means, train.lr_sh any more. This is now set by constants" in told
+    assert "There is no option train.sh_limit any more. This was removed" in told
+    assert "train.spread_weight any more. It is now called train.distortion_weight." in told
     assert told.count("any more") == 3
 
 
@@ -156,7 +156,7 @@ def test_an_older_outs_options_are_taken_by_their_new_names_and_values() -> None
 
 
 def test_a_value_that_is_gone_is_refused_with_the_one_to_write() -> None:
-    with pytest.raises(UsageError, match=r"initialize\.dense = 'sweep' is gone; write true"):
+    with pytest.raises(UsageError, match=r"initialize\.dense = 'sweep' no longer exists; write true"):
         resolve(LineConfig, [{"initialize": {"dense": "sweep"}}])
 
 

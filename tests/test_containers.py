@@ -18,7 +18,12 @@ from patience import PATIENCE_S, wait_until
 
 DOCKER = Path(__file__).resolve().parents[1] / "docker"
 SLURM = DOCKER / "slurm.sh"
-REASONS = ("There is no folder", "Name a folder of capture folders", "holds no run", "CUDA does not work here")
+REASONS = (
+    "There is no folder",
+    "Name a folder of capture folders",
+    "does not contain a run",
+    "CUDA does not work here",
+)
 COMMAND = re.compile(r"^ +(?:command|args): \[([^]]+)\]", re.MULTILINE)
 
 
@@ -71,7 +76,7 @@ def test_the_slurm_job_hands_the_warning_on_waits_for_the_end_and_is_queued_agai
     process.send_signal(number)  # Slurm's B: the shell alone
     _, told = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 143, told
-    assert "What was finished is kept" in told, told
+    assert "Finished work is kept" in told, told
     assert (told_slurm.read_text() if told_slurm.exists() else "") == queued
 
 

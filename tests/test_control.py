@@ -358,7 +358,7 @@ def test_file_of_other_photos_is_refused_and_some_missing_ones_are_named(
     strange = [replace(row, photo=f"IMG_{row.photo}") for row in rows(FIVE)]
     with pytest.raises(SplatpipeError, match=r"None of the photos.*IMG_DJI") as caught:
         georef(tmp_path / "a", whole, gcp_list(strange))
-    assert "names them as their files are called" in caught.value.hint
+    assert "listed by their file names" in caught.value.hint
     some = [replace(row, photo="GONE.JPG") if row.photo == "DJI_0020.JPG" else row for row in rows(FIVE)]
     result = georef(tmp_path / "b", whole, gcp_list(some))
     assert [w for w in result.told.warnings if "1 photo that is not in this capture: GONE.JPG" in w]
@@ -393,7 +393,7 @@ def test_coordinates_beyond_their_crs_are_of_a_named_file(tmp_path: Path, whole:
 def test_heights_in_feet_are_told(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     feet = [replace(row, place=(*row.place[:2], row.place[2] / 0.3048)) for row in rows(FIVE)]
     result = georef(tmp_path, whole, gcp_list(feet), check_points="none", adjust="off")
-    assert [w for w in result.told.warnings if "further than vertical datums differ" in w and "feet" in w]
+    assert [w for w in result.told.warnings if "more than vertical datums can differ" in w and "feet" in w]
 
 
 def test_mark_on_the_wrong_pixel_is_named_and_left_out(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
@@ -411,7 +411,7 @@ def test_marks_made_in_larger_photos_are_refused(tmp_path: Path, whole: pycolmap
     large = [replace(row, pixel=(4.0 * row.pixel[0], 4.0 * row.pixel[1])) for row in rows(FIVE)]
     with pytest.raises(SplatpipeError, match="outside of their photos") as caught:
         georef(tmp_path, whole, gcp_list(large))
-    assert "another size" in caught.value.hint
+    assert "resized or rotated" in caught.value.hint
 
 
 def test_point_seen_once_is_named(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
@@ -425,7 +425,7 @@ def test_control_without_heights_controls_horizontally(tmp_path: Path, whole: py
     """Without positions, how the cameras are held levels the model; with them, heights are theirs."""
     flat = [replace(row, place=(*row.place[:2], 0.0)) for row in rows(GROUND_AND_ROOF)]
     alone = georef(tmp_path / "alone", whole, gcp_list(flat), None)
-    assert any("0.0 is taken as unknown" in note for note in alone.told.notes)
+    assert any("0.0 is treated as unknown" in note for note in alone.told.notes)
     assert alone.table("check")["rmse_up_m"] is None
     assert alone.table("check")["rmse_horizontal_m"] < 2.0 * alone.gsd_m
     frame = load_frame(alone.out / "frame.json")

@@ -96,13 +96,13 @@ def test_nothing_is_in_the_way_of_a_good_installation():
 @pytest.mark.parametrize(
     ("installed", "reason", "hint"),
     [
-        (CudaInstallation(0), "no NVIDIA driver", "install its driver"),
+        (CudaInstallation(0), "No NVIDIA driver", "install its driver"),
         (CudaInstallation(12080, driver_code=100), "no NVIDIA graphics card", "nvidia-smi"),
         (CudaInstallation(12080, driver_code=803), "driver does not start .*803", "nvidia-smi"),
         (CudaInstallation(13000, has_library=False), "built without CUDA kernels", "nvcc"),
         (
             replace(GOOD, driver=12080),
-            r"too old: it knows CUDA 12.8, less than the CUDA kernels \(CUDA 13\) need",
+            r"too old: it supports CUDA 12.8, less than the CUDA kernels \(CUDA 13\) need",
             "driver: 580.65.06 or newer.*you need splatpipe built here with CUDA 12's nvcc.$",
         ),
         (
@@ -117,12 +117,12 @@ def test_nothing_is_in_the_way_of_a_good_installation():
         ),
         (replace(GOOD, library=(-3, replace(H200, architecture=61))), r"not built for NVIDIA H200 \(sm_61\)", "sm_75"),
         (replace(GOOD, library=(999, H200)), "does not answer", "nvidia-smi"),
-        (replace(GOOD, torch_cuda="", torch_works=False), "torch is a build for the CPU", "pytorch.org"),
+        (replace(GOOD, torch_cuda="", torch_works=False), "torch is a CPU-only build", "pytorch.org"),
         (
             replace(
                 GOOD, driver=12080, library=(0, replace(H200, runtime=12080)), torch_cuda="13.0", torch_works=False
             ),
-            r"too old: it knows CUDA 12.8, less than the installed torch \(CUDA 13\) need",
+            r"too old: it supports CUDA 12.8, less than the installed torch \(CUDA 13\) need",
             "580.65.06 or newer.*you need a torch for CUDA 12 ",
         ),
         (replace(GOOD, torch_works=False), "torch does not find", "torch.cuda.init"),
@@ -176,8 +176,8 @@ extern "C" int nvmlShutdown() { return 0; }
     [
         (13000, 100, True, "no NVIDIA graphics card"),
         (13000, 0, False, "built without CUDA kernels"),
-        (12080, 0, True, "too old: it knows CUDA 12.8, less than the CUDA kernels (CUDA 13)"),
-        (13000, 0, True, "torch does not find" if torch.version.cuda else "torch is a build for the CPU"),
+        (12080, 0, True, "too old: it supports CUDA 12.8, less than the CUDA kernels (CUDA 13)"),
+        (13000, 0, True, "torch does not find" if torch.version.cuda else "torch is a CPU-only build"),
     ],
 )
 def test_what_the_system_says_leads_to_the_reason(fake_driver, version, init, has_kernels, reason):

@@ -174,7 +174,7 @@ def test_going_on_with_another_device_is_told(scene: Path, tmp_path: Path) -> No
         with killed_at(EARLY if begun is ON_CUDA else LATE):
             trained(scene, tmp_path / begun.name, ALL, begun)
         summary, recorder = trained(scene, tmp_path / begun.name, ALL, other)
-        assert len(recorder.warnings) == 1 and "not the same to the last bit" in recorder.warnings[0]
+        assert len(recorder.warnings) == 1 and "not bit-identical" in recorder.warnings[0]
         assert "sm_80" in recorder.warnings[0] and summary["device"] == other.name
 
 

@@ -256,7 +256,7 @@ def test_a_polygon_that_crosses_itself_is_told_and_what_is_twice_inside_is_out(t
 
 def test_crops_that_leave_nothing_say_where_the_splat_is(tmp_path: Path):
     scene = Scene(true_model(), PLACED)
-    with pytest.raises(SplatpipeError, match="leaves nothing") as told:
+    with pytest.raises(SplatpipeError, match="would remove the whole splat") as told:
         edited(scene, ("crop_box", "0,0,1,1"))
     assert "EPSG:32634" in told.value.hint and "--local" in told.value.hint
     away = geojson(tmp_path / "away.geojson", [[21.1, 52.2], [21.2, 52.2], [21.2, 52.3]])
@@ -267,13 +267,13 @@ def test_crops_that_leave_nothing_say_where_the_splat_is(tmp_path: Path):
         edited(scene, ("crop_polygon", swapped))
     assert "swapped" in told.value.hint and "georef.boundary" not in told.value.hint
     nowhere = Scene(true_model(), SceneFacts())
-    with pytest.raises(SplatpipeError, match="nowhere on the earth"):
+    with pytest.raises(SplatpipeError, match="not georeferenced"):
         edited(nowhere, ("crop_polygon", away))
-    with pytest.raises(SplatpipeError, match="leaves nothing"):
+    with pytest.raises(SplatpipeError, match="would remove the whole splat"):
         edited(nowhere, ("crop_polygon", away), local=True)
-    with pytest.raises(SplatpipeError, match="leaves nothing"):
+    with pytest.raises(SplatpipeError, match="would remove the whole splat"):
         edited(nowhere, ("crop_heights", "100,200"))
-    with pytest.raises(SplatpipeError, match="leaves nothing"):
+    with pytest.raises(SplatpipeError, match="would remove the whole splat"):
         edited(nowhere, ("cut_box", "-99,-99,99,99"))
 
 
@@ -335,7 +335,7 @@ def test_degrees_of_harmonics_may_differ(tmp_path: Path):
         (replace(PLACED, place=replace(PLACE, vertical_datum="unknown")), "tens of metres"),
         (replace(PLACED, place=replace(PLACE, vertical_datum="EPSG:nonsense")), "nonsense"),
         (replace(PLACED, place=replace(PLACE, latitude=53.2)), "km away"),
-        (SceneFacts("z up", metres=True), "nowhere on the earth"),
+        (SceneFacts("z up", metres=True), "not georeferenced"),
     ],
 )
 def test_what_lies_nobody_knows_where_is_not_merged(tmp_path: Path, facts, told):
@@ -379,7 +379,7 @@ def test_photos_of_one_run_do_not_judge_what_was_merged_into_it(tmp_path: Path):
         step.apply(piece)
         for step in parse_steps([("merge", tmp_path / "other.ply"), ("clean", True)], OUTPUT, False, cameras(2))
     ]
-    assert told[-1]["photos"] == 0 and "Clean first" in piece.notes[0]
+    assert told[-1]["photos"] == 0 and "before --merge" in piece.notes[0]
 
 
 def test_photos_that_a_run_judges_itself_by_are_no_witnesses(run_folder: Path):
@@ -548,8 +548,8 @@ def test_a_run_is_edited_from_the_command_line_and_stays_as_it_is(run_folder: Pa
 
 def test_errors_leave_nothing_behind_and_say_what_to_do(run_folder: Path, tmp_path: Path):
     told = splatpipe_edit(run_folder, tmp_path / "a.ply", "--crop-box", "0,0,1,1")
-    assert told["exit_code"] == 1 and "leaves nothing" in told["error"]["message"]
-    with pytest.raises(UsageError, match="nothing to do"):
+    assert told["exit_code"] == 1 and "would remove the whole splat" in told["error"]["message"]
+    with pytest.raises(UsageError, match="No edit step"):
         edit_splat(
             EditTask(open_source(run_folder), OutputFile(tmp_path / "a.ply", format_named("ply")), []), Recorder()
         )
@@ -562,7 +562,7 @@ def test_what_belongs_to_a_run_is_not_written_over(run_folder: Path, name):
     task = EditTask(open_source(run_folder), OutputFile(run_folder / name, format_named("ply")), steps)
     with pytest.raises(UsageError) as told:
         edit_splat(task, Recorder())
-    assert "edited.ply" in told.value.hint or "IN stays" in told.value.hint
+    assert "edited.ply" in told.value.hint or "IN must not be overwritten" in told.value.hint
 
 
 def test_into_a_run_new_files_are_written_and_their_like_again(run_folder: Path):
@@ -579,7 +579,7 @@ def test_what_is_read_is_not_written_over(tmp_path: Path):
     plain_ply.write(tmp_path / "b.ply", Scene(true_model(), SceneFacts()))
     steps = parse_steps([("merge", tmp_path / "b.ply")], OUTPUT, False)
     for name in ("a.ply", "b.ply"):
-        with pytest.raises(UsageError, match="is read by this edit"):
+        with pytest.raises(UsageError, match="is an input of this edit"):
             edit_splat(
                 EditTask(open_source(tmp_path / "a.ply"), OutputFile(tmp_path / name, format_named("ply")), steps),
                 Recorder(),

@@ -343,11 +343,11 @@ def test_out_that_cannot_be_used(numbers: Path, tmp_path: Path) -> None:
         walk(request_of(numbers, numbers / "out"))
     with pytest.raises(MachineError, match="Cannot write"):
         walk(request_of(numbers, Path("/proc/splatpipe-out")))
-    with pytest.raises(UsageError, match="holds no run"):
+    with pytest.raises(UsageError, match="does not contain a run"):
         open_store(tmp_path / "nowhere", create=False)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "splat.ply").write_text("mine")
-    with pytest.raises(UsageError, match="files of something else"):
+    with pytest.raises(UsageError, match="files that are not a run's"):
         walk(request_of(numbers, tmp_path / "taken"))
 
 

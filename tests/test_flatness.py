@@ -170,7 +170,7 @@ def test_a_training_that_gains_goes_on_to_its_end_with_the_same_bits(scene: Path
 def test_a_size_whose_loss_is_flat_gives_way_to_larger_photos_at_once(scene: Path, tmp_path: Path) -> None:
     summary, recorder = trained(scene, tmp_path, SIZES)
     assert summary["sizes_ended"] == [6 * flatness.FEWEST_EPOCHS]
-    assert any("flat after 48 iterations: goes on with larger photos, to 161" in note for note in recorder.notes)
+    assert any("flat after 48 iterations: continuing with larger photos, to 161" in note for note in recorder.notes)
     history = json.loads((tmp_path / "history.json").read_text())
     assert {point["width"] for point in history["curve"]} == {tiny_scene.WIDTH}  # from iteration 50 on
     assert history["sizes_ended"] == [48] and history["flat_at"] == summary["flat_at"] == 96

@@ -44,7 +44,7 @@ def test_formats_that_are_none_or_impossible_are_told_at_once(demo_run: Path, tm
     out = shutil.copytree(demo_run, tmp_path / "out")
     with pytest.raises(UsageError, match="no format 'obj'"):
         with_formats(out, "obj")
-    with pytest.raises(UsageError, match="No format is named"):
+    with pytest.raises(UsageError, match="No format is given"):
         with_formats(out, " , ")
     check_possible(out, "laz,tiles")
 

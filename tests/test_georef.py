@@ -357,4 +357,4 @@ def test_points_without_marks_and_targets_leave_the_frame_to_the_positions(tmp_p
     scene.control = "EPSG:32615\nname,x,y,z\nG1,576870.0,5188000.0,199.0\nG2,576900.0,5188010.0,199.0\n"
     frame, summary, warnings = georef(scene, tmp_path)
     assert frame.kind == "enu" and errors_m(frame, scene).max() < 0.1 and "control_points" not in summary
-    assert any("no marks of them" in text and "no targets were found" in text for text in warnings)
+    assert any("without marks in photos" in text and "no targets were detected" in text for text in warnings)

@@ -39,7 +39,7 @@ def test_help_says_what_is_done_read_and_left_in_two_screens(name: str) -> None:
     words = " ".join(text.split())
     assert len(text.splitlines()) <= SCREENS
     assert " ".join(PAGES[name].about.replace("\\[", "[").split()) in words
-    assert "Read on: " in words
+    assert "See also: " in words
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))

@@ -340,7 +340,7 @@ def test_decoding_tells_when_a_photo_has_changed_since(folder: Path) -> None:
     with pytest.raises(SplatpipeError, match=r"a\.jpg is not what it was"):
         result.pixels("a.jpg")
     replace_in_silence(folder / "b.jpg")
-    with pytest.raises(SplatpipeError, match=r"b\.jpg is not what it was when the photos were checked: it was rep"):
+    with pytest.raises(SplatpipeError, match=r"b\.jpg has changed since the photos were checked: it was rep"):
         result.pixels("b.jpg")
     (folder / "b.jpg").unlink()
     with pytest.raises(SplatpipeError, match=r"b\.jpg is not what it was"):
@@ -391,7 +391,7 @@ def test_strange_names_work(folder: Path) -> None:
     result = ingest(folder)
     assert set(result.photos) == {"a.jpg", "b.jpg", *names}
     assert np.abs(result.pixels("写真/家.jpg").astype(int) - picture(5)).max() <= JPEG_ERROR
-    assert result.left_out == {"bad\\xff.jpg": "has a name that is no UTF-8: rename it"}
+    assert result.left_out == {"bad\\xff.jpg": "has a name that is not UTF-8: rename it"}
     assert all("\n" not in warning for warning in result.warnings)
 
 
@@ -466,7 +466,7 @@ def test_masks_are_found_by_name_and_brought_to_size(folder: Path, place: str, s
     assert_left_half(result.mask("a.jpg"))
     assert result.mask("b.jpg") is None
     assert result.summary["masks"] == 1
-    assert result.warnings == ["Nothing is known of the focal length of 2 photos; calibration has to find it."]
+    assert result.warnings == ["The focal length of 2 photos is unknown; it must be calibrated from scratch."]
 
 
 def test_masks_of_inner_folders_are_found(folder: Path) -> None:
@@ -668,7 +668,7 @@ def test_the_file_of_positions_counts_and_says_so(folder: Path, tmp_path: Path) 
         ["exif", "file"],
         ["default", "file"],
     )
-    assert any("not there, or twice: z.jpg" in warning for warning in result.warnings)
+    assert any("missing, or names them twice: z.jpg" in warning for warning in result.warnings)
     assert any("does not name c.jpg" in warning for warning in result.warnings)
 
 

@@ -151,7 +151,7 @@ def test_altitude_that_drifts_does_not_tilt_the_model() -> None:
     assert all(abs(errors[name]) <= bounds[name] for name in errors)
     notes = corner_photos.Recorder()
     tell(frame, fit, model, stated(model, places), notes)
-    assert any("positions are poor" in warning for warning in notes.warnings)
+    assert any("positions are inaccurate" in warning for warning in notes.warnings)
 
 
 def test_noise_that_leaves_scale_unknown_is_refused_with_its_size() -> None:

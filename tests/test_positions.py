@@ -112,7 +112,7 @@ def test_a_file_with_heights_in_its_crs_declares_their_datum(tmp_path: Path) -> 
 
 
 def test_a_file_of_another_capture_is_refused_and_odd_names_are_told(tmp_path: Path) -> None:
-    with pytest.raises(SplatpipeError, match=r"geo.txt names no photo that is there: x.jpg, y.jpg"):
+    with pytest.raises(SplatpipeError, match=r"geo.txt lists no photo of this capture: x.jpg, y.jpg"):
         places(tmp_path, "EPSG:4326\nx.jpg 13.5 47.8\ny.jpg 13.5 47.8\n", ["a.jpg"])
     (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg 13.5 47.8\nx.jpg 13.5 47.8\n")
     assert read_places(tmp_path / "geo.txt", ["a.jpg"]).unknown == ("x.jpg",)

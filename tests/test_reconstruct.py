@@ -73,7 +73,7 @@ def test_photos_from_one_spot_are_not_placed_without_points(tmp_path: Path) -> N
     ring = make_ring(count=16, reach=3, points=3000, most=120, one_spot=True)
     with pytest.raises(SplatpipeError, match="None of 16 photos could be placed") as refused:
         reconstruct(capture_of(ring, tmp_path / "spot"), SparseConfig(mapper="global"), corner_photos.Recorder())
-    assert "from different places" in refused.value.hint
+    assert "from different positions" in refused.value.hint
 
 
 def test_a_mapper_that_was_asked_for_is_not_replaced(weak: tuple[Ring, MappingInput]) -> None:

@@ -169,10 +169,10 @@ WRONG = [
     (RenderRequest(size="1x1"), 2, "--size"),
     (RenderRequest(size="640"), 2, "--size"),
     (RenderRequest(size="9999x10"), 2, "--size"),
-    (RenderRequest(to=Path("{tmp}/film.avi")), 2, "is no film"),
-    (RenderRequest(to=Path("{tmp}/folder.webm")), 2, "is no film"),
+    (RenderRequest(to=Path("{tmp}/film.avi")), 2, "is not a film file"),
+    (RenderRequest(to=Path("{tmp}/folder.webm")), 2, "is not a film file"),
     (RenderRequest(stills=True, to=Path("{tmp}/broken.json")), 2, "is a file"),
-    (RenderRequest(stills=True, to=Path("{tmp}/stills.webm")), 2, "is a film's name"),
+    (RenderRequest(stills=True, to=Path("{tmp}/stills.webm")), 2, "is a film file name"),
     (RenderRequest(to=Path("/proc/films/film.webm")), 4, "Cannot make"),
 ]
 
@@ -191,7 +191,7 @@ def test_wrong_wishes_are_told_before_anything_is_rendered(
 
 
 def test_an_out_without_a_splat_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="holds no run"):
+    with pytest.raises(UsageError, match="does not contain a run"):
         render_run(tmp_path, RenderRequest(), 1)
     (tmp_path / "stages").mkdir()
     with pytest.raises(UsageError, match="no trained splat"):

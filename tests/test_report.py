@@ -198,7 +198,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     assert (watched.requests, watched.errors) == ([], [])
     assert headline(watched) == "Stopped in train before it was finished"
     told = words(watched)
-    iteration = int(re.search(r"It had come to ([\d,]+) of 100,000 iterations", told).group(1).replace(",", ""))
+    iteration = int(re.search(r"It had reached ([\d,]+) of 100,000 iterations", told).group(1).replace(",", ""))
     events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text()[before:].splitlines()]
     progress = [event["data"]["done"] for event in events if event["data"].get("what") == "training"]
     steps = [event["data"]["step"] for event in events if event["kind"] == "metric"]
@@ -266,7 +266,7 @@ def test_a_run_without_any_position_says_that_nothing_is_in_metres(
     watched = open_page((out / "report.html").as_uri())
     assert (watched.requests, watched.errors) == ([], [])
     said = words(watched)
-    assert "Nothing in it can be measured in metres" in said and "none of the photos has one" in said
+    assert "It cannot be measured in metres" in said and "none of the photos has a position" in said
     assert "Ground sample distance" not in said and "check point" not in said
     assert "x (model units)" in said and "east (m)" not in said
     left_out = watched.page.locator("#capture tr", has_text="notes.jpg").inner_text()
@@ -350,11 +350,11 @@ def show_nothing_inside(told: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("part", "change", "level", "said"),
     [
-        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=17.0), "bad", "a poor likeness"),
-        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=22.0), "doubt", "a fair likeness"),
+        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=17.0), "bad", "poor image quality"),
+        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=22.0), "doubt", "fair image quality"),
         ("evaluate.metrics", lambda told: told.update(per_view=[]), "doubt", "No photo was held out"),
         ("evaluate.metrics", lambda told: told.update(whole=told["mean"]), "good", "dB inside the boundary"),
-        ("evaluate.metrics", show_nothing_inside, "doubt", "No held-out photo shows what lies inside the boundary"),
+        ("evaluate.metrics", show_nothing_inside, "doubt", "No held-out photo shows the area inside the boundary"),
         ("evaluate.metrics", lambda told: told["floaters"]["veil"].update(mean=0.2), "doubt", "20.0 % of the light"),
         (
             "evaluate.metrics",
@@ -369,15 +369,20 @@ def show_nothing_inside(told: dict[str, Any]) -> None:
             "doubt",
             "(5.00 m)",
         ),
-        ("georef.accuracy", lambda told: told["tables"].update(check=None), "doubt", "no check point proves it"),
+        ("georef.accuracy", lambda told: told["tables"].update(check=None), "doubt", "no check point to verify it"),
         (
             "georef.accuracy",
             lambda told: told["tables"].update(check=None, control=None),
             "doubt",
             "own positions alone",
         ),
-        ("georef.frame", lambda told: told.update(kind="arbitrary"), "doubt", "neither scale nor place"),
-        ("georef.frame", lambda told: told.update(kind="arbitrary", metres=True), "doubt", "metric but not placed"),
+        ("georef.frame", lambda told: told.update(kind="arbitrary"), "doubt", "neither scale nor georeference"),
+        (
+            "georef.frame",
+            lambda told: told.update(kind="arbitrary", metres=True),
+            "doubt",
+            "metric but not georeferenced",
+        ),
     ],
 )
 def test_the_verdict_follows_the_figures(
@@ -405,9 +410,9 @@ def test_scale_bars_are_told_one_by_one(copy_of_run: Path) -> None:
     assert "place and heading are arbitrary" in facts["Frame"] and "a pixel" in facts["Ground sample distance"]
     assert facts["P1 to P2"].endswith("m, +1.2 mm in the model")
     assert facts["P2 to P3"].endswith("-900.0 mm in the model, left out")
-    assert facts["P3 to P9"].endswith("a target of it was not found")
+    assert facts["P3 to P9"].endswith("one of its targets was not found")
     assert unit_of(inputs) == "metres"
-    finding = next(finding for finding in judge(inputs).findings if "metric but not placed" in finding.text)
+    finding = next(finding for finding in judge(inputs).findings if "metric but not georeferenced" in finding.text)
     assert finding.level == "doubt"  # one bar, which no other proves
 
 
@@ -418,11 +423,11 @@ def test_bad_cameras_are_the_first_words_of_page_and_console(
     verdict = {"level": "bad", "reasons": [reason]}
     rewrite(read_report_inputs(copy_of_run).part("sparse.summary"), lambda told: told.update(verdict=verdict))
     told = judge(read_report_inputs(copy_of_run))
-    assert (told.level, told.headline) == ("bad", "The cameras are bad")
+    assert (told.level, told.headline) == ("bad", "The camera poses are unreliable")
     assert (told.findings[0].level, told.findings[0].text) == ("bad", "40 of 90 pairs contradict it. Add photos.")
     show_bad_cameras(verdict)
     assert re.search(
-        "The cameras are bad.*40 of 90 pairs contradict it.*Add photos", capsys.readouterr().err, re.DOTALL
+        "The camera poses are unreliable.*40 of 90 pairs contradict it.*Add photos", capsys.readouterr().err, re.DOTALL
     )
     show_bad_cameras({"level": "doubt", "reasons": [{**reason, "level": "doubt"}]})
     assert capsys.readouterr().err == ""
@@ -430,7 +435,7 @@ def test_bad_cameras_are_the_first_words_of_page_and_console(
 
 def test_the_page_tells_which_mappers_were_tried(copy_of_run: Path) -> None:
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
-    table = page[page.index("Ways of mapping that were tried") : page.index("Calibration</h3>")]
+    table = page[page.index("Mapping methods tried") : page.index("Calibration</h3>")]
     assert "incremental" in table and "taken" in table and "nan" not in table
 
 
@@ -454,7 +459,7 @@ def test_a_report_that_cannot_be_written_does_not_spoil_a_good_run(copy_of_run: 
 
 def test_report_of_a_folder_without_a_run_is_a_wrong_call(tmp_path: Path) -> None:
     done = splatpipe("report", tmp_path)
-    assert done.returncode == 2 and "holds no run" in done.stderr
+    assert done.returncode == 2 and "does not contain a run" in done.stderr
     assert not list(tmp_path.iterdir())
 
 

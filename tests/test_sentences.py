@@ -16,11 +16,11 @@ SEEN = {"photos": 40, "cameras": 1, "positions": 40, "masks": 0, "left_out": 0, 
 SURVEYED = {"rmse_horizontal_m": 0.006701, "rmse_up_m": 0.009899, "count": 6}
 GEOREF = {"kind": "enu", "note": "From 12 control points.", "positions_left_out": 0, "points_left_out": 1}
 SAID = [
-    ("ingest", SEEN, "40 photos of 1 camera, all with positions good to 0.02 m"),
+    ("ingest", SEEN, "40 photos of 1 camera, all with positions accurate to 0.02 m"),
     (
         "ingest",
         SEEN | {"cameras": 2, "positions": 38, "sigma_horizontal_m": 3.0, "sigma_vertical_m": 5.0, "left_out": 1},
-        "40 photos of 2 cameras, 38 with positions good to 3 m (5 m in height), 1 file left out",
+        "40 photos of 2 cameras, 38 with positions accurate to 3 m (5 m in height), 1 file left out",
     ),
     ("sparse", PLACED, "all 40 photos placed, reprojection error 0.32 px, 23,143 tie points"),
     ("sparse", PLACED | {"registered": 37}, "37 of 40 photos placed, reprojection error 0.32 px, 23,143 tie points"),
@@ -55,10 +55,10 @@ def test_every_stage_has_one_and_none_fails_on_what_it_does_not_know() -> None:
 
 
 def test_the_verdict_comes_first_with_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
-    doubt = VerdictLine("doubt", "Floaters", "Something hangs in the air [bold]before[/] 5 photos")
+    doubt = VerdictLine("doubt", "Floaters", "Floaters in front of [bold]5[/] photos")
     show_verdict(Verdict("doubt", "Finished; 1 point to look at", "The run ended.", [doubt]))
     lines = capsys.readouterr().err.splitlines()
     assert lines[1:] == [
         "! Finished; 1 point to look at.  The run ended.",
-        "  ! Floaters  Something hangs in the air [bold]before[/] 5 photos",
+        "  ! Floaters  Floaters in front of [bold]5[/] photos",
     ]

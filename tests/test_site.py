@@ -257,7 +257,7 @@ def test_a_damaged_tree_is_told(site: Path, tmp_path: Path, open_page: Callable,
 def test_opened_from_a_disk_it_says_what_to_do(site: Path, open_page: Callable) -> None:
     page = open_page((site / "web/index.html").as_uri(), WIDTH, HEIGHT).page
     page.locator("#loading.failed").wait_for()
-    assert "do not allow a page that was opened from a disk" in page.locator("#message").inner_text()
+    assert "do not allow for a page opened from disk" in page.locator("#message").inner_text()
     assert "web host" in page.locator("#advice").inner_text()
 
 

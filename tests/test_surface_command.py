@@ -131,7 +131,7 @@ def test_a_run_without_scale_is_told_so_at_once_unless_it_is_placed_anew(demo_ru
         path.write_text(json.dumps(placed).ljust(len(text)))  # of its size, or the artifact would count as damaged
     check_possible(demo_run, options_for("ortho", None, None))
     check_possible(out, options_for("ortho", None, None), {"georef": {"max_position_error_m": 5.0}})
-    with pytest.raises(SplatpipeError, match="no scale"):
+    with pytest.raises(SplatpipeError, match="no metric scale"):
         check_possible(out, options_for("ortho", None, None))
 
 
@@ -140,7 +140,7 @@ def test_what_was_measured_is_told_in_lines() -> None:
     volume = {"polygon": 2, "name": "", "cut_m3": 23.834, "cut_sigma_m3": 0.9, "fill_m3": 0.0, "fill_sigma_m3": 0.01}
     told = {"sections": [{**section, "dxf": "section-1.dxf"}], "volumes": [volume]}
     first, second = measured_lines(Path("out"), told)
-    assert first == "Section 1: 41.77 m, 98% with heights, these to 1.7 cm: out/sections/section-1.dxf"
+    assert first == "Section 1: 41.77 m, 98% with heights, accurate to 1.7 cm: out/sections/section-1.dxf"
     assert second == "Polygon 2: cut 23.83 ± 0.90 m³, fill 0.00 ± 0.01 m³: out/volumes.json"
     assert measured_lines(Path("out"), {}) == []
 

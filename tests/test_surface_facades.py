@@ -346,7 +346,7 @@ def test_a_killed_call_goes_on_with_the_same_bytes(tmp_path: Path) -> None:
 def test_a_line_where_nothing_stands_is_refused(tmp_path: Path) -> None:
     x1, y1, x2, y2 = stated_line()
     for line in ((x1, y1 + 50, x2, y2 + 50), (x2, y2, x1, y1), (x1, y1, x1, y1), (float("nan"), y1, x2, y2)):
-        with pytest.raises(SplatpipeError, match="No wall that photos see"):
+        with pytest.raises(SplatpipeError, match="No wall seen by the photos"):
             make_facades(task(line), tmp_path, Quiet())
 
 

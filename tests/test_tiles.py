@@ -236,10 +236,10 @@ def test_a_crs_without_a_number_is_told_by_its_definition(tmp_path: Path):
 def test_tiles_of_a_splat_from_nowhere_are_refused(tmp_path: Path):
     scene, root = two_levels()
     nowhere = replace(scene, facts=replace(FACTS, place=None))
-    with pytest.raises(SplatpipeError, match="where this splat lies") as caught:
+    with pytest.raises(SplatpipeError, match="need a georeferenced splat") as caught:
         write_tiles(tmp_path, nowhere, root, np.eye(4))
     assert "Georeference" in caught.value.hint
-    with pytest.raises(SplatpipeError, match="where this splat lies"):
+    with pytest.raises(SplatpipeError, match="need a georeferenced splat"):
         write_tiles_on_globe(tmp_path, nowhere, root)
     assert not list(tmp_path.iterdir())
 

@@ -267,7 +267,7 @@ def test_a_card_that_is_left_alone_is_told_once(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(cuda_driver, "has_card", lambda: True)
     assert choose_device("cpu", "", notes.append).name == "cpu" and not notes
     assert choose_device("auto", "", notes.append).name == "cpu"
-    assert notes == ["the CPU computes, not the NVIDIA graphics card: The driver is old. Install another."]
+    assert notes == ["computing on the CPU, not on the NVIDIA graphics card: The driver is old. Install another."]
     choose_device("auto", TrainConfig(loss="kornia").unfit_for_cuda(), notes.append)
     assert len(notes) == 2 and "kornia" in notes[1] and notes[1] == notes[1].strip()
 

@@ -169,7 +169,7 @@ def test_a_limit_on_processes_is_told(numbers: Path, tmp_path: Path, monkeypatch
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr(sys, "executable", str(numbers))  # a folder: the kernel starts none
-        with pytest.raises(MachineError, match="No process could be started"):
+        with pytest.raises(MachineError, match="No worker process could be started"):
             walk(request_of(numbers, out))
     goes_on(numbers, out, LINE)
 
@@ -273,7 +273,7 @@ def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> 
     ):
         assert holder.stdout is not None and holder.stdout.readline() == "held\n"
         assert waiting.stderr is not None
-        while "waiting for it to end" not in waiting.stderr.readline():
+        while "waiting for it to finish" not in waiting.stderr.readline():
             assert waiting.poll() is None
         waiting.send_signal(signal.SIGTERM)
         said = waiting.communicate(timeout=5 * TIME_LIMIT_S)[1]

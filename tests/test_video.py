@@ -104,7 +104,7 @@ except MachineError as error:
     print(error.message, error.hint)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "could not be written whole" in done.stdout and "disk" in done.stdout
+    assert "could not be written completely" in done.stdout and "disk" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 

@@ -353,7 +353,7 @@ def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> 
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
 
     done = view(tmp_path)
-    assert done.returncode == 2 and "holds no run" in done.stderr
+    assert done.returncode == 2 and "does not contain a run" in done.stderr
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

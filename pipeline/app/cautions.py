@@ -57,22 +57,24 @@ def _of_mount(place: Path, mount: Mount, *, in_wsl: bool) -> Sequence[Caution]:
     if mount.kind in WINDOWS_KINDS or (in_wsl and "drvfs" in mount.options):
         found.append(
             Caution(
-                f"{where}: every file goes through another system, many times slower, and locks hold in this one only.",
-                "Choose an OUT in Linux's own file system, such as ~/out, and copy the results from there; photos may "
+                f"{where}: file access goes through another system and is many times slower, and locks apply to "
+                "this one only.",
+                "Choose an OUT in the Linux file system, such as ~/out, and copy the results from there; photos may "
                 "stay where they are.",
             )
         )
     elif option := _unshared_locks(mount):
         found.append(
             Caution(
-                f"{where}{option}: its locks hold on this machine only; another machine in the same OUT is noticed by "
-                "its signs of life, within half a minute.",
-                "Let one machine at a time work in an OUT, or mount it with locks (NFS 4, or 3 with its lock service).",
+                f"{where}{option}: its locks apply to this machine only; another machine working in the same OUT "
+                "is detected by "
+                "its heartbeat, within half a minute.",
+                "Use an OUT from one machine at a time, or mount it with locks (NFS 4, or 3 with its lock service).",
             )
         )
     elif mount.kind in IN_MEMORY:
         found.append(
-            Caution(f"{where}: it takes memory as it fills, and is gone with the machine.", "Choose an OUT on a disk.")
+            Caution(f"{where}: its files take up memory and are lost at shutdown.", "Choose an OUT on a disk.")
         )
     return found
 
@@ -83,14 +85,14 @@ def _unshared_locks(mount: Mount) -> str:
     if options:
         return f" with {', '.join(dict.fromkeys(options))}"
     passed_on = mount.kind in PASSED_ON or mount.kind.startswith("fuse.")
-    return ", passed on from elsewhere" if passed_on and mount.kind not in FUSE_WITH_LOCKS else ""
+    return ", passed through from another system" if passed_on and mount.kind not in FUSE_WITH_LOCKS else ""
 
 
 def _of_wsl(kernel: str, memory_bytes: int) -> Sequence[Caution]:
     if WSL not in kernel.casefold():
         return []
     if "wsl2" not in kernel.casefold():
-        return [Caution("This is WSL 1, which nobody has tried.", "Convert it: wsl --set-version DISTRIBUTION 2")]
+        return [Caution("This is WSL 1, which is untested.", "Convert it: wsl --set-version DISTRIBUTION 2")]
     if 0 < memory_bytes < SMALL_WSL_BYTES:
         return [
             Caution(

@@ -71,7 +71,7 @@ from splatpipe.pipeline.engine.machine import available_cores
 app = typer.Typer(
     name="splatpipe",
     help="From a folder of drone photos to a georeferenced, quality-checked 3D Gaussian splat.",
-    epilog="Each command tells more: splatpipe COMMAND --help. Read on: README.md, docs/options.md",
+    epilog="Details of each command: splatpipe COMMAND --help. See also: README.md, docs/options.md",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -118,7 +118,7 @@ def run(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Turn a folder of photos into a Gaussian splat; what is there and valid is reused."""
+    """Turn a folder of photos into a Gaussian splat; valid results of earlier runs are reused."""
     from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
     from splatpipe.pipeline.engine.config import load_preset
 
@@ -151,7 +151,7 @@ def demo(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the line on the capture that ships with splatpipe, to see it work."""
+    """Run the pipeline on the demo capture that ships with splatpipe."""
     from splatpipe.demo import capture_path
 
     budgets = {"time_budget": time_budget, "max_memory": max_memory}
@@ -172,12 +172,12 @@ def stage(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run one stage again on an existing OUT, and nothing else but what divides it; or make one of its shards."""
+    """Run one stage of an existing OUT again, and no others except the one that divides it; or one of its shards."""
     with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         check_stage(name)
         if shard is not None and assignments:
-            raise UsageError("All shards of a stage have the same options.", hint="Leave --set out, or --shard.")
+            raise UsageError("All shards of a stage have the same options.", hint="Omit either --set or --shard.")
         done.reports = shard is None
         request = existing(out, overrides(None, assignments, None).tables, device, threads)
         with RunSession(request, wait, "" if shard is None else f"{name}.{shard}") as runner:
@@ -190,7 +190,7 @@ def georef(
     out: OutArgument,
     gcp: Annotated[
         str | None,
-        typer.Option(metavar="FILE", help="Control points: gcp_list.txt or CSV; auto, or none. Else as before."),
+        typer.Option(metavar="FILE", help="Control points: gcp_list.txt or CSV; auto, or none. Default: as before."),
     ] = None,
     assignments: SetOption = None,
     device: DeviceOption = "auto",
@@ -199,7 +199,7 @@ def georef(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Place a finished run anew: other control points, another CRS. What does not change is reused."""
+    """Georeference a finished run again, with other control points or another CRS. Unaffected results are reused."""
     with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
@@ -216,17 +216,21 @@ def surface(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="What to make: ortho, dsm, facades, cloud, mesh; what the run has stays. Without it ortho,dsm, for "
-            "a section or a volume dsm.",
+            help="Products to make: ortho, dsm, facades, cloud, mesh; existing ones are kept. Default: ortho,dsm; for "
+            "a section or a volume, dsm.",
         ),
     ] = None,
     gsd: Annotated[
         str | None,
-        typer.Option(metavar="2cm", help="Side of a pixel on the ground; heights have cells twice as wide."),
+        typer.Option(
+            metavar="2cm", help="Ground pixel size of the orthophoto; cells of the surface model are twice as wide."
+        ),
     ] = None,
     source: Annotated[
         str | None,
-        typer.Option(help="Whose depths: photos, splat, or both: photos', and the splat's in their holes."),
+        typer.Option(
+            help="Source of the depths: photos, splat, or both (from photos, with holes filled from the splat)."
+        ),
     ] = None,
     section: Annotated[
         list[str] | None,
@@ -236,7 +240,11 @@ def surface(
         Path | None, typer.Option(metavar="FILE", help="Measure volumes inside the polygons of a GeoJSON.")
     ] = None,
     base: Annotated[
-        str, typer.Option(metavar="rim|lowest|HEIGHT", help="Of volumes: a plane through the rim, or a level one.")
+        str,
+        typer.Option(
+            metavar="rim|lowest|HEIGHT",
+            help="Base of volumes: a plane through the rim, or a level at the rim's lowest point or at HEIGHT.",
+        ),
     ] = "rim",
     assignments: SetOption = None,
     device: DeviceOption = "auto",
@@ -284,7 +292,7 @@ def render(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a film or stills of a finished run, along its cameras, around it, or by a file of keyframes."""
+    """Render a film or stills of a finished run: along its cameras, in an orbit, or from a keyframe file."""
     with CommandSummary(out, as_json) as done:
         from splatpipe.pipeline.app.renders import RenderRequest, render_run
 
@@ -298,27 +306,27 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for a free one.")] = 0,
     bind: Annotated[
         str,
-        typer.Option(metavar="ADDRESS", help="Address to listen on: 0.0.0.0 in a container, whose port is published."),
+        typer.Option(metavar="ADDRESS", help="Address to listen on; use 0.0.0.0 in a container with a published port."),
     ] = "127.0.0.1",
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     mark: Annotated[bool, typer.Option("--mark", help="Mark control points in the photos.")] = False,
     points: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="With --mark: points and their coordinates, a CSV: name,x,y,z."),
+        typer.Option(metavar="FILE", help="With --mark: CSV of the points' coordinates: name,x,y,z."),
     ] = None,
 ) -> None:
-    """Show a run in the browser: its training as it runs, its results; with --mark, mark control points."""
+    """Show a run in the browser: training progress and results; with --mark, mark control points."""
     from splatpipe.pipeline.app.console import say
     from splatpipe.pipeline.app.view.server import ViewOptions, serve
 
     if points is not None and not mark:
-        raise UsageError("--points says what to mark.", hint="Add --mark.")
+        raise UsageError("--points needs --mark.", hint="Add --mark.")
     serve(out, ViewOptions(port, bind, browser, mark, points), say)
 
 
 @helped(app)
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
-    """Say what is there, what is stale and why."""
+    """Show the status of each stage: what is valid, what is out of date, and why."""
     from splatpipe.pipeline.app.console import show_status
     from splatpipe.pipeline.engine.line import line_status
     from splatpipe.pipeline.engine.session import status_of
@@ -332,7 +340,7 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
 
 @helped(app)
 def report(out: OutArgument, as_json: JsonOption = False) -> None:
-    """Write OUT/report.html anew, from what is there."""
+    """Write OUT/report.html again from the existing results."""
     from splatpipe.pipeline.app.console import say
     from splatpipe.pipeline.app.report import make_report
     from splatpipe.pipeline.engine.run_folder import LOG_FILE, open_run_folder
@@ -347,7 +355,7 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 
 @helped(app)
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
-    """Remove artifacts that the present configuration no longer asks for."""
+    """Remove artifacts that the current configuration no longer uses."""
     from splatpipe.pipeline.app.console import say
     from splatpipe.pipeline.engine.line import line_status
     from splatpipe.pipeline.engine.lock import locked
@@ -364,7 +372,7 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
 
 @helped(app)
 def options(preset: PresetOption = "standard") -> None:
-    """List every option with its value in a preset and what it does."""
+    """List every option with its value in a preset and its description."""
     from splatpipe.pipeline.app.console import show_table
     from splatpipe.pipeline.engine.config import load_preset, lookup, option_help
 
@@ -376,11 +384,12 @@ def options(preset: PresetOption = "standard") -> None:
 @helped(app)
 def doctor(
     out: Annotated[
-        Path | None, typer.Argument(callback=lambda path: path and expanded(path), help="Where runs are to write.")
+        Path | None,
+        typer.Argument(callback=lambda path: path and expanded(path), help="Folder for the results of runs."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what this machine can do, and what to think of before a run on it."""
+    """Check this machine: its capabilities, and problems to resolve before a run."""
     from splatpipe.pipeline.app.cautions import cautions
     from splatpipe.pipeline.app.console import say, show_table
     from splatpipe.pipeline.app.doctor import examine
@@ -412,7 +421,9 @@ def main() -> NoReturn:
         app()
     except SystemExit as error:  # typer has told what is wrong with the call
         if error.code == EXIT_USAGE and "--json" in sys.argv:
-            print_json({"exit_code": EXIT_USAGE, "error": {"message": "Wrong call; see stderr.", "hint": "--help"}})
+            print_json(
+                {"exit_code": EXIT_USAGE, "error": {"message": "Invalid command line; see stderr.", "hint": "--help"}}
+            )
         raise
     except StopSignal as error:
         from splatpipe.pipeline.app.console import say

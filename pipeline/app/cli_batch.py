@@ -35,13 +35,16 @@ CapturesArgument = Annotated[
 ]
 ProfileOption = Annotated[
     Path | None,
-    typer.Option(metavar="FOLDER", help="Profile of Snakemake's, to run the jobs elsewhere: Slurm, Kubernetes."),
+    typer.Option(metavar="FOLDER", help="Snakemake profile, to run the jobs elsewhere: Slurm, Kubernetes."),
 ]
-RetriesOption = Annotated[int, typer.Option(min=0, max=10, help="How often a stage that died is begun again.")]
+RetriesOption = Annotated[int, typer.Option(min=0, max=10, help="How many times a stage that crashed is restarted.")]
 RetryFailedOption = Annotated[
-    bool, typer.Option("--retry-failed", help="Try again what failed for its photos or options, though none changed.")
+    bool,
+    typer.Option(
+        "--retry-failed", help="Retry captures that failed because of their photos or options, even if unchanged."
+    ),
 ]
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Say which jobs would run, by Snakemake's dry run.")]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="List the jobs that would run (Snakemake's dry run).")]
 
 
 def batch(

@@ -20,7 +20,7 @@ PRESETS = ("preview", "standard", "high")
 SIGNS = {"error": "✗", "warning": "!", "note": "·"}
 
 PageOption = Annotated[
-    Path, typer.Option("--output", "-o", help="The page; else check.html in the folder where you are.")
+    Path, typer.Option("--output", "-o", help="The page to write. Default: check.html in the current folder.")
 ]
 
 
@@ -32,7 +32,7 @@ def check(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what is wrong with a capture while you are still there; what a run would take."""
+    """Check a capture while still on site: its problems, and the time and memory of a run."""
     page = page.expanduser()
     with CommandSummary(page, as_json) as done:
         from splatpipe.pipeline.app.console import RunConsole, say
@@ -57,7 +57,7 @@ def check(
             write_page(preflight, page)
         except OSError as error:
             raise MachineError(
-                f"Cannot write the page {page}: {error.strerror}.", hint="Name another place for it: -o FILE."
+                f"Cannot write the page {page}: {error.strerror}.", hint="Choose another path: -o FILE."
             ) from error
         failed = preflight.worst == "error"
         done.details = {**facts, "exit_code": EXIT_INPUT if failed else 0, "outputs": [str(page)]}
@@ -77,7 +77,7 @@ def _show(preflight: Preflight) -> None:
         text += f", trained in {forecast.blocks} blocks" if forecast.blocks > 1 else ""
         say(f"  {text}" + (f"; lacks {forecast.lacking}" if forecast.lacking else ""))
     verdict = {
-        "error": "This capture cannot be reconstructed as it is",
-        "warning": "It can be reconstructed; see above what is lost",
+        "error": "This capture cannot be reconstructed as it stands",
+        "warning": "It can be reconstructed, with the limitations above",
     }
-    say(f"{len(preflight.photos)} photos. {verdict.get(preflight.worst or '', 'Nothing is wrong with it')}.")
+    say(f"{len(preflight.photos)} photos. {verdict.get(preflight.worst or '', 'No problems found')}.")

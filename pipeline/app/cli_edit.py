@@ -14,7 +14,7 @@ from splatpipe.pipeline.app.command_summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
 ORDER = "splatpipe.order"
-CROP, MOVE, REST = "Keep or take out", "Move, turn, scale", "Clean, merge, reduce"
+CROP, MOVE, REST = "Keep or remove", "Move, rotate, scale", "Clean, merge, reduce"
 
 
 class OrderedCommand(TyperCommand):
@@ -35,52 +35,62 @@ SourceArgument = Annotated[
     Path, typer.Argument(metavar="IN", callback=expanded, help="A splat of any format, or the OUT of a run.")
 ]
 TargetArgument = Annotated[
-    Path, typer.Argument(metavar="OUT", callback=expanded, help="The new file; its ending says the format.")
+    Path, typer.Argument(metavar="OUT", callback=expanded, help="The new file; its extension sets the format.")
 ]
 BoxOption = Annotated[
-    list[str] | None, _repeated("X1,Y1,X2,Y2", "Keep what lies in a box; with heights X1,Y1,Z1,X2,Y2,Z2.", CROP)
+    list[str] | None, _repeated("X1,Y1,X2,Y2", "Keep what is inside a box; with heights: X1,Y1,Z1,X2,Y2,Z2.", CROP)
 ]
 PolygonOption = Annotated[
-    list[Path] | None, _repeated("FILE", "Keep what lies in the polygons of a GeoJSON, in any CRS.", CROP)
+    list[Path] | None, _repeated("FILE", "Keep what is inside the polygons of a GeoJSON file, in any CRS.", CROP)
 ]
-HeightsOption = Annotated[list[str] | None, _repeated("LOW,HIGH", "Keep these heights; LOW, or ,HIGH alone.", CROP)]
-CutBoxOption = Annotated[list[str] | None, _repeated("X1,Y1,X2,Y2", "Take out what lies in a box.", CROP)]
-CutPolygonOption = Annotated[list[Path] | None, _repeated("FILE", "Take out what lies in the polygons.", CROP)]
-MoveOption = Annotated[list[str] | None, _repeated("EAST,NORTH,UP", "Move by so many metres.", MOVE)]
+HeightsOption = Annotated[
+    list[str] | None, _repeated("LOW,HIGH", "Keep a range of heights; LOW, or ,HIGH for one limit.", CROP)
+]
+CutBoxOption = Annotated[list[str] | None, _repeated("X1,Y1,X2,Y2", "Remove what is inside a box.", CROP)]
+CutPolygonOption = Annotated[list[Path] | None, _repeated("FILE", "Remove what is inside the polygons.", CROP)]
+MoveOption = Annotated[list[str] | None, _repeated("EAST,NORTH,UP", "Move by a distance in metres.", MOVE)]
 MoveToOption = Annotated[
-    list[str] | None, _repeated("X,Y[,Z]", "Move its middle, or the point of --about, to a place.", MOVE)
+    list[str] | None,
+    _repeated("X,Y[,Z]", "Move the splat's centre, or the point of --about, to these coordinates.", MOVE),
 ]
 RotateOption = Annotated[
     list[str] | None,
-    _repeated("DEGREES[,AXIS]", "Turn anticlockwise seen from above, or about x, y, z or an axis X,Y,Z.", MOVE),
+    _repeated("DEGREES[,AXIS]", "Rotate anticlockwise as seen from above, or about x, y, z or an axis X,Y,Z.", MOVE),
 ]
 ScaleOption = Annotated[
-    list[str] | None, _repeated("FACTOR", "Scale; the splat loses its place on the earth and its metres.", MOVE)
+    list[str] | None, _repeated("FACTOR", "Scale; the splat loses its georeference and metric scale.", MOVE)
 ]
 ScaleFromOption = Annotated[
     tuple[str, str, str] | None,
     typer.Option(
         metavar="A B LENGTH",
-        help="Scale so that points A and B (X,Y,Z) are so far apart, as 12.40m; A stays, lengths are metres.",
+        help=(
+            "Scale so that points A and B (X,Y,Z) are LENGTH apart, e.g. 12.40m; A stays fixed, and units become "
+            "metres."
+        ),
         rich_help_panel=MOVE,
     ),
 ]
 AboutOption = Annotated[
     list[str] | None,
-    _repeated("X,Y,Z|middle", "What stays in place in the steps that follow; else the splat's middle.", MOVE),
+    _repeated("X,Y,Z|middle", "Fixed point of the steps that follow. Default: the splat's centre.", MOVE),
 ]
 CleanOption = Annotated[bool, typer.Option("--clean", help="Remove floaters and rough edges.", rich_help_panel=REST)]
-MergeOption = Annotated[list[Path] | None, _repeated("FILE", "Add another splat, where it lies on the earth.", REST)]
+MergeOption = Annotated[list[Path] | None, _repeated("FILE", "Add another splat at its georeferenced position.", REST)]
 ReduceOption = Annotated[
-    list[str] | None, _repeated("N|100MB", "Merge neighbours until so many are left, or OUT is so small.", REST)
+    list[str] | None,
+    _repeated("N|100MB", "Merge neighbouring Gaussians down to N, or until OUT is at most this size.", REST),
 ]
 LocalOption = Annotated[
-    bool, typer.Option("--local", help="Coordinates are metres from the splat's zero, not of its CRS.")
+    bool, typer.Option("--local", help="Coordinates are in metres from the splat's origin, not in its CRS.")
 ]
 FormatOption = Annotated[
-    str | None, typer.Option("--format", "-f", metavar="NAME", help="Where OUT's ending does not say it: spz2, model.")
+    str | None,
+    typer.Option("--format", "-f", metavar="NAME", help="Format, if OUT's extension does not set it: spz2, model."),
 ]
-PicturesOption = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw it before and after.")]
+PicturesOption = Annotated[
+    bool, typer.Option("--pictures/--no-pictures", help="Write pictures of the splat before and after.")
+]
 
 
 def edit(
@@ -107,7 +117,7 @@ def edit(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Crop, clean, move, turn, scale, merge and reduce a splat, in the order in which the steps are given."""
+    """Crop, clean, move, rotate, scale, merge and reduce a splat, in the order in which the steps are given."""
     with CommandSummary(out, as_json) as done:
         options = {
             "crop_box": crop_box,
@@ -146,7 +156,10 @@ def steps_in_order(order: Sequence[str], options: Mapping[str, Any]) -> list[tup
         if name not in left:
             continue  # no step
         if not left[name]:
-            raise UsageError(f"--{name.replace('_', '-')} can be given once.", hint="Edit what comes out once more.")
+            raise UsageError(
+                f"--{name.replace('_', '-')} can be given only once.",
+                hint="Apply it to the edited file in a second command.",
+            )
         found.append((name, left[name].pop(0)))
     return found
 

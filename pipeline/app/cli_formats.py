@@ -23,16 +23,21 @@ from splatpipe.pipeline.engine.errors import UsageError
 
 FormatsOption = Annotated[
     str,
-    typer.Option("--format", "-f", metavar="NAMES", help="What to make, separated by commas; what the run has stays."),
+    typer.Option(
+        "--format", "-f", metavar="NAMES", help="Formats to make, separated by commas; existing ones are kept."
+    ),
 ]
 FormatOption = Annotated[
-    str | None, typer.Option("--format", "-f", metavar="NAME", help="Where OUT's ending does not say it: spz2, model.")
+    str | None,
+    typer.Option("--format", "-f", metavar="NAME", help="Format, if OUT's extension does not set it: spz2, model."),
 ]
 SplatArgument = Annotated[
     Path,
-    typer.Argument(metavar="IN", callback=expanded, help="PLY, SPZ, SOG or GLB; a model's folder."),
+    typer.Argument(metavar="IN", callback=expanded, help="PLY, SPZ, SOG or GLB, or a trainer's model folder."),
 ]
-TargetArgument = Annotated[Path, typer.Argument(metavar="OUT", callback=expanded, help="Its ending says the format.")]
+TargetArgument = Annotated[
+    Path, typer.Argument(metavar="OUT", callback=expanded, help="Its extension sets the format.")
+]
 
 
 def export(
@@ -45,7 +50,7 @@ def export(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Hand a finished run over in more formats, into OUT/export: docs/formats.md says which program reads which."""
+    """Export a finished run in more formats, to OUT/export: docs/formats.md says which program reads which."""
     from splatpipe.pipeline.app.formats import check_possible, with_formats
 
     with CommandSummary(out, as_json) as done:
@@ -71,7 +76,7 @@ def convert(
 
         kind = format_of_name(target, format_name)
         if target.exists() and target.samefile(source):
-            raise UsageError(f"{target} is what is read.", hint="Name another file to write.")
+            raise UsageError(f"{target} is the input file.", hint="Choose another output file.")
         facts: dict[str, Any] = convert_file(source, target, kind)
         done.details = {"convert": facts}
         say(f"{facts['gaussians']:,} Gaussians, {facts['bytes'] / 1e6:.1f} MB: {target}")

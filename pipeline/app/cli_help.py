@@ -10,7 +10,8 @@ from typing import Any
 import typer
 
 RUN_EXITS = (
-    "0 done, 1 the photos or files cannot be used, 2 a wrong call, 3 a stage failed, 4 this machine lacks something; "
+    "0 done, 1 the photos or files cannot be used, 2 invalid command line, 3 a stage failed, 4 this machine lacks "
+    "something; "
     "130 and 143 stopped: the same command goes on."
 )
 
@@ -37,13 +38,13 @@ class HelpPage:
         parts = ["Examples:" if len(self.examples) > 1 else "Example:", calls]
         if self.exits:
             parts.append(f"Exit codes: {self.exits}")
-        return "\n\n".join([*parts, f"Read on: {self.read_on}"])
+        return "\n\n".join([*parts, f"See also: {self.read_on}"])
 
 
 PAGES = {
     "run": HelpPage(
         "Reads JPEG, PNG or TIFF photos (GPS from EXIF and XMP), and beside them gcp_list.txt, geo.txt, "
-        "boundary.geojson and masks/, if they are there. Leaves in OUT splat.ply, viewer.html, report.html, "
+        "boundary.geojson and masks/, if present. Writes to OUT splat.ply, viewer.html, report.html, "
         "georef.json, ortho.tif, dsm.tif, a film and more, and the stages' artifacts in OUT/stages. The "
         "photos are not changed.",
         ("run PHOTOS OUT --preset preview", "run PHOTOS OUT --time-budget 2h --set export.sky=true"),
@@ -51,78 +52,81 @@ PAGES = {
         RUN_EXITS,
     ),
     "demo": HelpPage(
-        "Reads 40 rendered photos of a farmhouse with control points, which lie in the package. Leaves in OUT what a "
-        "run of your own photos would leave; it takes minutes and 1.2 GB of memory.",
+        "Reads 40 rendered photos of a farmhouse with control points, which ship with the package. Writes to OUT "
+        "what a "
+        "run of your own photos would write; it takes minutes and 1.2 GB of memory.",
         ("demo out/demo",),
         "README.md, docs/products.md",
         RUN_EXITS,
     ),
     "batch": HelpPage(
-        "Reads a folder of capture folders, or a list (TOML, CSV) with options for each. Leaves a run in OUT/NAME for "
-        "each capture, and batch.html, batch.csv and batch.json about all. Needs Snakemake: "
+        "Reads a folder of capture folders, or a list (TOML, CSV) with options for each. Writes a run to OUT/NAME for "
+        "each capture, and batch.html, batch.csv and batch.json about all of them. Needs Snakemake: "
         "pip install 'splatpipe\\[batch]'.",
         ("batch CAPTURES OUT --dry-run", "batch captures.toml OUT --retries 3"),
         "docs/unattended.md",
-        "0 all captures succeeded, 1 some failed, 2 a wrong call or list, 3 Snakemake failed, 4 this machine lacks "
+        "0 all captures succeeded, 1 some failed, 2 invalid command line or list, 3 Snakemake failed, 4 this "
+        "machine lacks "
         "something; 130 and 143 stopped.",
     ),
     "stage": HelpPage(
-        "Reads the artifacts of earlier stages in OUT. Leaves the stage's own, and out of date what depends on it "
-        "(splatpipe status tells); splatpipe run makes that anew.",
+        "Reads the artifacts of earlier stages in OUT. Writes the stage's own; stages that depend on it become out "
+        "of date "
+        "(see splatpipe status), and splatpipe run makes them again.",
         ("stage evaluate OUT", "stage train OUT --shard 2"),
         "docs/rooms.md, docs/blocks.md",
         RUN_EXITS,
     ),
     "georef": HelpPage(
-        "Reads OUT and the control points. Leaves OUT with the new place in each of its files; trains anew only if the "
+        "Reads OUT and the control points. Updates the georeference in all files of OUT; trains again only if the "
         "control bends the model.",
         ("georef OUT --gcp gcp_list.txt", "georef OUT --set georef.crs=EPSG:2178"),
         "docs/surveying.md",
         RUN_EXITS,
     ),
     "surface": HelpPage(
-        "Reads a run with a metric scale. Leaves in OUT the orthophoto and the surface model as GeoTIFFs, façade "
-        "elevations, a dense cloud (LAZ), a mesh, sections and volumes, as asked.",
+        "Reads a run with a metric scale. Writes to OUT the orthophoto and the surface model as GeoTIFFs, façade "
+        "elevations, a dense cloud (LAZ), a mesh, sections and volumes, as requested.",
         ("surface OUT --products ortho,dsm --gsd 2cm", "surface OUT --volume heaps.geojson --base lowest"),
         "docs/surfaces.md",
         RUN_EXITS,
     ),
     "export": HelpPage(
-        "Reads a finished run. Leaves the files in OUT/export; each says which way is up and where it lies on the "
+        "Reads a finished run. Writes the files to OUT/export; each records which way is up and its place on the "
         "earth.",
         ("export OUT --format spz,tiles",),
         "docs/formats.md",
         RUN_EXITS,
     ),
     "convert": HelpPage(
-        "Reads a PLY (also compressed), SPZ, SOG, GLB, or the folder of a trainer's model. Leaves one file, in the "
-        "format that its ending says. Needs no run.",
+        "Reads a PLY (also compressed), SPZ, SOG, GLB, or a trainer's model folder. Writes one file, in the "
+        "format of its extension. Needs no run.",
         ("convert splat.ply splat.spz", "convert splat.ply splat.sog"),
         "docs/formats.md",
     ),
     "render": HelpPage(
-        "Reads a finished run. Leaves a film or a folder of pictures below OUT/renders, or where --output says.",
+        "Reads a finished run. Writes a film or a folder of pictures to OUT/renders, or to --output.",
         ("render OUT --path orbit --seconds 20", "render OUT --stills --what depth"),
         "docs/viewing.md",
     ),
     "view": HelpPage(
-        "Reads OUT, also while a run works in it. Serves pages on this machine alone until Ctrl-C; leaves nothing, but "
+        "Reads OUT, also during a run. Serves pages to this machine only, until Ctrl-C; writes nothing, except "
         "with --mark the control points' places in the photos.",
         ("view OUT", "view OUT --mark --points control.csv"),
         "docs/viewing.md",
     ),
     "status": HelpPage(
-        "Reads OUT, also while a run works in it, and leaves it as it is.",
+        "Reads OUT, also during a run, and changes nothing.",
         ("status OUT",),
         "docs/rooms.md",
     ),
     "report": HelpPage(
-        "Reads OUT and leaves report.html in it. A run does that by itself; this is for one that was stopped.",
+        "Reads OUT and writes report.html into it. A run does this by itself; use this for one that was stopped.",
         ("report OUT",),
         "docs/products.md",
     ),
     "clean": HelpPage(
-        "Reads OUT. Removes artifacts of older options and photos from OUT/stages, and nothing else of OUT.",
+        "Reads OUT. Removes artifacts of older options and photos from OUT/stages, and nothing else in OUT.",
         ("clean OUT",),
         "docs/rooms.md",
     ),
@@ -132,20 +136,21 @@ PAGES = {
         "docs/options.md",
     ),
     "doctor": HelpPage(
-        "Looks at processor, memory, disk, CUDA and libraries; leaves nothing.",
+        "Examines processor, memory, disk, CUDA and libraries; writes nothing.",
         ("doctor", "doctor OUT --json"),
         "docs/cuda.md, docs/containers.md",
     ),
     "check": HelpPage(
-        "Reads the photos and the surveyor's files beside them, in half a minute. Leaves check.html with a map: what "
-        "overlaps too little, blurred photos, missing positions; and tells time, memory and disk of a run.",
+        "Reads the photos and the surveyor's files beside them, in half a minute. Writes check.html with a map: low "
+        "overlap, blurred photos, missing positions; and the time, memory and disk space of a run.",
         ("check PHOTOS", "check PHOTOS -o site.html"),
         "docs/preflight.md",
-        "0 it can be reconstructed, also with warnings, 1 it cannot as it is, 2 a wrong call.",
+        "0 it can be reconstructed, possibly with warnings, 1 it cannot as it stands, 2 invalid command line.",
     ),
     "edit": HelpPage(
-        "Reads a splat of any format, or a run. Leaves a new file, beside it NAME.edits.json with what was done, and "
-        "pictures before and after. Coordinates are of the splat's CRS, or its own where it lies nowhere on the earth.",
+        "Reads a splat of any format, or a run. Writes a new file, a record of the steps beside it "
+        "(NAME.edits.json), and "
+        "pictures before and after. Coordinates are in the splat's CRS, or local if it is not georeferenced.",
         (
             "edit OUT site.sog --crop-polygon site.geojson --reduce 50MB",
             "edit splat.ply moved.ply --rotate 37 --move 0,0,1.5",

@@ -19,7 +19,7 @@ def expanded(path: Path) -> Path:
     try:
         return path.expanduser()
     except RuntimeError as error:
-        raise UsageError(f"There is no home folder for {path}.", hint="Give the whole path, or set HOME.") from error
+        raise UsageError(f"There is no home folder for {path}.", hint="Give the full path, or set HOME.") from error
 
 
 def presets(incomplete: str) -> list[str]:
@@ -42,73 +42,85 @@ def devices(incomplete: str) -> list[str]:
 
 
 PhotosArgument = Annotated[
-    Path, typer.Argument(callback=expanded, help="Folder of photos, or one with images/ and sparse/0 (COLMAP).")
+    Path, typer.Argument(callback=expanded, help="Folder of photos, or a COLMAP folder with images/ and sparse/0.")
 ]
-OutArgument = Annotated[
-    Path, typer.Argument(callback=expanded, help="Folder for the results; a run goes on where it was stopped.")
+OutArgument = Annotated[Path, typer.Argument(callback=expanded, help="Folder for the results; a stopped run resumes.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="TOML file of options, which override the preset's.")
 ]
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with options, over the preset's.")]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="SECTION.OPTION=VALUE", help="One option, over all else. Repeatable."),
+    typer.Option(
+        "--set", metavar="SECTION.OPTION=VALUE", help="Set one option; overrides the preset and --config. Repeatable."
+    ),
 ]
 ShardOption = Annotated[
     int | None,
-    typer.Option(min=1, metavar="K", help="Make this shard alone; other processes may make others at the same time."),
+    typer.Option(min=1, metavar="K", help="Run only this shard; other processes may run others at the same time."),
 ]
 DeviceOption = Annotated[str, typer.Option(autocompletion=devices, help="auto, cpu or cuda.")]
-ThreadsOption = Annotated[int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. The result is the same.")]
-SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every random choice.")]
+ThreadsOption = Annotated[
+    int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. Does not change the result.")
+]
+SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed for all random numbers.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout at the end.")]
 WaitOption = Annotated[
-    bool, typer.Option("--wait", help="Wait where another splatpipe works in OUT, instead of being refused.")
+    bool, typer.Option("--wait", help="If another splatpipe is working in OUT, wait for it instead of failing.")
 ]
 NotifyOption = Annotated[
     str | None,
     typer.Option(
         metavar="COMMAND",
-        help="A shell command called at the end, good or bad; it finds SPLATPIPE_STATE (done, failed, stopped), "
-        "SPLATPIPE_CAPTURE, SPLATPIPE_REPORT and SPLATPIPE_OUT in its environment.",
+        help="Shell command to run at the end, on success or failure. Its environment has SPLATPIPE_STATE (done, "
+        "failed, stopped), SPLATPIPE_CAPTURE, SPLATPIPE_REPORT and SPLATPIPE_OUT.",
     ),
 ]
 PresetOption = Annotated[str, typer.Option(autocompletion=presets, help="preview (minutes), standard or high.")]
 TimeBudgetOption = Annotated[
     str | None,
-    typer.Option(metavar="10m|90s|1h30m", help="For the whole command; the training is planned to fill what is left."),
+    typer.Option(
+        metavar="10m|90s|1h30m",
+        help="Time for the whole command; training is planned to use what the other stages leave.",
+    ),
 ]
 MaxMemoryOption = Annotated[
-    str | None, typer.Option(metavar="8G|512M", help="Most memory that training may take, 10⁹ bytes a G.")
+    str | None, typer.Option(metavar="8G|512M", help="Memory limit of training; 1G is 10⁹ bytes.")
 ]
 BoundaryOption = Annotated[
     str | None,
-    typer.Option(metavar="FILE", help="The area that counts, GeoJSON; what is outside stays coarse. auto, or none."),
+    typer.Option(metavar="FILE", help="Area of interest (GeoJSON); everything outside stays coarse. auto, or none."),
 ]
 UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Stop after this stage.")]
 RerunOption = Annotated[
     list[str] | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage again. Repeatable.")
 ]
 RerunFromOption = Annotated[
-    str | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage and all after it again.")
+    str | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage and all later ones again.")
 ]
 PathOption = Annotated[
     str,
-    typer.Option(metavar="cameras|orbit|FILE", help="The way: through the cameras, around, or keyframes (JSON, CSV)."),
+    typer.Option(
+        metavar="cameras|orbit|FILE", help="Camera path: along the cameras, an orbit, or a keyframe file (JSON, CSV)."
+    ),
 ]
-WhatOption = Annotated[str, typer.Option(metavar="colour|depth|normals", help="What is shown.")]
+WhatOption = Annotated[str, typer.Option(metavar="colour|depth|normals", help="What to render.")]
 StillsOption = Annotated[
-    bool, typer.Option("--stills", help="Pictures, not a film: every photo's view, 12 around, or every keyframe.")
+    bool,
+    typer.Option(
+        "--stills", help="Pictures instead of a film: one for each photo, 12 of an orbit, or one for each keyframe."
+    ),
 ]
 SizeOption = Annotated[
-    str, typer.Option(metavar="WxH", help="In pixels; else 16:9, as many as photos had in training.")
+    str, typer.Option(metavar="WxH", help="In pixels. Default: 16:9, with as many pixels as the training photos.")
 ]
-SecondsOption = Annotated[float, typer.Option(min=0.1, max=600.0, help="Length of a film whose path has no times.")]
-FpsOption = Annotated[int, typer.Option(min=1, max=120, help="Frames a second.")]
+SecondsOption = Annotated[float, typer.Option(min=0.1, max=600.0, help="Length of the film, if the path has no times.")]
+FpsOption = Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")]
 TargetOption = Annotated[
     Path | None,
     typer.Option(
         "--output",
         "-o",
         callback=lambda path: path and expanded(path),
-        help="A film (.webm, or .mp4, four times slower) or the stills' folder; else below OUT/renders.",
+        help="Film file (.webm, or .mp4, four times slower) or folder of stills. Default: in OUT/renders.",
     ),
 ]

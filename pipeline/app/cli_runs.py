@@ -84,7 +84,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
         from splatpipe.pipeline.raster.cuda_library import why_not
 
         if unfit := config.train.unfit_for_cuda():
-            raise UsageError(unfit, hint="Leave --device out, or give --device cpu.")
+            raise UsageError(unfit, hint="Omit --device, or give --device cpu.")
         if missing := why_not():
             raise missing.error()
     if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
@@ -130,7 +130,7 @@ def check_stage(name: str) -> None:
 
     names = [entry.name for entry in LINE]
     if name not in names:
-        raise UsageError(f'There is no stage "{name}".', hint=f"The line is: {', '.join(names)}.")
+        raise UsageError(f'There is no stage "{name}".', hint=f"The stages are: {', '.join(names)}.")
 
 
 def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | None) -> frozenset[str]:
@@ -189,6 +189,6 @@ class RunSession:
         try:
             trouble = renew_viewer(self._request.out)
         except (OSError, SplatpipeError) as error:
-            trouble = f"viewer.html could not be renewed: {error}"
+            trouble = f"viewer.html could not be updated: {error}"
         if trouble:
             say(trouble)

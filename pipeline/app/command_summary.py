@@ -184,4 +184,4 @@ def for_the_user(error: Exception) -> SplatpipeError:
         with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:
             traceback.print_exception(error, file=file)
         hint = f"Please report it with {file.name}"
-    return StageError(f"A fault of splatpipe: {type(error).__name__}: {error}", hint)
+    return StageError(f"Internal error of splatpipe: {type(error).__name__}: {error}", hint)

@@ -202,7 +202,7 @@ class ShardTimes:
         whole = seconds * total / done
         each = [*self._took.get(self._stage, {}).values(), whole]
         left = whole - seconds + self._after * sum(each) / len(each)
-        return f", {_duration(left)} with the {self._after} after it"
+        return f", {_duration(left)} with the {self._after} that follow"
 
 
 def escape(text: str) -> str:
@@ -253,7 +253,7 @@ def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], news: 
         news: What was measured besides, a line each.
     """
     console = Console(file=sys.stderr, highlight=False)
-    done = "Everything was there already: nothing to do." if seconds is None else f"Done in {_duration(seconds)}."
+    done = "All results are up to date: nothing to do." if seconds is None else f"Done in {_duration(seconds)}."
     console.print(f"\n[bold]{done}[/]", soft_wrap=True)
     sizes: dict[Path, int] = {}
     for path in files:  # what lies in a folder is told of as that
@@ -264,7 +264,7 @@ def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], news: 
     for line in news:
         console.print(f"[bold]{escape(line)}[/]", soft_wrap=True)
     if seconds is None:
-        console.print(f"[dim]Change an option, or --rerun a stage, to do more. Results: {escape(str(out))}[/]")
+        console.print(f"[dim]To run again, change an option or --rerun a stage. Results: {escape(str(out))}[/]")
 
 
 def show_bad_cameras(verdict: Mapping[str, JSON]) -> None:
@@ -276,10 +276,10 @@ def show_bad_cameras(verdict: Mapping[str, JSON]) -> None:
     reasons = [reason for reason in verdict.get("reasons", []) if reason["level"] == "bad"]
     if not reasons:
         return
-    lines = ["Everything that was made from them is in doubt."]
+    lines = ["All results derived from them are unreliable."]
     for reason in reasons:
         lines += [escape(reason["text"])] + ([f"[bold]→[/] {escape(reason['hint'])}"] if reason["hint"] else [])
-    panel = Panel("\n".join(lines), title="The cameras are bad", border_style="red")
+    panel = Panel("\n".join(lines), title="The camera poses are unreliable", border_style="red")
     Console(file=sys.stderr, highlight=False).print(panel)
 
 
@@ -322,7 +322,7 @@ def _offsets(flights: Iterable[Mapping[str, JSON]]) -> list[str]:
     """What the positions of each flight are off together; the table is without it."""
     offsets = [(flight["flight"] + 1, *flight["offset_m"]) for flight in flights]
     return [
-        f"Positions of flight {number}: all together east {east:+.3f}, north {north:+.3f}, up {up:+.3f} m off."
+        f"Positions of flight {number}: common offset east {east:+.3f}, north {north:+.3f}, up {up:+.3f} m."
         for number, east, north, up in offsets
         if max(abs(east), abs(north), abs(up)) >= LEAST_OFFSET_M
     ]

@@ -29,14 +29,16 @@ def examine(place: Path) -> dict[str, JSON]:
         "cores": _cores(),
         "memory": _memory(),
         "shared memory": f"{_free(SHARED_MEMORY) if SHARED_MEMORY.is_dir() else 'none'} (splatpipe needs none)",
-        "place of results": str(place),
-        "file system there": _file_system(place),
-        "free disk there": _free(place),
+        "results folder": str(place),
+        "its file system": _file_system(place),
+        "its free disk space": _free(place),
         "at work there": _at_work(place),
         **versions(),
         "rasterizer": f"native, {isa_name()} (of {', '.join(isa_names())})",
         "CUDA": _cuda(),
-        "open3d": _version("open3d-cpu") or _version("open3d") or "not installed (an extra; the line does not need it)",
+        "open3d": _version("open3d-cpu")
+        or _version("open3d")
+        or "not installed (optional; the pipeline does not need it)",
     }
 
 
@@ -53,7 +55,7 @@ def _cuda() -> str:
 def _cores() -> str:
     """What runs may use, and what the machine has beyond that."""
     usable, all_of_them = available_cores(), os.cpu_count() or 0
-    return f"{usable} of {all_of_them}, by a limit on this process" if usable < all_of_them else str(usable)
+    return f"{usable} of {all_of_them}, limited for this process" if usable < all_of_them else str(usable)
 
 
 def _free(place: Path) -> str:

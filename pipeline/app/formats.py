@@ -42,7 +42,7 @@ def check_possible(out: Path, asked: str) -> None:
     for missing, needing in ((not frame.in_metres, NEED_METRES), (frame.origin is None, NEED_PLACE)):
         if missing and names & needing:
             raise SplatpipeError(
-                f"{min(names & needing)} needs to know where the run lies on the earth, which nothing says.",
+                f"{min(names & needing)} needs a georeferenced run, and this one is not.",
                 hint=f"Give it control points (splatpipe georef {out} --gcp FILE), or photos with positions.",
             )
 
@@ -53,7 +53,7 @@ def _parsed(text: str) -> tuple[str, ...]:
     except ValueError as error:
         raise UsageError(f"--format: {error}.") from error
     if not text.strip(", "):
-        raise UsageError("No format is named.", hint=f"Choose of: {', '.join(FORMATS)}.")
+        raise UsageError("No format is given.", hint=f"Choose from: {', '.join(FORMATS)}.")
     return names
 
 
@@ -71,7 +71,7 @@ def convert_file(source: Path, target: Path, kind: SplatFormat) -> dict[str, Any
 
     scene = read_scene(source)
     if not len(scene.gaussians):
-        raise SplatpipeError(f"{source} has no Gaussians.", hint="There is nothing to write.")
+        raise SplatpipeError(f"{source} has no Gaussians.", hint="There is nothing to export.")
     write_scene(target, scene, kind)
     files = [target] if target.is_file() else [path for path in target.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files)

@@ -46,7 +46,10 @@ def renew_viewer(out: Path) -> str:
         try:
             _renew(out / name, shown)
         except ValueError:
-            trouble = f"{name} is of an earlier version and cannot show what was measured: splatpipe stage export {out}"
+            trouble = (
+                f"{name} was written by an earlier version and cannot show measurements; update it with: "
+                f"splatpipe stage export {out}"
+            )
     return trouble
 
 

@@ -30,8 +30,8 @@ def check_command(command: str) -> None:
     """
     if not command.strip() or len(command) > LONGEST or "\0" in command:
         raise UsageError(
-            "--notify names no command.",
-            hint="Give one for the shell, e.g. --notify 'mail -s \"$SPLATPIPE_CAPTURE: $SPLATPIPE_STATE\" me'.",
+            "--notify has no command.",
+            hint="Give a shell command, e.g. --notify 'mail -s \"$SPLATPIPE_CAPTURE: $SPLATPIPE_STATE\" me'.",
         )
 
 
@@ -74,7 +74,7 @@ def notify(
     try:
         code = process.wait(time_limit_s)
     except subprocess.TimeoutExpired:
-        return f"The --notify command did not end within {time_limit_s:.0f} s and was ended."
+        return f"The --notify command did not end within {time_limit_s:.0f} s and was killed."
     finally:
         _end(process)
     return f"The --notify command ended with exit code {code}." if code else ""

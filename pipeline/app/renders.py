@@ -79,7 +79,7 @@ class RenderRequest:
         what: What | None = next((known for known in get_args(What) if known == self.what), None)
         if what is None:
             raise UsageError(
-                f'--what "{self.what[:20]}" is nothing that can be rendered.',
+                f'--what "{self.what[:20]}" cannot be rendered.',
                 hint=f"Choose {', '.join(get_args(What))}.",
             )
         if not self.size:
@@ -88,7 +88,7 @@ class RenderRequest:
         size = (int(match[1]), int(match[2])) if match else (0, 0)
         if not all(LEAST_SIDE <= side <= MOST_SIDE and (self.stills or side % 2 == 0) for side in size):
             raise UsageError(
-                f'--size "{self.size[:20]}" is no size that can be rendered.',
+                f'--size "{self.size[:20]}" is not a valid size.',
                 hint=f"Write it like 1280x720: {LEAST_SIDE} to {MOST_SIDE} pixels, even ones for a film.",
             )
         return what, size
@@ -103,17 +103,17 @@ class RenderRequest:
         stem = self.path if self.path in OWN_PATHS else flat_stems([Path(self.path).name])[0]
         target = self.to or out / FOLDER / f"{stem}-{self.what}{'' if self.stills else '.webm'}"
         if self.stills and target.exists() and not target.is_dir():
-            raise UsageError(f"{target} is a file.", hint="Stills go into a folder: name another one with -o.")
+            raise UsageError(f"{target} is a file.", hint="Stills are written to a folder: choose another with -o.")
         if self.stills and target.suffix in CODECS:
-            raise UsageError(f"{target} is a film's name.", hint="Stills go into a folder: name one with -o.")
+            raise UsageError(f"{target} is a film file name.", hint="Stills are written to a folder: give one with -o.")
         if not self.stills and (target.suffix not in CODECS or target.is_dir()):
-            raise UsageError(f"{target} is no film.", hint=f"A film ends in {' or '.join(CODECS)}.")
+            raise UsageError(f"{target} is not a film file.", hint=f"A film ends in {' or '.join(CODECS)}.")
         folder = target if self.stills else target.absolute().parent
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise MachineError(
-                f"Cannot make {folder}: {error.strerror}.", hint="Name another place with -o."
+                f"Cannot make {folder}: {error.strerror}.", hint="Choose another path with -o."
             ) from error
         return target
 
@@ -259,7 +259,7 @@ def _write(path: Path, array: np.ndarray) -> None:
 def _file(path: str) -> Path:
     file = Path(path).expanduser()
     if not file.is_file():
-        raise UsageError(f"There is no file {path[:200]}.", hint="--path is cameras, orbit, or a file of keyframes.")
+        raise UsageError(f"There is no file {path[:200]}.", hint="--path takes cameras, orbit, or a keyframe file.")
     return file
 
 
@@ -275,12 +275,12 @@ def _parts(out: Path) -> dict[str, Path]:
     missing = [name for name in READ if name not in found]
     if missing and "train.model" in found:
         raise UsageError(
-            f"{out} was trained by an earlier splatpipe: {missing[0]} is not there.",
-            hint=f"Run it again with this one: splatpipe run PHOTOS {out}",
+            f"{out} was trained by an earlier version of splatpipe: {missing[0]} is missing.",
+            hint=f"Run it again with this version: splatpipe run PHOTOS {out}",
         )
     if missing:
         raise UsageError(
-            f"{out} has no trained splat: {missing[0]} is not there.",
-            hint=f"Train one first: splatpipe run PHOTOS {out}",
+            f"{out} has no trained splat: {missing[0]} is missing.",
+            hint=f"Run the pipeline first: splatpipe run PHOTOS {out}",
         )
     return found

@@ -16,7 +16,7 @@ Figures = Mapping[str, Any]
 PAIRINGS = {
     "exhaustive": "every photo with every other",
     "spatial": "neighbours by position",
-    "retrieval": "photos that look alike",
+    "retrieval": "photos of similar appearance",
 }
 
 
@@ -44,7 +44,7 @@ def _ingest(made: Figures) -> str:
             if made["positions"] == made["photos"]
             else f"{count(made['positions'])} with positions"
         )
-        known += f" good to {_sigmas(made)}" if made.get("sigma_horizontal_m") else ""
+        known += f" accurate to {_sigmas(made)}" if made.get("sigma_horizontal_m") else ""
         said.append(known)
     else:
         said.append("none with a position")
@@ -65,13 +65,13 @@ def _control(made: Figures) -> str:
 
 
 def _features(made: Figures) -> str:
-    return f"{count(made['keypoints_per_photo'])} keypoints a photo"
+    return f"{count(made['keypoints_per_photo'])} keypoints per photo"
 
 
 def _matches(made: Figures) -> str:
     how = PAIRINGS.get(made["pairing"], made["pairing"])
     text = f"{count(made['verified'])} of {count(made['pairs'])} pairs match ({how}), "
-    return text + f"half of them in {count(made['median_inliers'])} points or more"
+    return text + f"median {count(made['median_inliers'])} inliers"
 
 
 def _sparse(made: Figures) -> str:
@@ -88,7 +88,7 @@ def _sparse(made: Figures) -> str:
 def _targets(made: Figures) -> str:
     said = [plural(made["coded"], "coded target")] if made["coded"] else []
     said += [plural(made["quadrants"], "sighting") + " of black-and-white quadrants"] if made["quadrants"] else []
-    return ", ".join(said) + " found" if said else "no targets looked for or found"
+    return ", ".join(said) + " found" if said else "no targets"
 
 
 def _georef(made: Figures) -> str:
@@ -115,7 +115,7 @@ def _undistort(made: Figures) -> str:
 
 
 def _split(made: Figures) -> str:
-    return f"{plural(made['trained_on'], 'photo')} to train on, {count(made['held_out'])} held out to judge by"
+    return f"{plural(made['trained_on'], 'photo')} for training, {count(made['held_out'])} held out for evaluation"
 
 
 def _initialize(made: Figures) -> str:
@@ -131,7 +131,7 @@ def _train(made: Figures) -> str:
     done, planned = made["iterations"], made.get("planned_iterations")
     said = f"{count(made['gaussians'])} Gaussians after {count(done)}"
     said += f" of {count(planned)} iterations" if planned and planned != done else " iterations"
-    said += ", as more gained nothing" if made.get("flat_at") else ""
+    said += "(stopped when the loss was flat)" if made.get("flat_at") else ""
     return said + (f", on {made['device']}" if made.get("device") not in (None, "cpu") else "")
 
 
@@ -144,7 +144,7 @@ def _clean(made: Figures) -> str:
 
 def _evaluate(made: Figures) -> str:
     if not made["test_views"]:
-        return "no photo was held out to judge by"
+        return "no photo was held out for evaluation"
     psnr, ssim = number(made["psnr"], 1), number(made["ssim"], 2)
     return f"{plural(made['test_views'], 'held-out photo')}: PSNR {psnr} dB, SSIM {ssim}"
 

@@ -130,7 +130,7 @@ def check_possible(out: Path, *tables: dict[str, Any]) -> None:
     frame = run.lineage(GEOREF).get("georef.frame")
     if frame is not None and not placed_anew and not load_frame(frame.path).in_metres:
         raise SplatpipeError(
-            "The run has no scale: nothing can be made of it in metres.",
+            "The run has no metric scale, so no surface products can be made.",
             hint=f"Give it control (splatpipe georef {out} --gcp FILE), scale bars, or photos with positions.",
         )
     if "mesh" in asked and run.config(LineConfig, *tables)[1].mesh.enabled:
@@ -149,7 +149,7 @@ def measured_lines(out: Path, told: Mapping[str, Any]) -> list[str]:
     lines = []
     for section in told.get("sections", ()):
         sigma_m = section["height_sigma_m"]
-        sure = "" if sigma_m is None else f", these to {sigma_m * 100.0:.1f} cm"
+        sure = "" if sigma_m is None else f", accurate to {sigma_m * 100.0:.1f} cm"
         known = f"{section['length_m']:.2f} m, {section['share_with_height']:.0%} with heights{sure}"
         lines.append(f"{section['name']}: {known}: {out / SECTIONS / section['dxf']}")
     for volume in told.get("volumes", ()):
@@ -209,7 +209,7 @@ def _open_surface(out: Path) -> _SurfaceModel:
     parts = open_run_folder(out, LINE).lineage(DSM, DEPTHS, UNDISTORT, GEOREF)
     files = parts["dsm.files"].path if "dsm.files" in parts else None
     if files is None or not (files / "dsm.tif").is_file():
-        raise SplatpipeError("The run has no surface model.", hint=f"Make it first: splatpipe surface {out}")
+        raise SplatpipeError("The run has no surface model.", hint=f"Make one first: splatpipe surface {out}")
     frame = load_frame(parts["georef.frame"].path)
     return _SurfaceModel(parts, frame, open_map(frame), open_surface(files / "dsm.tif", files / "dsm_confidence.tif"))
 

@@ -40,10 +40,13 @@ class Clean:
             options = rasterizer.RenderOptions(sh_degree=gaussians.sh_degree, antialias=piece.facts.antialias)
             photos = TrainingPhotos([_seen_by(camera, piece) for camera in self.cameras], options)
         elif self.cameras:
-            piece.notes.append("Photos of one run know nothing of a merged splat: it is cleaned without. Clean first.")
+            piece.notes.append(
+                "A merged splat is cleaned without the run's photos, which do not cover all of it. Put --clean "
+                "before --merge."
+            )
         cleaned = clean_scene(gaussians, photos)
         if not bool(cleaned.keep.any()):
-            raise SplatpipeError("Cleaning leaves nothing of the splat.", hint="Leave --clean out.")
+            raise SplatpipeError("Cleaning would remove the whole splat.", hint="Omit --clean.")
         piece.keep(cleaned.keep.numpy())
         return {"step": "clean", "photos": 0 if photos is None else len(photos.cameras), "removed": cleaned.removed}
 

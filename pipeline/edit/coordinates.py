@@ -69,7 +69,7 @@ class Coordinates:
         if not (np.isfinite(found).all() and (np.abs(found) <= LARGEST).all()):
             raise UsageError(
                 f"{self.name} has no place for {_shown(points[~np.isfinite(found).all(axis=1)])}.",
-                hint="East (or longitude) comes first. --local takes numbers as metres from the splat's zero.",
+                hint="East (or longitude) comes first. With --local, numbers are metres from the splat's origin.",
             )
         return found
 

@@ -104,7 +104,9 @@ class CropHeights:
         low = parse_numbers(first, option, (1,), form)[0] if first else -math.inf
         high = parse_numbers(second, option, (1,), form)[0] if second else math.inf
         if low >= high:
-            raise UsageError(f"Between {first} and {second} of {option} there are no heights.", hint="The lower first.")
+            raise UsageError(
+                f"Between {first} and {second} of {option} there are no heights.", hint="Give the lower height first."
+            )
         return CropHeights(low, high, local)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
@@ -150,7 +152,7 @@ class CropPolygon:
         if drawing.crossing:
             x, y = drawing.crossing
             piece.notes.append(
-                f"{drawing.name} crosses itself near {x:.10g}, {y:.10g}: what is enclosed twice counts as outside."
+                f"{drawing.name} crosses itself near {x:.10g}, {y:.10g}: areas enclosed twice count as outside."
             )
         _crop(piece, area.contains, self.inside, lambda: self._nothing(drawing, piece))
         return {
@@ -165,8 +167,8 @@ class CropPolygon:
             return PlanArea.seen_from_above(drawing.polygons)
         if piece.frame is None:
             raise SplatpipeError(
-                f"{drawing.name} cannot be laid onto a splat that lies nowhere on the earth.",
-                hint="Crop by --crop-box in its own coordinates, or add --local if the polygon is in them, too.",
+                f"{drawing.name} cannot be used on a splat that is not georeferenced.",
+                hint="Use --crop-box in the splat's own coordinates, or add --local if the polygon is in them.",
             )
         try:
             return placed_area(drawing, piece.frame)
@@ -201,12 +203,12 @@ def _nothing(what: str, piece: Workpiece, coordinates: Coordinates) -> Splatpipe
     """That nothing is left, and where the splat is."""
     ends = np.quantile(coordinates.stated(piece.sample()), MIDDLE, axis=0)
     low, high = (",".join(f"{number:.{_digits(coordinates)}f}" for number in end) for end in ends)
-    named = {"own": "in its own coordinates", "local": "in metres from its zero"}
+    named = {"own": "in its own coordinates", "local": "in metres from its origin"}
     where = named.get(coordinates.name, f"in {coordinates.name}")
     hint = f"Most of it lies between {low} and {high} ({where})."
     if coordinates.world is not None:
-        hint += " --local takes numbers as metres from its zero."
-    return SplatpipeError(f"The crop by {what} leaves nothing of the splat.", hint)
+        hint += " With --local, numbers are metres from its origin."
+    return SplatpipeError(f"The crop by {what} would remove the whole splat.", hint)
 
 
 def _digits(coordinates: Coordinates) -> int:

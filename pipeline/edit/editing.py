@@ -110,7 +110,7 @@ def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
             _write_picture(task, views, before, right)
             outputs.append(task.beside(PICTURE))
         except SplatpipeError as error:
-            report.warning(f"There are no pictures: {error.message}", error.hint)
+            report.warning(f"No pictures were written: {error.message}", error.hint)
     report.progress(total, total, "done", "steps")
     placed = None if facts.place is None else [facts.place.latitude, facts.place.longitude, facts.place.height_m]
     told = {"steps": edits, "gaussians": after.count, "place": placed, "metres": facts.metres}
@@ -140,11 +140,13 @@ def require_free(task: EditTask) -> None:
         UsageError: if there is no step, or the output is any of these, or a folder with something in it.
     """
     if not task.steps:
-        raise UsageError("There is nothing to do.", hint="Name a step, such as --crop-polygon FILE; see --help.")
+        raise UsageError("No edit step is given.", hint="Give a step, such as --crop-polygon FILE; see --help.")
     out = task.output.path.resolve()
     read = [task.source.path, *(open_source(step.path).path for step in task.steps if isinstance(step, Merge))]
     if any(path.resolve() == out for path in read):
-        raise UsageError(f"{task.output.path} is read by this edit.", hint="Write to another file: IN stays as it is.")
+        raise UsageError(
+            f"{task.output.path} is an input of this edit.", hint="Write to another file: IN must not be overwritten."
+        )
     if out.is_dir() and (any(out.iterdir()) or task.output.kind.ending):
         raise UsageError(f"{task.output.path} is a folder.", hint="Name a new file, such as edited.ply.")
     run = next((folder for folder in out.parents if is_run(folder)), None)
@@ -155,7 +157,7 @@ def require_free(task: EditTask) -> None:
     beside = [task.beside(RECORD), task.beside(PICTURE)]
     if own or (any(path.exists() for path in [out, *beside]) and not task.beside(RECORD).is_file()):
         raise UsageError(
-            f"{task.output.path} belongs to the run in {run}, which stays as it is.",
+            f"{task.output.path} belongs to the run in {run}, which edit does not change.",
             hint="Name a new file, such as edited.ply.",
         )
 
@@ -164,7 +166,7 @@ def _require_finite(scene: Scene) -> None:
     bad = len(scene.gaussians) - int(scene.gaussians.finite().sum())
     if bad:
         raise SplatpipeError(
-            f"{bad} Gaussians have left the numbers that a file can hold.", hint="Scale or move it by less."
+            f"{bad} Gaussians are out of the range that a file can hold.", hint="Scale or move it by less."
         )
 
 

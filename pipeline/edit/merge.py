@@ -46,7 +46,7 @@ class Merge:
         if other.facts.antialias != ours.facts.antialias:
             piece.notes.append(
                 f"Only one of {source.name} and the splat was trained with anti-aliasing: "
-                "small Gaussians of the other are drawn too thin or too bold."
+                "small Gaussians of the other will look too thin or too thick."
             )
         count = len(other.gaussians)
         piece.take(_joined(ours, other, moved))
@@ -83,7 +83,7 @@ def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similar
     if (ours.place is None) != (other.place is None):
         without = name if other.place is None else "the splat"
         raise SplatpipeError(
-            f"{without} lies nowhere on the earth, the other one does: where they lie to each other is not known.",
+            f"{without} is not georeferenced but the other splat is, so their relative position is unknown.",
             hint="Georeference its run (splatpipe georef), and take the splat that it exports.",
         )
     if ours.place is not None and other.place is not None:
@@ -91,7 +91,7 @@ def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similar
     if ours.axes != other.axes:
         raise SplatpipeError(
             f"{name} has its {other.axes.replace(' ', ' axis ')}, the splat its {ours.axes.replace(' ', ' axis ')}.",
-            hint="Without a place on the earth only splats of one frame can be merged.",
+            hint="Splats that are not georeferenced can be merged only in the same frame.",
         )
     if ours.metres != other.metres:
         raise SplatpipeError(
@@ -108,14 +108,14 @@ def _on_earth(ours: SplatOrigin, other: SplatOrigin, name: str) -> Similarity:
         told = [describe_vertical(datum) if datum != UNKNOWN else "an unknown datum" for datum in datums]
         raise SplatpipeError(
             f"Heights of the splat are in {told[0]}, those of {name} in {told[1]}: they may be tens of metres apart.",
-            hint="Give both runs one datum: --set georef.vertical=…, then splatpipe georef OUT.",
+            hint="Give both runs the same vertical datum: --set georef.vertical=…, then splatpipe georef OUT.",
         )
     to_ours = between(origin_of(other), origin_of(ours))
     apart = float(np.linalg.norm(to_ours.translation))
     if apart > MOST_APART_M:
         raise SplatpipeError(
-            f"{name} lies {apart / 1000.0:,.0f} km away from the splat: one file cannot hold both.",
-            hint=f"At most {MOST_APART_M / 1000.0:.0f} km: places in a file are 32-bit numbers.",
+            f"{name} lies {apart / 1000.0:,.0f} km from the splat: one file cannot hold both.",
+            hint=f"At most {MOST_APART_M / 1000.0:.0f} km: coordinates in a file are 32-bit numbers.",
         )
     return to_ours
 

@@ -86,8 +86,8 @@ class Move:
         offset = Coordinates.of(piece.facts, local=True).in_frame(np.array([self.offset]))[0]
         if piece.facts.place is not None and float(np.linalg.norm(offset)) > FAR_M:
             raise SplatpipeError(
-                f"{np.linalg.norm(offset) / 1000.0:,.0f} km away, east, north and up are others.",
-                hint="Give the coordinates that it is to come to: --move-to X,Y,Z.",
+                f"{np.linalg.norm(offset) / 1000.0:,.0f} km away, the directions of east, north and up differ.",
+                hint="Give the target coordinates instead: --move-to X,Y,Z.",
             )
         piece.move(Similarity(1.0, np.eye(3), offset))
         return {"step": "move", "by": list(self.offset)}
@@ -177,7 +177,7 @@ class Rotate:
         degrees = parse_numbers(first, option, (1,), form)[0]
         axis = AXES[rest] if rest in AXES else parse_numbers(rest, option, (3,), form) if rest else None
         if abs(degrees) > MOST_DEGREES or (axis is not None and math.hypot(*axis) == 0.0):
-            raise UsageError(f'Cannot turn by "{text[:60]}".', hint=f"Write it as {option} {form}.")
+            raise UsageError(f'Cannot rotate by "{text[:60]}".', hint=f"Write it as {option} {form}.")
         return Rotate(degrees, axis, pivot)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
@@ -217,7 +217,7 @@ class ScaleBy:
         factor = parse_numbers(text, option, (1,), "FACTOR")[0]
         if not FACTORS[0] <= factor <= FACTORS[1]:
             raise UsageError(
-                f"Cannot scale by {text[:60]}.", hint=f"A factor is between {FACTORS[0]:g} and {FACTORS[1]:g}."
+                f"Cannot scale by {text[:60]}.", hint=f"The factor must be between {FACTORS[0]:g} and {FACTORS[1]:g}."
             )
         return ScaleBy(factor, pivot)
 
@@ -225,10 +225,7 @@ class ScaleBy:
         """Scale; what is recorded of it."""
         piece.move(_about(self.pivot.place(piece), self.factor, np.eye(3)))
         if piece.facts.place is not None:
-            piece.notes.append(
-                "A splat that is scaled by a bare factor has no place on the earth any more. "
-                "--scale-from A B LENGTH keeps it."
-            )
+            piece.notes.append("Scaling by a factor drops the splat's georeference. --scale-from A B LENGTH keeps it.")
         piece.facts = facts_without_place(piece.facts)
         return {"step": "scale", "factor": self.factor, "about": self.pivot.as_text()}
 
@@ -259,7 +256,7 @@ class ScaleFrom:
         first, second = (parse_numbers(text, option, (3,), "X,Y,Z X,Y,Z 12.40m") for text in texts[:2])
         length_m = parse_length(texts[2], option)
         if length_m <= 0.0:
-            raise UsageError(f"The length of {option} is nothing.", hint=f"Write it as {option} A B 12.40m.")
+            raise UsageError(f"The length of {option} is zero.", hint=f"Write it as {option} A B 12.40m.")
         return ScaleFrom(first, second, length_m, local)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
@@ -275,7 +272,7 @@ class ScaleFrom:
         if not FACTORS[0] <= factor <= FACTORS[1]:
             raise SplatpipeError(
                 f"The points of --scale-from are {distance:g} apart in the splat, for {self.length_m:g} m.",
-                hint="Read both points' coordinates off the splat, as far apart as they were measured.",
+                hint="Take both points' coordinates from the splat, at the ends of the measured length.",
             )
         piece.move(_about(first, factor, np.eye(3)))
         piece.facts = replace(piece.facts, metres=True)

@@ -112,8 +112,8 @@ class Reduce:
             count = wanted
         if not best:
             raise SplatpipeError(
-                f"{self.size_bytes / 1e6:g} MB are too few for a {self.output.kind.name} of this splat.",
-                hint="Ask for more, or for a format that packs more tightly.",
+                f"{self.size_bytes / 1e6:g} MB is too small for a {self.output.kind.name} of this splat.",
+                hint="Ask for more, or choose a format that compresses better.",
             )
         return reduce_to(whole, best)
 

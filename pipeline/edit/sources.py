@@ -75,7 +75,7 @@ def open_source(path: Path) -> SplatSource:
             raise SplatpipeError(f"{path} has no {SPLAT} yet.", hint=f"Finish the run: splatpipe run PHOTOS {path}")
         return SplatSource(path / SPLAT, path)
     if not path.exists():
-        raise SplatpipeError(f"There is no {path}.", hint="Name a splat's file, or the OUT of a run.")
+        raise SplatpipeError(f"There is no {path}.", hint="Give a splat file, or the OUT of a run.")
     beside = path.name == SPLAT and is_run(path.parent)
     return SplatSource(path, path.parent if beside else None)
 

@@ -33,7 +33,9 @@ def parse_steps(
         UsageError: if one makes no sense, or there are too many.
     """
     if len(given) > MOST_STEPS:
-        raise UsageError(f"{len(given)} steps are too many.", hint=f"At most {MOST_STEPS}; edit what comes out again.")
+        raise UsageError(
+            f"{len(given)} steps are too many.", hint=f"At most {MOST_STEPS}; apply the rest to the edited file."
+        )
     pivot = Pivot(None, local)
     steps: list[Step] = []
     for name, value in given:

@@ -137,7 +137,7 @@ class Workpiece:
         before = self._moved.scale * _step(_largest(self._gaussians.means))  # what a file had already is no loss
         if not _step(float(np.abs(sample).max())) <= max(COARSEST * size, before):
             raise SplatpipeError(
-                "So far from zero a splat's file cannot hold it: its places are 32-bit numbers.",
+                "The splat would be too far from the origin for a file, whose coordinates are 32-bit numbers.",
                 hint="Keep coordinates small; a georeferenced splat can be moved anywhere with --move-to.",
             )
 
@@ -155,7 +155,8 @@ class Workpiece:
             placed = replace(placed, crs="")
         self.facts = replace(self.facts, place=placed)
         self.notes.append(
-            f"Its zero lies at {latitude:.7f} {longitude:.7f} now: at the old one's distance, places would be rounded."
+            f"Its origin is now at {latitude:.7f} {longitude:.7f}: at the old origin's distance, coordinates "
+            "would be rounded."
         )
 
 

@@ -161,7 +161,9 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
             if problem["type"] == "extra_forbidden" and dotted in gone:
                 by_hint.setdefault(gone[dotted], []).append(dotted)
             elif isinstance(problem["input"], str) and problem["input"] in (now := replaced.get(dotted, {})):
-                problems.append(f"{dotted} = {problem['input']!r} is gone; write {json.dumps(now[problem['input']])}.")
+                problems.append(
+                    f"{dotted} = {problem['input']!r} no longer exists; write {json.dumps(now[problem['input']])}."
+                )
             else:
                 problems.append(_describe(model, dotted, problem["type"], problem["msg"], problem["input"]))
         problems += [_gone(names, hint) for hint, names in by_hint.items()]

@@ -60,7 +60,7 @@ class StopSignal(BaseException):
         super().__init__("Stopped.")
         self.exit_code = exit_code
         self.at_s = time.monotonic()  # the end is promised within seconds of this
-        self.hint = "What was finished is kept: run the same command again to go on."
+        self.hint = "Finished work is kept: repeat the command to resume."
 
 
 def exit_code(error: BaseException | None) -> int:

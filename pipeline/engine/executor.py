@@ -69,8 +69,8 @@ class Executor:
         self._process = None
         _close(process)
         raise StageError(
-            f"The stage {task.stage} died{_cause(code)}.",
-            hint=f"{_remedy(code)} The log ends with what it said: {self._log}",
+            f"The stage {task.stage} crashed{_cause(code)}.",
+            hint=f"{_remedy(code)} See the end of the log: {self._log}",
         )
 
     def peak_memory_bytes(self) -> int | None:
@@ -129,8 +129,8 @@ class Executor:
             )
         except OSError as error:
             raise MachineError(
-                f"No process could be started for the work: {error.strerror}.",
-                hint="Does a limit on processes or memory apply here (ulimit -u, a container's pids)?",
+                f"No worker process could be started: {error.strerror}.",
+                hint="Check for limits on processes or memory (ulimit -u, a container's pids limit).",
             ) from error
 
     def _raise(self, failure: Mapping[str, str]) -> None:
@@ -158,4 +158,4 @@ def _cause(code: int) -> str:
 def _remedy(code: int) -> str:
     if code == -signal.SIGKILL:
         return "The system may have run out of memory: close other programs, or choose a smaller preset."
-    return "What was finished is kept; run again, and if it dies again, please report it."
+    return "Finished work is kept; run again, and if it crashes again, please report it."

@@ -102,7 +102,7 @@ def _counted(path: Path, stage: str) -> int:
         count = None
     if type(count) is not int or count < 0:
         raise StageError(
-            f"{path} does not say how many shards {stage} has.", hint="This is a fault of splatpipe; please report it."
+            f"{path} does not say how many shards {stage} has.", hint="This is a bug in splatpipe; please report it."
         )
     return count
 
@@ -181,4 +181,4 @@ def explain(inputs: StageInputs, earlier: Iterable[Artifact]) -> str:
             if mine.get(name) != old.get(name)
         ]
     reasons += [f"{name} changed" for name in inputs.reads if before["reads"].get(name) != inputs.reads[name]]
-    return ", ".join(reasons) or "its files are damaged or gone"
+    return ", ".join(reasons) or "its files are damaged or missing"

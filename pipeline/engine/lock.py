@@ -101,7 +101,7 @@ class Hold:
             raise MachineError(
                 f"Another splatpipe ({self._taker}) has taken over {_place(self._path)}: this one gave no sign of "
                 f"life for {SILENCE_S:.0f} s.",
-                hint="Let that one end. What was finished is kept.",
+                hint="Let that one finish. Finished work is kept.",
             )
 
     def close(self) -> None:
@@ -276,7 +276,7 @@ class _Queue:
         if not self.allowed:
             raise _refusal(self.path, other)
         if not self.announced:
-            self.tell(f"Another splatpipe ({other or 'unknown'}) is {_doing(self.path)}: waiting for it to end.")
+            self.tell(f"Another splatpipe ({other or 'unknown'}) is {_doing(self.path)}: waiting for it to finish.")
             self.announced = True
 
 
@@ -320,7 +320,7 @@ def _outlast(path: Path, waiting: _Queue) -> Holder | None:
 
 
 def _refusal(path: Path, other: Holder | None) -> UsageError:
-    hint = "Wait for it to end (--wait does that), or choose another OUT."
+    hint = "Wait for it to finish (or use --wait), or choose another OUT."
     if other is not None and other.is_elsewhere:  # a server may keep a dead machine's lock: NFS 3 until that is back
         hint += f" If {other.host} has crashed for good, remove {path}."
     return UsageError(f"Another splatpipe ({other or 'unknown'}) is {_doing(path)}.", hint=hint)
@@ -356,7 +356,8 @@ def _flocked(descriptor: int, out: Path, kind: int) -> bool:
         mount = mount_of(out)
         where = f"the file system there ({mount.kind} at {mount.point})" if mount else "the file system there"
         raise MachineError(
-            f"Cannot lock {out}: {where} has no locks ({error.strerror}), so two runs at once would spoil it.",
+            f"Cannot lock {out}: {where} does not support locks ({error.strerror}), so two simultaneous runs would "
+            "corrupt it.",
             hint="Choose an OUT on a local disk, or mount it with locks (NFS: version 4, or 3 with its lock service).",
         ) from error
     return True

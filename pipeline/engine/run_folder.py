@@ -82,7 +82,7 @@ class RunFolder:
         photos = table.pop("photos", None)
         table.pop("splatpipe", None)
         if not isinstance(photos, str) or not all(isinstance(section, Mapping) for section in table.values()):
-            raise UsageError(f"{path} is not what a run leaves.", hint="Run again: splatpipe run PHOTOS OUT")
+            raise UsageError(f"{path} is not a valid file of a run.", hint="Run again: splatpipe run PHOTOS OUT")
         return Path(photos), table
 
     def config(self, model: type[Model], *above: Table) -> tuple[Path, Model]:

@@ -148,7 +148,7 @@ class Runner:
             has = f"{len(jobs)} here" if stage.shards else "none"
             raise UsageError(
                 f"The stage {name} has no shard {number}: it has {has}.",
-                hint=f"Leave --shard out, or see splatpipe status {self.store.out}",
+                hint=f"Omit --shard, or see splatpipe status {self.store.out}",
             )
         job = jobs[number - 1]
         with self._reported([job.stage.name]):
@@ -181,8 +181,8 @@ class Runner:
     def _unready(self, name: str, missing: Sequence[Stage]) -> UsageError:
         names = [stage.name for stage in missing]
         return UsageError(
-            f"The stage {name} reads what {', '.join(names)} leaves, and that is not there or no longer valid.",
-            hint=f"Run the line up to there first: splatpipe run PHOTOS {self.store.out} --until {names[-1]}",
+            f"The stage {name} reads what {', '.join(names)} leaves, which is missing or out of date.",
+            hint=f"Run the pipeline up to there first: splatpipe run PHOTOS {self.store.out} --until {names[-1]}",
         )
 
     @contextmanager
@@ -311,7 +311,7 @@ class Runner:
             what = "The photos" if "source.photos" in changed else "The survey's files"
             raise SplatpipeError(
                 f"{what} changed while the stage {stage.name} was reading them.",
-                hint="Run again, when nobody writes there any more: what was made before is reused.",
+                hint="Run again when nothing is writing to them; earlier results are reused.",
             )
 
     def _check_space(self) -> None:
@@ -320,7 +320,7 @@ class Runner:
             raise MachineError(
                 f"The disk of {self.store.out} is full: {free >> 20} MiB are free, and {MIN_FREE_BYTES >> 20} are "
                 "the least that a stage needs.",
-                hint="Make room, then run again: it goes on from here.",
+                hint="Free some space, then run again: it resumes from here.",
             )
 
     @contextmanager
@@ -332,7 +332,7 @@ class Runner:
             self._check_places()
             raise MachineError(
                 f"Cannot write to {self.store.out}: {error.strerror or error}.",
-                hint="Make room or check the permissions, then run again: it goes on from here.",
+                hint="Free some space or check the permissions, then run again: it resumes from here.",
             ) from error
         except SplatpipeError as error:
             self._check_places()
@@ -352,13 +352,13 @@ class Runner:
         """What lies behind many an error: a disk that is no longer there."""
         if not self.store.stages.is_dir():
             raise MachineError(
-                f"{self.store.out} is gone.",
-                hint="Was its disk taken away, or the folder removed or renamed? Run again when it is back.",
+                f"{self.store.out} has disappeared.",
+                hint="Was its disk disconnected, or the folder removed or renamed? Run again when it is back.",
             )
         if not self.line.photos_dir.is_dir():
             raise SplatpipeError(
-                f"The photos' folder {self.line.photos_dir} is gone.",
-                hint="Bring it back, then run again: what was finished is kept.",
+                f"The photo folder {self.line.photos_dir} has disappeared.",
+                hint="Restore it, then run again: finished work is kept.",
             )
 
 

@@ -53,7 +53,7 @@ class RunSource:
         if len(photos) > MAX_SOURCE_FILES:
             raise SplatpipeError(
                 f"{self.folder} holds {len(photos):,} files.",
-                hint="Name the folder that has the photos of one capture.",
+                hint="Give the folder that has the photos of one capture.",
             )
         parts = {"source.photos": photos}
         if self.model is not None:
@@ -95,9 +95,9 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
     if not folder.exists():
         raise SplatpipeError(f"There is no folder {photos}.", hint="Check the path of the photos.")
     if not folder.is_dir():
-        raise SplatpipeError(f"{photos} is a file.", hint="Name the folder that has the photos.")
+        raise SplatpipeError(f"{photos} is a file.", hint="Give the folder that has the photos.")
     if not os.access(folder, os.R_OK | os.X_OK):
-        raise SplatpipeError(f"The folder {photos} may not be read.", hint="Check its permissions.")
+        raise SplatpipeError(f"The folder {photos} cannot be read: permission denied.", hint="Check its permissions.")
     destination = out.expanduser().resolve()
     if destination == folder or folder in destination.parents:
         raise UsageError(
@@ -151,7 +151,7 @@ def _choose(file: NamedFile, option: str, setting: str, beside: Mapping[Path, Ma
         if len(found) > 1:
             raise UsageError(
                 f"{found[0].parent} has both {found[0].name} and {found[1].name}.",
-                hint=f"Say which one counts: --set {option}=PATH, or {option}=none.",
+                hint=f"Choose one: --set {option}=PATH, or {option}=none.",
             )
         if found:
             return _checked(found[0], option)
@@ -163,10 +163,12 @@ def _checked(path: Path, option: str) -> Path:
         what = "is a folder" if path.is_dir() else "is no file" if path.exists() else "is not there"
         raise SplatpipeError(f"The file {path} of {option} {what}.", hint=f"Check the path, or set {option}=none.")
     if not os.access(path, os.R_OK):
-        raise SplatpipeError(f"The file {path} of {option} may not be read.", hint="Check its permissions.")
+        raise SplatpipeError(
+            f"The file {path} of {option} cannot be read: permission denied.", hint="Check its permissions."
+        )
     if path.stat().st_size > MAX_NAMED_BYTES:
         raise SplatpipeError(
-            f"The file {path} of {option} has {path.stat().st_size / 1e6:,.0f} MB, too many for a table of positions.",
+            f"The file {path} of {option} has {path.stat().st_size / 1e6:,.0f} MB, too large for a table of positions.",
             hint=f"Check the path, or set {option}=none.",
         )
     return path

@@ -135,8 +135,8 @@ class Store:
         for name, relative in stage.parts.items():
             if not (partial / relative).exists():
                 raise StageError(
-                    f"The stage {stage.name} left no {relative}.",
-                    hint="This is a fault of splatpipe; please report it.",
+                    f"The stage {stage.name} did not write {relative}.",
+                    hint="This is a bug in splatpipe; please report it.",
                 )
             entries = tree_entries(partial / relative, partial)
             parts[name] = {
@@ -282,19 +282,21 @@ def open_store(out: Path, *, create: bool) -> Store:
         MachineError: if it cannot be written.
     """
     if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is made if it is not there.")
+        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is created if missing.")
     above = next((parent for parent in out.parents if parent.exists() and not parent.is_dir()), None)
     if above is not None:
-        raise UsageError(f"{above} is a file.", hint=f"{out} cannot be in it; name another folder for the results.")
+        raise UsageError(
+            f"{above} is a file.", hint=f"{out} cannot be inside it; choose another folder for the results."
+        )
     if not create and not (out / "stages").is_dir():
-        raise UsageError(f"{out} holds no run.", hint=f"Begin with: splatpipe run PHOTOS {out}")
+        raise UsageError(f"{out} does not contain a run.", hint=f"Begin with: splatpipe run PHOTOS {out}")
     _check_format(out)
     store = Store(out)
     if create and not store.stages.exists():
         taken = [name for name in ("splat.ply", "config.toml", "metrics.json", "cameras.json") if (out / name).exists()]
         if taken:
             raise UsageError(
-                f"{out} has files of something else ({', '.join(taken)}).",
+                f"{out} contains files that are not a run's ({', '.join(taken)}).",
                 hint="Choose an empty or a new folder.",
             )
     if not create:
@@ -328,10 +330,10 @@ def _check_format(out: Path) -> None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(
             f"{out / 'stages' / 'format.json'} is damaged.",
-            hint="If this version made it, delete that file and run again: what is whole is reused.",
+            hint="If this version made it, delete that file and run again: intact results are reused.",
         ) from error
     if found != FORMAT:
         raise UsageError(
-            f"{out} was made by a version of splatpipe with another layout ({found}; this one has {FORMAT}).",
+            f"{out} was made by a version of splatpipe with a different layout ({found}; this one has {FORMAT}).",
             hint="Choose another OUT, or use the version that made it. Nothing in it was touched.",
         )

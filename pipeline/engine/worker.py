@@ -139,11 +139,11 @@ def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
         what = "write" if error.errno in NO_ROOM else "use a file"
         return MachineError(
             f"The stage {stage} could not {what}: {error.strerror}{where}.",
-            "Make room, or look after the disk, then run again: it goes on from here.",
+            "Free some space or check the disk, then run again: it resumes from here.",
         )
     if "disk is full" in text or "no space left" in text:
         return MachineError(
-            f"The disk ran full in the stage {stage}.", "Make room, then run again: it goes on from here."
+            f"The disk filled up in the stage {stage}.", "Free some space, then run again: it resumes from here."
         )
     if isinstance(error, MemoryError) or any(said in text for said in NO_MEMORY):
         return MachineError(

@@ -194,7 +194,7 @@ def smoothed(route: Route, distance: float, width: float) -> tuple[Route, Double
     """
     along = np.append(0.0, np.cumsum(route.steps(distance)))
     if not along[-1] > LEAST_LENGTH:
-        raise UsageError("All photos were taken from one place: there is no path between them.")
+        raise UsageError("All photos were taken from one position, so there is no path between them.")
     count = max(FINE_STEPS, FINE_STEPS_A_PLACE * len(route))
     values = np.column_stack([np.interp(np.linspace(0.0, along[-1], count + 1), along, v) for v in route.values().T])
     own = along / along[-1] * count
@@ -297,7 +297,7 @@ def centripetal_knots(route: Route, distance: float) -> Doubles:
     """
     gaps = route.steps(distance)
     if not gaps.sum() > LEAST_LENGTH:
-        raise UsageError("All places of the path are one: there is no path between them.")
+        raise UsageError("All keyframes are at one position, so there is no path between them.")
     return np.append(0.0, np.cumsum(np.sqrt(np.maximum(gaps, LEAST_LENGTH**2))))
 
 

@@ -102,7 +102,7 @@ class Keyframes:
             UsageError: if there is no way: a single keyframe, or several that are the same.
         """
         if len(self.route) < 2:
-            raise UsageError("A film takes two keyframes at least.", hint="Take --stills for a single one.")
+            raise UsageError("A film needs at least two keyframes.", hint="For a single one, use --stills.")
         if self.times_s is not None:
             moments = np.linspace(0.0, self.times_s[-1], max(2, round(float(self.times_s[-1]) * fps)))
             return self._at(self.times_s, moments)
@@ -140,9 +140,9 @@ def _of_json(text: str) -> list[Numbers]:
     try:
         value = json.loads(text)
     except RecursionError as error:
-        raise LineError(0, "its brackets are too deep") from error
+        raise LineError(0, "it is nested too deeply") from error
     except ValueError as error:
-        raise LineError(getattr(error, "lineno", 0), "it is no valid JSON") from error
+        raise LineError(getattr(error, "lineno", 0), "it is not valid JSON") from error
     listed = value.get("keyframes") if isinstance(value, dict) else value
     if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
         raise LineError(0, "it has no list of keyframes")
@@ -166,7 +166,7 @@ def _of_item(number: int, item: Mapping[str, Any]) -> Numbers:
 
 def _finite(number: int, what: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise LineError(0, f"{what} of keyframe {number} is {str(value)[:40]!r}, no number that it can be")
+        raise LineError(0, f"{what} of keyframe {number} is {str(value)[:40]!r}, which is not a valid number")
     return float(value)
 
 
@@ -215,7 +215,7 @@ def _target(number: int, item: Numbers) -> list[float]:
     """NaN without one."""
     found = [item.get(name, math.nan) for name in TARGET]
     if 0 < sum(math.isnan(value) for value in found) < 3:
-        raise LineError(number, "a keyframe has a part of a target")
+        raise LineError(number, "a keyframe has an incomplete target")
     return found
 
 
@@ -230,7 +230,7 @@ def _ahead(number: int, item: Numbers) -> list[float]:
         raise LineError(number, "a keyframe has neither a target nor heading and pitch")
     heading, pitch = math.radians(item["heading"]), math.radians(item["pitch"])
     if abs(item["pitch"]) > STEEPEST_DEG or abs(item["heading"]) > FULL_TURNS_DEG:
-        raise LineError(number, "a pitch is not between -90 and 90 degrees, or a heading absurd")
+        raise LineError(number, "a pitch is not between -90 and 90 degrees, or a heading is out of range")
     flat = math.cos(min(abs(pitch), math.radians(LEAST_TILT_DEG)))
     return [flat * math.sin(heading), flat * math.cos(heading), math.sin(pitch)]
 

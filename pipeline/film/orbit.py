@@ -38,7 +38,7 @@ def orbit(capture: PhotoTrack, frames: int) -> Route:
     """
     kept, _ = followed_photos(capture)
     if len(kept) == 0:
-        raise UsageError("No photo sees enough of the sparse points to tell what to go around.")
+        raise UsageError("No photo sees enough sparse points to determine the centre of an orbit.")
     upright = rotation_to_up(capture.up)
     targets = np.array([np.median(capture.points[capture.seen[index]], axis=0) for index in kept])
     middle = np.median(targets @ upright.T, axis=0)

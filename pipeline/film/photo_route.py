@@ -80,7 +80,7 @@ def photo_film(capture: PhotoTrack, frames: int, seconds: float) -> Route:
     """
     kept, distance = followed_photos(capture)
     if len(kept) < 2:
-        raise UsageError("Fewer than two photos see the same things: there is no path between them.")
+        raise UsageError("Fewer than two photos overlap, so there is no path between them.")
     route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
     kept = kept[_order(route, distance)]
     kept = kept[_no_detours(upright_route([capture.cameras[int(index)] for index in kept], capture.up), distance)]
@@ -228,7 +228,7 @@ def _stretch(
             best, most = slice(start, end + 1), seen
     if most == 0:
         raise UsageError(
-            "No two neighbouring photos have a free way between them, so there is no path along them.",
-            hint="Take --path orbit, or a file of keyframes.",
+            "No two neighbouring photos have free space between them, so there is no path along them.",
+            hint="Use --path orbit, or a keyframe file.",
         )
     return best

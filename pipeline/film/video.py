@@ -45,7 +45,7 @@ class VideoWriter:
         if size[0] % 2 or size[1] % 2:
             raise ValueError(f"a film of {size[0]} × {size[1]} pixels: its colours have half of each side")
         if path.suffix not in CODECS:
-            raise ValueError(f"{path.name} is no film")
+            raise ValueError(f"{path.name} is not a film file")
         self._path, self._size, self._fps = path.absolute(), size, fps
         self._partial = self._path.with_name(f".{self._path.stem}.part{path.suffix}")
         self._frames = 0
@@ -104,8 +104,8 @@ class VideoWriter:
             with suppress(OSError):
                 self._partial.unlink()
             raise MachineError(
-                f"The film {self._path.name} could not be written whole.",
-                hint="Is the disk full? Make room, run again.",
+                f"The film {self._path.name} could not be written completely.",
+                hint="Is the disk full? Free some space and run again.",
             )
 
     def _number_track(self) -> None:

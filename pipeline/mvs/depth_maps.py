@@ -117,7 +117,7 @@ def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[DepthMapFile]:
 
 
 def _unreadable(name: str) -> StageError:
-    return StageError(f"{name} is none of this dataset's depth maps.", hint="Run again with --rerun-from depths.")
+    return StageError(f"{name} is not one of this dataset's depth maps.", hint="Run again with --rerun-from depths.")
 
 
 def find_depth_maps(

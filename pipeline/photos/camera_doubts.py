@@ -34,7 +34,7 @@ def camera_doubts(
             Doubt(
                 "resized",
                 f"{which} are {common}.",
-                "Photos as the camera wrote them show more, and their metadata fit; these count as reduced.",
+                "These are treated as reduced. Original photos have more detail, and metadata that match.",
                 weight="note",
             )
         )
@@ -73,7 +73,7 @@ def _mixed_cameras(
     if len(many) > 1:
         told = "; ".join(f"{len(members[number])} photos of {_described(members[number][0])}" for number in many)
         doubts.append(
-            Doubt("cameras", f"The capture mixes cameras: {told}.", "Each is calibrated by itself.", weight="note")
+            Doubt("cameras", f"The capture mixes cameras: {told}.", "Each is calibrated separately.", weight="note")
         )
     for number, own in sorted(members.items()):
         names = tuple(photo.name for photo in own if photo.name not in resized)
@@ -84,7 +84,7 @@ def _mixed_cameras(
             Doubt(
                 code,
                 f"{some(names)}: {what}.",
-                "A camera of few photos cannot be calibrated well: leave them out, or fly again with one camera.",
+                "A camera with few photos cannot be calibrated well: leave them out, or fly again with one camera.",
                 names,
             )
         )
@@ -103,7 +103,7 @@ def _difference(photo: CheckedPhoto, other: CheckedPhoto) -> tuple[str, str]:
         return "resized", f"{photo.width} × {photo.height} px, the others {other.width} × {other.height}"
     if (photo.exif.focal_mm, photo.exif.focal_35mm) != (other.exif.focal_mm, other.exif.focal_35mm):
         return "focal-length", f"a focal length of {_focal(photo)}, the others {_focal(other)}"
-    return "cameras", "not taken as the others were (turned, or with the lens's distortion taken out)"
+    return "cameras", "not like the others (rotated, or with lens distortion already removed)"
 
 
 def _body(photo: CheckedPhoto) -> tuple[str, str, str]:

@@ -226,15 +226,16 @@ def tell_cameras(rows: Sequence[JSON], report: Reporter) -> None:
         if row["exif_size"] is None:
             continue
         (width, height), (taken_width, taken_height) = row["size"], row["exif_size"]
-        sizes = (
-            f"{row['photos']} photos of the {row['name']} have {width} × {height} pixels, where their EXIF speaks of"
-        )
+        sizes = f"{row['photos']} photos of the {row['name']} have {width} × {height} pixels, but their EXIF states"
         sizes += f" {taken_width} × {taken_height}"
         if row["cropped"]:
-            report.note(f"{sizes}: another shape, so they were cropped, and EXIF does not tell their focal length.")
+            report.note(
+                f"{sizes}: another aspect ratio, so they were cropped, and their focal length cannot be taken from "
+                "EXIF."
+            )
         else:
             factor = max(width, height) / max(taken_width, taken_height)
-            report.note(f"{sizes}: they count as reduced, and its focal length is scaled by {factor:.3g}.")
+            report.note(f"{sizes}: they are treated as reduced, and its focal length is scaled by {factor:.3g}.")
 
 
 def cameras_json(groups: Sequence[CameraGroup]) -> JSON:

@@ -151,7 +151,7 @@ def _refusal(picture: Image.Image, limits: PictureLimits) -> str:
     if picture.format == "TIFF" and _tiff_tag(picture, TAG_DNG_VERSION, None) is not None:
         return "is a camera's raw file (DNG): develop it to JPEG or TIFF"
     if picture.mode not in READ_MODES:
-        return f"has colours of a kind that is not read ({picture.mode}): convert it to 8-bit RGB"
+        return f"has an unsupported colour mode ({picture.mode}): convert it to 8-bit RGB"
     return ""
 
 
@@ -159,7 +159,7 @@ def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image
     exif = read_exif(picture)
     xmp = parse_xmp(find_packet(_xmp_bytes(picture)) or find_packet(data))
     if xmp.get("GPano:ProjectionType"):
-        return ExcludedPhoto(candidate.name, "is a stitched panorama: give the single pictures it was made of")
+        return ExcludedPhoto(candidate.name, "is a stitched panorama: give the original photos")
     orientation = stored_orientation(exif, picture)
     width, height = picture.size
     turned = picture.format == "TIFF" and orientation != 1
@@ -175,7 +175,7 @@ def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image
             return ExcludedPhoto(candidate.name, _why_broken(error))
         pixels = _deep_facts(loaded) if isinstance(loaded, np.ndarray) else _plain_facts(loaded, (width, height))
     if pixels is None:
-        return ExcludedPhoto(candidate.name, "has no pixel with a value")
+        return ExcludedPhoto(candidate.name, "has no valid pixel")
     return CheckedPhoto(
         name=candidate.name,
         path=candidate.path,
@@ -275,7 +275,7 @@ def _xmp_bytes(picture: Image.Image) -> bytes:
 def _why_broken(error: Exception) -> str:
     text = str(error)
     if "truncated" in text.lower() or isinstance(error, EOFError):
-        return "is cut off: it ends before its last pixel; copy it again from the camera"
+        return "is truncated: it ends before its last pixel; copy it again from the camera"
     if "cannot identify" in text:
         return "is damaged: its header cannot be read"
     detail = " ".join(text.split())[:120]

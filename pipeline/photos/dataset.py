@@ -166,7 +166,7 @@ def split_views(names: Sequence[str], every: int, views: str) -> Split:
         if unknown := [name for name, photo in found.items() if photo is None]:
             raise SplatpipeError(
                 f"split.views names {some(unknown)}, which the model does not have, or more than once.",
-                hint=f"Its photos are called like {some(ordered)}.",
+                hint=f"Its photos are named like {some(ordered)}.",
             )
         wanted = {photo for photo in found.values() if photo is not None}
     else:
@@ -174,7 +174,7 @@ def split_views(names: Sequence[str], every: int, views: str) -> Split:
     training = [name for name in ordered if name not in wanted]
     if not training:
         raise SplatpipeError(
-            f"All {len(ordered)} photos are held out, so none is left to train on.",
+            f"All {len(ordered)} photos are held out, so none is left for training.",
             hint="Raise split.every, or set it to 0.",
         )
     return Split(tuple(training), tuple(name for name in ordered if name in wanted))

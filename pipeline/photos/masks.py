@@ -128,7 +128,7 @@ def read_mask(mask: MaskFile, photo: CheckedPhoto, max_pixels: int) -> UInt8[np.
         raise MaskError(f"cannot be read ({' '.join(str(error).split())[:120]})") from error
     drawn = grey if exif.orientation == photo.exif.orientation else _to_stored(grey, exif.orientation, photo)
     if not _same_shape(drawn.size, (photo.width, photo.height)):
-        raise MaskError(f"has another shape ({grey.width} × {grey.height}) than its photo")
+        raise MaskError(f"has another aspect ratio ({grey.width} × {grey.height}) than its photo")
     values = np.asarray(drawn)
     threshold = 1 if lossless and int(values.max()) < FEW_LABELS else HALF
     binary = Image.fromarray(np.where(values >= threshold, 255, 0).astype(np.uint8))

@@ -275,6 +275,6 @@ def _inside(folder: Path, relative: str) -> Path:
 
 def _changed(name: str, what: str) -> SplatpipeError:
     return SplatpipeError(
-        f"{name} is not what it was when the photos were checked: {what}",
-        hint="Bring the photo back, or run again so that the photos are checked anew.",
+        f"{name} has changed since the photos were checked: {what}",
+        hint="Restore the photo, or run again to check the photos again.",
     )

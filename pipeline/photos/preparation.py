@@ -106,7 +106,7 @@ def prepare_masks(
     matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
     if unused:
         names = some([mask.label for mask in unused])
-        work.report.warning(f"No photo is found for the mask {names}.", "A mask has its photo's name: NAME.png.")
+        work.report.warning(f"There is no photo for the mask {names}.", "A mask must have its photo's name: NAME.png.")
     masked = [photo for photo in photos if photo.name in matched or photo.name in opacity]
 
     def write(photo: CheckedPhoto) -> str | None:
@@ -118,7 +118,7 @@ def prepare_masks(
             return problem
         save_png(values, work.part / mask_path(photo.name, kind.part))
         if kind is MASKS and np.mean(values == 0) > MOSTLY_IGNORED:
-            return f"The mask of {printable(photo.name)} leaves hardly anything of it: black is what is ignored."
+            return f"The mask of {printable(photo.name)} hides almost the whole photo: black areas are ignored."
         return problem
 
     problems = _in_threads(write, masked, work, "preparing masks", "masks")

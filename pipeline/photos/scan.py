@@ -72,7 +72,9 @@ def scan_folder(root: Path) -> Scan:
     others = 0
 
     def unreadable(error: OSError) -> None:
-        left_out.append(ExcludedPhoto(_name(Path(error.filename), root), "is a folder that may not be read"))
+        left_out.append(
+            ExcludedPhoto(_name(Path(error.filename), root), "is a folder that cannot be read (permission denied)")
+        )
 
     for folder, folders, files in os.walk(root, onerror=unreadable):
         passed = [name for name in folders if name.startswith(".") or name.casefold() in (MASK_FOLDER, SKY_FOLDER)]
@@ -122,7 +124,7 @@ def _why_not(path: Path) -> str | None:
     if kind == "photo":
         return None
     if kind:
-        return f"is a {kind} picture, which is not read: convert it to JPEG or PNG"
+        return f"is a {kind} picture, which is not supported: convert it to JPEG or PNG"
     if not pretends:
         return ""
     return "is empty" if not head else f"is no {_claim(suffix)} picture, whatever its name says"
@@ -132,9 +134,9 @@ def _why_not_name(relative: Path) -> str | None:
     try:
         str(relative).encode()
     except UnicodeEncodeError:
-        return "has a name that is no UTF-8: rename it"
+        return "has a name that is not UTF-8: rename it"
     # Masks and converted photos are called NAME.png, and file systems take 255 bytes.
-    return "has too long a name: rename it" if len(relative.name.encode()) > MAX_NAME_BYTES else None
+    return "has a name that is too long: rename it" if len(relative.name.encode()) > MAX_NAME_BYTES else None
 
 
 def _claim(suffix: str) -> str:

@@ -74,14 +74,14 @@ def place(
     if len(placed) < LEAST_VIEWS:
         raise SplatpipeError(
             f"Of the {len(images)} photos in the sparse model, {len(placed)} can be used.",
-            hint="images/ must hold them, with the names and in the shape that the model has.",
+            hint="images/ must contain them, with the names and aspect ratios of the model.",
         )
     if missing:
-        report.warning(f"{len(missing)} photos of the sparse model are not there and are left out: {some(missing)}.")
+        report.warning(f"{len(missing)} photos of the sparse model are missing and are left out: {some(missing)}.")
     if unusable:
         report.warning(
             f"{len(unusable)} photos do not fit their cameras in the sparse model and are left out: {some(unusable)}.",
-            hint="Their width over height differs, or camera or pose are not finite.",
+            hint="Their aspect ratio differs, or their camera or pose is not finite.",
         )
     return [placed[name] for name in sorted(placed)]
 
@@ -100,7 +100,7 @@ def read_flown(path: Path) -> pycolmap.Reconstruction:
     except (OSError, ValueError, RuntimeError, IndexError) as error:
         raise SplatpipeError(
             f"The sparse model cannot be read: {' '.join(str(error).split())[:200]}",
-            hint="It must be COLMAP's cameras, images and points3D, as .bin or .txt.",
+            hint="It must have COLMAP's cameras, images and points3D files, as .bin or .txt.",
         ) from error
 
 

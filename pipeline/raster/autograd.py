@@ -210,6 +210,6 @@ def _refuse(error: Exception, gaussians: int) -> NoReturn:
             hint="Lower train.max_megapixels or train.max_gaussians.",
         ) from error
     raise SplatpipeError(
-        f"{gaussians} Gaussians cover the picture so often over that 32-bit indices do not hold it.",
+        f"{gaussians} Gaussians overlap so much in the picture that 32-bit indices overflow.",
         hint="Lower train.max_megapixels or train.max_gaussians.",
     ) from error

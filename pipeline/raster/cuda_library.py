@@ -100,7 +100,7 @@ class CudaLibrary:
         if code > 0:
             raise MachineError(
                 f"The graphics card failed in {name}: {self.error(code)}.",
-                hint="Run the command again: it goes on from its last checkpoint. --device cpu does without the card.",
+                hint="Run the command again: it resumes from its last checkpoint. --device cpu does not use the card.",
             )
 
     def error(self, code: int) -> str:
@@ -161,19 +161,19 @@ class CudaInstallation:
     torch_works: bool = True
 
 
-_REINSTALL = "Install splatpipe again: its parts are of different versions."
-_NO_DRIVER = NoCuda("There is no NVIDIA driver.", "With an NVIDIA graphics card, install its driver.")
+_REINSTALL = "Reinstall splatpipe: its parts have different versions."
+_NO_DRIVER = NoCuda("No NVIDIA driver is installed.", "With an NVIDIA graphics card, install its driver.")
 _NO_DEVICE = NoCuda(
-    "There is no NVIDIA graphics card that CUDA sees.",
-    "If there is one, nvidia-smi shows whether its driver runs; CUDA_VISIBLE_DEVICES and containers can hide it.",
+    "CUDA finds no NVIDIA graphics card.",
+    "If there is one, check its driver with nvidia-smi; CUDA_VISIBLE_DEVICES and containers can hide it.",
 )
 _BUILT_WITHOUT = NoCuda(
     "This splatpipe was built without CUDA kernels.",
     "Install a build that has them, or build it where nvcc (CUDA 12 or 13) is installed.",
 )
 _TORCH_CPU = NoCuda(
-    "The installed torch is a build for the CPU.",
-    "Install one with CUDA in its place: https://pytorch.org/get-started tells the command.",
+    "The installed torch is a CPU-only build.",
+    "Replace it by one with CUDA: see https://pytorch.org/get-started for the command.",
 )
 
 
@@ -195,7 +195,7 @@ def reason_of(installed: CudaInstallation) -> NoCuda | None:
             return NoCuda(
                 f"The CUDA kernels were not built for {device.name} (sm_{device.architecture}).",
                 "They are built for cards from sm_75 (Turing, 2018) on, and by `make run` for the card it finds: "
-                "build them here.",
+                "build splatpipe on this machine.",
             )
         if code:
             return NoCuda(f"The NVIDIA card does not answer (error {code}).", _NO_DEVICE.hint)
@@ -267,10 +267,10 @@ def _too_old(installed: CudaInstallation) -> NoCuda:
     needed = f"{DRIVERS[most]} or newer" if most in DRIVERS else f"one for CUDA {most}"
     others = {
         "the CUDA kernels": f"splatpipe built here with CUDA {known}'s nvcc",
-        "the installed torch": f"a torch for CUDA {known} (https://pytorch.org/get-started tells the command)",
+        "the installed torch": f"a torch for CUDA {known} (see https://pytorch.org/get-started for the command)",
     }
     instead = " and ".join(other for name, other in others.items() if built[name] > known)
     return NoCuda(
-        f"The NVIDIA driver is too old: it knows CUDA {version_text(installed.driver)}, less than {newer} need.",
-        f"Install a newer NVIDIA driver: {needed}. With the driver as it is, you need {instead}.",
+        f"The NVIDIA driver is too old: it supports CUDA {version_text(installed.driver)}, less than {newer} need.",
+        f"Install a newer NVIDIA driver: {needed}. With the current driver, you need {instead}.",
     )

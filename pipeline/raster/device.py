@@ -125,7 +125,7 @@ def choose_device(wanted: str, unfit: str = "", note: Note | None = None) -> Dev
         raise missing.error()
     if missing is not None:
         if note is not None and cuda_driver.has_card():
-            note(f"the CPU computes, not the NVIDIA graphics card: {missing.reason} {missing.hint}".rstrip())
+            note(f"computing on the CPU, not on the NVIDIA graphics card: {missing.reason} {missing.hint}".rstrip())
         return cpu()
     # NVIDIA's containers round what is multiplied to TF32's 10 bits (TORCH_ALLOW_TF32_CUBLAS_OVERRIDE); a sky has more.
     torch.backends.cuda.matmul.allow_tf32 = False
@@ -187,8 +187,11 @@ def taken_in_place(tensor: Float[Tensor, "n ..."], rows: Int[Tensor, " m"]) -> F
             if first == 0:
                 raise
             raise MachineError(
-                f"The graphics card's memory ended while {len(rows):,} Gaussians were moved in it.",
-                hint="Close what else uses the card, or lower train.max_gaussians; run again to go on from here.",
+                f"The graphics card ran out of memory while {len(rows):,} Gaussians were moved in it.",
+                hint=(
+                    "Close other programs that use the card, or lower train.max_gaussians; run again to resume "
+                    "from here."
+                ),
             ) from error
         columns[: len(rows)] = moved
         del moved  # before the next ones

@@ -30,13 +30,13 @@ def choose_isa(wanted: str, available: Sequence[str]) -> str:
         return available[0]
     if wanted not in INSTRUCTION_SETS:
         raise UsageError(
-            f'{VARIABLE} asks for "{wanted}", which is no instruction set of ours.',
+            f'{VARIABLE} asks for "{wanted}", which is not a supported instruction set.',
             hint=f"Choose auto, {', '.join(INSTRUCTION_SETS[:-1])} or {INSTRUCTION_SETS[-1]}.",
         )
     if wanted not in available:
         raise MachineError(
             f"{VARIABLE} asks for {wanted}, which this CPU does not have.",
-            hint=f"Leave it unset for the best, or choose of {', '.join(available)}.",
+            hint=f"Leave it unset for the best, or choose from {', '.join(available)}.",
         )
     return wanted
 

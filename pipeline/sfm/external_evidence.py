@@ -62,10 +62,10 @@ def _untold_focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, c
         return []
     known = all(verified.cameras[number].has_prior_focal_length for number in rough)
     told = f"to {100.0 * worst:.0f} %" if math.isfinite(worst) else "not at all"
-    text = f"The photos tell the focal length {told}, and "
-    text += "what the metadata say of it is rough." if known else "the metadata do not state it."
+    text = f"The photos determine the focal length {told}, and "
+    text += "the value in the metadata is only approximate." if known else "it is not in the metadata."
     return [
-        Reason("doubt", text, "Add oblique photos or a second height, or measure distances against known ones.", "lens")
+        Reason("doubt", text, "Add oblique photos or a second height, or compare distances with known ones.", "lens")
     ]
 
 
@@ -80,9 +80,12 @@ def _positions(model: pycolmap.Reconstruction, positions: Sequence[JSON]) -> lis
     off = disagreement(np.array([image.projection_center() for image in images]), _metres(entries))
     if off.median_m < max(FAR_SIGMAS * sigma, FAR_SHARE * off.size_m) or off.smooth > SMOOTH:
         return []
-    text = f"The cameras are {off.median_m:.0f} m (median) from where the photos say, neighbours off the same way: "
-    text += "the model may be bent, or the positions drifted."
-    return [Reason("doubt", text, "Measure control points, or compare a known distance.", "positions")]
+    text = (
+        f"The cameras are {off.median_m:.0f} m (median) from the photos' stated positions, with similar offsets "
+        "for neighbours: "
+    )
+    text += "the model may be bent, or the positions may have drifted."
+    return [Reason("doubt", text, "Add control points, or compare a known distance.", "positions")]
 
 
 def _metres(entries: Sequence[JSON]) -> Float64[np.ndarray, "n 3"]:

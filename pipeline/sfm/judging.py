@@ -155,8 +155,8 @@ def _placed(model: pycolmap.Reconstruction, total: int) -> list[Reason]:
     if count >= PLACED_GOOD * total:
         return []
     level: Level = "doubt" if count >= PLACED_DOUBT * total else "bad"
-    text = f"Only {count} of {total} photos could be placed: what the others show is missing."
-    hint = "Look at the photos that were left out: take more with overlap, or try --set matches.pairing=exhaustive."
+    text = f"Only {count} of {total} photos could be placed: the areas that only the others show are missing."
+    hint = "Look at the photos that were not placed: take more with overlap, or try --set matches.pairing=exhaustive."
     return [Reason(level, text, hint, "placed")]
 
 
@@ -172,16 +172,20 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras:
         stray = max(focal / prior, prior / focal) - 1.0
         doubt, bad = FOCAL_TRUSTED if is_trusted(group) else FOCAL_STATED
         hint = (
-            "Heights and scale may be off: compare a known one. Oblique photos or a second height tell the lens better."
+            "Heights and scale may be off: compare a known one. Oblique photos or a second flying height "
+            "constrain the lens better."
         )
         if not FOCAL_LONGER[0] <= ratio <= FOCAL_LONGER[1]:
-            text = f"{which} came out as {focal:.0f} pixels, {ratio:.2g} times the photo's longer side: no such lens."
+            text = (
+                f"{which} came out as {focal:.0f} pixels, {ratio:.2g} times the photo's longer side, which is "
+                "implausible."
+            )
             found.append(Reason("bad", text, hint, "focal"))
             ran_away += photos[number]
         elif before.has_prior_focal_length and stray > doubt:
             text = f"{which} went from {prior:.0f} to {focal:.0f} pixels, {100 * (focal / prior - 1):+.0f} %."
             if not is_trusted(group):
-                text += " What the metadata say of it is rough."
+                text += " The value in the metadata is only approximate."
             found.append(Reason("bad" if stray > bad else "doubt", text, hint, "focal"))
             ran_away += photos[number] if stray > bad else 0
     if ran_away < FEW_SHARE * photos.total():
@@ -198,7 +202,10 @@ def _unexplained(agreement: Agreement) -> list[Reason]:
     text = f"The cameras explain only {100 * share:.0f} % of the matches among the placed photos."
     return [
         Reason(
-            level, text, "Check that the photos are of one lens setting and of a scene that stood still.", "unexplained"
+            level,
+            text,
+            "Check that all photos have the same lens settings and that the scene did not move.",
+            "unexplained",
         )
     ]
 
@@ -216,12 +223,12 @@ def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: V
     bad = count >= CONTRADICTED_BAD * pairs or (strong >= FEW_PAIRS and strong >= STRONG_BAD * pairs)
     if not bad and cut.ratio < CUT_DOUBT and count < CONTRADICTED_DOUBT * pairs:
         return []
-    text = f"{count} of {pairs} pairs of photos contradict the cameras that were found"
+    text = f"{count} of {pairs} pairs of photos contradict the reconstructed cameras"
     if cut.ratio >= CUT_BAD:
-        text += f": {_who(cut, verified)} disagree with the others, so the model is bent or has something twice."
+        text += f": {_who(cut, verified)} disagree with the others, so the model is bent or contains duplicates."
     else:
-        text += ": the model may be bent, or things in it look alike."
-    hint = "Look at sparse.glb for things that stand there twice. Add photos that close the way round, or try"
+        text += ": the model may be bent, or the scene has repeated features."
+    hint = "Look for duplicated objects in sparse.glb. Add photos that close the loop, or try"
     hint += " --set sparse.mapper=global and --set matches.pairing=exhaustive."
     return [Reason("bad" if bad or cut.ratio >= CUT_BAD else "doubt", text, hint, "bent")]
 

@@ -87,9 +87,9 @@ def _of_file(
         ours = sorted({f"{group.width} × {group.height}" for group in groups})[:SIZES_SHOWN]
         theirs = sorted({f"{each.lens.width:g} × {each.lens.height:g}" for each in found})[:SIZES_SHOWN]
         raise SplatpipeError(
-            f"The lens in {name} is not these photos': it is of pictures of {', '.join(theirs)}, they have"
+            f"The lens in {name} does not belong to these photos: it is for pictures of {', '.join(theirs)}, they have"
             f" {', '.join(ours)} pixels.",
-            hint="Its width over height, and its focal length, have to be the photos'. Name another with"
+            hint="Its aspect ratio and focal length must match the photos. Give another with"
             " --set ingest.lens=PATH, or =none.",
         )
     return [None if lens is None else replace(lens, source=FILE) for lens in result]
@@ -115,7 +115,7 @@ def _chosen(near: Sequence[tuple[FileLens, StatedLens, int]], group: CameraGroup
             return some[0]
     raise SplatpipeError(
         f"{name} has {len(near)} lenses that fit photos of {group.width} × {group.height} pixels.",
-        hint="Leave in it the one that these photos were taken with, and name it with --set ingest.lens=PATH.",
+        hint="Keep only the one these photos were taken with, and give the file with --set ingest.lens=PATH.",
     )
 
 

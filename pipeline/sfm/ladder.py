@@ -95,7 +95,7 @@ def climb(capture: MappingInput, found: MappingResult, config: SparseConfig, rep
         found = rung(work, found)
         cpu_s = time.process_time() - started
         gained = len(left) - len(unplaced(found))
-        report.note(f"Ladder, {name}: {gained} of {len(left)} photos that were left are placed now.")
+        report.note(f"Ladder, {name}: {gained} of {len(left)} remaining photos placed.")
         found = replace(found, rungs=(*before.rungs, {**_row(name, before, found), "cpu_s": round(cpu_s, 2)}))
     return found
 
@@ -118,7 +118,7 @@ def settle(work: LadderContext, found: MappingResult) -> MappingResult:
 def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
     """Match photos that are left with others that may show the same, then place them."""
     left = unplaced(found)
-    work.tell(0, len(left), "looking for partners of photos that are left")
+    work.tell(0, len(left), "looking for matches of the remaining photos")
     tried = work.capture.tried | tried_pairs(found.database)
     pairs = choose_pairs(rank_partners(work.capture, found, left, work.options.seed), tried, PAIRS_A_PHOTO)
     if not pairs:
@@ -131,7 +131,7 @@ def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
 def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> MappingResult:
     """Find new keypoints in photos that are left and in those that may show the same, then place them."""
     left = unplaced(found)
-    work.tell(0, len(left), "looking for partners of photos that are left")
+    work.tell(0, len(left), "looking for matches of the remaining photos")
     ranked = rank_partners(work.capture, found, left, work.options.seed)
     photos = _worth_another_look(found, ranked, max(MOST_STRONGER, int(MOST_STRONGER_SHARE * len(work.capture.photos))))
     pairs = _among(found, ranked, photos)
@@ -204,7 +204,7 @@ def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
         added.update(fresh)
     if not added:
         return found
-    work.tell(len(added), len(unplaced(found)), "adjusting with photos that were placed")
+    work.tell(len(added), len(unplaced(found)), "adjusting with the newly placed photos")
     return _adjusted(work, found, model, added)
 
 
@@ -217,7 +217,7 @@ def _placements(
     cameras = cameras_of(model)
     placements = {}
     for done, number in enumerate(sorted(left)):
-        work.tell(done, len(left), "placing photos that are left")
+        work.tell(done, len(left), "placing the remaining photos")
         camera = verified.camera_of[number]
         placement = place(
             sightings(verified, rows, number),

@@ -92,7 +92,7 @@ def strengthen(
             grown.update_keypoints(number, np.concatenate([before, features.keypoints]))
             parts[number - 1] = np.concatenate([parts[number - 1], features.colours])
             added += len(features.keypoints)
-            report.progress(done, len(ordered), "stronger keypoints for photos that are left", "photos")
+            report.progress(done, len(ordered), "more keypoints for the remaining photos", "photos")
     match_pairs(fresh, work, [(i - 1, j - 1) for i, j in sorted(pairs)], seed, capture.threads, report)
     take_verified(work, target, starts)
     for path in (fresh, work):

@@ -75,7 +75,7 @@ def read_lens_file(path: Path) -> tuple[FileLens, ...]:
     except (_RefusedError, ValueError, OverflowError, OSError) as error:
         raise SplatpipeError(
             f"{path.name} cannot be used as a lens: {str(error)[:200]}.",
-            hint=f"It takes {FORMATS}. Name another with --set ingest.lens=PATH, or =none to do without.",
+            hint=f"Supported are {FORMATS}. Give another with --set ingest.lens=PATH, or =none for no lens file.",
         ) from error
 
 
@@ -101,7 +101,7 @@ def checked_lens(lens: StatedLens) -> StatedLens:
         ValueError: with the reason.
     """
     if not is_known(lens.model):
-        raise ValueError(f"COLMAP's camera model {lens.model[:40]} is not taken")
+        raise ValueError(f"COLMAP's camera model {lens.model[:40]} is not supported")
     if not all(math.isfinite(value) for value in (*lens.params, lens.width, lens.height)):
         raise ValueError("a number is not finite")
     if not (0.0 < lens.width <= 1e6 and 0.0 < lens.height <= 1e6):
@@ -161,11 +161,11 @@ def _colmap(lines: Sequence[str]) -> list[FileLens]:
         if not fields or fields[0].startswith("#"):
             continue
         if len(fields) < 5 or len(fields) > 40:
-            raise _RefusedError("it is none of the known formats")
+            raise _RefusedError("its format is not known")
         int(fields[0][:MAX_CHARS])
         model = fields[1]
         if not is_known(model):
-            raise _RefusedError(f"COLMAP's camera model {model[:40]} is not taken")
+            raise _RefusedError(f"COLMAP's camera model {model[:40]} is not supported")
         params = tuple(_number(field) for field in fields[4:])
         if len(params) != len(PARAMETERS[model]):
             raise _RefusedError(f"{model} has {len(PARAMETERS[model])} parameters, not {len(params)}")
@@ -296,12 +296,12 @@ def _metashape_lens(entry: Mapping[str, str]) -> StatedLens:
         raise _RefusedError("it is an old PhotoScan's; export it again from Metashape")
     projection = entry["projection"]
     if projection not in ("frame", "fisheye", "equidistant_fisheye"):
-        raise _RefusedError(f"Metashape's projection {projection[:30]} is not taken")
+        raise _RefusedError(f"Metashape's projection {projection[:30]} is not supported")
     width, height, focal = value("width"), value("height"), value("f")
     if min(width, height, focal) <= 0.0:
         raise _RefusedError("it lacks f, width or height")
     if abs(value("b2")) * 0.5 * height / focal > HIGHEST_TERM_PX:
-        raise _RefusedError("its pixels are skewed (b2), which COLMAP's models have not")
+        raise _RefusedError("its pixels are skewed (b2), which COLMAP's models do not support")
     inner = (focal + value("b1"), focal, width / 2 + value("cx"), height / 2 + value("cy"))
     radial = [value(f"k{n}") for n in (1, 2, 3, 4)]
     tangential = (value("p2"), value("p1"))
@@ -310,7 +310,7 @@ def _metashape_lens(entry: Mapping[str, str]) -> StatedLens:
         three = _three_of_four(radial, focal, math.hypot(width, height) / 2)
         return StatedLens("FULL_OPENCV", *size, _brown(inner, three, tangential), "file", entry["label"])
     if max(map(abs, tangential)) * focal > HIGHEST_TERM_PX:
-        raise _RefusedError("it is a fisheye with tangential distortion, which COLMAP's has not")
+        raise _RefusedError("it is a fisheye with tangential distortion, which COLMAP's model does not support")
     return StatedLens("OPENCV_FISHEYE", *size, (*inner, *radial), "file", entry["label"])
 
 

@@ -221,18 +221,18 @@ def tell_lenses(summary: Mapping[str, JSON], report: Reporter) -> None:
         if row["freed"]:
             what = ", ".join(WORDS.get(name, name) for name in row["freed"])
             report.note(
-                f"The lens of camera {row['camera']} has more to it than a simple one: {what} ({row['model']})."
+                f"The lens of camera {row['camera']} needs more than the simple model: {what} ({row['model']})."
             )
         if row["stated"] and (row["off_stated_px"] or 0.0) > FAR_FROM_STATED * row["width"]:
             report.warning(
-                f"The photos take the lens of camera {row['camera']} {row['off_stated_px']:.1f} pixels (RMS) from the"
+                f"The photos move the lens of camera {row['camera']} {row['off_stated_px']:.1f} pixels (RMS) from the"
                 " one that is stated.",
-                hint="Is it this camera's, at this focus and size? --set sparse.lens=held takes it as it is.",
+                hint="Is it for this camera, at this focus and image size? --set sparse.lens=held keeps it fixed.",
             )
         refused = [each for each in row["tried"] if each["freed"] == "stated" and not each["kept"]]
         if refused:
             report.warning(
                 f"The lens that is stated for camera {row['camera']} is not the one these photos were taken with: they"
                 f" are predicted {-refused[0]['held_out_gain']:.0%} worse with it, so it is not used.",
-                hint="Give the calibration of this camera, or --set sparse.lens=held to take it all the same.",
+                hint="Give the calibration of this camera, or use it anyway with --set sparse.lens=held.",
             )

@@ -146,7 +146,7 @@ def _spatial(layout: Layout, neighbours: int, look_alike: Callable[[], Costs]) -
     if np.count_nonzero(located) < 2:
         raise SplatpipeError(
             "matches.pairing=spatial needs photos with positions, and these have none.",
-            hint="Leave matches.pairing at auto.",
+            hint="Set matches.pairing=auto.",
         )
     costs = spatial_costs(layout)
     known = layout.views.known() if layout.views is not None else np.zeros_like(located)

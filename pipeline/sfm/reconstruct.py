@@ -257,7 +257,7 @@ def _check_enough(count: int, config: SparseConfig, total: int) -> None:
     if count < max(config.min_model_size, math.ceil(LEAST_SHARE * total)):
         raise SplatpipeError(
             f"Only {count} of {total} photos could be placed." if count else f"None of {total} photos could be placed.",
-            hint="Photos must overlap by two thirds and be taken from different places."
+            hint="Photos must overlap by two thirds and be taken from different positions."
             " Add overlap, or try --set matches.pairing=exhaustive.",
         )
 

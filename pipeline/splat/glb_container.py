@@ -57,8 +57,8 @@ def write_head(file: BufferedIOBase, document: Mapping[str, Any], binary_bytes: 
     total = _HEADER.size + 2 * _CHUNK_HEADER.size + len(text) + binary_bytes
     if total > MOST_BYTES:
         raise SplatpipeError(
-            f"A GLB of {total / 1e9:.1f} GB cannot be: its length is told in 32 bits, which end at 4.3 GB.",
-            hint="Reduce the splat, crop it, or take another format: ply, spz or 3dtiles.",
+            f"A GLB cannot have {total / 1e9:.1f} GB: its 32-bit length ends at 4.3 GB.",
+            hint="Reduce the splat, crop it, or choose another format: ply, spz or 3dtiles.",
         )
     file.write(_HEADER.pack(MAGIC, VERSION, total))
     file.write(_CHUNK_HEADER.pack(len(text), JSON_CHUNK) + text)

@@ -188,7 +188,7 @@ def _check_vertex(path: Path, vertex: PlyElement, has_chunks: bool) -> int:
     kinds = dict(vertex.fields)
     if has_chunks and "packed_position" in kinds:
         raise SplatpipeError(
-            f"{path} is a compressed PLY.", hint="Make a plain one of it first: splatpipe convert IN OUT.ply."
+            f"{path} is a compressed PLY.", hint="Convert it to a plain PLY first: splatpipe convert IN OUT.ply."
         )
     missing = [name for name in _REQUIRED if name not in kinds]
     if missing:

@@ -111,8 +111,8 @@ def refuse_nowhere(facts: SceneFacts) -> None:
     """
     if facts.place is None:
         raise SplatpipeError(
-            "3D Tiles lie on the globe, but where this splat lies on the earth is not known.",
-            hint="Georeference its run (GPS in the photos, --geo or --gcp), or take glb, spz or ply.",
+            "3D Tiles need a georeferenced splat, and this one is not.",
+            hint="Georeference its run (GPS in the photos, --geo or --gcp), or choose glb, spz or ply.",
         )
 
 

@@ -44,8 +44,8 @@ def write_geojson(path: Path, contours: Contours, grid: Grid) -> None:
     """
     if grid.crs.world is None:
         raise SplatpipeError(
-            "The reconstruction lies nowhere on the earth, so its contours have no longitude and latitude.",
-            "Take the DXF, or place it: give photos with positions, or a gcp_list.txt.",
+            "The reconstruction is not georeferenced, so its contours have no longitude and latitude.",
+            "Use the DXF, or georeference the run: give photos with positions, or a gcp_list.txt.",
         )
     header = {"type": "FeatureCollection", "heights": grid.crs.described_heights()}
     with whole_file(path) as aside, aside.open("w", encoding="utf-8") as file:

@@ -94,7 +94,7 @@ def trace_contours(dsm: Path, interval: float | None = None) -> Contours:
             interval = neat_interval(abs(raster.transform.a) * _cell_in_heights(raster), max(high - low, 0.0))
         if not (math.isfinite(interval) and interval > 0.0) or (high - low) / interval > MOST_LEVELS:
             raise SplatpipeError(
-                f"Contours every {interval:g} over {high - low:g} are not to be drawn.", "Name another interval."
+                f"Contours every {interval:g} over {high - low:g} cannot be drawn.", "Choose another interval."
             )
         joints = _Joints()
         for window in _windows(raster):
@@ -183,7 +183,7 @@ class _Joints:
         self._vertices += len(piece)
         if self._vertices > MOST_VERTICES:
             raise SplatpipeError(
-                f"The contours have more than {MOST_VERTICES:,} points.", "Name a larger interval, or larger cells."
+                f"The contours have more than {MOST_VERTICES:,} points.", "Choose a larger interval, or larger cells."
             )
         begin, end = _place(level, piece[0]), _place(level, piece[-1])
         if begin == end:

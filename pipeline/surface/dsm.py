@@ -128,7 +128,7 @@ def _write_contours(out: Path, grid: Grid, report: Reporter) -> None:
     try:
         contours = trace_contours(out / "dsm.tif")
     except SplatpipeError as error:
-        report.warning(f"There are no contours: {error.message}", error.hint)
+        report.warning(f"No contours were made: {error.message}", error.hint)
         return
     write_dxf(out / "contours.dxf", contours, grid.crs)
     if grid.crs.world is not None:

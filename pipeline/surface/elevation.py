@@ -75,7 +75,7 @@ def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
     if width * height > MOST_CELLS:
         raise SplatpipeError(
             f"The façade {wall.name} of {width:,} × {height:,} pixels of {cell_m:g} m is too large.",
-            "Choose larger ones with --gsd.",
+            "Choose larger pixels with --gsd.",
         )
     from_local = np.eye(4)
     from_local[:3, :3] = [[*wall.along, 0.0], [0.0, 0.0, 1.0], [*wall.facing, 0.0]]

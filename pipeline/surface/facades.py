@@ -81,7 +81,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
     walls = stated_walls(task.lines, facets, crs) if task.lines else _within(find_walls(facets), task.surface.area)
     if not walls:
         report.progress(1, 1, "looking for walls")
-        report.warning("No walls were found.", "Photos that look at them are needed; or name walls by their ends.")
+        report.warning("No walls were found.", "Add photos that face them, or give walls by their end points.")
         write_facades(out / LIST, [], crs)
         return []
     places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
@@ -148,8 +148,8 @@ def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wal
         wall = stated_wall(ends[0], ends[1], facets) if np.isfinite(ends).all() and apart > 0.0 else None
         if wall is None:
             raise SplatpipeError(
-                f"No wall that photos see stands along {x1:.10g},{y1:.10g},{x2:.10g},{y2:.10g}.",
-                "Name its left end first, as seen from before it, in the run's CRS.",
+                f"No wall seen by the photos lies along {x1:.10g},{y1:.10g},{x2:.10g},{y2:.10g}.",
+                "Give its left end first, as seen from in front of it, in the run's CRS.",
             )
         walls.append(wall)
     return named(walls)

@@ -112,10 +112,10 @@ def make_grid(frame: Frame, box: Float64[np.ndarray, "2 3"], gsd_m: float) -> Gr
         SplatpipeError: if the frame has no metres or its CRS cannot be used, or the grid would be absurdly large.
     """
     if not LEAST_CELL_M <= gsd_m <= MOST_CELL_M:
-        raise SplatpipeError(f"Cells of {gsd_m:g} m are none for a surface.", "Name a size such as --gsd 2cm.")
+        raise SplatpipeError(f"Cells of {gsd_m:g} m are not valid for a surface.", "Give a size such as --gsd 2cm.")
     box = np.asarray(box, np.float64)
     if not np.isfinite(box).all() or not (box[0] <= box[1]).all():
-        raise SplatpipeError("The scene has no extent.", "Look at the sparse model: were photos placed?")
+        raise SplatpipeError("The scene has no extent.", "Check the sparse model: were photos placed?")
     crs = open_map(frame)
     cell = cell_size(crs, gsd_m)
     mapped = crs.crs_from_local(_border(box))

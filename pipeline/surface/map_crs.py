@@ -93,7 +93,7 @@ def open_map(frame: Frame) -> MapCrs:
     if frame.origin is None:
         if not frame.metres:
             raise SplatpipeError(
-                "The reconstruction has no scale, so nothing in metres can be made of it.",
+                "The reconstruction has no metric scale, so no products in metres can be made.",
                 "Give photos with positions, a gcp_list.txt, or scale bars.",
             )
         return MapCrs(pyproj.CRS(LOCAL_WKT), None, LOCAL, 1.0, 1.0, None)

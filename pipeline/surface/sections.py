@@ -73,14 +73,14 @@ def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence
     told = ",".join(f"{number:.10g}" for number in line)
     count = math.ceil(length / surface.cell * SAMPLES_A_CELL) + 1
     if length == 0.0 or count > MOST_SAMPLES:
-        raise SplatpipeError(f"The section {told} has no length, or far too much.", "Check its coordinates.")
+        raise SplatpipeError(f"The section {told} has no length, or is far too long.", "Check its coordinates.")
     share = np.linspace(0.0, 1.0, count)
     place = start + share[:, None] * (end - start)
     height, sigma_m = surface.along(place)
     if not np.isfinite(height).any():
         raise SplatpipeError(
-            f"The section {told} crosses nothing of the surface model.",
-            f"Give easting and northing of its start and its end, in {crs.horizontal.name}.",
+            f"The section {told} does not cross the surface model.",
+            f"Give the easting and northing of its start and end, in {crs.horizontal.name}.",
         )
     metre = ground_metres(crs)
     points = np.zeros((0, 2))

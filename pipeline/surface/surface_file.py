@@ -96,7 +96,7 @@ def open_surface(path: Path, confidence: Path | None = None) -> SurfaceFile:
     except GDAL_ERRORS as error:
         raise SplatpipeError(f"{path} cannot be read: {error}", "Make it again with --rerun dsm.") from error
     if at.b or at.d or at.a <= 0.0 or at.a != -at.e:
-        raise SplatpipeError(f"{path.name} is not north up with square cells.", "Take the run's own dsm.tif.")
+        raise SplatpipeError(f"{path.name} is not north up with square cells.", "Use the run's own dsm.tif.")
     return SurfaceFile(path, confidence, Lattice(at.c, at.f, at.a, shape[1], shape[0]))
 
 

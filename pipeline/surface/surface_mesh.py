@@ -106,7 +106,7 @@ def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[Trian
     mesh = without_crumbs(mesh, CRUMB_VOXELS * blocks.voxel_m**2)
     if not len(mesh.triangles):
         raise SplatpipeError(
-            "There is no surface for a mesh that three photos see.", "Add overlap, or make it with a wider boundary."
+            "No surface is seen by three photos, so there is no mesh.", "Add overlap, or use a wider boundary."
         )
     return mesh, blocks.voxel_m
 

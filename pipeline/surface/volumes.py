@@ -166,8 +166,8 @@ def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
     known = np.isfinite(up)
     if known.sum() < LEAST_RIM or known.mean() < LEAST_RIM_SHARE:
         raise SplatpipeError(
-            f"Only {100.0 * known.mean():.0f} % of the polygon's outline has heights, too little for a base.",
-            "Draw it where the surface is known, or state the base's height.",
+            f"Only {100.0 * known.mean():.0f} % of the polygon's outline has heights, which is too little for a base.",
+            "Draw it where the surface has heights, or give the base's height.",
         )
     if stated == "lowest":
         return _lowest(middle, up[known], sigma[known])
@@ -214,7 +214,7 @@ def _fitted(
     for _ in range(ROUNDS):
         normal = design.T @ (weight[:, None] * design)
         if np.linalg.cond(normal) > 1e12:
-            raise SplatpipeError("The polygon's outline is no area to lay a plane through.", "Draw another one.")
+            raise SplatpipeError("The polygon's outline encloses no area to fit a plane to.", "Draw another one.")
         terms = np.linalg.solve(normal, design.T @ (weight * up))
         off = up - design @ terms
         spread = max(1.4826 * float(np.median(np.abs(off))), 1e-6)

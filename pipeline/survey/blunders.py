@@ -35,7 +35,7 @@ DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, a
 SWAPPED_SHARE = 0.3  # of how far two points are off, what is left of it when their names are swapped
 WEAK = 4.0  # times the control's own accuracy: the model is known less well
 LEAST_GSD = 3.0  # a point off by fewer ground pixels is none that a message helps with
-CONTROL_HINT = "--set georef.control=none goes on without control."
+CONTROL_HINT = "--set georef.control=none runs without control."
 
 
 def require_near(survey: Survey, config: GeorefConfig, stations: Stations) -> Float64[np.ndarray, "n 3"]:
@@ -57,10 +57,10 @@ def require_near(survey: Survey, config: GeorefConfig, stations: Stations) -> Fl
     away = _distance_m(geodetic, stations)
     if away > FAR_M:
         better = _better_reading(survey, stations) or (
-            "Check the CRS in its first line, and that east (or longitude) comes before north."
+            "Check the CRS in its first line, and that east (or longitude) comes before north (or latitude)."
         )
         raise SplatpipeError(
-            f"The points of {survey.name} lie {away / 1000.0:,.1f} km from where the photos were taken, read in"
+            f"The points of {survey.name} lie {away / 1000.0:,.1f} km from the photos when read in"
             f" {survey.crs.text} ({survey.crs.name}).",
             f"{better} {CONTROL_HINT}",
         )
@@ -93,8 +93,8 @@ def name_blunders(
     for a, b in swapped:
         report.warning(
             f"The names {points[a].name} and {points[b].name} look swapped in {survey.name}:"
-            " each lies where the other is surveyed. Both are left out.",
-            "Exchange the two names, and run again.",
+            " each is at the other's surveyed coordinates. Both are left out.",
+            "Swap the two names, and run again.",
         )
         points[a] = points[a].left_out(f"it looks swapped with {points[b].name}")
         points[b] = points[b].left_out(f"it looks swapped with {points[a].name}")
@@ -152,16 +152,16 @@ def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Report
     sigma = float(np.median(stations.sigmas[:, 0]))
     if float(shift.min()) > max(DATUM_M, DATUM_SIGMAS * sigma):
         report.warning(
-            f"The control of {survey.name} lies {shift.min():.0f} m beside the photos' positions.",
-            f"Is {survey.crs.text} its CRS, and its datum the right one? The frame follows the control.",
+            f"The control of {survey.name} lies {shift.min():.0f} m horizontally off the photos' positions.",
+            f"Check that {survey.crs.text} is its CRS and datum. The georeference follows the control.",
         )
     lift = fit.offsets[:, 2]
     heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
     if heights and float(np.abs(lift).min()) > DATUMS_APART_M:
         report.warning(
             f"The heights of {survey.name} lie {abs(lift[0]):.0f} m {'below' if lift[0] > 0 else 'above'} the photos'"
-            " positions, further than vertical datums differ.",
-            "Are they in feet, or above a point of the site? The frame follows the control.",
+            " positions, more than vertical datums can differ.",
+            "Check whether they are in feet, or relative to a local benchmark. The georeference follows the control.",
         )
 
 
@@ -176,8 +176,8 @@ def tell_weak(fit: JointFit, observed: JointObservations, model: SparseModel, re
     known = noise * float(np.median(fit.sigmas_at(model.points)[:, measured].max(axis=1)))
     if known > WEAK * worth:
         report.warning(
-            f"The control tells where the model is to {known:.2f} m only, away from its points.",
-            "Add control points, spread over the site and not on one line.",
+            f"Away from its points, the control determines the model's position only to {known:.2f} m.",
+            "Add control points spread over the site, not along one line.",
         )
 
 
@@ -199,14 +199,14 @@ def gsd_m(survey: Survey, model: SparseModel, scale: float) -> float:
 def _told_off(point: SurveyPoint, off: _Offset, report: Reporter) -> SurveyPoint:
     if point.role == "check":
         report.warning(
-            f"Check point {point.name} lies {off.length:.2f} m from where it is surveyed ({off}).",
-            "Compare its coordinates and marks with the field book. It stays in the accuracy's table.",
+            f"Check point {point.name} lies {off.length:.2f} m from its surveyed position ({off}).",
+            "Check its coordinates and marks against the field book. It stays in the accuracy table.",
         )
         return point
     report.warning(
-        f"Control point {point.name} is left out: the others and the photos have it {off.length:.2f} m"
+        f"Control point {point.name} is left out: the other points and the photos place it {off.length:.2f} m"
         f" from where it is surveyed ({off}).",
-        "Compare its coordinates and its marks with the field book, correct the file, and run again.",
+        "Check its coordinates and marks against the field book, correct the file, and run again.",
     )
     return point.left_out(f"it is {off.length:.2f} m off where the others and the photos have it")
 
@@ -262,7 +262,7 @@ def _better_reading(survey: Survey, stations: Stations) -> str:
             except SplatpipeError:
                 continue
             if _distance_m(geodetic, stations) <= FAR_M and (swapped or text != survey.crs.text):
-                how = "with its first two coordinates exchanged" if swapped else f"as {text}"
+                how = "with its first two coordinates swapped" if swapped else f"as {text}"
                 how += f" and as {text}" if swapped and text != survey.crs.text else ""
-                return f"Read {how} they lie where the photos were taken: correct the file."
+                return f"Read {how}, they match the photos' positions: correct the file."
     return ""

@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
 from splatpipe.pipeline.survey.frames import Frame
 
 FORMAT = 1
-WITHOUT = "Or go without a boundary: --set georef.boundary=none."
+WITHOUT = "Or run without a boundary: --set georef.boundary=none."
 DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 LARGEST_DEGREES = (180.0, 90.0)
 DEGREE_DIGITS = 8  # a millimetre
@@ -106,7 +106,9 @@ def _crs_of(drawing: BoundaryFile, frame: Frame) -> str:
     """What a file names, or WGS 84 by RFC 7946, or the run's CRS where the numbers are no degrees."""
     if frame.origin is None:
         raise SplatpipeError(
-            f"The boundary {drawing.name} cannot be laid onto a model without coordinates: {frame.note}".rstrip("."),
+            f"The boundary {drawing.name} cannot be used on a model that is not georeferenced: {frame.note}".rstrip(
+                "."
+            ),
             f"Give the photos' positions (geo.txt) or control points. {WITHOUT}",
         )
     if drawing.crs:
@@ -117,8 +119,8 @@ def _crs_of(drawing: BoundaryFile, frame: Frame) -> str:
     if frame.crs and not parse_crs(frame.crs).is_geographic:
         return frame.crs
     raise SplatpipeError(
-        f"The boundary {drawing.name} names no CRS, and its coordinates are no degrees.",
-        "Save it in WGS 84 (EPSG:4326), or name the run's CRS: --set georef.crs=EPSG:n.",
+        f"The boundary {drawing.name} states no CRS, and its coordinates are not degrees.",
+        "Save it in WGS 84 (EPSG:4326), or set the run's CRS: --set georef.crs=EPSG:n.",
     )
 
 
@@ -152,15 +154,15 @@ def _elsewhere(
     nearest = apart[np.argmin(np.square(apart).sum(axis=1))]
     away = float(np.hypot(*nearest))
     direction = DIRECTIONS[round(math.atan2(nearest[1], nearest[0]) / (math.pi / 4.0)) % 8]
-    hint = f"Check its place and its CRS, taken for {parse_crs(crs).name}. {WITHOUT}"
+    hint = f"Check its position and its CRS, assumed to be {parse_crs(crs).name}. {WITHOUT}"
     try:
         if _in_world(drawing, crs, frame, swapped=True)[0].contains(points).any():
-            hint = "Its coordinates are swapped: GeoJSON has the longitude (or easting) first."
+            hint = "Its coordinates are swapped: in GeoJSON, longitude (or easting) comes first."
     except SplatpipeError:  # the other way round they are nowhere
         pass
     told = f"{away / 1000.0:,.1f} km" if away >= 1000.0 else f"{away:.0f} m"
     return SplatpipeError(
-        f"Nothing of the capture lies inside the boundary {drawing.name}, {told} {direction} of its middle.", hint
+        f"No part of the capture lies inside the boundary {drawing.name}, {told} {direction} of its centre.", hint
     )
 
 
@@ -169,17 +171,17 @@ def _tell(drawing: BoundaryFile, boundary: Boundary, points: int, report: Report
         x, y = drawing.crossing
         report.warning(
             f"The boundary {drawing.name} crosses itself near {x:.10g}, {y:.10g}.",
-            "What is enclosed twice counts as outside; draw it without crossings.",
+            "Areas enclosed twice count as outside; redraw it so that it does not cross itself.",
         )
     if drawing.passed_over:
-        report.warning(f"The boundary {drawing.name} has points or lines, too, which bound nothing.")
+        report.warning(f"The boundary {drawing.name} also has points or lines, which are ignored.")
     inside = round(boundary.share * points)
     if inside < FEW_POINTS:
         report.warning(
             f"Only {inside} points of the sparse model lie inside the boundary.",
-            "Check its place: positions without corrections (RTK) may be metres off.",
+            "Check its position: photo positions without RTK or PPK may be metres off.",
         )
     report.note(
         f"boundary: {boundary.area.size():,.0f} m², {100.0 * boundary.share:.0f} % of the sparse points inside; "
-        "what is outside stays coarse"
+        "the outside stays coarse"
     )

@@ -94,9 +94,9 @@ def _value(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise SplatpipeError(f"The boundary {path.name} cannot be read: {error.strerror}.", EXPECTED) from error
     except (ValueError, RecursionError) as error:  # no text, no JSON, a number of a million digits, a tower of brackets
-        raise SplatpipeError(f"The boundary {path.name} is no GeoJSON.", EXPECTED) from error
+        raise SplatpipeError(f"The boundary {path.name} is not valid GeoJSON.", EXPECTED) from error
     if not isinstance(value, dict):
-        raise SplatpipeError(f"The boundary {path.name} is no GeoJSON.", EXPECTED)
+        raise SplatpipeError(f"The boundary {path.name} is not valid GeoJSON.", EXPECTED)
     return value
 
 
@@ -120,7 +120,7 @@ def _geometries(value: Any, depth: int, name: str) -> Iterator[tuple[dict[str, A
         yield value, name
         return
     else:
-        raise _BrokenError("is no GeoJSON: something in it has no type that is known")
+        raise _BrokenError("is not valid GeoJSON: something in it has an unknown type")
     if not isinstance(parts, list):
         raise _BrokenError(f"has a {kind} that is no list")
     for part in parts:
@@ -170,7 +170,7 @@ def _position(stated: Any) -> tuple[float, float]:
     numbers = _listed(stated)[:2]
     for number in numbers:
         if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) <= LARGEST:
-            raise _BrokenError("has a coordinate that is no number of this earth")
+            raise _BrokenError("has a coordinate that is out of range")
     if len(numbers) < 2:
         raise _BrokenError("has a position without two coordinates")
     return float(numbers[0]), float(numbers[1])
@@ -185,7 +185,7 @@ def _crs(value: dict[str, Any], name: str) -> str:
     text = properties.get("name") if isinstance(properties, dict) else None
     if not isinstance(text, str) or stated.get("type") not in ("name", "EPSG"):
         hint = "Save it in WGS 84 (EPSG:4326), which GeoJSON has by default."
-        raise SplatpipeError(f"The boundary {name} does not name its CRS, but points to it.", hint)
+        raise SplatpipeError(f"The boundary {name} gives its CRS as a link, not by name.", hint)
     if match := _EPSG_NAMES.fullmatch(text.strip()):
         return f"EPSG:{int(match[1])}"
     return WGS84 if _CRS84.fullmatch(text.strip()) else text.strip()

@@ -120,7 +120,7 @@ def place_by_control(
         if can_adjust(model.reconstruction):
             result = _adjusted(result, capture, config, report)
         else:
-            report.warning("A model with camera rigs is placed by control, but not adjusted to it.")
+            report.warning("A model with camera rigs is georeferenced by control, but not adjusted to it.")
     if result.bent is None:  # with what the adjustment found of the control
         observed = observed_in(site, result.survey, model, start[0].scale, config.mark_sigma_px)
         observed = with_sigmas_times(observed, result.sigma_factor)
@@ -140,7 +140,7 @@ def _frame(frame: Frame | None, survey: Survey, site: LocalSurvey, fit: JointFit
     by += [f"the positions of {len(site.stations)} photos"] if len(site.stations) else []
     note = f"From {' and '.join(by)}."
     if not heights:
-        note += " Heights are the positions'." if len(site.stations) else " Heights count from the control points."
+        note += " Heights are the positions'." if len(site.stations) else " Heights are relative to the control points."
     residuals = dict(frame.residuals) if frame is not None else {}
     residuals.pop("uncertainty", None)  # the positions' alone
     left_out = frame.left_out if frame is not None else ()
@@ -170,9 +170,10 @@ def _settle(result: ControlResult, capture: GeorefInput, config: GeorefConfig, r
         index, off, best = better
         point = best.survey.points[index]
         report.warning(
-            f"Control point {point.name} is left out: adjusted to the others, the photos have it {off:.2f} m from where"
-            " it is surveyed.",
-            "Compare its coordinates and its marks with the field book, correct the file, and run again.",
+            f"Control point {point.name} is left out: after adjustment to the others, the photos place it "
+            f"{off:.2f} m from"
+            " its surveyed position.",
+            "Check its coordinates and marks against the field book, correct the file, and run again.",
         )
     return best
 
@@ -214,8 +215,8 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
     survey, done, factor = settled.survey, settled.done, settled.factor
     if not done.usable:
         report.warning(
-            "The adjustment to the control did not find a solution: the control places the model without bending it.",
-            "Is the control spread over the site, and marked right?",
+            "The adjustment to the control did not converge: the control georeferences the model without adjusting it.",
+            "Check that the control is spread over the site and marked correctly.",
         )
         return replace(result, survey=survey)
     if factor > 1.0:
@@ -223,14 +224,17 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
         report.warning(
             f"The control points agree with each other and the photos to {worth:.2f} m only, {factor:.1f} times what"
             " they are stated or taken to be worth: their standard deviations are raised by that.",
-            "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… says what they are worth.",
+            "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… sets their standard "
+            "deviation.",
         )
     _tell_lens(done, capture, report)
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
     result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held)
     if moved < BENT_PX:
         return result
-    report.note(f"Control moves what the photos show by {moved:.1f} px: the model is bent to it, and trained anew.")
+    report.note(
+        f"Control moves what the photos show by {moved:.1f} px: the model is adjusted to it, and trained again."
+    )
     world_from_model = result.placed.world_from_model
     bent = pycolmap.Reconstruction(done.reconstruction)
     back = world_from_model.inverse()
@@ -245,20 +249,20 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
 
 
 def _tell_lens(done: ControlAdjustment, capture: GeorefInput, report: Reporter) -> None:
-    """Warn of focal lengths that nothing tells, and of those that control takes far from what the metadata say."""
+    """Warn of focal lengths that nothing tells, and of those that control takes far from the value in the metadata."""
     for number, camera in sorted(done.reconstruction.cameras.items()):
         prior = capture.focal_priors.get(number)
         if number in done.held:
             report.warning(
-                f"Neither the photos nor the control tell the focal length (to {done.focal_sigmas[number]:.1%}):"
-                " it stays within 3 % of what the metadata say.",
-                "Add control at another height, or oblique photos, for heights to be trusted.",
+                f"Neither the photos nor the control determine the focal length (to {done.focal_sigmas[number]:.1%}):"
+                " it stays within 3 % of the value in the metadata.",
+                "Add control at another height, or oblique photos, for reliable heights.",
             )
         elif prior is not None and abs(camera.mean_focal_length() / prior - 1.0) > STRAY:
             report.warning(
                 f"Control takes the focal length from {prior:.0f} to {camera.mean_focal_length():.0f} pixels,"
-                " more than 10 % from what the metadata say.",
-                "Was it another lens, or are the photos cropped? Check heights against known ones.",
+                " more than 10 % from the value in the metadata.",
+                "Was another lens used, or are the photos cropped? Check heights against known ones.",
             )
 
 

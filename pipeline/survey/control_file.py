@@ -209,7 +209,7 @@ def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[s
 
 _EXPECTED = (
     "First a line with the CRS, e.g. EPSG:32633, then lines of `x y z pixel_x pixel_y photo point`;"
-    " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo; without the last three where targets are to be found."
+    " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo; omit the last three if targets are to be detected."
 )
 _KIND = TableKind("control file", _EXPECTED, max_bytes=32 << 20, max_lines=200_000)
 _POINTS = TableKind(
@@ -224,14 +224,14 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row]]:
     first, crs = written[0][0], written[0][1].strip()
     fields = crs.split()
     if len(fields) >= 6 and all(is_number(field) for field in fields[:5]):
-        raise LineError(first, "the first line has to name the CRS, and is an observation", _EXPECTED)
+        raise LineError(first, "the first line must state the CRS, but it is an observation", _EXPECTED)
     for number, line in written[:2]:
         _require_no_header(number, line)
     rows = []
     for number, line in written[1:]:
         fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 5 else line.split()
         if len(fields) < 6:
-            raise LineError(number, f"{len(fields)} fields where at least 6 are needed")
+            raise LineError(number, f"{len(fields)} fields, but at least 6 are needed")
         place = (number_in(number, "x", fields[0]), number_in(number, "y", fields[1]), _height(number, fields[2]))
         mark = Mark(
             _name(number, fields[5]), number_in(number, "pixel x", fields[3]), number_in(number, "pixel y", fields[4])
@@ -275,7 +275,7 @@ def _csv_row(number: int, row: Mapping[str, str]) -> Row:
 def _assemble(table: Table) -> ControlFile:
     crs, groups = table.crs, table.groups
     if not crs or len(crs) > MAX_LINE_CHARS:
-        raise LineError(0, "it names no CRS")
+        raise LineError(0, "it states no CRS")
     if not groups:
         raise LineError(0, "it has no observations")
     if len(groups) > MAX_POINTS:
@@ -298,7 +298,11 @@ def _point(name: str, rows: Sequence[Row], keep_zero: bool) -> SurveyedPoint:
         _require_same(name, first, row)
         if row.mark is not None:
             if row.mark.photo in marks and row.mark != marks[row.mark.photo]:
-                raise LineError(row.line, f"a second mark of {name} in {row.mark.photo}", "A photo shows a point once.")
+                raise LineError(
+                    row.line,
+                    f"a second mark of {name} in {row.mark.photo}",
+                    "A point can be marked only once in a photo.",
+                )
             marks[row.mark.photo] = row.mark
     x, y, z = first.place
     role = next((row.role for row in rows if row.role is not None), None)
@@ -315,7 +319,7 @@ def _require_same(name: str, first: Row, row: Row) -> None:
             raise LineError(
                 row.line,
                 f"{name} has other coordinates than in line {first.line}",
-                "One name is one point: correct the coordinates, or give the points different names.",
+                "Each name must be one point: correct the coordinates, or give the points different names.",
             )
     if row.role is not None and first.role is not None and row.role != first.role:
         raise LineError(row.line, f"{name} is {row.role} here and {first.role} in line {first.line}")

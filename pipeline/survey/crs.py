@@ -120,7 +120,7 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
     note = crs.assumed
     if not group.transformers and approximate and _like_wgs84(crs):
         group = _quiet_group(crs.horizontal, latitude, longitude, allow_ballpark=True)
-        note = "EPSG has no operation to WGS 84: its datum is taken for that, which may be metres off."
+        note = "EPSG has no operation to WGS 84: its datum is treated as WGS 84, which may be metres off."
     if not group.transformers:
         raise _no_way(f"{crs.text} ({crs.name})", _like_wgs84(crs))
     best = group.transformers[0]
@@ -214,8 +214,8 @@ def undulation(
         return np.zeros(len(latitude))
     if vertical == UNKNOWN:
         raise SplatpipeError(
-            "The vertical datum of the heights is not known, so they cannot be brought into another one.",
-            "Declare it: --set georef.vertical=ellipsoidal, or =EPSG:n of the heights' datum.",
+            "The vertical datum of the heights is not known, so they cannot be converted to another one.",
+            "State it: --set georef.vertical=ellipsoidal, or =EPSG:n of the heights' datum.",
         )
     code = vertical.removeprefix("EPSG:")
     place = float(np.median(latitude)), float(np.median(longitude))
@@ -224,14 +224,14 @@ def undulation(
         missing = _missing_grids(group)
         named = f": {', '.join(missing[:GRIDS_SHOWN])}" if missing else ""
         raise SplatpipeError(
-            f"Heights in {describe_vertical(vertical)} need a grid of the geoid that is not there{named}.",
+            f"Heights in {describe_vertical(vertical)} need a geoid grid that is not installed{named}.",
             _how_to_fetch(missing),
         )
     _, _, height = group.transformers[0].transform(longitude, latitude, np.zeros(len(latitude)))
     if not np.isfinite(height).all():
         raise SplatpipeError(
-            f"The scene lies outside of the geoid's grid of {describe_vertical(vertical)}.",
-            "Name the vertical datum that its heights are in.",
+            f"The scene lies outside the geoid grid of {describe_vertical(vertical)}.",
+            "State the vertical datum of its heights.",
         )
     return np.asarray(height, dtype=np.float64)
 
@@ -277,12 +277,14 @@ def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
     if crs.area is not None:
         away = _outside_km(crs.area, latitude, longitude)
         if away > MAX_OUTSIDE_KM:
-            raise SplatpipeError(f"{place} is {away:,.0f} km outside of the area of {crs.text} ({crs.name}).", hint)
+            raise SplatpipeError(f"{place} is {away:,.0f} km outside the area of {crs.text} ({crs.name}).", hint)
     elif not crs.is_geographic:
         factors = pyproj.Proj(crs.horizontal).get_factors(longitude, latitude)
         stretch = max(abs(factors.meridional_scale - 1.0), abs(factors.parallel_scale - 1.0))
         if not stretch <= STRETCH:  # also where it is infinite or not a number
-            raise SplatpipeError(f"{place} is not where {crs.text} is true to scale: another part of the earth.", hint)
+            raise SplatpipeError(
+                f"{place} is in another part of the earth, where {crs.text} is not true to scale.", hint
+            )
 
 
 def _require_no_degrees(points: Float64[np.ndarray, "n 3"], crs: Crs, latitude: float, longitude: float) -> None:
@@ -291,7 +293,7 @@ def _require_no_degrees(points: Float64[np.ndarray, "n 3"], crs: Crs, latitude: 
     if like_degrees and crs.area is not None and _outside_km(crs.area, latitude, longitude) > 0.0:
         raise SplatpipeError(
             f"The coordinates look like degrees, and {crs.text} ({crs.name}) has none.",
-            "Name the CRS that they are in: EPSG:4326 for longitude and latitude of WGS 84.",
+            "State their CRS: EPSG:4326 for longitude and latitude of WGS 84.",
         )
 
 
@@ -313,18 +315,18 @@ def _missing_grids(group: TransformerGroup) -> list[str]:
 
 
 def _how_to_fetch(grids: Sequence[str]) -> str:
-    fetch = f"Fetch it: `pyproj sync --file {grids[0]}`" if grids else "Name another datum"
-    return f"{fetch}, or choose a CRS that needs none."
+    fetch = f"Fetch it: `pyproj sync --file {grids[0]}`" if grids else "Choose another datum"
+    return f"{fetch}, or choose a CRS that needs no grid."
 
 
 def _lacks_grid(crs: Crs, group: TransformerGroup) -> SplatpipeError:
     missing = _missing_grids(group)
-    rest = "without it PROJ knows no way to WGS 84"
+    rest = "without it PROJ has no transformation to WGS 84"
     if group.transformers:
         rest = f"without it the best is {group.transformers[0].description}, {group.transformers[0].accuracy:g} m"
     return SplatpipeError(
-        f"{crs.text} ({crs.name}) needs a grid that is not there: {', '.join(missing[:GRIDS_SHOWN])}; {rest}.",
-        _how_to_fetch(missing) + " --set georef.approximate_crs=true takes it as it is.",
+        f"{crs.text} ({crs.name}) needs a grid that is not installed: {', '.join(missing[:GRIDS_SHOWN])}; {rest}.",
+        _how_to_fetch(missing) + " --set georef.approximate_crs=true accepts that.",
     )
 
 
@@ -340,12 +342,12 @@ def _like_wgs84(crs: Crs) -> bool:
 def _no_way(crs: str, like_wgs84: bool = False) -> SplatpipeError:
     hint = "State its datum: an EPSG code, or +datum=… or +towgs84=… in the PROJ string."
     if like_wgs84:
-        hint = "--set georef.approximate_crs=true takes its datum for WGS 84, which may be metres off."
-    return SplatpipeError(f"PROJ knows no way between {crs} and WGS 84.", hint)
+        hint = "--set georef.approximate_crs=true treats its datum as WGS 84, which may be metres off."
+    return SplatpipeError(f"PROJ has no transformation between {crs} and WGS 84.", hint)
 
 
 def _not_there(crs: Crs, point: Float64[np.ndarray, " 3"]) -> SplatpipeError:
     return SplatpipeError(
-        f"{crs.text} ({crs.name}) has no place for the coordinates {point[0]:g} {point[1]:g}.",
+        f"{crs.text} ({crs.name}) is not defined at the coordinates {point[0]:g} {point[1]:g}.",
         "Check the CRS, and the order of the coordinates: east (or longitude) comes first.",
     )

@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 ELLIPSOIDAL = "ellipsoidal"
 UNKNOWN = "unknown"
 LONGEST_TEXT = 500  # characters; the longest PROJ strings in use have some 200
-FORMS = "Name it as EPSG:25832, EPSG:25832+7837 (with its heights), +proj=… or WGS84 UTM 32N."
+FORMS = "State it as EPSG:25832, EPSG:25832+7837 (with its heights), +proj=… or WGS84 UTM 32N."
 # fmt: off
 PROJ_KEYS = frozenset((
     "proj", "zone", "south", "datum", "ellps", "a", "b", "rf", "f", "R", "units", "to_meter", "lat_0", "lat_1",
@@ -73,7 +73,7 @@ def parse_crs(text: str) -> Crs:
     """
     text = " ".join(text.split()) if len(text) <= LONGEST_TEXT else text
     if len(text) > LONGEST_TEXT or not text.isascii() or not text.isprintable():
-        raise SplatpipeError("A coordinate reference system is not stated in a form that is known.", FORMS)
+        raise SplatpipeError("The coordinate reference system is not in a known form.", FORMS)
     if match := _EPSG.fullmatch(text):
         return _from_epsg(*match.groups())
     if match := _UTM.fullmatch(text):
@@ -83,7 +83,7 @@ def parse_crs(text: str) -> Crs:
         return _from_epsg(str((32600 if side == "N" else 32700) + zone), None)
     if text.startswith("+"):
         return _from_proj(text)
-    raise SplatpipeError(f'"{text}" is no coordinate reference system in a form that is known.', FORMS)
+    raise SplatpipeError(f'"{text}" is not a coordinate reference system in a known form.', FORMS)
 
 
 def parse_vertical(text: str) -> str:
@@ -95,13 +95,13 @@ def parse_vertical(text: str) -> str:
     text = text.strip()
     if text.lower() in (ELLIPSOIDAL, UNKNOWN):
         return text.lower()
-    hint = "Name it as ellipsoidal, unknown, or EPSG:7837 (DHHN2016), EPSG:5703 (NAVD88), EPSG:5773 (EGM96)."
+    hint = "State it as ellipsoidal, unknown, or EPSG:7837 (DHHN2016), EPSG:5703 (NAVD88), EPSG:5773 (EGM96)."
     match = _EPSG.fullmatch(text) if len(text) <= LONGEST_TEXT else None
     if match is None or match[2]:
-        raise SplatpipeError(f'"{text[:60]}" is no vertical datum.', hint)
+        raise SplatpipeError(f'"{text[:60]}" is not a vertical datum.', hint)
     crs = _authority(match[1])
     if not crs.is_vertical:
-        raise SplatpipeError(f"EPSG:{match[1]} ({crs.name}) is no vertical datum.", hint)
+        raise SplatpipeError(f"EPSG:{match[1]} ({crs.name}) is not a vertical datum.", hint)
     _height_unit(crs)
     return f"EPSG:{int(match[1])}"
 
@@ -156,7 +156,7 @@ def _from_epsg(code: str, heights: str | None) -> Crs:
     text, name = f"EPSG:{int(code)}", crs.name
     if heights is not None:
         if vertical != UNKNOWN:
-            raise SplatpipeError(f"{text} ({name}) has heights of its own.", f"Name {text} alone.")
+            raise SplatpipeError(f"{text} ({name}) already has a vertical datum.", f"Give {text} alone.")
         vertical = parse_vertical(f"EPSG:{heights}")
         upper = _authority(heights)
         unit_m, text, name = _height_unit(upper), f"{text}+{int(heights)}", f"{name} + {upper.name}"
@@ -174,13 +174,13 @@ def _from_proj(text: str) -> Crs:
         return _from_epsg(match[1], match[2])
     if "geoidgrids" in keys:
         raise SplatpipeError(
-            "A PROJ string with +geoidgrids is not taken.",
-            "Leave that out, and name the heights' datum: --set georef.vertical=EPSG:n.",
+            "A PROJ string with +geoidgrids is not supported.",
+            "Omit it, and state the vertical datum: --set georef.vertical=EPSG:n.",
         )
     wrong = sorted(set(keys) - PROJ_KEYS)
     if wrong or keys.get("nadgrids", "@null") != "@null" or not all(part.startswith("+") for part in text.split(" ")):
         named = f" with +{(wrong or ['nadgrids'])[0][:30]}"
-        raise SplatpipeError(f"A PROJ string{named} is not taken.", "Name the CRS by its EPSG code.")
+        raise SplatpipeError(f"A PROJ string{named} is not supported.", "Give the CRS by its EPSG code.")
     unit = keys.get("vunits") or keys.get("units", "m")
     kept = [token for token in text.split(" ") if not token.startswith(("+vunits", "+type", "+no_defs"))]
     stated = " ".join([*kept, "+no_defs"])
@@ -196,7 +196,7 @@ def _from_proj(text: str) -> Crs:
         raise SplatpipeError(f"{text[:120]} is neither a projected nor a geographic CRS.", FORMS)
     unit_m = 1.0 if crs.is_geographic and "vunits" not in keys else HEIGHT_UNITS_M.get(unit, 0.0)
     if unit_m == 0.0:
-        raise SplatpipeError(f"The unit {unit[:20]} of {text[:120]} is not known.", "m, ft and us-ft are.")
+        raise SplatpipeError(f"The unit {unit[:20]} of {text[:120]} is not known.", "Known are m, ft and us-ft.")
     return Crs(stated, stated, UNKNOWN, unit_m, None, assumed, crs.to_3d())
 
 
@@ -211,5 +211,7 @@ def _authority(code: str) -> pyproj.CRS:
 def _height_unit(vertical: pyproj.CRS) -> float:
     axis = vertical.axis_info[0]
     if axis.direction != "up":
-        raise SplatpipeError(f"{vertical.name} counts downwards: depths are not taken.", "Name heights' datum.")
+        raise SplatpipeError(
+            f"{vertical.name} counts downwards: depths are not supported.", "Give a vertical datum of heights."
+        )
     return float(axis.unit_conversion_factor)

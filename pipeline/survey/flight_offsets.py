@@ -122,13 +122,14 @@ def tell_flights_apart(flights: Sequence[Mapping[str, Any]], report: Reporter) -
         east, north, up = flight["offset_m"]
         if flight["apart"][1]:
             report.warning(
-                f"The heights of {name} are {abs(up):.1f} m {'above' if up > 0 else 'below'} those of the flight that "
-                "the frame follows.",
-                "They are in another vertical datum, or the aircraft's own zero was wrong; the offset is estimated and "
-                "taken off.",
+                f"The heights of {name} are {abs(up):.1f} m {'above' if up > 0 else 'below'} those of the reference "
+                "flight.",
+                "They are in another vertical datum, or the aircraft's height reference was wrong; the offset is "
+                "estimated "
+                "and removed.",
             )
         if flight["apart"][0]:
             report.warning(
-                f"The positions of {name} are {math.hypot(east, north):.1f} m off the flight that the frame follows.",
-                "The base station's coordinates may be wrong; the offset is estimated and taken off.",
+                f"The positions of {name} are {math.hypot(east, north):.1f} m off those of the reference flight.",
+                "The base station's coordinates may be wrong; the offset is estimated and removed.",
             )

@@ -197,16 +197,18 @@ def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Position
     tell_flights_apart(frame.residuals["flights"], report)
     if frame.left_out:
         report.warning(
-            f"The stated position of {len(frame.left_out)} photos is off and left out of the fit: "
+            f"The stated position of {len(frame.left_out)} photos is wrong and is left out of the fit: "
             f"{some(frame.left_out)}.",
             "The photos themselves are used.",
         )
     heights = _heights(frame, model, positions)
     if heights is not None and abs(heights[0] / heights[1] - 1.0) > HEIGHT_TOLERANCE:
         report.warning(
-            f"The cameras are {heights[0]:.1f} m above the ground in the model, {heights[1]:.1f} m by the drone.",
-            "On a flight at one height the focal length is hardly observable, and heights scale with it; or it took "
-            "off from other ground.",
+            f"The cameras are {heights[0]:.1f} m above the ground in the model, {heights[1]:.1f} m according to "
+            "the drone.",
+            "At a single flying height the focal length is poorly determined, and heights scale with it; or the "
+            "take-off "
+            "point was at another ground height.",
         )
 
 
@@ -220,9 +222,10 @@ def _tell_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Re
         ]
         across, height = (factor * sigma for factor, sigma in zip(factors.tolist(), stated, strict=True))
         report.warning(
-            f"The photos' positions are poor: off by about {across:.1f} m horizontally and {height:.1f} m in height,"
-            f" where {stated[0]:g} and {stated[1]:g} m were to be expected. So {fit.uncertainty.sentence()}.",
-            "Control points (gcp_list.txt), or better positions (positions.csv), would place it well.",
+            f"The photos' positions are inaccurate: off by about {across:.1f} m horizontally and {height:.1f} m in "
+            "height,"
+            f" where {stated[0]:g} and {stated[1]:g} m were expected. Result: {fit.uncertainty.sentence()}.",
+            "Control points (gcp_list.txt), or better positions (positions.csv), would improve the georeference.",
         )
 
 
@@ -230,15 +233,15 @@ def _tell_directions(fit: PositionFit, report: Reporter) -> None:
     """Warn of directions that are not the positions'."""
     if fit.contradicted_rad > 0.0:
         report.warning(
-            f"The photos' positions would turn the model by {math.degrees(fit.contradicted_rad):.0f}° against"
-            f" {fit.held_by}: their error drifts along the flight. How the model is turned is mostly from the latter.",
-            "Look whether level ground is level in the result. Control points would tell.",
+            f"The photos' positions would rotate the model by {math.degrees(fit.contradicted_rad):.0f}° against"
+            f" {fit.held_by}: their error drifts along the flight. The model's orientation is mostly from the latter.",
+            "Check that level ground is level in the result, or add control points.",
         )
     elif fit.held_by and fit.alone_rad > LINE_RAD:
-        report.warning(f"The photos were taken along a line: the rotation that they leave open is from {fit.held_by}.")
+        report.warning(f"The photos were taken along a line: the rotation about it is from {fit.held_by}.")
     elif fit.held_by:
         report.warning(
-            f"The photos' positions tell how the model is turned only to {math.degrees(fit.alone_rad):.1f}°:"
+            f"The photos' positions determine the model's orientation only to {math.degrees(fit.alone_rad):.1f}°:"
             f" it is from {fit.held_by} as well."
         )
 

@@ -264,14 +264,14 @@ def require_fit(fit: JointFit, observed: JointObservations, survey: Survey) -> N
     if extent < LEAST_EXTENT_M:
         raise SplatpipeError(
             f"All control points of {survey.name} have the same coordinates.",
-            "Each name has coordinates of its own: was one line copied to all?",
+            "Each name needs its own coordinates: was one line copied to all?",
         )
     if error > MISFIT_SHARE * extent:
         raise SplatpipeError(
             f"The control points of {survey.name} do not fit the model: they are {error:,.1f} m off"
-            f" where they span {extent:,.1f} m.",
+            f" over an extent of {extent:,.1f} m.",
             f"Check the CRS in its first line ({survey.crs.text}), the order of the coordinates (east first), and that"
-            " names and marks belong together.",
+            " names and marks match.",
         )
     if not math.isfinite(error):
         raise SplatpipeError(f"The control points of {survey.name} do not fit the model.", "Check its coordinates.")

@@ -115,7 +115,7 @@ def read_model(path: Path, photos: Iterable[str]) -> SparseModel:
     except Exception as error:  # pycolmap raises its C++ errors as several types
         raise SplatpipeError(
             f"The sparse model cannot be read: {' '.join(str(error).split())[:200]}",
-            "It has to hold cameras, images and points3D, as COLMAP writes them (.bin or .txt).",
+            "It must have cameras, images and points3D, as COLMAP writes them (.bin or .txt).",
         ) from error
     if not any(image.has_pose for image in reconstruction.images.values()):
         raise SplatpipeError("The sparse model has no photo with a pose.", "Reconstruct again, with more overlap.")

@@ -51,8 +51,8 @@ def _none_on_earth(positions: PositionList) -> list[Doubt]:
         doubts.append(
             Doubt(
                 "position-impossible",
-                f"The position is none that can be on Earth: {some(positions.impossible)}.",
-                "These photos take part without their position.",
+                f"Impossible positions: {some(positions.impossible)}.",
+                "These photos are used without their positions.",
                 positions.impossible,
             )
         )
@@ -63,8 +63,8 @@ def _none_on_earth(positions: PositionList) -> list[Doubt]:
         doubts.append(
             Doubt(
                 "position-far",
-                f"Positions that cannot be right: {'; '.join(told[:10])}{more}.",
-                "These photos take part without their position.",
+                f"Implausible positions: {'; '.join(told[:10])}{more}.",
+                "These photos are used without their positions.",
                 tuple(sorted(elsewhere)),
             )
         )
@@ -80,14 +80,14 @@ def _missing(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Do
         return [
             Doubt(
                 "position-missing",
-                "No photo has a position: the result will have neither scale nor place.",
-                "Control points or scale bars give both; or was the receiver off, or the EXIF lost in a copy?",
+                "No photo has a position: the result will have neither scale nor georeference.",
+                "Control points give both, scale bars the scale. Was the receiver off, or the EXIF lost in a copy?",
                 weight="note",
             )
         ]
     which = some(without) if len(without) <= len(photos) / 2 else f"{len(without)} of {len(photos)} photos"
     single = without if len(without) <= len(photos) / 2 else ()
-    hint = "Was the receiver's fix lost, or the EXIF in a copy? They take part without it."
+    hint = "Was the receiver's fix lost, or the EXIF in a copy? They are used without it."
     return [Doubt("position-missing", f"Without a position: {which}.", hint, single)]
 
 
@@ -106,12 +106,12 @@ def _contradicting(photos: Sequence[CheckedPhoto]) -> list[Doubt]:
     names = tuple(sorted(name for name, metres in apart.items() if metres > limit))
     if step > ANOTHER_PLACE_M:
         text = f"EXIF and the drone's XMP place the photos {step:,.0f} m apart."
-        return [Doubt("position-contradiction", text, "EXIF's places are used; were they written anew?")]
+        return [Doubt("position-contradiction", text, "EXIF's positions are used; were they rewritten?")]
     if not names:
         return []
     furthest = max(names, key=apart.__getitem__)
-    text = f"EXIF and XMP state different places: {some(names)} (up to {apart[furthest]:,.0f} m apart)."
-    return [Doubt("position-contradiction", text, "EXIF's are used: correct them, or write the originals back.", names)]
+    text = f"EXIF and XMP state different positions: {some(names)} (up to {apart[furthest]:,.0f} m apart)."
+    return [Doubt("position-contradiction", text, "EXIF's are used: correct them, or restore the originals.", names)]
 
 
 def _altitudes(positions: Sequence[Position]) -> list[Doubt]:
@@ -121,7 +121,7 @@ def _altitudes(positions: Sequence[Position]) -> list[Doubt]:
     without = tuple(each.name for each in positions if each.altitude_m is None)
     if stated and without and len(without) <= len(positions) / 2:
         text = f"Without an altitude: {some(without)}."
-        doubts.append(Doubt("altitude-missing", text, "Their heights count as unknown.", without))
+        doubts.append(Doubt("altitude-missing", text, "Their heights are treated as unknown.", without))
     if len(stated) < 3:
         return doubts
     values = np.array(list(stated.values()), dtype=np.float64)
@@ -142,8 +142,8 @@ def _datums(positions: PositionList) -> list[Doubt]:
         doubts.append(
             Doubt(
                 "altitude-datums",
-                f"Altitudes are of different kinds: {told}.",
-                "Heights of different datums differ by up to a hundred metres: give positions of one in geo.txt.",
+                f"Altitudes have different references: {told}.",
+                "Heights of different datums differ by up to a hundred metres: give positions in one datum in geo.txt.",
             )
         )
     step = positions.altitude_step_m
@@ -173,9 +173,9 @@ def _lost_fix(positions: Sequence[Position]) -> list[Doubt]:
         return []
     sigmas: Mapping[str, float] = {each.name: each.sigma_horizontal_m for each in positions}
     worst = max(sigmas[name] for name in lost)
-    text = f"RTK was lost: {some(lost)} (their positions are good to {worst:.2g} m; the others' to "
+    text = f"RTK was lost: {some(lost)} (their positions are accurate to {worst:.2g} m; the others' to "
     text += f"{np.median([sigmas[name] for name in fixed if fixed[name]]):.2g} m)."
-    return [Doubt("rtk-lost", text, "They count for less; PPK, or flying them again with a fix, mends it.", lost)]
+    return [Doubt("rtk-lost", text, "They get less weight; PPK, or flying them again with a fix, would help.", lost)]
 
 
 def _is_fixed(position: Position) -> bool:

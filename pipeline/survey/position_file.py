@@ -109,7 +109,7 @@ def read_position_file(path: Path) -> PositionFile:
         photos = [_photo(number, row) for number, row in rows]
         _require_once(photos)
     if not photos:
-        raise SplatpipeError(f"The file of positions {path.name} names no photo.", EXPECTED)
+        raise SplatpipeError(f"The file of positions {path.name} lists no photos.", EXPECTED)
     return PositionFile(crs, tuple(photos))
 
 
@@ -117,13 +117,13 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[tuple[int, 
     first, crs = written[0]
     fields = crs.split()
     if len(fields) >= 3 and all(is_number(field) for field in fields[1:3]):
-        raise LineError(first, "the first line has to name the CRS, and is a photo's")
+        raise LineError(first, "the first line must state the CRS, but it is a photo's")
     rows: list[tuple[int, Mapping[str, str]]] = []
     for number, line in written[1:]:
         # A name with blanks is one field where tabs part the fields.
         fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 2 else line.split()
         if len(fields) < 3:
-            raise LineError(number, f"{len(fields)} fields where at least 3 are needed")
+            raise LineError(number, f"{len(fields)} fields, but at least 3 are needed")
         row = dict(zip(ODM_ORDER, fields, strict=False))
         if len(fields) < ANGLES_FROM:
             row = {key: row[key] for key in ("name", "x", "y", "z") if key in row}
@@ -156,7 +156,7 @@ def _angles(
     if yaw is None or pitch is None or yaw == pitch == (roll or 0.0) == 0.0:
         return None
     if max(abs(yaw), abs(pitch), abs(roll or 0.0)) > LARGEST_ANGLE_DEG:
-        raise LineError(number, "angles that are none in degrees")
+        raise LineError(number, "angles that are out of range in degrees")
     return yaw, pitch, roll or 0.0
 
 

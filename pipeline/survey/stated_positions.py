@@ -74,8 +74,9 @@ def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False)
             matched[name] = photo
     if not matched:
         raise SplatpipeError(
-            f"{path.name} names no photo that is there: {some(unknown)}.",
-            "It may be of another capture: name the right one with --set ingest.positions=PATH, or =none to ignore it.",
+            f"{path.name} lists no photo of this capture: {some(unknown)}.",
+            "It may belong to another capture: give the right one with --set ingest.positions=PATH, or =none to "
+            "ignore it.",
         )
     crs = parse_crs(file.crs)
     rows = list(matched.values())

@@ -58,7 +58,7 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
             raise SplatpipeError(f"{name} is too large.", kind.expected)
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise SplatpipeError(f"{name} is no UTF-8 text.", "Save it as plain text in UTF-8.") from error
+        raise SplatpipeError(f"{name} is not UTF-8 text.", "Save it as plain text in UTF-8.") from error
     except OSError as error:
         raise SplatpipeError(f"The {kind.what} {path} cannot be read: {error.strerror}.", "Check the path.") from error
     lines = text.splitlines()
@@ -130,7 +130,7 @@ def number_in(line: int, what: str, text: str) -> float:
     """
     text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
     if not is_number(text) or abs(float(text)) > LARGEST:
-        raise LineError(line, f"{what} is {text[:40]!r}, no number that it can be")
+        raise LineError(line, f"{what} is {text[:40]!r}, which is not a valid number")
     return float(text)
 
 
@@ -174,5 +174,5 @@ def csv_rows(
     if not crs and title_of(titles[places["x"]]) in GEOGRAPHIC:
         crs = "EPSG:4326"
     if not crs:
-        raise LineError(0, "it names no CRS", "Put it into the first line, e.g. EPSG:32633, or into a column crs.")
+        raise LineError(0, "it states no CRS", "Put it in the first line, e.g. EPSG:32633, or in a column crs.")
     return crs, rows

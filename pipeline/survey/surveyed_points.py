@@ -139,13 +139,13 @@ def load_survey(
         points = _with_targets(points, find_targets(Survey(file, crs, path.name, tuple(points))), model, photos, config)
     if not any(point.sightings for point in points):
         report.warning(
-            f"{path.name} has points but no marks of them in photos, and no targets were found that they are.",
+            f"{path.name} has points without marks in photos, and no targets were detected for them.",
             "Mark each point in at least two, better four photos: splatpipe view OUT --mark.",
         )
         return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
     if file.zero_heights:
         report.note(
-            f"A height of 0.0 is taken as unknown: {some(file.zero_heights)} of {path.name} "
+            f"A height of 0.0 is treated as unknown: {some(file.zero_heights)} of {path.name} "
             f"{'controls' if len(file.zero_heights) == 1 else 'control'} horizontally only."
         )
     _tell_unusable(points, path.name, model, photos, report)
@@ -259,22 +259,22 @@ def _tell_marks(
     if all_missing:
         raise SplatpipeError(
             f"None of the photos that {name} names is in this capture: {some(missing)}.",
-            "Check that the file belongs to these photos; it names them as their files are called."
-            " --set georef.control=none goes on without control.",
+            "Check that the file belongs to these photos; photos must be listed by their file names."
+            " --set georef.control=none runs without control.",
         )
     if missing:
         report.warning(
             f"{name} names {missing_photos(missing)}.",
-            "Their marks are left out. Correct the names, or add the photos.",
+            "Their marks are ignored. Correct the names, or add the photos.",
         )
     if len(outside) > OUTSIDE_SHARE * marks:
         raise SplatpipeError(
-            f"{len(outside)} of {marks} marks of {name} lie outside of their photos: {some(outside)}.",
-            "Were they made in photos of another size, or turned ones? Pixels count in the photos as they are here.",
+            f"{len(outside)} of {marks} marks of {name} lie outside their photos: {some(outside)}.",
+            "Were they made in photos that were resized or rotated? Pixel coordinates must be in these photos.",
         )
     if outside:
         report.warning(
-            f"{len(outside)} marks of {name} lie outside of their photos and are left out: {some(outside)}.",
+            f"{len(outside)} marks of {name} lie outside their photos and are left out: {some(outside)}.",
             "Correct their pixel coordinates.",
         )
 
@@ -313,7 +313,7 @@ def _tell_unusable(
         if point.found is None:
             report.warning(
                 f"Point {point.name} of {name} is left out: {point.why}.",
-                "Mark it in at least two photos that show it from different places; better four.",
+                "Mark it in at least two photos taken from different positions; four are better.",
             )
             continue
         wrong = [s for s in point.sightings if s.index is not None and not s.agrees]
@@ -323,8 +323,8 @@ def _tell_unusable(
                 s.photo if r is None else f"{s.photo} ({np.hypot(*r):.0f} px)" for s, r in zip(wrong, off, strict=True)
             ]
             report.warning(
-                f"Marks of {point.name} do not lie where its other marks have it, and are left out: {some(named)}.",
-                "Correct these marks: another point may have been marked, or the wrong photo named.",
+                f"Marks of {point.name} disagree with its other marks, and are left out: {some(named)}.",
+                "Correct these marks: another point may have been marked, or the wrong photo given.",
             )
 
 
@@ -352,7 +352,7 @@ def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]
         unknown = sorted(checks - {point.name for point in points})
         if unknown:
             raise SplatpipeError(
-                f"georef.check_points names points that the control file does not have: {some(unknown)}.",
+                f"georef.check_points has points that are not in the control file: {some(unknown)}.",
                 f"It has {some([point.name for point in points])}.",
             )
     return [

@@ -60,7 +60,7 @@ class TargetSurvey:
         if found.named:
             marks = sum(len(each.track.finds) for each in found.named)
             told = some([each.name for each in found.named])
-            report.note(f"Targets found in the photos: {told}, with {marks} marks.")
+            report.note(f"Targets detected in the photos: {told}, with {marks} marks.")
         refused = [f"{count} {what}" for what, count in sorted(found.refused.items())]
         if refused:
             report.note(f"Targets not used: {', '.join(refused)}.")
@@ -110,12 +110,13 @@ def scale_of(
     missing = [f"{bar.a} to {bar.b}" for bar in bars if bar.a not in places or bar.b not in places]
     if missing:
         report.warning(
-            f"Of {len(missing)} of {len(bars)} scale bars a target was not found: {some(missing)}.",
-            "Names of coded targets end in their number; each has to be sharp in two photos, with 20 pixels at least.",
+            f"Of {len(missing)} of {len(bars)} scale bars a target was not detected: {some(missing)}.",
+            "A coded target's name must end in its number; each must be sharp in two photos and at least 20 pixels "
+            "wide.",
         )
     if scale is None:
         if len(missing) < len(bars):
-            report.warning("The scale bars contradict each other, and none of them is used.", "Measure them again.")
+            report.warning("The scale bars contradict each other, so none of them is used.", "Measure them again.")
         return None
     wrong = [
         f"{bar.a} to {bar.b} ({scale.errors_m[k]:+.3f} m)"
@@ -141,9 +142,9 @@ def compare(frame: Frame, scale: ModelScale, report: Reporter) -> None:
     """Say how far the frame's metres are the bars'."""
     ratio = frame.world_from_model.scale / scale.metres_per_unit - 1.0
     bars = f"{_counted(scale)} (good to {scale.sigma:.3%})"
-    what = f"By {bars} lengths in this result are {ratio:+.3%} off."
+    what = f"According to {bars}, lengths in this result are {ratio:+.3%} off."
     if abs(ratio) > SCALE_OFF * scale.sigma + 0.01:
-        report.warning(what, "Check the bars, and the coordinates or positions that the scale is from.")
+        report.warning(what, "Check the bars, and the coordinates or positions that set the scale.")
     else:
         report.note(what)
 

@@ -133,7 +133,7 @@ class World:
         if self.vertical == ELLIPSOIDAL:
             return Placement(self.origin.ecef_from_enu(), False, 0.0, "")
         if self.vertical == UNKNOWN:
-            note = "The heights' datum is not known: they are taken for ellipsoidal, and may be tens of metres off."
+            note = "The vertical datum is not known: heights are treated as ellipsoidal, and may be tens of metres off."
             return Placement(self.origin.ecef_from_enu(), True, None, note)
         samples = _samples(box)
         geodetic = self.origin.geodetic_from_enu(samples)
@@ -141,7 +141,7 @@ class World:
             raised = undulation(self.vertical, np.array([self.origin.latitude]), np.array([self.origin.longitude]))
             geodetic[:, 2] += undulation(self.vertical, geodetic[:, 0], geodetic[:, 1])
         except SplatpipeError as error:
-            note = f"Heights are taken for ellipsoidal, and may be tens of metres off. {error.message}"
+            note = f"Heights are treated as ellipsoidal, and may be tens of metres off. {error.message}"
             return Placement(self.origin.ecef_from_enu(), True, None, note)
         matrix = replace(self.origin, height_m=self.origin.height_m + float(raised[0])).ecef_from_enu()
         off = samples @ matrix[:3, :3].T + matrix[:3, 3] - ecef_from_geodetic(geodetic)

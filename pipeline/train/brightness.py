@@ -68,7 +68,7 @@ def decided_exposure(
     spread = exposure_spread(views, dataset, threads)
     differ = spread >= DIFFERING
     if differ:
-        report.note(f"exposures differ by {spread:.0%}: they are modelled")
+        report.note(f"exposures differ by {spread:.0%}, so exposure is modelled")
     return config.model_copy(update={"exposure": "affine" if differ else "off"})
 
 

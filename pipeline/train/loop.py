@@ -177,7 +177,7 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
         optimise(Training(state, course, out / CHECKPOINT, clock), photos, report)
     if (flat_at := state.history.flat_at) > 0:
         planned = plan.after(state.history.sizes_ended).schedule.iterations
-        report.note(f"flat after {flat_at:,} iterations: ended with {state.iteration:,} of {planned:,}")
+        report.note(f"flat after {flat_at:,} iterations: finished at {state.iteration:,} of {planned:,}")
     return state
 
 
@@ -309,11 +309,14 @@ def resume(path: Path, course: TrainingSetup, report: Reporter) -> TrainState | 
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:
-        report.warning(f"The checkpoint of the training cannot be used: {error}. It starts afresh.")
+        report.warning(f"The checkpoint of the training cannot be used: {error}. Training starts from the beginning.")
         return None
     begun, here = checkpoint.facts.get("instruction_set"), device.kernels
     if begun != here:
-        report.warning(f"The training goes on with {here} from {begun}: as good, but not the same to the last bit.")
+        report.warning(
+            f"Training resumes on {here}, after starting on {begun}: the quality is the same, but the result is "
+            "not bit-identical."
+        )
     return state
 
 
@@ -361,7 +364,7 @@ def tell_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -
     limited = plan.options.max_memory_bytes > 0
     report.warning(
         f"The {'memory limit is close' if limited else 'device has no memory left'}, "
-        f"so no Gaussian is added after iteration {state.iteration:,}.",
+        f"so no Gaussians are added after iteration {state.iteration:,}.",
         hint=f"{'Give more with --max-memory' if limited else 'Lower train.max_gaussians'}, "
         "or smaller photos with train.max_megapixels.",
     )
@@ -370,7 +373,8 @@ def tell_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -
 def tell_larger_photos(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
     """Say that a size ended before its time, and what that leaves to do."""
     report.note(
-        f"flat after {state.iteration:,} iterations: goes on with larger photos, to {plan.schedule.iterations:,} in all"
+        f"flat after {state.iteration:,} iterations: continuing with larger photos, to "
+        f"{plan.schedule.iterations:,} in all"
     )
 
 
@@ -380,8 +384,8 @@ def end_now(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report:
     tell(state, plan, report)
     if state.iteration < plan.schedule.iterations:
         report.note(
-            f"its time is up after {state.iteration:,} of {plan.schedule.iterations:,} planned iterations; "
-            "the model is taken as it stands"
+            f"time budget used up after {state.iteration:,} of {plan.schedule.iterations:,} planned iterations; "
+            "the model is kept as it is"
         )
 
 

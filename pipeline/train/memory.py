@@ -49,15 +49,15 @@ def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bo
     if most < min(FEWEST_GAUSSIANS, sparse):
         least = limit - room + PIXEL_BYTES * pixels + FEWEST_GAUSSIANS * of_one
         raise MachineError(
-            f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB of them already, "
-            f"and {pixels / 1e6:.2f} megapixels of a photo need room, too.",
+            f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB already, "
+            f"and {pixels / 1e6:.2f} megapixels of a photo need memory as well.",
             hint=f"Give --max-memory at least {least / 1e6 + 1:.0f}M.",
         )
     if most < sparse:
         report.warning(
             f"{limit / 1e9:.2f} GB hold {most:,} Gaussians, fewer than the {sparse:,} sparse points: "
             "every part of the scene is thinned evenly.",
-            hint="Give more with --max-memory for a finer model.",
+            hint="For a finer model, give more with --max-memory.",
         )
     cap = min(plan.options.max_gaussians, int(most))
     return plan.of(plan.options.model_copy(update={"max_gaussians": cap}))

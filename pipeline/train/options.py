@@ -12,8 +12,8 @@ from splatpipe.pipeline.engine.stage import StageConfig
 LONGEST_BUDGET_S = 30 * 86_400.0
 LARGEST_MEMORY = 1 << 50
 FILM_FROM_BUDGET_S = 600.0  # a shorter time budget has no time for a film
-_CONSTANT = "This is decided by constants now: leave it out."
-_NO_GAIN = "No gain was ever measured with this: leave it out."
+_CONSTANT = "This is now set by constants: remove it."
+_NO_GAIN = "This was removed, as it never gave a measurable gain: remove it."
 GONE = {
     **dict.fromkeys(
         (
@@ -97,7 +97,7 @@ class TrainConfig(StageConfig):
     def unfit_for_cuda(self) -> str:
         """Why these options do not train on a CUDA device; empty where they do."""
         if self.loss == "kornia":
-            return "train.loss=kornia has no gradient on a CUDA device that is the same each time."
+            return "train.loss=kornia does not have a reproducible gradient on a CUDA device."
         return ""
 
 

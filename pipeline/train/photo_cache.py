@@ -144,5 +144,5 @@ class PhotoCache:
         except OSError as error:
             raise MachineError(
                 f"The decoded photos cannot be kept in {self._folder}: {error.strerror}.",
-                hint="Make room or check the permissions, then run again: it goes on from here.",
+                hint="Free some space or check the permissions, then run again: it resumes from here.",
             ) from error

@@ -238,8 +238,8 @@ def make_plan(
     extent = scene_extent(cameras)
     if not math.isfinite(extent) or extent <= 0.0:
         raise SplatpipeError(
-            f"All {len(cameras)} cameras stand in one place, so the scene has no size.",
-            hint="Take the photos from different places, and hold out fewer of them.",
+            f"All {len(cameras)} cameras are at one position, so the scene's extent is undefined.",
+            hint="Take photos from different positions, and hold out fewer of them.",
         )
     plan = TrainingPlan(
         options=config,

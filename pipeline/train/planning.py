@@ -94,7 +94,7 @@ def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Re
         measured = measure(trial, subject, step, effort)
     except torch.OutOfMemoryError as error:
         raise MachineError(
-            f"The graphics card's memory does not hold the trial that --time-budget is planned by, of "
+            f"The graphics card has too little memory for the trial run that plans --time-budget, of "
             f"{trial.options.max_gaussians:,} Gaussians.",
             hint=HINT,
         ) from error
@@ -102,8 +102,9 @@ def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Re
     choice = choose(_task(plan, scene, measured, left))
     if choice.seconds <= LEAST_SHARE * budget:
         report.warning(
-            f"The stages before training took {before:.0f} s of the {budget:.0f} s, so there is time for a look only.",
-            hint="Run again with the same or a longer --time-budget: what is done is reused.",
+            f"The stages before training took {before:.0f} s of the {budget:.0f} s, so there is time only for a "
+            "rough model.",
+            hint="Run again with the same or a longer --time-budget: earlier results are reused.",
         )
     return replace(
         plan.of(choice.options),

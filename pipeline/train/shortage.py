@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 KEPT_SHARE = 0.9  # of the Gaussians each time, the most opaque: what is lost is what shows least
-HINT = "Lower train.max_megapixels or train.max_gaussians, or close what else uses the graphics card."
+HINT = "Lower train.max_megapixels or train.max_gaussians, or close other programs that use the graphics card."
 
 Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 
@@ -51,8 +51,8 @@ def iterate_within_memory(
         _take_less(state, kernels, report)
     if kernels is not None and kernels.forecast.most_pairs < pairs:  # once, however often they were halved
         report.warning(
-            f"The graphics card's memory is short in iteration {now:,}: each picture is worked off in smaller parts, "
-            "which is slower and gives the same bits.",
+            f"The graphics card's memory is short in iteration {now:,}: each picture is processed in smaller parts, "
+            "which is slower and gives the same result.",
             hint=HINT,
         )
 
@@ -83,7 +83,7 @@ def _take_less(state: TrainState, kernels: CudaKernels | None, report: Reporter)
     except torch.OutOfMemoryError as error:  # the model may be half the old one
         raise MachineError(f"The graphics card's memory does not hold even {fewer:,} Gaussians.", hint=HINT) from error
     report.warning(
-        f"The graphics card's memory does not hold {count:,} Gaussians: the training goes on with the "
+        f"The graphics card's memory does not hold {count:,} Gaussians: training continues with the "
         f"{fewer:,} most opaque, and adds none from iteration {now:,} on.",
         hint=HINT,
     )

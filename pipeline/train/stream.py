@@ -182,9 +182,9 @@ class PhotoStream:
         wanted, room = self.wanted_bytes(), self._cache.room_bytes
         if wanted > room:
             report.warning(
-                f"The decoded photos take {wanted / 1e6:,.0f} MB, and the disk has room for {room / 1e6:,.0f} MB: "
+                f"The decoded photos take {wanted / 1e6:,.0f} MB, but the disk has room for {room / 1e6:,.0f} MB: "
                 "those that do not fit are decoded every time they are trained on, which is slower.",
-                hint="Make room on the disk of OUT, or lower train.max_megapixels.",
+                hint="Free space on the disk of OUT, or lower train.max_megapixels.",
             )
 
     def _store(self, index: int) -> None:

@@ -33,7 +33,7 @@ def format_names(text: str) -> tuple[str, ...]:
     asked = {name.strip() for name in text.split(",")} - {"", "ply"}
     unknown = sorted(asked - set(FORMATS))
     if unknown:
-        raise ValueError(f"there is no format {unknown[0][:40]!r}; choose of {', '.join(('ply', *FORMATS))}")
+        raise ValueError(f"there is no format {unknown[0][:40]!r}; choose from {', '.join(('ply', *FORMATS))}")
     return tuple(name for name in FORMATS if name in asked)
 
 

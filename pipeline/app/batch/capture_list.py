@@ -76,7 +76,9 @@ def read_captures(captures: Path, out: Path) -> tuple[ListedCapture, ...]:
             f"{captures} is neither a folder nor a list of captures.", hint="A list's name ends in .toml or .csv."
         )
     if not found:
-        raise UsageError(f"{captures} names no capture.", hint="Put each capture's photos into a folder of its own.")
+        raise UsageError(
+            f"{captures} contains no captures.", hint="Put each capture's photos into a folder of its own."
+        )
     _check_names(found, captures)
     _check_places(found, out.expanduser().resolve())
     return tuple(found)
@@ -130,9 +132,9 @@ def _known(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[s
         if key == "set" and isinstance(value, str):
             taken[key] = [value]
         elif key == "set" and not (isinstance(value, list) and all(isinstance(text, str) for text in value)):
-            raise UsageError(f"{where}: set is no list of texts.", hint='Write set = ["train.iterations=3000"].')
+            raise UsageError(f"{where}: set is not a list of strings.", hint='Write set = ["train.iterations=3000"].')
         elif key != "set" and not isinstance(value, str):
-            raise UsageError(f"{where}: {key} is no text.", hint=f'Write {key} = "…".')
+            raise UsageError(f"{where}: {key} is not a string.", hint=f'Write {key} = "…".')
     return taken
 
 
@@ -144,11 +146,13 @@ def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]
     except SplatpipeError as error:
         raise UsageError(error.message, hint=error.hint) from error
     except csv.Error as error:
-        raise UsageError(f"The list of captures {path.name} is no CSV: {error}.", hint=CSV_KIND.expected) from error
+        raise UsageError(
+            f"The list of captures {path.name} is not valid CSV: {error}.", hint=CSV_KIND.expected
+        ) from error
     titles = [title.strip() if "." in title else title.strip().casefold().replace(" ", "_") for title in rows[0]]
     unknown = [title for title in titles if "." not in title and (title not in KEYS or title == "set")]
     if unknown or "photos" not in titles or len(set(titles)) < len(titles):
-        what = f'has an unknown column "{unknown[0]}"' if unknown else "has a column twice, or none with photos"
+        what = f'has an unknown column "{unknown[0]}"' if unknown else "has a duplicate column, or no photos column"
         raise UsageError(f"The list of captures {path.name} {what}.", hint=CSV_KIND.expected)
     for (number, _), row in zip(lines[1:], rows[1:], strict=False):
         if len(row) > len(titles):
@@ -163,7 +167,7 @@ def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]
 def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> ListedCapture:
     """A capture from its row or table; paths in it count from the list's folder."""
     if not told.get("photos"):
-        raise UsageError("A capture of the list names no photos.", hint="Name its folder under photos.")
+        raise UsageError("A capture in the list has no photos.", hint="Set photos to its folder.")
     try:
         photos = _below(folder, str(told["photos"]))
     except SplatpipeError as error:
@@ -200,7 +204,9 @@ def _below(folder: Path, text: str) -> Path:
             raise ValueError("a NUL")
         return folder / Path(text).expanduser()
     except (ValueError, RuntimeError) as error:  # ~nobody, or ~ where no HOME is
-        raise SplatpipeError(f"{text!r} is no path that this machine knows.", "Write it whole, without ~.") from error
+        raise SplatpipeError(
+            f"{text!r} cannot be expanded to a path on this machine.", "Write the full path, without ~."
+        ) from error
 
 
 def with_files_from(folder: Path, table: Table) -> Table:
@@ -228,13 +234,13 @@ def _check_places(captures: Sequence[ListedCapture], out: Path) -> None:
 def _check_names(captures: Sequence[ListedCapture], listed: Path) -> None:
     """Each becomes a folder, on any file system."""
     if len(captures) > MAX_CAPTURES:
-        raise UsageError(f"{listed} names {len(captures):,} captures.", hint=f"At most {MAX_CAPTURES:,} make a batch.")
+        raise UsageError(f"{listed} has {len(captures):,} captures.", hint=f"A batch takes at most {MAX_CAPTURES:,}.")
     seen: set[str] = set()
     for name in (capture.name for capture in captures):
         bad = not name.isprintable() or set(name) & set('/\\:*?"<>|') or name.startswith(".") or name != name.strip()
         if bad or not name or len(name) > MAX_NAME or name.casefold() in OWN_NAMES:
             raise UsageError(
-                f"{name[:MAX_NAME]!r} cannot be the name of a folder of results.",
+                f"{name[:MAX_NAME]!r} cannot be used as the name of a results folder.",
                 hint="Rename the capture's folder, or give the capture another name in a list.",
             )
         plain = unicodedata.normalize("NFC", name).casefold()  # some file systems take é in both its forms for one

@@ -52,7 +52,7 @@ def check_folder(out: Path) -> None:
     if (out / "stages").exists():
         raise UsageError(f"{out} is the folder of one run.", hint="Choose another OUT for the batch.")
     if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is made if it is not there.")
+        raise UsageError(f"{out} is a file.", hint="Name a folder for the results; it is created if missing.")
 
 
 @contextmanager
@@ -180,7 +180,7 @@ class Driver:
                     self._tell(self._account.state())
                     time.sleep(POLL_S)
             except BaseException:
-                self._notifications.say("Ending the batch: what runs is asked to end, and keeps what it has.")
+                self._notifications.say("Stopping the batch: running jobs are asked to stop and keep their progress.")
                 end_group(self._call, process.pid, local=self._profile.local, gone=lambda: process.poll() is not None)
                 process.wait()
                 raise
@@ -219,7 +219,7 @@ class Driver:
         except (OSError, MachineError) as error:
             if str(error) != self._unwritten:
                 self._unwritten = str(error)
-                self._notifications.say(f"Cannot write where the batch stands: {error}")
+                self._notifications.say(f"Cannot write the status of the batch: {error}")
         self._published_s, self._last = time.time(), state
 
     def _notify(self, state: str, name: str, page: str) -> None:
@@ -239,7 +239,7 @@ class WorkflowError(MachineError):
 
     def __init__(self, code: int, said: str, log: Path) -> None:
         super().__init__(
-            f"Snakemake ended with exit code {code} before the batch was through. {said}".strip(),
+            f"Snakemake ended with exit code {code} before the batch had finished. {said}".strip(),
             hint=f"Its log has the details: {log}. Repeat the command to go on.",
         )
 

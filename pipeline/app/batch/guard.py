@@ -17,7 +17,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.app.batch.plan import Call
 
-KILLED = "The command itself was killed, by somebody or by a system that ran out of memory; its jobs were ended."
+KILLED = "The batch command itself was killed, by a user or by the system for lack of memory; its jobs were stopped."
 
 
 def main() -> None:

@@ -140,8 +140,8 @@ def _pass_on_signals(process: subprocess.Popen[bytes]) -> None:
 def _ending(code: int, told: bytes, events: Path) -> TryResult:
     if code < 0:
         name = signal.Signals(-code).name
-        hint = "Its log has what it said last; run out of memory is what SIGKILL mostly means."
-        return TryResult(128 - code, f"The command died of {name}.", hint)
+        hint = "See the end of its log; SIGKILL usually means that memory ran out."
+        return TryResult(128 - code, f"The command was killed by {name}.", hint)
     if code == 0:
         return TryResult(0)
     error = _error(told)

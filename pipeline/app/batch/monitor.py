@@ -272,5 +272,5 @@ def _short(free: int | None, needed: int) -> tuple[str, ...]:
         return ()
     return (
         f"The disk has {free / 1e9:.1f} GB free, and what is still to run takes about {needed / 1e9:.1f} GB: "
-        "a stage that does not fit does not begin.",
+        "a stage that does not fit will not start.",
     )

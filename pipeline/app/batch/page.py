@@ -139,9 +139,9 @@ def _headline(state: BatchState) -> tuple[Level, str]:
     failed = counts.get("failed", 0)
     lost = f", {failed:,} failed" if failed else ""
     if state.at_work:
-        return ("bad" if failed else ""), f"At work: {finished:,} of {plural(total, 'capture')} finished{lost}"
+        return ("bad" if failed else ""), f"Running: {finished:,} of {plural(total, 'capture')} finished{lost}"
     if not total:
-        return "doubt", "There was no capture to work on"
+        return "doubt", "There were no captures to process"
     if state.message:
         return "bad", f"Ended early: {finished:,} of {plural(total, 'capture')} finished{lost}"
     if state.all_succeeded:
@@ -159,7 +159,7 @@ def _text(state: BatchState) -> str:
     """When, for how long, and what it takes."""
     until_s = state.as_of_s if state.ended_s is None else state.ended_s
     poor = sum(capture.level == "bad" and capture.state in FINISHED for capture in state.captures)
-    told = [state.message, f"Of what finished, {poor:,} came out poorly." if poor else ""]
+    told = [state.message, f"Of what finished, {poor:,} have poor results." if poor else ""]
     told += [f"Began {_moment(state.began_s)}."]
     if state.ended_s is not None:
         told.append(f"Ended {_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")

@@ -33,7 +33,7 @@ from splatpipe.stages.forecast import forecast, machine_speed
 
 CLUSTER_THREADS = 8  # of a job that another machine runs; a profile's set-threads says otherwise
 LONGEST_SLUG = 40
-UNTRIED = "Nothing has changed since, so it was not tried again; --retry-failed does."
+UNTRIED = "Nothing has changed since, so it was not tried again; use --retry-failed to do so."
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def open_profile(folder: Path | None) -> Profile:
     for name in PROFILE_FILES:
         with suppress(FileNotFoundError, NotADirectoryError):
             return Profile(folder, (folder / name).read_text(encoding="utf-8"))
-    raise UsageError(f"{folder} is no profile of Snakemake's.", hint="Name a folder that has a config.yaml.")
+    raise UsageError(f"{folder} is not a Snakemake profile.", hint="Name a folder that has a config.yaml.")
 
 
 def require_snakemake() -> None:

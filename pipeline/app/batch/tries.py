@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_USAGE
 from splatpipe.pipeline.engine.stage import JSON
 
 HOPELESS = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options fail again: no second try
-NO_WORD = "It ended without a word: its process was killed, as a system does that runs out of memory."
+NO_WORD = "It ended without an error message: its process was killed, usually by the system for lack of memory."
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,9 @@ def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Positio
         if drawing.crossing:
             x, y = drawing.crossing
             text = f"The boundary {path.name} crosses itself near {x:.10g}, {y:.10g}."
-            findings.append(Finding("boundary-crossing", "warning", text, "Draw it without crossings."))
+            findings.append(
+                Finding("boundary-crossing", "warning", text, "Redraw it so that it does not cross itself.")
+            )
         if not stated:
             return [*findings, *([] if controlled else [_unplaced(path.name)])]
         geodetic = np.array([[each.latitude, each.longitude, each.altitude_m] for each in stated], dtype=np.float64)
@@ -56,5 +58,5 @@ def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Positio
 
 
 def _unplaced(name: str) -> Finding:
-    text = f"The boundary {name} cannot be laid onto photos without positions."
+    text = f"The boundary {name} cannot be used with photos that have no positions."
     return Finding("boundary-broken", "error", text, "Give positions (geo.txt) or control points, or run without it.")

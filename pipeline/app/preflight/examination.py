@@ -134,7 +134,7 @@ def examine_photos(intake: Intake, threads: int, report: Reporter) -> PhotoExami
     with single_threaded_opencv():
         for found in ordered_map(glimpse, intake.photos, threads):
             glimpses.append(found)
-            report.progress(len(glimpses), count, "looking at photos", "photos")
+            report.progress(len(glimpses), count, "examining photos", "photos")
         overlap = match_quickly(intake.layout, glimpses, threads, report)
     dull = duller(glimpses, overlap.found)
     assert dull.shape == (count, DIRECTIONS)
@@ -187,10 +187,11 @@ def forecast_presets(
         lacking = []
         if 0 < machine.memory_bytes < need.memory_bytes:
             lacking.append(
-                f"{need.memory_bytes / 1e9:.1f} GB of memory, and there are {machine.memory_bytes / 1e9:.1f}"
+                f"{need.memory_bytes / 1e9:.1f} GB of memory, of which this machine has "
+                f"{machine.memory_bytes / 1e9:.1f}"
             )
         if disk.free < disk_bytes:
-            lacking.append(f"{disk_bytes / 1e9:.1f} GB on the disk, and {disk.free / 1e9:.1f} are free here")
+            lacking.append(f"{disk_bytes / 1e9:.1f} GB of disk, of which {disk.free / 1e9:.1f} are free here")
         told.append(
             PresetForecast(
                 preset,

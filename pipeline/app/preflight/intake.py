@@ -143,7 +143,7 @@ def _file_places(
         return {}, [Finding("positions-file", "error", error.message, error.hint)]
     if not places.unknown:
         return places.by_name, []
-    text = f"{path.name} names photos that are not there, or twice: {some(places.unknown)}."
+    text = f"{path.name} names photos that are missing, or names them twice: {some(places.unknown)}."
     return places.by_name, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
 
 
@@ -152,7 +152,7 @@ def _unreadable(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
     by_reason: dict[str, list[str]] = {}
     for entry in entries:
         by_reason.setdefault(entry.reason, []).append(entry.name)
-    hint = "It takes no part in a run: copy it again from the card, or take the photo again."
+    hint = "A run leaves it out: copy it from the card again, or retake the photo."
     return [
         Finding("unreadable", "warning", f"{some(names)} {reason}.", hint, tuple(sorted(names)))
         for reason, names in sorted(by_reason.items())
@@ -167,11 +167,11 @@ def _duplicates(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
     # The reason ends with the twin's name: who looks for the copy finds both.
     twins = {entry.reason.partition(" as ")[2] for entry in entries}
     names = tuple(sorted({entry.name for entry in entries} | twins))
-    text = f"Photos are there twice: {'; '.join(told[:5])}{more}."
-    return [Finding("duplicate", "warning", text, "They are left out; was a card copied twice?", names)]
+    text = f"Duplicate photos: {'; '.join(told[:5])}{more}."
+    return [Finding("duplicate", "warning", text, "The duplicates are left out; was a card copied twice?", names)]
 
 
 def _too_few(count: int) -> Finding:
-    told = "None of the pictures can be used." if count == 0 else "There is only one usable photo."
-    hint = "A reconstruction needs many overlapping photos of one place."
+    told = "None of the photos can be used." if count == 0 else "There is only one usable photo."
+    hint = "A reconstruction needs many overlapping photos of the same scene."
     return Finding("too-few", "error", told, hint)

@@ -102,27 +102,29 @@ def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]
     if count < 2:
         return []
     if len(pieces[0]) < max(2.0, LEAST_TOGETHER * count):
-        text = f"Hardly any photos show the same thing: at most {len(pieces[0])} of {count} hang together."
-        hint = "Photos must overlap by two thirds, be sharp, and show texture: this cannot be reconstructed."
+        text = f"Hardly any photos overlap: at most {len(pieces[0])} of {count} are connected."
+        hint = "This cannot be reconstructed: photos must overlap by two thirds, be sharp and show texture."
         return [Finding("no-overlap", "error", text, hint)]
     findings = []
     alone = tuple(sorted(names[piece[0]] for piece in pieces if len(piece) == 1))
     if alone:
         text = f"Matches no other photo: {some(alone)}." if len(alone) <= count / 10 else ""
         text = text or f"{len(alone)} of {count} photos match no other one at low resolution."
-        hint = "A run will most likely lose them: take more photos around them, with two thirds of overlap."
+        hint = "A run will probably fail to place them: take more photos around them, with two thirds overlap."
         findings.append(Finding("orphan", "warning", text, hint, alone if len(alone) <= count / 10 else ()))
     islands = [piece for piece in pieces[1:] if len(piece) > 1]
     if islands:
         told = "; ".join(some([names[k] for k in piece], 4) for piece in islands[:3])
-        text = f"The photos fall into {len(islands) + 1} pieces that do not overlap: {told}"
+        text = f"The photos fall into {len(islands) + 1} groups that do not overlap: {told}"
         text += " …" if len(islands) > 3 else ""
-        hint = "Take photos between the pieces, so that one leads to the other."
+        hint = "Take photos between the groups, to connect them."
         findings.append(Finding("pieces", "warning", f"{text}.", hint))
     usual = float(np.median(overlap.partners(count)))
     if usual < THIN_PARTNERS and count > 3:
-        text = f"The overlap is thin: a photo matches {usual:.0f} others by the median."
-        findings.append(Finding("thin-overlap", "warning", text, "Fly with more overlap: two thirds each way."))
+        text = f"The overlap is low: a photo matches {usual:.0f} others (median)."
+        findings.append(
+            Finding("thin-overlap", "warning", text, "Fly with more overlap: two thirds along and across track.")
+        )
     return findings
 
 
@@ -138,8 +140,8 @@ def swap_findings(names: Sequence[str], flight: PositionEvidence) -> list[Findin
     for pair in find_swapped(flight):
         first, second = (names[k] for k in pair)
         apart = float(np.linalg.norm(flight.places_m[pair[0]] - flight.places_m[pair[1]]))
-        text = f"{printable(first)} and {printable(second)} seem to have each other's position ({apart:.0f} m apart):"
-        text += " what they show and the order of the flight say so."
+        text = f"{printable(first)} and {printable(second)} appear to have swapped positions ({apart:.0f} m apart):"
+        text += " their content and the flight order suggest so."
         hint = "Swap their positions back, or set them in geo.txt."
         findings.append(Finding("position-swapped", "warning", text, hint, tuple(sorted((first, second)))))
     return findings
@@ -152,11 +154,11 @@ def gap_findings(names: Sequence[str], flight: PositionEvidence) -> tuple[list[F
         before, after = printable(names[strip.before]), printable(names[strip.after])
         text = f"About {strip.missing} photos are missing between {before} and {after}"
         if strip.numbers:
-            text = f"{strip.missing} photos are missing between {before} and {after}, by their numbers"
+            text = f"{strip.missing} photos are missing between {before} and {after}, judging by the file numbers"
         if np.isfinite(strip.apart_m):
             text += f": {strip.apart_m:.0f} m apart, {strip.usual_m:.0f} m elsewhere"
             gaps.append(Gap(_outline(flight, strip), f"{strip.missing} photos missing"))
-        hint = "Look whether they are on the card; else fly this strip again."
+        hint = "Check whether they are on the card; if not, fly this strip again."
         findings.append(Finding("gap", "warning", f"{text}.", hint))
     return findings, gaps
 

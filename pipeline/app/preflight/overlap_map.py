@@ -128,7 +128,7 @@ def _svg(size: tuple[int, int], summary: str, many: bool, inner: str) -> Markup:
 
 def _summary(preflight: Preflight, kind: str) -> str:
     """What the picture shows, for those who cannot see it."""
-    what = "Map of the photos" if kind == "map" else "The photos in a ring, in the order of their names"
+    what = "Map of the photos" if kind == "map" else "The photos in a ring, in name order"
     parts = [plural(len(preflight.photos), "photo"), plural(len(preflight.pairs), "pair") + " compared"]
     parts += [plural(len(preflight.gaps), "gap"), plural(len(preflight.orphans), "photo") + " that match no other"]
     return f"{what}: {', '.join(parts)}."
@@ -200,7 +200,7 @@ def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtfu
         if photo.name in doubtful:
             kind, title = "doubtful", f"{title}: {doubtful[photo.name]}"
         if pieces.get(i, 0) > 0:
-            kind, title = "apart", f"{title}, in piece {pieces[i] + 1}, apart from the rest"
+            kind, title = "apart", f"{title}, in group {pieces[i] + 1}, not connected to the rest"
         if i in orphans:
             kind, title = "orphan", f"{title}, matches no other photo"
         marks = _path(f"photo {kind}", f"M{x} {y}h0", title)
@@ -220,7 +220,7 @@ def _control(frame: MapFrame, preflight: Preflight) -> str:
         title = f"{point.kind} point {name}"
         if not inside:
             off = math.dist(point.position_m, (frame.west + frame.metres / 2, frame.north - _tall(frame) / 2))
-            title += f": {length(off)} from the middle of the map, beyond it"
+            title += f": {length(off)} from the centre of the map, outside it"
         elif point.photos is not None:
             title += f": {count(point.photos)} photos may show it"
         poor = " poor" if not inside or point.photos == 0 else ""

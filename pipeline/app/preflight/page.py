@@ -105,20 +105,21 @@ def check_page(preflight: Preflight) -> str:
 def _verdict(preflight: Preflight) -> tuple[str, str, str]:
     """Level, headline and sentence that the page begins with."""
     if not preflight.photos:
-        return "bad", "There is no photo to work with", "Nothing that can be read was found in the folder."
+        return "bad", "There are no usable photos", "No readable photo was found in the folder."
     counts = Counter(finding.severity for finding in preflight.findings)
     photos = plural(len(preflight.photos), "photo")
     if counts["error"]:
         more = f", and {plural(counts['warning'], 'warning')}" if counts["warning"] else ""
         text = (
-            f"Do not leave yet: with {plural(counts['error'], 'error')}{more}, these {photos} will not do as they are."
+            f"Do not leave the site yet: with {plural(counts['error'], 'error')}{more}, these {photos} cannot "
+            "be used as they stand."
         )
-        return "bad", "This capture cannot be reconstructed as it is", text
+        return "bad", "This capture cannot be reconstructed as it stands", text
     if counts["warning"]:
         which = "One point" if counts["warning"] == 1 else f"{counts['warning']:,} points"
-        text = f"The {photos} can be reconstructed; what is told below costs photos, accuracy or completeness."
-        return "doubt", f"{which} to see to before you leave", text
-    return "good", "Nothing stands in the way", f"The {photos} can be reconstructed, as far as can be told beforehand."
+        text = f"The {photos} can be reconstructed; the findings below cost photos, accuracy or completeness."
+        return "doubt", f"{which} to resolve before you leave", text
+    return "good", "No problems found", f"The {photos} can be reconstructed, as far as can be judged in advance."
 
 
 def _named(forecast: PresetForecast) -> str:
@@ -158,7 +159,7 @@ def _facts(preflight: Preflight) -> list[tuple[str, str]]:
             "all" if placed == len(photos) else f"{count(placed) if placed else 'none'} of {count(len(photos))}",
         ),
         ("Pairs", f"{count(matched)} match of {count(len(preflight.pairs))} compared" if preflight.pairs else ""),
-        ("Pieces", f"{count(pieces)} that do not hang together" if pieces > 1 else ""),
+        ("Pieces", f"{count(pieces)} that are not connected" if pieces > 1 else ""),
     ]
     return [fact for fact in facts if fact[1]]
 

@@ -1,4 +1,4 @@
-"""Looking at the photos themselves: blur, exposure, copies that were saved anew."""
+"""Looking at the photos themselves: blur, exposure, copies that were saved again."""
 
 from __future__ import annotations
 
@@ -46,15 +46,16 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
             Finding(
                 "blurred",
                 "warning",
-                f"{len(soft)} of {len(photos)} photos are clearly less sharp than their neighbours, all along.",
-                "Fly slower, or with a shorter shutter.",
+                f"{len(soft)} of {len(photos)} photos are clearly less sharp than their neighbours, throughout the "
+                "capture.",
+                "Fly slower, or use a faster shutter.",
             )
         )
     if len(dull):
         names = tuple(photos[k].name for k in dull)
         least = float(np.exp(-worst[dull].max() / 2.0))
         text = f"Blurred: {some(names)} (down to {least:.0%} of their neighbours' detail)."
-        findings.append(Finding("blurred", "warning", text, "Take them again, or leave them out.", names))
+        findings.append(Finding("blurred", "warning", text, "Retake them, or leave them out.", names))
     return findings
 
 
@@ -68,7 +69,7 @@ def find_exposures(
         name, step = photos[k].name, float(brighter_ev[k])
         text = f"{printable(name)} is {abs(step):.1f} EV {'brighter' if step > 0 else 'darker'} than its neighbours"
         text += f" where both show the same{_by_settings(photos, k, step)}."
-        hint = "Fix the exposure for a flight, or leave the photo out."
+        hint = "Lock the exposure during a flight, or leave the photo out."
         code = "overexposed" if step > 0 else "underexposed"
         findings.append(Finding(code, "warning", text, hint, (name,)))
     told = set(jumps)
@@ -87,14 +88,14 @@ def _empty(
     usual = float(np.median(shares)) if shares else 0.0
     if usual > CLIPPED:
         text = f"Most photos are {level} over more than half of their pixels."
-        return [Finding(code, "warning", text, "Correct the exposure: nothing can be matched there.")]
+        return [Finding(code, "warning", text, "Correct the exposure: nothing can be matched in those areas.")]
     clipped = [share > max(CLIPPED, usual + CLIPPED_MORE) for share in shares]
     found = [k for k in range(len(photos)) if k not in told and (clipped[k] or beyond[k])]
     if not found:
         return []
     names = tuple(photos[k].name for k in found)
-    text = f"Hardly any drawing, {level} for the most part: {some(names)}."
-    return [Finding(code, "warning", text, "Take them again, or leave them out.", names)]
+    text = f"Hardly any detail, {level} over most of the picture: {some(names)}."
+    return [Finding(code, "warning", text, "Retake them, or leave them out.", names)]
 
 
 def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:
@@ -109,7 +110,7 @@ def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:
 
 
 def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures]) -> list[Finding]:
-    """Photos that are another one saved anew: the same picture and time, other bytes."""
+    """Photos that are another one saved again: the same picture and time, other bytes."""
     if len(photos) < 2:
         return []
     small = np.stack([glimpse.signature.ravel() for glimpse in glimpses])
@@ -122,8 +123,8 @@ def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures
             copies[photos[k].name] = photos[j].name
     if not copies:
         return []
-    told = [f"{printable(name)} is {printable(twin)} saved anew" for name, twin in list(copies.items())[:5]]
+    told = [f"{printable(name)} is {printable(twin)} saved again" for name, twin in list(copies.items())[:5]]
     more = f"; and {len(copies) - 5} more" if len(copies) > 5 else ""
-    text = f"Photos are there twice: {'; '.join(told)}{more}."
-    hint = "Leave the copies out: they count double, and a held-out photo may be among the trained ones."
+    text = f"Duplicate photos: {'; '.join(told)}{more}."
+    hint = "Leave the copies out: they count twice, and a held-out photo may also be trained on."
     return [Finding("duplicate", "warning", text, hint, tuple(sorted({*copies, *copies.values()})))]

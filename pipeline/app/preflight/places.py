@@ -64,7 +64,10 @@ def focal_findings(intake: Intake) -> list[Finding]:
     good = [each for each in stated if max(each.sigma_horizontal_m, each.sigma_vertical_m) <= WELL_KNOWN_M]
     if len(good) > len(stated) / 2:
         return []
-    text = "All photos look straight down from one height: that leaves the focal length open, and heights with it."
+    text = (
+        "All photos look straight down from one height: the focal length, and with it heights, cannot be "
+        "determined reliably."
+    )
     hint = "Add some photos at 45° or from another height, or control points with heights, or a calibrated lens."
     return [Finding("nadir-only", "warning", text, hint)]
 
@@ -141,12 +144,12 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
     if missing:
         text = f"{name} names {missing_photos(missing)}."
         findings.append(
-            Finding("control-marks", "warning", text, "Their marks are left out. Correct the names, or add the photos.")
+            Finding("control-marks", "warning", text, "Their marks are ignored. Correct the names, or add the photos.")
         )
     if outside:
         severe = len(outside) > OUTSIDE_SHARE * len(marks)
         text = f"{len(outside)} of {len(marks)} marks of {name} lie outside of their photos: {some(outside)}."
-        hint = "Were they made in photos of another size, or turned ones?"
+        hint = "Were they made in photos that were resized or rotated?"
         findings.append(Finding("control-marks", "error" if severe else "warning", text, hint))
     return findings
 
@@ -177,7 +180,7 @@ def _outside(
     nearest[placed] = tree.query(points[placed])[0]
     if float(np.median(nearest)) > ELSEWHERE_M:
         text = f"The points of {name} lie {np.median(nearest) / 1000.0:,.1f} km from the photos."
-        return [Finding("control-outside", "error", text, "Check the CRS and the zone, and that east comes first.")]
+        return [Finding("control-outside", "error", text, "Check the CRS, its zone, and that east comes first.")]
     spacing = float(np.median(tree.query(positions, k=2)[0][:, 1])) if len(positions) > 1 else 0.0
     reach = max(LEAST_REACH_M, REACH_SPACINGS * spacing)
     off = [
@@ -187,7 +190,7 @@ def _outside(
     ]
     if not off:
         return []
-    text = f"Points of {name} that no photo can show: {some(off)}."
+    text = f"Points of {name} outside the view of all photos: {some(off)}."
     return [Finding("control-outside", "warning", text, "Check their coordinates, or take photos around them.")]
 
 

@@ -44,7 +44,7 @@ def require_memory(request: Request) -> None:
     limit, least = config.train.max_memory_bytes, least_memory_bytes(config)
     if 0 < limit < least and not _on_cuda(request):
         raise MachineError(
-            f"No training keeps to {limit / 1e9:.2f} GB: the libraries alone take most of {least / 1e9:.2f} GB.",
+            f"Training does not fit in {limit / 1e9:.2f} GB: the libraries alone take most of {least / 1e9:.2f} GB.",
             hint=f"Give --max-memory at least {-(-least // 1_000_000)}M.",
         )
 
@@ -81,7 +81,7 @@ def forecast_text(request: Request) -> str:
     if work.blocks is not None:
         told += f", {blocks_text(work.blocks)}"
     elif config.train.max_memory_bytes and work.most_gaussians < work.grown:
-        told += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos ask for more"
+        told += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos would support more"
     return f"{told}."
 
 

@@ -51,7 +51,7 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
         from splatpipe.pipeline.app.report.charts import stated_map
 
         places = [(float(position["latitude"]), float(position["longitude"])) for position in positions]
-        text = "Where the photos say that they were taken, joined in name order. Whereto they look is not known yet."
+        text = "Positions from the photos' metadata, joined in name order. Viewing directions are not known yet."
         chapter["maps"] = [{"svg": stated_map(places), "text": text}]
     return chapter
 
@@ -62,12 +62,12 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Cha
     models = inputs.read("sparse.summary")
     facts = [
         ("Photos placed", f"{count(sparse.get('registered'))} of {count(sparse.get('photos'))}"),
-        ("Keypoints", f"{count(features.get('keypoints'))}, {count(features.get('keypoints_per_photo'))} a photo"),
+        ("Keypoints", f"{count(features.get('keypoints'))}, {count(features.get('keypoints_per_photo'))} per photo"),
         ("Pairs", f"{count(matches.get('verified'))} verified of {count(matches.get('pairs'))} tried"),
         ("Matches a pair", f"{count(matches.get('median_inliers'))} (median)"),
         ("Pairs chosen", str(matches.get("pairing", ""))),
         ("Sparse points", count(sparse.get("points3d"))),
-        ("Track length", f"{number(sparse.get('mean_track_length'), 1)} photos a point on average"),
+        ("Track length", f"{number(sparse.get('mean_track_length'), 1)} photos per point on average"),
         ("Reprojection error", f"{number(sparse.get('mean_reprojection_error_px'), 2)} pixels on average"),
     ]
     if not sparse:  # the stage failed or was never reached
@@ -111,13 +111,13 @@ def _mapped(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     facts = [
         (
             "Overlap",
-            f"{share(shares[3])} of the places with sparse points lie in 3 photos or more, {share(shares[5])} in 5",
+            f"{share(shares[3])} of the area with sparse points is seen by 3 photos or more, {share(shares[5])} in 5",
         ),
-        ("A point is found in", f"{float(geometry.tracks.mean()):.1f} photos on average"),
+        ("Track length", f"{float(geometry.tracks.mean()):.1f} photos on average"),
     ]
     if unit:
         facts = [
-            ("Ground sample distance", f"{length(gsd)} a pixel"),
+            ("Ground sample distance", f"{length(gsd)} per pixel"),
             (
                 "Height above ground",
                 f"{heights[0]:.1f} to {heights[-1]:.1f} m, median {heights[len(heights) // 2]:.1f} m",
@@ -128,10 +128,10 @@ def _mapped(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     maps = [
         {
             "svg": survey_map(geometry, unit, held_out(inputs)),
-            "text": "Where the photos were taken, whereto they look, and the ground that each shows (footprint), up to "
+            "text": "Camera positions, viewing directions, and the ground that each photo covers (footprint), up to "
             "where its points end; that walls and trees are in the way is not counted.",
         },
-        {"svg": overlap_map(geometry.overlap, unit), "text": "In how many of these footprints each place lies."},
+        {"svg": overlap_map(geometry.overlap, unit), "text": "The number of these footprints that cover each place."},
     ]
     return {"map_facts": facts, "maps": maps}
 
@@ -142,18 +142,21 @@ def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     found = inputs.read("matches.pairs")
     pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])]
     drawn = [
-        (charts.observations_bars(geometry), f"Photos with fewer than {LEAST_POINTS} points (red) are placed poorly."),
+        (
+            charts.observations_bars(geometry),
+            f"Photos with fewer than {LEAST_POINTS} points (red) are poorly constrained.",
+        ),
         (
             charts.track_histogram(geometry),
-            "Points of two photos only (orange) prove little; longer tracks hold the model.",
+            "Points seen by only two photos (orange) constrain little; longer tracks hold the model together.",
         ),
-        (charts.error_histogram(geometry), "How far the points miss their pixels."),
+        (charts.error_histogram(geometry), "Distribution of the reprojection errors."),
     ]
     for number_of, field in enumerate(geometry.fields[:4], start=1):
         text = "Mean residuals over the picture, much enlarged: a pattern would tell that the lens model does not fit."
         drawn.append((charts.residual_field(field, number_of), text))
     if pairs:
-        drawn.append((charts.match_map(geometry, pairs, unit_of(inputs)), "Which photos were matched with which."))
+        drawn.append((charts.match_map(geometry, pairs, unit_of(inputs)), "Pairs of photos that were matched."))
     return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
 
 
@@ -229,20 +232,20 @@ def _rung(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _masks(summary: Mapping[str, Any]) -> str:
-    kinds = [(summary.get("masks"), "of what to ignore"), (summary.get("sky_masks"), "of the sky")]
+    kinds = [(summary.get("masks"), "of areas to ignore"), (summary.get("sky_masks"), "of the sky")]
     return ", ".join(f"{count(number_of)} {what}" for number_of, what in kinds if number_of) or "none"
 
 
 def _span(times: Sequence[str]) -> str:
     if not times:
-        return "no times in the photos"
+        return "the photos have no times"
     first, last = times[0].replace("T", " "), times[-1].replace("T", " ")
     return first if first == last else f"{first} to {last} (camera's clock)"
 
 
 def _positions(summary: Mapping[str, Any], positions: Sequence[Mapping[str, Any]]) -> str:
     if not positions:
-        return "none of the photos has one"
+        return "none of the photos has a position"
     told = f"{len(positions):,} photos"
     sources = ", ".join(_source(source) for source in summary.get("position_sources", []))
     told += f", from {sources}" if sources else ""

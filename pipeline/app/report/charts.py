@@ -76,7 +76,7 @@ def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
     figure, axes = new_figure(*map_size(box))
     axes.plot(east, north, "o-", ms=4, mfc=BLUE, mec="white", mew=0.5, color=LINE, lw=0.8)
     as_map(axes, box, "m")
-    return to_svg(figure, "Map of where the photos say that they were taken")
+    return to_svg(figure, "Map of the positions in the photos' metadata")
 
 
 def overlap_map(overlap: OverlapGrid, unit: str) -> Markup:
@@ -92,7 +92,7 @@ def overlap_map(overlap: OverlapGrid, unit: str) -> Markup:
         axes.plot([], [], "s", ms=7, color=colour, label=label)
     axes.legend(title="photos", loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     as_map(axes, overlap.box, unit)
-    return to_svg(figure, "Map of how many photos show each place")
+    return to_svg(figure, "Map of the number of photos that cover each place")
 
 
 def match_map(geometry: Geometry, pairs: Sequence[tuple[str, str, int]], unit: str) -> Markup:
@@ -136,7 +136,7 @@ def track_histogram(geometry: Geometry) -> Markup:
     ticks = list(range(2, longest + 1, 1 if longest <= 12 else 2))
     more = int(geometry.tracks.max()) > longest
     axes.set_xticks(ticks, [f"{tick}{'+' if more and tick == longest else ''}" for tick in ticks])
-    axes.set_xlabel("photos in which a point was found")
+    axes.set_xlabel("photos that observe a point (track length)")
     axes.set_ylabel("sparse points")
     return to_svg(figure, "Track lengths of the sparse points")
 

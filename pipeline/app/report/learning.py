@@ -42,7 +42,7 @@ def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     facts = [
         ("Blocks", _blocks(inputs)),
         ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
-        ("Gaussians", f"{count(gaussians)}, {count(inputs.summary('initialize').get('gaussians'))} at the beginning"),
+        ("Gaussians", f"{count(gaussians)}, {count(inputs.summary('initialize').get('gaussians'))} at the start"),
         ("Cleaned", removed_in_words(inputs.summary("clean"))),
         (
             "Size of the photos",
@@ -127,7 +127,7 @@ def _views_drawn(
             figures = list(zip((title for _, title, _ in measures), row["values"], strict=True))
             shown.append({"name": str(view["name"]), "pictures": pictures, "figures": figures})
     bars = [(str(view["name"]), float(view["psnr"])) for view in views if view.get("psnr") is not None]
-    charts = [{"svg": view_bars(bars, "dB"), "text": "Every held-out photo, the worst first."}] if len(bars) > 1 else []
+    charts = [{"svg": view_bars(bars, "dB"), "text": "All held-out photos, worst first."}] if len(bars) > 1 else []
     return {"shown": shown, "charts": charts}
 
 
@@ -144,9 +144,12 @@ def _floaters(floaters: Mapping[str, Any]) -> list[tuple[str, str]]:
     depth, veil = floaters.get("depth_disagreement") or {}, floaters.get("veil") or {}
     before = "held-out" if veil.get("held_out", True) else "training"
     return [
-        (f"Veil before {before} photos", f"{share(veil.get('mean'), 2)} of the light of the points that they see"),
-        ("Opacity in the air", f"{share(floaters.get('free_space_opacity'), 3)} of all"),
-        ("Share of the views", f"{share(floaters.get('free_space_rendered'), 3)} of what they show hangs in the air"),
+        (f"Haze in front of {before} photos", f"{share(veil.get('mean'), 2)} of the light from the points they see"),
+        ("Opacity in free space", f"{share(floaters.get('free_space_opacity'), 3)} of all"),
+        (
+            "Share of the rendered views",
+            f"{share(floaters.get('free_space_rendered'), 3)} of what they show is floaters in free space",
+        ),
         ("Depths of neighbouring views", f"differ by {share(depth.get('median'), 2)} (median)"),
         ("Depths more than 5 % off", f"in {share(depth.get('share_above_5_percent'), 1)} of the pixels"),
     ]
@@ -171,9 +174,9 @@ def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | 
         "loss": (
             "loss (L1 + D-SSIM)",
             True,
-            "The training photos' loss: it falls, and flattens where nothing is gained.",
+            "Loss on the training photos: it falls, and flattens when training no longer gains.",
         ),
-        "gaussians": ("Gaussians", False, "How many Gaussians there were: density control adds and prunes them."),
+        "gaussians": ("Gaussians", False, "Number of Gaussians, as density control adds and prunes them."),
     }
     charts = []
     for name, (label, log, text) in told.items():
@@ -206,7 +209,7 @@ def _blocks(inputs: ReportInputs) -> str:
     if blocks == 1:
         return ""
     if "train" in inputs.artifacts:
-        return f"trained in {count(blocks)}, after a coarse pass over the whole"
+        return f"trained in {count(blocks)}, after a coarse pass over the whole scene"
     stages = inputs.history.stages.items()
     done = [name for name, stage in stages if name.startswith("train.") and stage.state in ("finished", "reused")]
     return f"{count(len(done))} of {count(blocks)} trained"

@@ -15,25 +15,29 @@ Chapter = dict[str, Any]
 WHAT = {
     "splat.ply": "the splat, for any viewer of Gaussian splats",
     "splat.spz": "the splat, compressed, for viewer.html",
-    "viewer.html": "the splat to walk around and measure in, in any browser, offline",
+    "viewer.html": "a viewer to navigate and measure the splat in any browser, offline",
     "flythrough.webm": "a film through the scene",
     "ortho.tif": "the true orthophoto, a GeoTIFF",
     "dsm.tif": "the surface model: heights, a GeoTIFF",
-    "dsm_confidence.tif": "how many photos confirm each height, and its expected deviation in millimetres",
+    "dsm_confidence.tif": "number of photos that confirm each height, and its expected deviation in millimetres",
     "contours.dxf": "contours of the surface model, for CAD",
     "contours.geojson": "contours of the surface model, for maps",
-    "georef.json": "where the splat is: CRS, datum, matrices",
+    "georef.json": "georeference of the splat: CRS, datum, matrices",
     "cameras.json": "the cameras in the splat's frame",
-    "metrics.json": "every figure of this report, for programs",
+    "metrics.json": "all figures of this report, machine-readable",
     "sparse.glb": "sparse points and cameras, for any 3D viewer",
     "sky.ply": "the sky as a dome of Gaussians",
 }
 FIRST = ("viewer.html", "flythrough.webm", "splat.ply")  # what people want to open, so linked at the top, too
 FOLDERS = {
-    "undistort.dataset": "undistorted photos and cameras, as other trainers take them",
-    "evaluate.views": "held-out photos, renders and errors in full size",
+    "undistort.dataset": "undistorted photos and cameras, for other trainers",
+    "evaluate.views": "held-out photos, renders and errors at full size",
 }
-RECORDS = {"config.toml": "all options", "events.jsonl": "what happened", "splatpipe.log": "what the libraries said"}
+RECORDS = {
+    "config.toml": "all options",
+    "events.jsonl": "what happened",
+    "splatpipe.log": "log output of the libraries",
+}
 
 
 def making_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
@@ -187,9 +191,9 @@ def _charts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     memory = [(row["name"], row["memory"] / 1e9) for row in rows if row["memory"]]
     charts = []
     if times:
-        text = "Where the time went, by the clock; also of stages that an earlier run made."
+        text = "Elapsed time of each stage, including stages made by an earlier run."
         charts.append({"svg": stage_bars(times, "seconds", "Time of the stages"), "text": text})
     if memory:
-        text = "Memory at its peak."
+        text = "Peak memory of each stage."
         charts.append({"svg": stage_bars(memory, "gigabytes", "Peak memory of the stages"), "text": text})
     return charts

@@ -120,7 +120,7 @@ def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:
         error = number(sparse.get("mean_reprojection_error_px"), 2)
         cards += [("Photos placed", placed, ""), ("Reprojection error", f"{error} px", "mean")]
     if accuracy.get("gsd_m"):
-        cards.append(("Ground sample distance", length(accuracy["gsd_m"]), "a photo's pixel, on the object"))
+        cards.append(("Ground sample distance", length(accuracy["gsd_m"]), "size of a photo's pixel on the object"))
     for name, title in (("check", "Check points"), ("control", "Control points")):
         if tables.get(name):
             found = tables[name]
@@ -135,5 +135,5 @@ def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:
         cards.append(("Gaussians", count(inputs.summary("clean").get("gaussians", train.get("gaussians"))), ""))
     seconds = [float(artifact.manifest["seconds"]) for artifact in inputs.artifacts.values()]
     if seconds:
-        cards.append(("Computed in", duration(sum(seconds)), "all stages, by the clock"))
+        cards.append(("Computed in", duration(sum(seconds)), "elapsed time of all stages"))
     return cards

@@ -64,9 +64,9 @@ def _frame_facts(
     frame, control, report = parts
     if frame.get("kind") != "enu":
         if frame.get("metres"):
-            gsd = ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel")
-            return [("Frame", "z up, in metres by scale bars; place and heading are arbitrary"), gsd, *_bars(report)]
-        return [("Frame", "z up; scale, place and heading are arbitrary: no metres")]
+            gsd = ("Ground sample distance", f"{length(report.get('gsd_m'))} per pixel")
+            return [("Frame", "z up, in metres by scale bars; position and heading are arbitrary"), gsd, *_bars(report)]
+        return [("Frame", "z up; scale, position and heading are arbitrary: no metres")]
     origin = frame["origin"]
     place = f"{origin['latitude']:.7f}°, {origin['longitude']:.7f}°, {number(origin['height_m'])} m"
     summary = inputs.summary("georef")
@@ -75,13 +75,13 @@ def _frame_facts(
         ("Origin", f"{place} (latitude, longitude, height)"),
         ("CRS of the coordinates", _crs(inputs, frame)),
         ("Vertical datum", _vertical(str(frame.get("vertical_datum", "unknown")), named=named)),
-        ("Ground sample distance", f"{length(report.get('gsd_m'))} a pixel"),
+        ("Ground sample distance", f"{length(report.get('gsd_m'))} per pixel"),
     ]
     told = (report.get("uncertainty") or {}).get("sentence")
     if told:
-        facts.append(("By the positions alone", str(told)))
+        facts.append(("From the photo positions alone", str(told)))
     if control.get("file"):
-        told = f"{control['file']}, in {control.get('crs')}; marks taken to be good to {control.get('sigma_pixel')} px"
+        told = f"{control['file']}, in {control.get('crs')}; marks assumed accurate to {control.get('sigma_pixel')} px"
         facts.append(("Control file", told))
     bent = summary.get("model_bent")
     if bent is not None:
@@ -99,7 +99,7 @@ def _bars(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     facts = [("Scale bars", str(scale["sentence"]))]
     for bar in scale["bars"][:MOST_BARS]:
         off = (
-            "a target of it was not found"
+            "one of its targets was not found"
             if bar["error_m"] is None
             else f"{1000 * bar['error_m']:+.1f} mm in the model"
         )
@@ -154,8 +154,8 @@ def _tables(model: Mapping[str, Any], splat: Mapping[str, Any]) -> list[dict[str
 def _flights(tables: Mapping[str, Any]) -> list[str]:
     flights = [flight for table in tables.values() if table for flight in table.get("flights", [])]
     return [
-        f"Flight {flight['flight'] + 1}, {count(flight.get('photos'))} photos: all together "
-        "{} m east, {} m north, {} m up of where the model has them.".format(*map(metres, flight["offset_m"]))
+        f"Flight {flight['flight'] + 1}, {count(flight.get('photos'))} photos: common offset "
+        "{} m east, {} m north, {} m up from the model.".format(*map(metres, flight["offset_m"]))
         for flight in flights
     ]
 
@@ -192,11 +192,11 @@ def _drawn(
     if frame.get("kind") == "enu":
         surveyed = _surveyed_residuals(points)
         if surveyed:
-            text = "How far the surveyed points lie from where they were surveyed (estimated less surveyed)."
+            text = "Residuals of the surveyed points (estimated minus surveyed)."
             charts.append({"svg": residual_map(geometry, surveyed), "text": text})
         photos = _photo_residuals(geometry, frame)
         if photos:
-            text = "How far the photos' own positions are from where the model has the photos."
+            text = "Residuals of the photos' own positions relative to the model."
             charts.append({"svg": residual_map(geometry, {"photo": photos}), "text": text})
     chips = cut_chips(points, inputs.part("ingest.photos"), inputs.photos_dir)
     total = sum(len(point["observations"]) for point in points)

@@ -32,14 +32,14 @@ def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     facts = [
         ("cell of the surface model", length(dsm["cell_m"])),
         ("area with heights", f"{count(round(dsm['area_m2']))} m²"),
-        ("expected deviation of a height", f"{length(dsm['expected_deviation_m'])}, the middle one"),
+        ("expected deviation of a height", f"{length(dsm['expected_deviation_m'])} (median)"),
         ("ground sample distance of the photos", length(dsm["gsd_m"])),
         ("heights", str(dsm["heights"])),
         ("CRS", str(dsm["crs"])),
     ]
     if ortho.get("pixels"):
         facts.insert(0, ("pixel of the orthophoto", length(ortho["pixel_m"])))
-        facts.append(("exposures levelled over", f"{ortho['exposures_stops']:.1f} stops"))
+        facts.append(("exposures balanced over", f"{ortho['exposures_stops']:.1f} stops"))
     cloud, mesh = inputs.summary("cloud"), inputs.summary("mesh")
     if cloud.get("points"):
         facts.append(("points of the cloud", f"{count(cloud['points'])}, {length(cloud['spacing_m'])} apart"))
@@ -99,7 +99,13 @@ def _pictures(inputs: ReportInputs) -> list[dict[str, Any]]:
     path = _file(inputs, "ortho.files", "ortho.tif")
     if path is not None:
         pixels = ortho_picture(path, PICTURE_SIDE)
-        found.append(("orthophoto", "ortho.tif: true, so walls do not lean; white where nobody saw enough", pixels))
+        found.append(
+            (
+                "orthophoto",
+                "ortho.tif: a true orthophoto, so walls do not lean; white where too few photos see the surface",
+                pixels,
+            )
+        )
     path = _file(inputs, "dsm.files", "dsm.tif")
     relief = None if path is None else relief_picture(path, PICTURE_SIDE)
     if relief is not None:

@@ -26,7 +26,7 @@ MOST_NAMED = 3
 FEW_CHECKS = 3  # fewer prove little
 PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos at 2 megapixels, their exposure apart (trials.md)
 CAMERAS = "Cameras"
-CAMERAS_BAD = "The cameras are bad"
+CAMERAS_BAD = "The camera poses are unreliable"
 VEIL = 0.03  # of the light before held-out photos' points: 8 of 255 grey values, which begin to show
 
 
@@ -68,10 +68,10 @@ def judge(inputs: ReportInputs) -> Verdict:
         return Verdict("bad", CAMERAS_BAD, " ".join(filter(None, [text, ended.text if ended else ""])), findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
     if any(finding.level == "bad" for finding in doubtful):
-        return Verdict("bad", "Finished, but with a serious shortcoming", text, findings)
+        return Verdict("bad", "Finished, but with a serious problem", text, findings)
     if doubtful:
-        return Verdict("doubt", f"Finished; {plural(len(doubtful), 'point')} to look at", text, findings)
-    return Verdict("good", "Finished, and nothing looks doubtful", text, findings)
+        return Verdict("doubt", f"Finished; {plural(len(doubtful), 'point')} to check", text, findings)
+    return Verdict("good", "Finished without findings", text, findings)
 
 
 def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
@@ -83,16 +83,18 @@ def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
     if history.complete:
         gone = [name for name in history.stages if name == stage_name(name) and name not in inputs.artifacts]
         if gone:
-            lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or cannot be read any more."
-            return VerdictLine("bad", "Finished, but its results are damaged", f"{lost} The same command mends it."), ""
+            lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or can no longer be read."
+            return VerdictLine(
+                "bad", "Finished, but its results are damaged", f"{lost} Repeat the command to restore it."
+            ), ""
         last = [stage.name for stage in LINE if stage.name in inputs.artifacts][-1:]
         if last == [LINE[-1].name]:
             return None, f"The run ended on {when}."
         got = f"up to {last[0]}" if last else "without a result"
-        return VerdictLine("doubt", f"The line was run {got}, as asked for", f"It ended on {when}."), ""
+        return VerdictLine("doubt", f"Run {got}, as requested", f"It ended on {when}."), ""
     stage = history.culprit
     where = f" in {stage.name}" if stage is not None else ""
-    kept = "What was finished is kept: the same command goes on from there."
+    kept = "Finished stages are kept: repeat the command to resume."
     if history.running:
         return VerdictLine(
             "doubt", f"Still running{where}", f"{_far(inputs)} Events up to {moment(history.ended_s)}."
@@ -106,7 +108,7 @@ def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
         return VerdictLine(
             "bad", f"Failed{where}", " ".join(filter(None, [history.message, history.hint])) + f" ({when})"
         ), ""
-    lost = f"Its events end without a word: it was killed, or the machine went down. {_far(inputs)} Last heard {when}."
+    lost = f"Its events end abruptly: it was killed, or the machine went down. {_far(inputs)} Last heard {when}."
     return VerdictLine("bad", f"Broken off{where}", f"{lost} {kept}"), ""
 
 
@@ -116,7 +118,7 @@ def _far(inputs: ReportInputs) -> str:
     if stage is None or not stage.messages.progress:
         return ""
     total, unit = stage.messages.progress.get("total"), str(stage.messages.progress.get("unit", ""))
-    return f"It had come to {count(stage.reached)} of {count(total)} {unit}."
+    return f"It had reached {count(stage.reached)} of {count(total)} {unit}."
 
 
 def _cameras(inputs: ReportInputs) -> VerdictLine | None:
@@ -146,7 +148,7 @@ def _reprojection(inputs: ReportInputs) -> VerdictLine | None:
     if error is None:
         return None
     level: Level = "good" if error <= ERROR_GOOD_PX else "doubt" if error <= ERROR_DOUBT_PX else "bad"
-    told = {"good": "points and what they were made of agree", "doubt": "more than usual"}
+    told = {"good": "points and observations agree", "doubt": "more than usual"}
     told["bad"] = "the cameras contradict each other"
     return VerdictLine(level, "Reprojection error", f"{error:.2f} pixels on average: {told[level]}.")
 
@@ -161,11 +163,11 @@ def _focal(inputs: ReportInputs) -> VerdictLine | None:
     if not off:
         return None
     if max(off) <= FOCAL_GOOD:
-        return VerdictLine("good", "Focal length", f"Calibrated within {share(max(off), 1)} of what the photos state.")
-    return VerdictLine("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from what the photos state.")
+        return VerdictLine("good", "Focal length", f"Calibrated within {share(max(off), 1)} of the photos' metadata.")
+    return VerdictLine("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from the photos' metadata.")
 
 
-UNPLACED = "Lengths and heights can be measured; where on the earth it lies and where north is, nothing tells."
+UNPLACED = "Lengths and heights can be measured; its position on the earth and north are unknown."
 SCALE_GOOD = 0.005  # relative standard deviation of scale bars: five millimetres a metre
 
 
@@ -175,13 +177,13 @@ def _place(inputs: ReportInputs) -> VerdictLine | None:
     frame = inputs.read("georef.frame")
     if frame.get("kind") != "enu" and frame.get("metres"):
         scale = inputs.read("georef.accuracy").get("scale") or {}
-        text = f"The model is metric but not placed: {scale.get('sentence', 'its metres are of scale bars.')}"
+        text = f"The model is metric but not georeferenced: {scale.get('sentence', 'its scale is from scale bars.')}"
         good = scale.get("sigma", 1.0) <= SCALE_GOOD and sum(bar["used"] for bar in scale.get("bars", [])) > 1
         return VerdictLine("good" if good else "doubt", "Georeferencing", f"{text} {UNPLACED}")
     if frame.get("kind") != "enu":
         why = str(frame.get("note", "")).removeprefix("Arbitrary scale: ").partition(". Up is from")[0].rstrip(".")
-        text = f"The model has neither scale nor place: {why or 'nothing tells them'}, and no control places it."
-        return VerdictLine("doubt", "Georeferencing", f"{text} Nothing in it can be measured in metres.")
+        text = f"The model has neither scale nor georeference: {why or 'no reason recorded'}, and no control places it."
+        return VerdictLine("doubt", "Georeferencing", f"{text} It cannot be measured in metres.")
     report = inputs.read("georef.accuracy")
     tables, gsd = report["tables"], report.get("gsd_m")
     checks, control = tables.get("check"), tables.get("control")
@@ -189,7 +191,10 @@ def _place(inputs: ReportInputs) -> VerdictLine | None:
         return _checked(checks, gsd)
     if control:
         fit = f"{length(control['rmse_horizontal_m'])} horizontally, {length(control['rmse_up_m'])} in height"
-        text = f"{plural(control['count'], 'control point')} fit by {fit}, but no check point proves it elsewhere."
+        text = (
+            f"{plural(control['count'], 'control point')} fit to {fit}, but there is no check point to verify "
+            "it elsewhere."
+        )
         return VerdictLine("doubt", "Accuracy", text)
     gps = tables.get("gps") or {}
     off = (
@@ -197,7 +202,10 @@ def _place(inputs: ReportInputs) -> VerdictLine | None:
     )
     told = (report.get("uncertainty") or {}).get("sentence")
     worth = f", {told}" if told else ""
-    text = f"Placed by the photos' own positions alone ({off}){worth}: no control or check point proves it."
+    text = (
+        f"Georeferenced by the photos' own positions alone ({off}){worth}: there is no control or check point "
+        "to verify it."
+    )
     return VerdictLine("doubt", "Accuracy", text)
 
 
@@ -210,9 +218,9 @@ def _checked(table: Mapping[str, Any], gsd: float | None) -> VerdictLine:
     told += f", {number((horizontal or 0.0) / gsd, 1)} and {number((vertical or 0.0) / gsd, 1)} ground sample distances"
     good = (horizontal or 0.0) <= HORIZONTAL_GSDS * gsd and (vertical or 0.0) <= VERTICAL_GSDS * gsd
     if table["count"] < FEW_CHECKS:
-        return VerdictLine("doubt", "Accuracy", f"{told}; so few prove little.")
+        return VerdictLine("doubt", "Accuracy", f"{told}; so few points prove little.")
     bounds = f"{HORIZONTAL_GSDS:g} and {VERTICAL_GSDS:g}"
-    verdict = "as a careful survey has it" if good else f"more than the {bounds} that are usual"
+    verdict = "as expected of a careful survey" if good else f"more than the {bounds} that are usual"
     return VerdictLine("good" if good else "doubt", "Accuracy", f"{told}: {verdict}.")
 
 
@@ -229,9 +237,9 @@ def _splat(inputs: ReportInputs) -> VerdictLine | None:
     far = sorted((name for name, off in lengths.items() if off > bound), key=lambda n: -lengths[n])
     if not far:
         off = length(max(lengths.values()))
-        text = f"At {plural(len(points), 'surveyed point')} the splat's own surface is within {off}."
+        text = f"At {plural(len(points), 'surveyed point')} the splat's surface is within {off}."
         return VerdictLine("good", "Surface", text)
-    text = f"The splat's own surface is off by more than {length(bound)} ({SURFACE_GSDS:g} ground sample distances) at "
+    text = f"The splat's surface is off by more than {length(bound)} ({SURFACE_GSDS:g} ground sample distances) at "
     text += f"{len(far)} of {plural(len(points), 'surveyed point')}: "
     text += ", ".join(f"{name} ({length(lengths[name])})" for name in far[:MOST_NAMED])
     return VerdictLine("doubt", "Surface", text + (", …" if len(far) > MOST_NAMED else "") + ".")
@@ -244,19 +252,17 @@ def _views(inputs: ReportInputs) -> VerdictLine | None:
     bounded = " inside the boundary" if "whole" in metrics else ""
     mean, views = metrics["mean"], [view for view in metrics["per_view"] if view["psnr"] is not None]
     if bounded and metrics["per_view"] and not views:
-        text = "No held-out photo shows what lies inside the boundary, so nothing tells how good it is."
+        text = "No held-out photo shows the area inside the boundary, so its quality cannot be measured."
         return VerdictLine("doubt", "Held-out photos", text)
     if not views:
-        return VerdictLine(
-            "doubt", "Held-out photos", "No photo was held out, so nothing tells how good the pictures are."
-        )
+        return VerdictLine("doubt", "Held-out photos", "No photo was held out, so image quality cannot be measured.")
     worst_of = min(views, key=_likeness)
     value, worst = _likeness(mean), _likeness(worst_of)
     level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
-    told = {"good": "a good likeness", "doubt": "a fair likeness", "bad": "a poor likeness"}[level]
+    told = {"good": "good image quality", "doubt": "fair image quality", "bad": "poor image quality"}[level]
     at = f", at {size} megapixels" if (size := judged_size(metrics)) else ""
     text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded}{at} "
-    text += f"({value:.1f} without what exposure did), SSIM {number(mean['ssim'], 2)}: {told}"
+    text += f"({value:.1f} after colour fit), SSIM {number(mean['ssim'], 2)}: {told}"
     if level == "good" and worst < PSNR_DOUBT_DB:
         return VerdictLine(
             "doubt", "Held-out photos", f"{text} on average, but not of {worst_of['name']} ({worst:.1f} dB)."
@@ -275,8 +281,8 @@ def _floaters(inputs: ReportInputs) -> VerdictLine | None:
     if veil.get("mean") is None:
         return None
     level: Level = "good" if veil["mean"] <= VEIL else "doubt"
-    what = "Hardly anything hangs" if level == "good" else "Something hangs"
+    what = "Few floaters" if level == "good" else "Floaters"
     which = "that training never saw" if veil.get("held_out", True) else "of the training, since none was held out"
-    text = f"{what} in the air before {plural(veil['photos'], 'photo')} {which}: it stops"
-    text += f" {share(veil['mean'], 1)} of the light of the points that they see"
-    return VerdictLine(level, "Floaters", f"{text}, at the worst {share(veil['worst'], 1)} ({veil['worst_photo']}).")
+    text = f"{what} in front of {plural(veil['photos'], 'photo')} {which}: they block"
+    text += f" {share(veil['mean'], 1)} of the light from the points seen"
+    return VerdictLine(level, "Floaters", f"{text}, at worst {share(veil['worst'], 1)} ({veil['worst_photo']}).")

@@ -100,20 +100,20 @@ class Guard:
         if HOSTS.fullmatch(host) is None:
             raise RefusedError(421, "This is splatpipe view on this machine; it answers to 127.0.0.1 and localhost.")
         if scope["method"] not in METHODS:
-            raise RefusedError(405, "It takes GET, HEAD and POST.")
+            raise RefusedError(405, "Only GET, HEAD and POST are accepted.")
         path: bytes = scope.get("raw_path") or b""
         if len(path) > LONGEST_PATH or PATH.fullmatch(path) is None:
-            raise RefusedError(404, "There is no such thing here.")
+            raise RefusedError(404, "Not found.")
         headers = Headers(scope=scope)
         origin = headers.get("origin")
         if origin is not None and origin != f"http://{host}":
-            raise RefusedError(403, "Another page's request.")
+            raise RefusedError(403, "Request from another page refused.")
         if headers.get("sec-fetch-site") in FOREIGN and headers.get("sec-fetch-mode") != "navigate":
-            raise RefusedError(403, "Another site's request.")
+            raise RefusedError(403, "Request from another site refused.")
         if scope["method"] == "POST":
             _check_writing(headers, self._token)
         elif headers.get("transfer-encoding") or headers.get("content-length", "0") != "0":
-            raise RefusedError(400, "A request for something to read has no body.")
+            raise RefusedError(400, "A read request must not have a body.")
 
 
 def _check_writing(headers: Headers, token: str) -> None:
@@ -123,9 +123,9 @@ def _check_writing(headers: Headers, token: str) -> None:
         raise RefusedError(415, "It takes JSON.")
     length = headers.get("content-length", "")
     if not (length.isascii() and length.isdigit()):
-        raise RefusedError(411, "It takes a Content-Length.")
+        raise RefusedError(411, "Content-Length is required.")
     if int(length) > LARGEST_BODY:
-        raise RefusedError(413, "It is too large.")
+        raise RefusedError(413, "The request is too large.")
 
 
 def _only(headers: Iterable[tuple[bytes, bytes]], name: bytes, title: str) -> str:
@@ -141,6 +141,6 @@ async def _body(receive: Receive) -> bytes:
         message: Any = await receive()
         body += message.get("body", b"")
         if len(body) > LARGEST_BODY:
-            raise RefusedError(413, "It is too large.")
+            raise RefusedError(413, "The request is too large.")
         if message["type"] != "http.request" or not message.get("more_body"):
             return bytes(body)

@@ -18,15 +18,15 @@ REPORT = "report.html"  # the one thing for people in OUT that no stage delivers
 VIEWER = "viewer.html"
 LARGEST_METRICS = 64 << 20
 WHAT = {
-    REPORT: "what was done, and how good it is",
-    VIEWER: "the splat in 3D, in one page",
-    SITE_PAGE: "the splat in 3D, in levels of detail: put the folder web/ on any web host",
-    "splat.ply": "the splat, in the layout that every viewer reads",
+    REPORT: "what was done, and the quality of the result",
+    VIEWER: "the splat in 3D, in a single page",
+    SITE_PAGE: "the splat in 3D, with levels of detail: put the folder web/ on any web host",
+    "splat.ply": "the splat, for any viewer of Gaussian splats",
     "splat.spz": "the splat, compressed, as the viewer draws it",
     "sky.ply": "the sky, as a dome of Gaussians",
     "georef.json": "where the splat is: CRS, vertical datum, matrices",
-    "cameras.json": "the cameras, in the same frame",
-    "metrics.json": "every figure of quality",
+    "cameras.json": "the cameras, in the splat's frame",
+    "metrics.json": "all quality figures",
     "sparse.glb": "sparse points and camera frusta",
     "flythrough.webm": "a flight through the scene",
 }
@@ -70,26 +70,26 @@ def _state(log: RunLog, at_work: bool) -> dict[str, str]:
     if log.stages and all(stage.state in ("done", "reused") for stage in log.stages.values()):
         return {"kind": "done", "text": "Finished."}
     if running is not None:
-        return {"kind": "failed", "text": f"Ended in {running.name}. The same command goes on where it was."}
+        return {"kind": "failed", "text": f"Ended in {running.name}. Repeat the command to resume."}
     return {"kind": "done", "text": ""}
 
 
 def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> list[dict[str, Any]]:
     ways = []
     if marking:
-        ways.append(("/mark", "Mark control points", "Show where the photos have the surveyed points"))
+        ways.append(("/mark", "Mark control points", "Mark the surveyed points in the photos"))
     if at_work:
-        ways.append(("/live", "Watch the training", "The latest checkpoint beside the photos, and the curves"))
+        ways.append(("/live", "Watch the training", "The latest checkpoint beside the photos, and the training curves"))
     if VIEWER in names:
         ways.append((f"/{VIEWER}", "3D viewer", "Fly around, measure, read coordinates"))
     if SITE_PAGE in names:
-        ways.append((f"/{SITE_PAGE}", "Viewer for the web", "For any web host: coarse at once, finer where one looks"))
+        ways.append((f"/{SITE_PAGE}", "Viewer for the web", "For any web host: coarse at first, finer where you look"))
     if REPORT in names:
-        ways.append((f"/{REPORT}", "Report", "What was captured, what was done, how good it is"))
+        ways.append((f"/{REPORT}", "Report", "The capture, the processing and the quality of the result"))
     if "flythrough.webm" in names:
         ways.append(("/flythrough.webm", "Film", "A flight through the scene"))
     if not at_work and has_log:
-        ways.append(("/live", "Training", "Its curves, and its renders beside the photos"))
+        ways.append(("/live", "Training", "Training curves, and renders beside the photos"))
     return [{"href": href, "title": title, "text": text, "first": k == 0} for k, (href, title, text) in enumerate(ways)]
 
 

@@ -46,7 +46,7 @@ class MarkPages:
     def _page(self, request: Request) -> Response:
         # Only a window of its own gets the secret: a page of the run has our origin and might ask for it.
         if request.headers.get("sec-fetch-dest", "document") != "document":
-            raise HTTPException(403, "Open it in a window of its own.")
+            raise HTTPException(403, "Open it in its own window.")
         return self._pages.page("mark.html", {"name": self._pages.run.name, "token": self._pages.token})
 
     def _overview(self, _request: Request) -> Response:

@@ -130,7 +130,7 @@ class Marking:
         x, y = (round(value, DIGITS) for value in after)
         size = self.job.photos[photo]
         if not (math.isfinite(x) and math.isfinite(y) and 0.0 <= x <= size.width and 0.0 <= y <= size.height):
-            raise WrongRequestError("The place lies outside of the photo.")
+            raise WrongRequestError("The position is outside the photo.")
         return x, y
 
     def _fresh(self) -> ControlText:

@@ -89,7 +89,7 @@ def open_job(run: RunFolder, points_file: Path | None) -> MarkingJob:
     missing = [name for name in ("ingest.photos", "ingest.positions", "sparse.model") if name not in parts]
     if missing:
         raise UsageError(
-            f"{run.out} has no sparse model yet, and marking takes one to know where to look.",
+            f"{run.out} has no sparse model yet, which marking needs to predict where points appear.",
             hint=f"Run first: splatpipe run {photos_dir} {run.out} --until georef",
         )
     photos = load_photo_list(parts["ingest.photos"]).by_name()
@@ -169,7 +169,7 @@ def _text_and_points(
     if stated is not None and parse_crs(stated.crs) != parse_crs(text.table.crs):
         raise UsageError(
             f"{points_file} is in {stated.crs}, and {text.path} in {text.table.crs}.",
-            hint="One control file has one CRS: bring the points into it.",
+            hint="One control file has one CRS: convert the points to it.",
         )
     return text, _together(known, () if stated is None else stated.points, text.path)
 
@@ -183,7 +183,7 @@ def _together(known: Sequence[SurveyedPoint], stated: Sequence[SurveyedPoint], p
         if off > SAME_PLACE_M:
             raise UsageError(
                 f"{point.name} has other coordinates in {path} than in the file of points.",
-                hint="One name is one point: correct one of the two files.",
+                hint="Each name must be one point: correct one of the two files.",
             )
     return tuple(by_name.values())
 

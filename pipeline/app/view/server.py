@@ -96,8 +96,8 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
 
         def ready() -> None:
             if bind != ADDRESS:
-                say(f"It listens on {bind}: publish the port to this machine alone (-p {ADDRESS}:PORT:PORT).")
-            say(f"Open {start} (Ctrl-C ends it)")
+                say(f"It listens on {bind}: publish the port to this machine only (-p {ADDRESS}:PORT:PORT).")
+            say(f"Open {start} (Ctrl-C to stop)")
             if options.open_browser:
                 threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
 
@@ -137,7 +137,7 @@ def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> 
 
     marking = Marking(open_job(pages.run, options.points))
     pages.marking = True
-    say(f"Marks go into {marking.job.text.path}")
+    say(f"Marks are saved to {marking.job.text.path}")
     return MarkPages(marking, pages).routes()
 
 
@@ -160,8 +160,8 @@ def _checked(bind: str) -> str:
         return str(ipaddress.IPv4Address(bind))
     except ValueError as error:
         raise UsageError(
-            f'"{bind}" is no IPv4 address to listen on.',
-            hint="In a container --bind 0.0.0.0, else leave --bind out.",
+            f'"{bind}" is not an IPv4 address to listen on.',
+            hint="In a container --bind 0.0.0.0, otherwise omit --bind.",
         ) from error
 
 

@@ -99,17 +99,17 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
         raise SplatpipeError(
             f"{path}: {len(bad)} of {len(gaussians)} Gaussians have values that are not numbers "
             f"(the first is number {int(bad[0])}).",
-            hint="The program that wrote it failed there; export it again, or remove them in a splat editor.",
+            hint="Export it again, or remove them in a splat editor.",
         )
     if not len(gaussians):
         return
     if float(gaussians.log_scales.max()) > MOST_LOG_SCALE:
         raise SplatpipeError(
-            f"{path}: scales as large as exp({float(gaussians.log_scales.max()):.6g}) are no splat's.",
-            hint="A splat file holds the scales' logarithms; the program that wrote it wrote something else.",
+            f"{path}: scales as large as exp({float(gaussians.log_scales.max()):.6g}) are not valid for a splat.",
+            hint="A splat file holds the scales' logarithms; this file appears to hold something else.",
         )
     if max(float(gaussians.means.max()), -float(gaussians.means.min())) > MOST_COORDINATE:
-        raise SplatpipeError(f"{path}: coordinates beyond {MOST_COORDINATE:g} are no splat's.", hint=_AGAIN)
+        raise SplatpipeError(f"{path}: coordinates beyond {MOST_COORDINATE:g} are not valid for a splat.", hint=_AGAIN)
 
 
 def all_finite(gaussians: Gaussians) -> bool:

@@ -36,7 +36,7 @@ def read_scene(path: Path) -> Scene:
     except OSError as error:
         raise SplatpipeError(f"Cannot read {path}: {error.strerror or error}.", hint="Check the path.") from error
     except MemoryError as error:
-        raise MachineError(f"{path} does not fit in memory.", hint="Take a machine with more.") from error
+        raise MachineError(f"{path} does not fit in memory.", hint="Use a machine with more memory.") from error
 
 
 def format_of_content(path: Path) -> SplatFormat:
@@ -51,7 +51,7 @@ def format_of_content(path: Path) -> SplatFormat:
         name = _name_of_file(path)
     found = next((each for each in SPLAT_FORMATS if each.name == name and each.reads), None)
     if found is None:
-        raise SplatpipeError(f"{path} is no splat that can be read.", hint=_HINT)
+        raise SplatpipeError(f"{path} is not a readable splat.", hint=_HINT)
     return found
 
 
@@ -85,7 +85,9 @@ def format_of_name(path: Path, asked: str | None = None) -> SplatFormat:
     fits = [each for each in SPLAT_FORMATS if each.ending and path.name.lower().endswith(each.ending)]
     if not fits:
         endings = ", ".join(dict.fromkeys(each.ending for each in SPLAT_FORMATS if each.ending))
-        raise UsageError(f"No format ends in {path.suffix}.", hint=f"Choose of {endings}, or name it with --format.")
+        raise UsageError(
+            f"No format has the extension {path.suffix}.", hint=f"Choose from {endings}, or set it with --format."
+        )
     return max(fits, key=lambda each: len(each.ending))
 
 
@@ -107,7 +109,7 @@ def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> No
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir() and (kind.ending or any(path.iterdir())):
-            raise UsageError(f"{path} is a folder that is there.", hint="Name a new file or folder.")
+            raise UsageError(f"{path} is an existing folder.", hint="Name a new file or folder.")
         try:
             kind.write(aside, scene if kind.exact else in_unit_quats(scene))
             sync_tree(aside) if aside.is_dir() else _sync_file(aside)

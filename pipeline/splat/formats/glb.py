@@ -110,7 +110,7 @@ def _rows(gaussians: Gaussians) -> Iterator[np.ndarray]:
     identity = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     scales = torch.exp(gaussians.log_scales.double()).float()
     if not bool(torch.isfinite(scales).all()):
-        raise SplatpipeError("Gaussians are larger than a GLB can tell.", hint="Clean the splat: splatpipe edit.")
+        raise SplatpipeError("Gaussians are larger than a GLB can store.", hint="Clean the splat: splatpipe edit.")
     yield gaussians.means.numpy().astype("<f4")
     yield torch.round(255.0 * rgba.clamp(0.0, 1.0)).to(torch.uint8).numpy()
     yield torch.where(lengths > 0.0, quats / lengths.clamp(min=1e-300), identity).numpy().astype("<f4")

@@ -59,10 +59,10 @@ def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:
     there = {number for number, folder in enumerate(shards, 1) if (folder / "model.ply").is_file()}
     missing = [str(number) for number in range(1, len(site.blocks) + 1) if number not in there]
     if missing or len(shards) > len(site.blocks):
-        told = f"block {', '.join(missing)} left no model" if missing else f"{len(shards)} models are here"
+        told = f"block {', '.join(missing)} has no model" if missing else f"{len(shards)} models are here"
         raise StageError(
             f"The {len(site.blocks)} blocks cannot be merged: {told}.",
-            hint="Run again with --rerun-from train: blocks that are missing are trained.",
+            hint="Run again with --rerun-from train: missing blocks are trained.",
         )
 
 

@@ -110,7 +110,7 @@ def _look_around(
     """
     found = []
     for number, outlook in enumerate(outlooks):
-        report.progress(number, len(outlooks), "looking around blocks", "blocks")
+        report.progress(number, len(outlooks), "choosing the photos of blocks", "blocks")
         prospect = BlockScope.of(partition, number, outlook.windows, parts, scene)
         prospect.write(folder, number)
         found.append(len(prospect.around.rows))

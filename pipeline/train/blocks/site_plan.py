@@ -92,8 +92,8 @@ def limit_of_whole(path: Path) -> int:
         fields: Any = json.loads(path.read_text(encoding="utf-8"))
         if int(fields["shards"]):
             raise StageError(
-                f"None of the {fields['shards']} blocks is here to be merged.",
-                hint="Run again: blocks that are missing are trained.",
+                f"None of the {fields['shards']} blocks is available for merging.",
+                hint="Run again: missing blocks are trained.",
             )
         return int(fields.get("limit_bytes", 0))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

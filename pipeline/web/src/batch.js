@@ -37,7 +37,7 @@ function tick() {
 pause.hidden = false;
 pause.addEventListener("click", () => {
   paused = !paused;
-  pause.textContent = paused ? "Go on refreshing" : "Pause";
+  pause.textContent = paused ? "Resume refreshing" : "Pause";
   pause.setAttribute("aria-pressed", String(paused));
 });
 tick();

@@ -10,7 +10,7 @@ const NAMES = { waiting: "waits", running: "at work", done: "done", reused: "reu
 const CURVES = { loss: "Loss", gaussians: "Gaussians" };
 const MODELS = {
   initial: "the start, before training",
-  coarse: "the whole, which blocks go on from",
+  coarse: "the whole scene, from which the blocks continue",
   checkpoint: "iteration",
   model: "finished, iteration",
 };
@@ -80,7 +80,7 @@ function showState(running, failed) {
         : ["failed", "not at work"];
   $("state").className = `state ${kind}`;
   $("state").textContent = text;
-  const after = told.left_after_s ? `, ${duration(running.seconds_left + told.left_after_s)} with those after it` : "";
+  const after = told.left_after_s ? `, ${duration(running.seconds_left + told.left_after_s)} with those that follow` : "";
   $("left").textContent =
     told.at_work && running?.seconds_left != null ? `${duration(running.seconds_left)} left in ${running.name}${after}` : "";
 }

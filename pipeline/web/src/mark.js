@@ -12,11 +12,11 @@ const $ = (id) => document.getElementById(id);
 const CLOSE_ZOOM = 4; // screen pixels a photo's pixel, where the place is known well
 const ROOM = 2.8; // radii of uncertainty that the view shows
 const KEYS = [
-  ["Click", "mark the point; again to correct"],
+  ["Click", "mark the point; click again to correct it"],
   ["Arrows", "move the mark by a pixel; with Shift by a tenth, with Alt by ten"],
-  ["Enter", "accept, and on to the next photo that remains"],
-  ["Del", "remove the mark; one that was found is noted as not visible here"],
-  ["X", "the point is not visible in this photo (again: it is)"],
+  ["Enter", "accept, and go to the next unmarked photo"],
+  ["Del", "remove the mark; a detected one is recorded as not visible here"],
+  ["X", "the point is not visible in this photo (press again to undo)"],
   ["N  P", "next, previous photo"],
   ["J  K", "next, previous point"],
   ["+  -  wheel", "zoom"],
@@ -153,7 +153,7 @@ function nudge(dx, dy) {
 async function accept() {
   const here = row();
   if (!here.mark) {
-    if (!state.moved) return hint("Click where the point is, or move the cross onto it with the arrows: the expected place alone is no measurement.");
+    if (!state.moved) return hint("Click where the point is, or move the cross onto it with the arrows: the predicted position is not a measurement.");
     mark(state.moved, false);
   }
   await outbox.send();
@@ -170,7 +170,7 @@ async function onward() {
   if (other != null) return choosePoint(other);
   if (next) return choosePhoto(next.photo);
   const blind = state.detail.photos.every((each) => !each.predicted);
-  return hint(blind ? "Nothing tells yet where other photos show it: choose one with N and P." : "Every point is marked wherever it is likely to be seen.");
+  return hint(blind ? "Its position in other photos cannot be predicted yet: choose one with N and P." : "Every point is marked in all photos where it is likely to be visible.");
 }
 
 function remove() {
@@ -180,7 +180,7 @@ function remove() {
   Object.assign(here, { mark: null, found: false, hidden: found, residual_px: null });
   send({ action: found ? "hide" : "unmark" });
   showAll();
-  if (found) hint("What was found here is not used any more: noted as not visible. X takes that back.");
+  if (found) hint("The detected mark is no longer used: recorded as not visible. X undoes that.");
 }
 
 async function hide() {
@@ -227,7 +227,7 @@ function showSaved() {
   const node = $("saved");
   node.className = waiting ? (outbox.trouble ? "bad" : "busy") : "good";
   const many = `${waiting} change${waiting > 1 ? "s" : ""}`;
-  node.textContent = !waiting ? "All saved" : outbox.trouble ? `${many} not saved: ${outbox.trouble} Kept here, and tried again.` : "Saving…";
+  node.textContent = !waiting ? "All saved" : outbox.trouble ? `${many} not saved: ${outbox.trouble} Kept here; retrying.` : "Saving…";
 }
 
 function showAll() {

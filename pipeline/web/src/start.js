@@ -29,7 +29,7 @@ const ready = unpack()
   .then(run)
   .catch(() => {
     document.getElementById("message").textContent = "The viewer cannot be loaded.";
-    document.getElementById("advice").textContent = "Reload this page; on its host the folder has to be whole.";
+    document.getElementById("advice").textContent = "Reload this page, and check that the host has the complete folder.";
     throw new Error("the viewer cannot be loaded");
   })
   .then(() => window.splatpipe.ready); // the viewer's own, see viewer.js

@@ -258,7 +258,7 @@ class Viewer {
     this.tellPoint(point);
     if (!this.tool) return;
     if (!point) {
-      $("hint").textContent = "There is nothing to measure here: click on the model.";
+      $("hint").textContent = "No surface here: click on the model.";
       return;
     }
     const result = this.measuring.click(point);
@@ -310,7 +310,7 @@ class Viewer {
       const { distance, horizontal, height } = result;
       hint.textContent = `Length ${measuring.told(distance)} · horizontal ${measuring.told(horizontal)} · height ${measuring.told(height, true)}`;
     } else if (this.tool) {
-      hint.textContent = measuring.first ? "Click the second point." : "Click the first point. Esc ends, Backspace takes back.";
+      hint.textContent = measuring.first ? "Click the second point." : "Click the first point. Esc to finish, Backspace to undo.";
     }
   }
 

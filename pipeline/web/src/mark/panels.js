@@ -20,7 +20,7 @@ export function metres(value) {
 }
 
 export function showEstimate(root, told) {
-  root.replaceChildren(element("h2", {}, "What the marks tell"));
+  root.replaceChildren(element("h2", {}, "Fit of the marks"));
   if (!told.placed) {
     root.append(element("p", {}, "No frame yet: mark three points, each in two photos or more."));
   } else {
@@ -66,16 +66,16 @@ function stateOf(point, wanted) {
 function title(point) {
   const [x, y, z] = point.coordinates;
   const lines = [`${point.name}: ${x}  ${y}  ${z ?? "(no height)"}`];
-  if (point.residual_m) lines.push(`found less surveyed: ${point.residual_m.map(metres).join(", ")} (east, north, up)`);
-  if (point.found) lines.push(`${point.found} of ${point.marks} marks were found: nobody made them`);
+  if (point.residual_m) lines.push(`estimated minus surveyed: ${point.residual_m.map(metres).join(", ")} (east, north, up)`);
+  if (point.found) lines.push(`${point.found} of ${point.marks} marks were detected automatically`);
   if (point.why) lines.push(point.why);
-  if (point.wrong) lines.push(`${point.wrong} of its marks do not agree with the others`);
+  if (point.wrong) lines.push(`${point.wrong} of its marks disagree with the others`);
   return lines.join("\n");
 }
 
 export const isLeft = (row) => row.predicted != null && !row.mark && !row.hidden && !row.doubtful;
 
-const FOUND = "found: a target that nobody marked. Move it and it is your mark; Del says that it is wrong.";
+const FOUND = "detected automatically. Move it to make it your mark; Del rejects it.";
 
 function stateOfPhoto(row) {
   if (row.mark) return !row.agrees ? "wrong" : row.found ? "found" : "marked";

@@ -83,7 +83,7 @@ export class Outbox {
       const change = this.waiting[0];
       const [point, photo] = this.numbers(change);
       try {
-        if (point < 0 || photo < 0) throw Object.assign(new Error("No longer in this run."), { status: 400 });
+        if (point < 0 || photo < 0) throw Object.assign(new Error("This point or photo is no longer in this run."), { status: 400 });
         const answer = await post("/api/mark/change", { ...change, point, photo });
         this.trouble = "";
         this.waiting.shift();

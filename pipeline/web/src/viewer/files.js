@@ -17,10 +17,10 @@ export async function fetchBytes(address, { total = 0, progress = () => {}, sign
     answer = await fetch(address, { signal, cache });
   } catch (error) {
     if (signal?.aborted) throw error;
-    throw new LoadError(`${name} cannot be reached.`, "Is the server still running? Start it again and reload this page.");
+    throw new LoadError(`${name} cannot be loaded.`, "Is the server still running? Start it again and reload this page.");
   }
   if (!answer.ok) {
-    throw new LoadError(`${name} is not there (${answer.status}).`, "It has to lie beside this page: copy both.");
+    throw new LoadError(`${name} is missing (${answer.status}).`, "It must be in the same folder as this page: copy both.");
   }
   const parts = [];
   let count = 0;

@@ -15,8 +15,8 @@ const UNSEEN = 0.25; // of a Gaussian that is drawn is what one costs that is ou
 export async function readLevels(address) {
   if (location.protocol === "file:") {
     throw new LoadError(
-      "This page reads the model from the files beside it, which browsers do not allow a page that was opened from a disk.",
-      'Put the whole folder on any web host; or see it on this machine with "splatpipe view" of the run, or with ' +
+      "This page reads the model from files beside it, which browsers do not allow for a page opened from disk.",
+      'Put the whole folder on any web host, or view it on this machine with "splatpipe view" on the run, or with ' +
         '"python3 -m http.server" in this folder.',
     );
   }
@@ -31,7 +31,7 @@ export async function readLevels(address) {
   } catch {
     // told below
   }
-  throw new LoadError("levels.json is damaged.", "Copy the folder again, or make it anew: splatpipe export.");
+  throw new LoadError("levels.json is damaged.", "Copy the folder again, or export it again: splatpipe export.");
 }
 
 /** How large what a node leaves out is in the window, pixels, and whether any of it is in the window. */

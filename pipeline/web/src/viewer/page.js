@@ -36,13 +36,13 @@ export async function readSplat(facts, progress) {
       inlined.remove();
       return await bytesOf(text, progress);
     } catch {
-      throw new LoadError("The splat in this page is damaged.", "Copy the page again, or make it anew: splatpipe run.");
+      throw new LoadError("The splat in this page is damaged.", "Copy the page again, or write it again: splatpipe run.");
     }
   }
   if (location.protocol === "file:") {
     throw new LoadError(
-      `This model is large, so it lies beside the page, in ${facts.splat.address}. Browsers do not let a page that was ` +
-        "opened from a disk read its neighbours.",
+      `This model is large, so it is stored beside the page, in ${facts.splat.address}. Browsers do not let a page that was ` +
+        "opened from disk read other files.",
       `Drop ${facts.splat.address} onto this page or choose it below; or run "splatpipe view" on the folder.`,
     );
   }

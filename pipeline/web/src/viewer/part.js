@@ -46,7 +46,7 @@ export async function readPart(bytes, origin = [0, 0, 0]) {
   try {
     await splats.initialized;
   } catch {
-    throw new LoadError("The splat cannot be read.", "It may be damaged or cut off: copy it again, or make it anew.");
+    throw new LoadError("The splat cannot be read.", "It may be damaged or cut off: copy it again, or export it again.");
   }
   return new SplatPart(splats, origin);
 }

@@ -28,7 +28,7 @@ function sectionLines({ length_m, share_with_height, height_sigma_m }) {
 
 function volumeLines(facts) {
   const told = (kind) => `${withSigma(facts[`${kind}_m3`], facts[`${kind}_sigma_m3`])} m³`;
-  const base = { rim: "the plane through the rim", lowest: "the lowest of the rim", stated: "a stated height" }[facts.base];
+  const base = { rim: "the plane through the rim", lowest: "the lowest point of the rim", stated: "a stated height" }[facts.base];
   return [`net ${told("net")}`, `cut ${told("cut")}, fill ${told("fill")}`, `${facts.area_m2.toFixed(1)} m², over ${base ?? "a base"}`];
 }
 
@@ -110,7 +110,7 @@ export class Results {
     const trace = this.items[this.chosen]?.trace;
     const reading = $("reading");
     if (index === null || !trace) {
-      reading.textContent = `Metres; heights ${this.chart.enlarged.toFixed(1)} times enlarged. Point at the chart to read it.`;
+      reading.textContent = `Metres; heights ${this.chart.enlarged.toFixed(1)} times exaggerated. Point at the chart to read values.`;
       this.traces.point(null);
       return;
     }

@@ -25,7 +25,7 @@ export class Stage {
     const context = canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" });
     if (!context) {
       throw new LoadError(
-        "This browser has no WebGL 2, which draws the model.",
+        "This browser has no WebGL 2, which is needed to draw the model.",
         "Use a current Firefox, Chrome, Edge or Safari, and allow hardware acceleration in its settings.",
       );
     }
