@@ -334,7 +334,7 @@ def test_swapped_names_are_told(tmp_path: Path, whole: pycolmap.Reconstruction, 
 @pytest.mark.parametrize(
     ("crs", "swap", "message", "hint"),
     [
-        ("EPSG:32632", False, "km from where the photos were taken|outside", "EPSG:32633"),
+        ("EPSG:32632", False, "km from the photos|outside", "EPSG:32633"),
         ("EPSG:32733", False, "km", "EPSG:32633"),
         ("EPSG:32633", True, "km|no place", "exchanged"),
         ("EPSG:4326", False, "no place|km", "EPSG:32633"),

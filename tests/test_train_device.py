@@ -231,7 +231,7 @@ def test_a_trial_that_a_device_does_not_hold_is_told(monkeypatch: pytest.MonkeyP
         raise torch.OutOfMemoryError("out of memory")
 
     monkeypatch.setattr(planning, "measure", measure)
-    with pytest.raises(MachineError, match=r"does not hold the trial .* of 9,000 Gaussians") as failure:
+    with pytest.raises(MachineError, match=r"too little memory for the trial .* of 9,000 Gaussians") as failure:
         planning.within_time(*budgeted(60.0, cpu()), iterate, tiny_scene.Recorder())
     assert "train.max_megapixels" in failure.value.hint
 
