@@ -209,7 +209,7 @@ def test_from_the_side_to_straight_down_without_spinning() -> None:
 
 
 def test_photos_from_one_place_have_no_path() -> None:
-    with pytest.raises(UsageError, match="one place"):
+    with pytest.raises(UsageError, match="one position"):
         smoothed(upright_route([photo((9, 2, 3), (0, 0, 3))] * 2, UP), 10.0, 0.1)
     with pytest.raises(UsageError, match="no path"):
         film([photo((20, 2, 3), (0, 0, 3))])

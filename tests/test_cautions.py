@@ -77,7 +77,7 @@ def test_locks_that_hold_on_one_machine_only_are_told(
 def test_read_only_and_memory_are_told(tmp_path: Path) -> None:
     mounted = "82 24 0:47 / /media/stick ro - vfat /dev/sdb rw\n83 24 0:48 / /run/x rw - tmpfs tmpfs rw\n"
     assert "read-only" in told(tmp_path, "/media/stick/out", mounted=mounted)[0]
-    assert "takes memory" in told(tmp_path, "/run/x/out", mounted=mounted)[0]
+    assert "up memory" in told(tmp_path, "/run/x/out", mounted=mounted)[0]
 
 
 def test_the_mount_that_hides_another_counts(tmp_path: Path) -> None:

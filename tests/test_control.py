@@ -275,7 +275,7 @@ def test_focal_length_that_nothing_tells_is_held_near_the_metadata(tmp_path: Pat
     flat = adjusted(true_model(NADIR, flat=True), LENS[0] * 1.1, LENS[3])
     ground = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08")
     result = georef(tmp_path, flat, gcp_list(rows(ground, NADIR)), check_points="none")
-    assert [w for w in result.told.warnings if "tell the focal length" in w]
+    assert [w for w in result.told.warnings if "determine the focal length" in w]
     assert result.summary["focal_held"] == [1]
     if result.summary["model_bent"]:
         focal = pycolmap.Reconstruction(result.out / "sparse" / "0").cameras[1].params[0]
@@ -336,8 +336,8 @@ def test_swapped_names_are_told(tmp_path: Path, whole: pycolmap.Reconstruction, 
     [
         ("EPSG:32632", False, "km from the photos|outside", "EPSG:32633"),
         ("EPSG:32733", False, "km", "EPSG:32633"),
-        ("EPSG:32633", True, "km|no place", "exchanged"),
-        ("EPSG:4326", False, "no place|km", "EPSG:32633"),
+        ("EPSG:32633", True, "km|not defined", "swapped"),
+        ("EPSG:4326", False, "not defined|km", "EPSG:32633"),
     ],
 )
 def test_file_in_the_wrong_crs_is_refused_with_the_right_one(
@@ -409,7 +409,7 @@ def test_mark_on_the_wrong_pixel_is_named_and_left_out(tmp_path: Path, whole: py
 
 def test_marks_made_in_larger_photos_are_refused(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     large = [replace(row, pixel=(4.0 * row.pixel[0], 4.0 * row.pixel[1])) for row in rows(FIVE)]
-    with pytest.raises(SplatpipeError, match="outside of their photos") as caught:
+    with pytest.raises(SplatpipeError, match="outside their photos") as caught:
         georef(tmp_path, whole, gcp_list(large))
     assert "resized or rotated" in caught.value.hint
 

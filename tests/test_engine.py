@@ -355,7 +355,7 @@ def test_out_of_another_version_is_left_untouched(numbers: Path, out: Path) -> N
     walk(request_of(numbers, out))
     (out / "stages" / "format.json").write_text('{"format": 99}')
     before = sorted(out.rglob("*"))
-    with pytest.raises(UsageError, match="another layout"):
+    with pytest.raises(UsageError, match="a different layout"):
         walk(request_of(numbers, out))
     assert sorted(out.rglob("*")) == before
 

@@ -26,7 +26,7 @@ APART = 11  # no pair with it was tried
 WEAK = 12  # hardly any keypoints
 TIES = {(2, 3): 16, (3, 4): 16, (5, 6): 16, (7, 8): 15, (8, 9): 15}
 FEW = 40
-RUNGS = ("placing the remaining photos", "joining models", "matching", "stronger keypoints")
+RUNGS = ("placing the remaining photos", "joining models", "matching", "more keypoints")
 
 
 def prepare(folder: Path) -> None:

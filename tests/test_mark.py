@@ -475,7 +475,7 @@ def test_found_targets_are_shown_moved_and_refused_in_the_browser(found_run: Pat
         page.evaluate(f"splatpipe.mark.goTo('P16', '{photo}')")
         chosen = page.locator("#photos li[aria-current]")
         assert "found" in (chosen.get_attribute("class") or "") and "found" in (chosen.get_attribute("title") or "")
-        assert "were found" in (page.locator("#list li", has_text="P16").get_attribute("title") or "")
+        assert "were detected" in (page.locator("#list li", has_text="P16").get_attribute("title") or "")
         assert "found in" in page.locator("#about").inner_text()
         page.keyboard.press("Enter")  # agreed to: nothing is written
         state(page)

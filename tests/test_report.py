@@ -407,7 +407,7 @@ def test_scale_bars_are_told_one_by_one(copy_of_run: Path) -> None:
     chapter = placing_chapter(inputs, None)
     assert chapter is not None
     facts = dict(chapter["facts"])
-    assert "place and heading are arbitrary" in facts["Frame"] and "a pixel" in facts["Ground sample distance"]
+    assert "position and heading are arbitrary" in facts["Frame"] and "per pixel" in facts["Ground sample distance"]
     assert facts["P1 to P2"].endswith("m, +1.2 mm in the model")
     assert facts["P2 to P3"].endswith("-900.0 mm in the model, left out")
     assert facts["P3 to P9"].endswith("one of its targets was not found")

@@ -297,7 +297,7 @@ def test_an_error_of_the_machines_or_the_inputs_stops_the_run_at_once(
 
     monkeypatch.setenv(sharded.FAIL_VARIABLE, "1")
     with (
-        pytest.raises(SplatpipeError, match=r"photos' folder .* is gone"),
+        pytest.raises(SplatpipeError, match=r"photo folder .* has disappeared"),
         open_session(request_of(numbers, out), meddle) as runner,
     ):
         runner.walk()

@@ -239,7 +239,7 @@ def largest_file(size: int) -> Iterator[None]:
 def test_full_disk_is_told_with_what_to_do(dataset: Path, cache: Path) -> None:
     with pytest.raises(MachineError, match="decoded photos cannot be kept") as failure, largest_file(30_000):
         streamed(load_views(dataset), cache, [0] * 30)
-    assert "Make room" in failure.value.hint
+    assert "Free some space" in failure.value.hint
     with pytest.raises(MachineError, match="No such file"):
         PhotoStream.over([], [], 0, 1, cache / "gone")
 

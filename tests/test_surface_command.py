@@ -64,7 +64,7 @@ def test_a_finished_run_is_cut_and_measured(demo_run: Path, tmp_path: Path) -> N
     before = files()
     code, told = surface(out, "--section", line, "--section", "0,0,10,10")
     assert code == 1
-    assert "crosses nothing" in told["error"]["message"]
+    assert "does not cross" in told["error"]["message"]
     assert files() == before  # nothing is half done
     (out / "sections/notes.txt").write_text("mine")
     assert surface(out, "--section", f"{x},{y},{x},{y + 5.0}")[0] == 0

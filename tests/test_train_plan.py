@@ -158,7 +158,7 @@ def test_held_out_photos_are_not_trained_on() -> None:
 
 def test_cameras_in_one_place_are_refused_with_a_hint() -> None:
     same = [View(camera_at(f"{i}.png", (1.0, 2.0, 3.0)), Path("x"), None) for i in range(3)]
-    with pytest.raises(SplatpipeError, match="one place") as raised:
+    with pytest.raises(SplatpipeError, match="one position") as raised:
         make_plan(TrainConfig(), same, tiny_scene.split_of(same), 9)
     assert raised.value.hint
 

@@ -147,7 +147,7 @@ def test_a_folder_that_vanishes_is_told_and_nothing_is_put_in_its_place(
         if (event.kind, event.stage) == ("stage_started", stage):
             (tmp_path / which).rename(tmp_path / "elsewhere")
 
-    with pytest.raises(error, match=f"{which} is gone") as told:
+    with pytest.raises(error, match=f"{which} has disappeared") as told:
         walk(request_of(numbers, out), vanish)
     assert told.value.exit_code == code and told.value.hint
     assert not (tmp_path / which).exists()
