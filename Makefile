@@ -169,7 +169,7 @@ options-page: $(EITHER)
 
 .venv/.wheel: .venv/.dependencies .venv/.headers .venv/.node .venv/.cuda $(SOURCES)
 	@echo "== building splatpipe"
-	@rm -rf dist && $(WITH_HEADERS) $(PIP) wheel -q --no-deps --no-build-isolation -w dist .
+	@rm -f dist/splatpipe-*.whl && $(WITH_HEADERS) $(PIP) wheel -q --no-deps --no-build-isolation -w dist .
 	@echo "== splatpipe is built $$(cat $$(ls -t build/*/cuda.txt | head -1))"
 	@touch $@
 

@@ -72,7 +72,7 @@ class Technique:
         return photo
 
     def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
-        """What is added to the photo's loss."""
+        """What is added to the photo's loss; one on the Gaussians themselves keeps the model of `before_render`."""
         return None
 
     def begin_again(self) -> None:

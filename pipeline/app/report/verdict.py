@@ -89,7 +89,8 @@ def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
             ), ""
         last = [stage.name for stage in LINE if stage.name in inputs.artifacts][-1:]
         if last == [LINE[-1].name]:
-            return None, f"The run ended on {when}."
+            took = duration(history.ended_s - history.began_s)
+            return None, f"The run ended on {moment(history.ended_s)}; its last command took {took}."
         got = f"up to {last[0]}" if last else "without a result"
         return VerdictLine("doubt", f"Run {got}, as requested", f"It ended on {when}."), ""
     stage = history.culprit
