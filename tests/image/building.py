@@ -131,7 +131,7 @@ def _make_base(tools: ImageTools, base: str, folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     command = ["debootstrap", "--variant=minbase", SUITE, str(folder)]
     if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
-        raise Problem("debootstrap failed.")
+        raise Problem(f"debootstrap failed; its log: {folder / 'debootstrap' / 'debootstrap.log'}.")
     for leftover in ("var/cache/apt/archives", "var/lib/apt/lists"):
         shutil.rmtree(folder / leftover)
         (folder / leftover / "partial").mkdir(parents=True)
