@@ -1,4 +1,4 @@
-"""All options of the line, a section a stage; each room has its own. Light to import."""
+"""All options of the line, one section per stage; each package defines its own. Light to import."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from splatpipe.pipeline.web.options import ExportConfig
 
 
 class LineConfig(StageConfig):
-    """Everything that changes the answer, a section a stage."""
+    """Everything that affects the results, one section per stage."""
 
     renamed: ClassVar[Mapping[str, str]] = {
         "evaluate.every": "split.every",

@@ -5,16 +5,17 @@ from __future__ import annotations
 from splatpipe.pipeline.engine.stage import StageConfig
 
 SEEN_MEGAPIXELS = 0.3
-"""Of the photos' pictures that tell what floats: a floater that hides something is larger than their pixels."""
+"""Size of the renders that floaters are detected in: a floater that hides anything is larger than one of their
+pixels."""
 
 
 class CleanConfig(StageConfig):
-    """What is delivered of the trained splat."""
+    """Which of the trained Gaussians are delivered."""
 
     enabled: bool = True
-    """Remove floaters, haze and what no photo shows before the splat is measured and delivered."""
+    """Remove floaters, haze and Gaussians that no photo supports before the splat is evaluated and exported."""
 
     @property
     def is_off(self) -> bool:
-        """Never: where nothing is removed, the splat as it was trained is its answer, and what follows reads that."""
+        """Always False: with cleaning disabled, the stage still passes the trained splat on to the later stages."""
         return False

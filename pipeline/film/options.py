@@ -9,19 +9,19 @@ from pydantic import Field, field_validator
 from splatpipe.pipeline.engine.stage import StageConfig
 
 MOST_FILM_MEGAPIXELS = 2.0736
-"""Of a film that nobody gave a size: 1920 × 1080. Screens that show more are few, and 20 megapixels a frame take a
-gigabyte of memory and the night."""
+"""Largest film if no size is given: 1920 × 1080. Few screens show more, and frames of 20 megapixels take a gigabyte of
+memory and all night."""
 
 
 class FlythroughConfig(StageConfig):
     seconds: Annotated[float, Field(ge=0.0, le=600.0)] = 10.0
-    """Length of `flythrough.webm`, a film along a smooth way through the cameras; 0: none. A time budget keeps time for
-    10 seconds, from ten minutes on."""
+    """Length of `flythrough.webm`, a film along a smooth path through the cameras; 0: no film. Time budgets of ten
+    minutes or more reserve time for a film of 10 seconds."""
     fps: Annotated[int, Field(ge=1, le=120)] = 25
-    """Frames a second."""
+    """Frames per second."""
     size: Annotated[str, Field(pattern=r"^(auto|[0-9]{2,4}x[0-9]{2,4})$")] = "auto"
-    """Width and height in pixels, even, such as 1280x720. Auto: 16:9, as many pixels as the photos have in training,
-    at most 1920x1080."""
+    """Width and height in pixels, both even, such as 1280x720. Auto: 16:9 with as many pixels as the training photos
+    have, at most 1920x1080."""
 
     @field_validator("size")
     @classmethod

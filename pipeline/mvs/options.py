@@ -1,4 +1,4 @@
-"""Options of the stages that start the splat. Light to import."""
+"""Options of the stages that initialize the splat and estimate depth maps. Light to import."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ from splatpipe.pipeline.engine.stage import StageConfig
 
 class InitializeConfig(StageConfig):
     max_gaussians: PositiveInt = 1_000_000
-    """At most this many sparse points become Gaussians, those seen in most photos first."""
+    """Maximum number of sparse points that become Gaussians; those observed in the most photos come first."""
     opacity: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
-    """Opacity at the start. Published: 0.1, from which walls stay a fog whose depth lies behind its front."""
+    """Initial opacity. The published value is 0.1, with which walls remain a fog whose depth lies behind the
+    surface."""
     max_angle: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
-    """Cap on a Gaussian's size for outliers, as a share of its distance to the nearest camera."""
+    """Upper limit on a Gaussian's initial size, as a fraction of its distance to the nearest camera; limits
+    outliers."""
     dense: bool = True
-    """Add points where the sparse ones are thin, by PatchMatch between neighbouring photos: 0.6 CPU seconds a
-    photo. At most 50,000; with the sparse ones they fill half of the training's cap at most, so that it can grow."""
+    """Add points by PatchMatch between neighbouring photos where the sparse points are thin: 0.6 CPU seconds per photo.
+    At most 50,000 are added; together with the sparse points they fill at most half of the cap on Gaussians, which
+    leaves room for densification."""
 
 
 class DepthsConfig(StageConfig):
     enabled: bool = True
-    """Find depths of all photos, which surface products are made from."""
+    """Estimate a depth map for every photo; the surface products are made from them."""
     max_megapixels: PositiveFloat = 1.2
-    """Photos are made this small before their depths are found: 10 to 14 CPU seconds a megapixel."""
+    """Photos are reduced to this size before their depths are estimated: 10 to 14 CPU seconds per megapixel."""

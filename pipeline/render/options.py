@@ -1,14 +1,14 @@
-"""Options of the stages that measure the splat. Light to import."""
+"""Options of the stages that evaluate the splat. Light to import."""
 
 from __future__ import annotations
 
 from splatpipe.pipeline.engine.stage import StageConfig
 
 JUDGED_MEGAPIXELS = 2.0
-"""Held-out photos are measured at so many, or at their own size where that is smaller, whatever was trained: figures of
-runs compare, and what a preset leaves blurred is seen. Full screens have as many; a photo's own pixels are mostly noise
-and Bayer pattern beyond."""
+"""Held-out photos are evaluated at this size, or at their own if that is smaller, whatever size was trained: this makes
+runs comparable and shows what a preset leaves blurred. A full-screen image has about as many pixels; beyond that, a
+photo's pixels are mostly noise and Bayer pattern."""
 
 
 class EvaluateConfig(StageConfig):
-    """None: `split` tells what is measured with."""
+    """No options: `split` decides which photos are held out."""

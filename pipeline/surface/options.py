@@ -1,4 +1,4 @@
-"""Options of the stages that make what is handed over besides the splat. Light to import."""
+"""Options of the stages that make the surface products. Light to import."""
 
 from __future__ import annotations
 
@@ -8,38 +8,37 @@ from splatpipe.pipeline.engine.stage import StageConfig
 
 class DsmConfig(StageConfig):
     enabled: bool = True
-    """Make the surface model: dsm.tif, its confidence, contours."""
+    """Make the surface model (DSM): dsm.tif, its confidence, contours."""
     cell_m: NonNegativeFloat = 0.0
-    """Side of its cells on the ground, metres; 0: two pixels of the photos, or one of their depths where that is
-    larger."""
+    """Cell size on the ground, metres; 0: two pixels of the photos, or one of the depth maps if that is larger."""
 
 
 class OrthoConfig(StageConfig):
     enabled: bool = True
-    """Make the orthophoto, ortho.tif; it needs the surface model."""
+    """Make the true orthophoto, ortho.tif; requires the surface model."""
     gsd_m: NonNegativeFloat = 0.0
-    """Side of its pixels on the ground, metres; 0: as the photos."""
+    """Pixel size on the ground, metres; 0: the GSD of the photos."""
 
 
 class FacadesConfig(StageConfig):
     enabled: bool = False
-    """Draw elevations of walls into facades/: pictures to scale, depths about the wall's plane, DXF, SVG."""
+    """Draw wall elevations into facades/: images to scale, depths relative to the plane of the wall, DXF, SVG."""
     gsd_m: NonNegativeFloat = 0.0
-    """Side of their pixels on the wall, metres; 0: as the photos."""
+    """Pixel size on the wall, metres; 0: the GSD of the photos."""
     lines: str = ""
-    """Walls to draw, each `x1,y1,x2,y2`: its left and its right end as seen from before it, in the run's CRS; separated
-    by semicolons. Empty: all walls that are found."""
+    """Walls to draw, each as `x1,y1,x2,y2`: the left and right ends seen from in front of it, in the run's CRS;
+    separated by semicolons. Empty: all walls that are detected."""
 
 
 class CloudConfig(StageConfig):
     enabled: bool = False
-    """Make the dense cloud, cloud.laz."""
+    """Make the dense point cloud, cloud.laz."""
     spacing_m: NonNegativeFloat = 0.0
-    """Its points are no closer, metres; 0: a pixel of the photos."""
+    """Minimum spacing of its points, metres; 0: the GSD of the photos."""
 
 
 class MeshConfig(StageConfig):
     enabled: bool = False
-    """Make the mesh: mesh/mesh.glb and mesh/mesh.ply. It takes open3d: pip install "splatpipe[mesh]"."""
+    """Make the mesh: mesh/mesh.glb and mesh/mesh.ply. Requires open3d: pip install "splatpipe[mesh]"."""
     triangles: PositiveInt = 1_000_000
-    """At most so many."""
+    """Maximum number of triangles."""

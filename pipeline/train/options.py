@@ -33,69 +33,75 @@ GONE = {
         _NO_GAIN,
     ),
 }
-"""Options that other versions had, and what to do instead."""
+"""Options of earlier versions, and what to do instead."""
 
 
 class TrainConfig(StageConfig):
     """3D Gaussian splatting; lengths and learning rates follow from the iterations (see `schedule` in plan.json).
 
-    At 30,000 iterations and more the lengths are the published ones, a shorter run's are shorter.
+    At 30,000 iterations and more the lengths are the published ones; shorter runs have shorter ones.
     """
 
     iterations: Literal["auto"] | PositiveInt = "auto"
-    """Optimisation steps, one photo or a window of it each. Auto: as many as show every part of every photo often
-    enough at each size, at least `least_iterations`. A time budget plans its own."""
+    """Optimisation steps, each on one photo or a window of it. Auto: enough to show every part of every photo often
+    enough at each size, at least `least_iterations`. A time budget plans its own number."""
     least_iterations: PositiveInt = 30_000
-    """Fewest that `iterations=auto` takes, however few the photos."""
+    """Minimum for `iterations=auto`, however few photos there are."""
     max_megapixels: Annotated[float, Field(ge=0.0, le=200.0)] = 0.0
-    """Photos are trained on at this size at most, from smaller to larger; 0: at the dataset's."""
+    """Largest size of training photos, reached from smaller ones in steps; 0: that of the dataset."""
     time_budget_s: Annotated[float, Field(ge=0.0, le=LONGEST_BUDGET_S)] = 0.0
-    """Seconds for the whole command: resolution, cap and iterations are planned to fill what is left. 0: none."""
+    """Time budget of the whole command, seconds: photo size, cap on Gaussians and iterations are planned to fill the
+    time that the other stages leave. 0: none."""
     max_memory_bytes: Annotated[int, Field(ge=0, le=LARGEST_MEMORY)] = 0
-    """Most resident memory that training may take, its libraries included; on a CUDA device, most of the device's. Caps
-    the Gaussians. 0: no limit."""
+    """Limit on the resident memory of training, including its libraries; on a CUDA device, on device memory. Caps the
+    number of Gaussians. 0: no limit."""
     seed: NonNegativeInt = 0
-    """Seed of the order of photos and of density control."""
+    """Random seed of the order of photos and of density control."""
     max_gaussians: PositiveInt = 1_000_000
-    """Hard cap on Gaussians, at most 1.3 kB of memory each; where it binds, the largest scores are densified first."""
+    """Hard cap on the number of Gaussians, which take up to 1.3 kB of memory each; at the cap, those with the largest
+    scores are densified first."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
-    """Degree of the spherical harmonics that are trained."""
+    """Degree of the spherical harmonics (SH)."""
     loss: Literal["native", "kornia"] = "native"
-    """Who computes the loss and its gradient: our kernels, or kornia's SSIM under torch, some 50 times slower."""
+    """Implementation of the loss and its gradient: splatpipe's own kernels (`native`), or kornia's SSIM in torch, about
+    50 times slower."""
     exposure: Literal["auto", "off", "affine"] = "auto"
-    """What exposure and white balance did to each photo: not modelled, or as an affine map of its colours that is
-    trained along; the splat keeps the photos' mean appearance. Auto: `affine` where the photos show the same points
-    6 % apart or more."""
+    """Model of each photo's exposure and white balance: none (`off`), or an affine map of its colours that is trained
+    along with the splat (`affine`); the splat keeps the mean appearance of the photos. Auto: `affine` if the photos
+    show the same points 6 % apart or more."""
     antialias: bool = True
-    """Anti-aliased projection (mip): for renders much smaller or larger than the photos."""
+    """Anti-aliased projection (mip), for renders at much smaller or larger scales than the photos."""
     background: Literal["black", "white", "random"] = "random"
-    """What is behind the Gaussians in training; `random` (a colour an iteration) forbids holes."""
+    """Background colour in training; `random` (a new colour in each iteration) prevents holes."""
     coarse_levels: Annotated[int, Field(ge=0, le=4)] = 0
-    """Start with photos halved this many times and double them on the way: faster, a little smoother."""
+    """Start with photos halved this many times and double them during training: faster, slightly smoother."""
     densify: bool = True
     """Clone, split and prune Gaussians (adaptive density control)."""
     density: Literal["published", "absolute"] = "absolute"
-    """Where Gaussians are added: where the screen gradient is large, summed as `absolute` magnitudes or as `published`,
-    which takes that method's rates, resets of opacity and pruning by size on screen, too."""
+    """Densification criterion: the screen-space gradient, accumulated as magnitudes (`absolute`) or as in the original
+    method (`published`), which also uses the original learning rates, opacity resets and pruning by size on screen."""
     prune_free_space: NonNegativeInt = 1
-    """Gaussians before the surface for at least so many photos, or right before a camera, are removed; 0 for never."""
+    """Floater pruning: remove Gaussians in front of the surface in at least this many photos, or right in front of a
+    camera; 0: never."""
     distortion_weight: NonNegativeFloat = 0.0
-    """Weight of the spread of the depths along a pixel's ray in the loss: layers become one surface. Tried: 0.05."""
+    """Weight of the distortion loss, which contracts the depths along each pixel's ray, so that layers merge into one
+    surface. Tested value: 0.05."""
     dropout: Literal["auto"] | Annotated[float, Field(ge=0.0, le=0.9)] = "auto"
-    """Share of the Gaussians left out of an iteration at random, rising to this at the end (DropGaussian).
-    Auto: 0.2 up to 16 photos, evenly less up to 32, from there on 0."""
+    """Fraction of Gaussians dropped at random in each iteration, rising to this value at the end (DropGaussian). Auto:
+    0.2 up to 16 photos, falling linearly to 0 at 32."""
     sky: Literal["off", "model"] = "model"
-    """`model`: the sky, found in the photos or drawn in `sky_masks/`, has a colour by direction of its own and no
-    Gaussians; the deliverable leaves it out. Where no photo shows any it stays off."""
+    """`model`: the sky, detected in the photos or drawn in `sky_masks/`, is modelled as a colour per direction, without
+    Gaussians, and is not part of the delivered splat. Off if no photo shows sky."""
     robust: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
-    """Moving things: up to about this share of all pixels, a quarter of a photo at most, is left out of the loss where
-    a photo differs, visit after visit, from what the others agree on; 0: none. Tried: 0.05."""
+    """Moving objects: up to about this fraction of all pixels, and at most a quarter of a photo, is left out of the
+    loss where a photo repeatedly contradicts the others; 0: none. Tested value: 0.05."""
     stop_when_flat: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-    """Where going on would take off less than this share of the training photos' loss, larger photos come at once; at
-    the largest size the schedule is run down within a tenth of the iterations done. 0 for never; presets have 0.1."""
+    """If further training at the current size would reduce the training loss by less than this fraction, move on to
+    larger photos at once; at the largest size, end within another tenth of the iterations done. 0: never; the presets
+    use 0.1."""
 
     def unfit_for_cuda(self) -> str:
-        """Why these options do not train on a CUDA device; empty where they do."""
+        """Why these options cannot be used on a CUDA device; empty if they can."""
         if self.loss == "kornia":
             return "train.loss=kornia does not have a reproducible gradient on a CUDA device."
         return ""
@@ -103,5 +109,5 @@ class TrainConfig(StageConfig):
 
 class SplatDepthsConfig(StageConfig):
     enabled: bool = False
-    """Flatten a copy of the splat and render depths of all photos from it, for surface products: where photos have no
-    texture it knows more than they do."""
+    """Flatten a copy of the splat and render depth maps of all photos from it for the surface products; where photos
+    have no texture, it is more complete than their own depths."""

@@ -1,4 +1,4 @@
-"""Options of the stages that hand it over. Light to import."""
+"""Options of the stage that exports the deliverables. Light to import."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from splatpipe.pipeline.engine.stage import StageConfig
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 
 EXPORT, WEB = "export", "web"
-"""Folders of the formats below OUT."""
+"""Folders under OUT that the formats are written to."""
 FORMATS = (
     *(each.name for each in SPLAT_FORMATS if each.name != "ply"),
     "tiles",
@@ -21,14 +21,15 @@ FORMATS = (
     "colmap",
     "transforms",
 )
-"""All that `export.formats` can name: a splat's, and those that take a run; `splat.ply` is always there."""
+"""All names that `export.formats` takes: splat formats, and those that need a whole run; `splat.ply` is always
+written."""
 
 
 def format_names(text: str) -> tuple[str, ...]:
     """The formats of a list like ``spz, glb``, each once, in the order of ``FORMATS``.
 
     Raises:
-        ValueError: if there is none of that name.
+        ValueError: if a name is not one of them.
     """
     asked = {name.strip() for name in text.split(",")} - {"", "ply"}
     unknown = sorted(asked - set(FORMATS))
@@ -43,10 +44,11 @@ def _checked(text: str) -> str:
 
 class ExportConfig(StageConfig):
     formats: Annotated[str, AfterValidator(_checked)] = ""
-    """Further formats, separated by commas, into `export/` and `web/`; docs/formats.md lists them."""
+    """Further formats, separated by commas, written to `export/` and `web/`; see docs/formats.md."""
     sky: bool = False
-    """Hand over the sky of `train.sky`, too: `sky.ply`, a dome of Gaussians around the splat, in its frame."""
+    """Also export the sky of `train.sky`: `sky.ply`, a dome of Gaussians around the splat, in the same frame."""
     title: Annotated[str, Field(max_length=200)] = "3D model"
-    """What `viewer.html` is called, e.g. the building and the date."""
+    """Title of `viewer.html`, e.g. the building and the date."""
     viewer_megabytes: NonNegativeFloat = 60.0
-    """A `viewer.html` that would be larger reads `splat.spz` beside it, which takes `splatpipe view`; 0 for none."""
+    """Largest `viewer.html`, megabytes: a larger one loads `splat.spz` from beside it, which requires `splatpipe view`;
+    0: no viewer."""

@@ -12,7 +12,9 @@ MOST_ASKED = 256  # blocks: cells are cut on a grid that divides them no finer
 
 
 class BlocksConfig(StageConfig):
-    """Scenes whose Gaussians do not fit in memory are cut into blocks of ground, trained one by one and merged."""
+    """Blocks: a scene whose Gaussians do not fit in memory is cut on the ground plan, trained block by block and
+    merged."""
 
     least: Annotated[int, Field(ge=0, le=MOST_ASKED)] = 0
-    """Blocks at least, for several machines to train at once; 0: as few as memory allows, one where all fits."""
+    """Minimum number of blocks, so that several machines can train at once; 0: as few as memory allows, one if
+    everything fits."""
