@@ -1,3 +1,3 @@
-"""The stages of the line, one body each. ``line.py`` has their order and their options."""
+"""The pipeline's stages, one module each. ``line.py`` defines their order and their options."""
 
 import splatpipe.pipeline  # noqa: F401  - comes before any stage's pycolmap: see there

@@ -1,4 +1,4 @@
-"""blocks: whether a scene is trained whole or in blocks; for blocks the coarse pass over all, and the cells."""
+"""blocks: decide whether to train the scene whole or in blocks; for blocks, run the coarse pass and lay out cells."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ LARGEST_PHOTO = 200.0  # megapixels: the dataset's own size is what counts
 
 
 def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `blocks.json`, `coarse/` (model, sky and exposures of the whole, as blocks begin) and `prospects/`.
+    """Write `blocks.json`, `coarse/` (the whole scene's model, sky and exposures, where blocks start) and `prospects/`.
 
-    The last has what each block looks at. Without blocks both folders are empty.
+    `prospects/` lists what each block trains on. Without blocks, both folders are empty.
 
-    What was decided lies in `division.json` before anything is trained, so a run that goes on elsewhere goes on alike.
+    The decision is stored in `division.json` before training starts, so that a resumed run keeps it on any machine.
 
     Raises:
-        MachineError: if the device asked for is not there.
+        MachineError: if the requested device is not available.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     train = TrainConfig.model_validate(
@@ -62,7 +62,7 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     if not told.is_file():
         limits = TrainingLimits(division.coarse_cap, division.window_pixels)
         summary = train_coarse(train, inputs, limits, coarse, report)
-        sync_tree(coarse)  # what is told to be there is there, even after a power cut
+        sync_tree(coarse)  # before the file that marks it complete, so that a power cut loses nothing
         write_durably(told, json.dumps(dict(summary)))
     (coarse / "checkpoint.npz").unlink(missing_ok=True)
     site, told_of_blocks = lay_out(train, inputs, division, out, report)
@@ -76,11 +76,11 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 
 
 def kept_division(path: Path, make: Callable[[], Division]) -> Division:
-    """What was decided before in this folder, which is of one key; decided now where nothing was.
+    """Return the stored division, or make and store one if there is none.
 
     Args:
-        path: Where it is kept.
-        make: Decides.
+        path: File of the division, in a folder that belongs to one key.
+        make: Makes the division.
     """
     try:
         return Division.of_facts(json.loads(path.read_text(encoding="utf-8")))
@@ -91,23 +91,23 @@ def kept_division(path: Path, make: Callable[[], Division]) -> Division:
 
 
 def _whole_plan(train: TrainConfig, inputs: Inputs, device: Device) -> TrainingPlan:
-    """The training of the scene in one, without limits of memory."""
+    """Plan training the whole scene at once, without a memory limit."""
     views, split = load_views(inputs["undistort.dataset"]), load_split(inputs["split.views"])
     start = read_splat_header(inputs["initialize.splat"]).count
     return make_plan(train, views, split, start, WINDOW_PIXELS[device.name])
 
 
 def _division(config: BlocksConfig, train: TrainConfig, plan: TrainingPlan, device: Device) -> Division:
-    if train.time_budget_s:  # which plans one training
+    if train.time_budget_s:  # a time budget plans a single training
         return divided(_scene(train, plan), 0)
     limit = memory_limit(train.max_memory_bytes, _memory_of(device))
     return divided(_scene(train, plan), limit and limit + _beside(device), config.least)
 
 
 def _unasked_limit(division: Division, train: TrainConfig, device: Device, report: Reporter) -> int:
-    """Of memory, that a training in one has to keep to where nobody asked for one; 0 where it will not come near.
+    """Memory limit for training the scene whole if the user set none, bytes; 0 if training will not come near it.
 
-    A device's own memory ends growth by itself.
+    On CUDA, the device's own memory ends growth.
     """
     if not division.is_near or train.max_memory_bytes or device.name == "cuda":
         return 0
@@ -119,7 +119,7 @@ def _unasked_limit(division: Division, train: TrainConfig, device: Device, repor
 
 
 def _beside(device: Device) -> int:
-    """What of a training's memory is not on its device: the libraries, where that is a card."""
+    """Bytes of training memory that are not on the device: the libraries', if it is a GPU."""
     return LIBRARIES_BYTES if device.name == "cuda" else 0
 
 
@@ -140,13 +140,13 @@ def _scene(train: TrainConfig, plan: TrainingPlan) -> SceneSize:
 
 
 def _shape(plan: TrainingPlan) -> float:
-    """The shorter side over the longer one of the commonest photos."""
+    """Ratio of shorter to longer side of the most common photo size."""
     width, height, _count = max(plan.sizes, key=lambda size: size[2])
     return min(width, height) / max(width, height)
 
 
 def _tell(division: Division, train: TrainConfig, limit_bytes: int, report: Reporter) -> None:
-    """The decision for people; the limit as they know it."""
+    """Report the decision to the user, with the memory limit as the user gave it."""
     told = f"{division.cap:,} Gaussians are trained in {division.blocks} blocks"
     if limit_bytes:
         told += f", each within {limit_bytes / 1e9:.1f} GB"

@@ -1,4 +1,4 @@
-"""clean: the trained splat without floaters, haze, and what no photo shows; what is measured and delivered."""
+"""clean: remove floaters, haze and Gaussians that no photo shows; the result is evaluated and delivered."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_sp
 
 
 def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `model.ply`, the trained model's own bytes where cleaning is switched off, and `cleaned.json`.
+    """Write `model.ply` (a copy of the trained model if cleaning is switched off) and `cleaned.json`.
 
     Raises:
         SplatpipeError: if a file is missing or broken.
-        MachineError: if the device asked for is not there.
+        MachineError: if the requested device is not available.
     """
     trained, model = inputs["train.model"], out / "model.ply"
     if not config.enabled:
@@ -59,7 +59,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
 
 
 def _cleaned(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> CleaningResult:
-    """By the photos that it was trained on: those held out are to measure it, and say nothing here."""
+    """Clean by the training photos only: the held-out ones must stay independent for evaluation."""
     held_out = set(load_split(inputs["split.views"]).held_out)
     views = [view for view in load_views(inputs["undistort.dataset"]) if view.camera.name not in held_out]
     options, _ = as_trained(inputs["train.rendering"], gaussians)

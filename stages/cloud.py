@@ -1,4 +1,4 @@
-"""cloud: the dense cloud of the photos' depths."""
+"""cloud: the dense point cloud from the photos' depth maps."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from splatpipe.pipeline.surface.run_sources import open_surveyed
 
 
 def run(config: CloudConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `files/cloud.laz`; nothing where there is no site.
+    """Write `files/cloud.laz`; nothing if there is no site.
 
     Raises:
-        SplatpipeError: if the site is absurdly large, or depths are broken.
+        SplatpipeError: if the site is absurdly large, or a depth map is broken.
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Control: the surveyed points without their marks, and the scale bars; a broken file is told here, before the work."""
+"""control: read the surveyed points, without their marks, and the scale bars; reports broken files before any work."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatpipe.pipeline.survey.target_finds import WantedTargets, save_wanted
 
 
 def run(config: ControlConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the part points (``points.json``). Marks are left to georef, so that another one asks for no new search.
+    """Write the part points (``points.json``). Marks are left to georef, so that a changed mark needs no new search.
 
     Raises:
         SplatpipeError: if one of the files is broken.

@@ -1,7 +1,7 @@
-"""What a unit of each stage's work costs: constants of forecasts, fitted to finished runs. Light to import.
+"""Cost per unit of work of each stage: constants for forecasts, fitted to finished runs. Light to import.
 
 `benchmarks/forecast.py --costs` fits and prints them; `benchmarks/forecast.json` has the runs, at `preview` with two
-threads of a shared 2-core x86-64 machine with AVX-512, whose CPU seconds these are.
+threads on a shared 2-core x86-64 machine with AVX-512. CPU seconds are those of that machine.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class StageCosts:
-    """Of one stage; `work.py` says what its units are.
+    """Costs of one stage; `work.py` defines its units.
 
     Attributes:
-        cpu: Seconds of a unit of CPU time.
-        resident: Bytes of its process whatever the size: interpreter, libraries, their buffers.
-        memory: Bytes of a unit of what grows.
-        disk: Bytes of a unit of what it leaves.
+        cpu: CPU seconds per unit.
+        resident: Bytes of memory of its process at any size: interpreter, libraries, their buffers.
+        memory: Bytes of memory per unit.
+        disk: Bytes of output per unit.
     """
 
     cpu: float
@@ -30,10 +30,10 @@ class StageCosts:
 
 @dataclass(frozen=True)
 class FormatCosts:
-    """Of one of `export.formats`, a Gaussian.
+    """Costs per Gaussian of one of `export.formats`.
 
     Attributes:
-        cpu: Seconds of CPU time.
+        cpu: CPU seconds.
         disk: Bytes.
     """
 
@@ -56,12 +56,12 @@ FORMAT_COSTS: Mapping[str, FormatCosts] = MappingProxyType(
         "laz": FormatCosts(2.0e-6, 12.0),
     }
 )
-"""Of 59,000 and 103,000 Gaussians of degree 3 (brighton, demo); a SOG of a million takes half as long a Gaussian."""
+"""From 59,000 and 103,000 Gaussians of SH degree 3 (brighton, demo); per Gaussian, SOG of a million takes half."""
 LEVELS_CPU = 3.8e-5
-"""Seconds of a Gaussian of the levels of detail, which are made once for all that are streamed."""
+"""CPU seconds per Gaussian for the levels of detail, which are made once for all streamed formats."""
 IN_LEVELS = frozenset({"tiles", "streamed-sog", "web"})
 WITH_PHOTOS = frozenset({"colmap", "transforms"})
-"""Have a folder of the undistorted photos, one for both."""
+"""Formats that include a folder of the undistorted photos, which they share."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ class Costs:
     """Constants of forecasts.
 
     Attributes:
-        keypoints: Of a megapixel in which they are looked for, by extractor.
-        pairs: Of a photo, where not all are matched, with 20 neighbours.
-        gaussians: Of a photo, after `preview`'s density control.
-        flat: Share of its iterations after which a training ends, where it may when its loss is flat.
-        stages: By name.
+        keypoints: Per megapixel of the images they are extracted from, by extractor.
+        pairs: Per photo, unless matching is exhaustive, with 20 neighbours.
+        gaussians: Per photo, after `preview`'s density control.
+        flat: Share of the iterations after which training ends if it may stop when the loss is flat.
+        stages: Costs by stage name.
     """
 
     keypoints: Mapping[str, float]

@@ -1,4 +1,4 @@
-"""depths: a depth map for every photo, where other photos confirm it; what surfaces are made from."""
+"""depths: a depth map for every photo, where other photos confirm it; the input of all surface products."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from splatpipe.pipeline.photos.dataset import load_views
 
 
 def run(config: DepthsConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `maps/`, in the model's frame; empty where they are not asked for.
+    """Write `maps/`, in the model's frame; empty if not requested.
 
-    All photos have a map, held-out ones, too: nothing is judged by surfaces that was trained without them.
+    Held-out photos have maps, too: surfaces are not used to evaluate the splat that was trained without them.
 
     Raises:
         StageError: if the dataset cannot be read.

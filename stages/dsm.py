@@ -1,4 +1,4 @@
-"""dsm: the height of the topmost surface, from the depths of the photos."""
+"""dsm: the digital surface model (height of the topmost surface) from the photos' depth maps."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from splatpipe.pipeline.surface.options import DsmConfig
 from splatpipe.pipeline.surface.run_sources import open_run_surface
 from splatpipe.pipeline.surface.site_extent import measure_extent, save_site
 
-CELL_GSD = 2.0  # of the photos: heights are known less finely than colours; and no more finely than depths
+CELL_GSD = 2.0  # times the photos' GSD: heights are known less finely than colours, and no more finely than depths
 
 
 def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `files/` (dsm.tif, dsm_confidence.tif, contours) and `site.json`; nothing where it cannot be made.
+    """Write `files/` (dsm.tif, dsm_confidence.tif, contours) and `site.json`; no files if there are no usable depths.
 
     Raises:
-        SplatpipeError: if its grid would be absurdly large, or what it is made from is broken.
+        SplatpipeError: if the grid would be absurdly large, or an input is broken.
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""evaluate: the held-out photos, rendered and measured (what is, is kept as 8-bit PNG), what floats, what is where."""
+"""evaluate: render and measure the held-out views (stored as 8-bit PNG), floaters and the splat's accuracy."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from splatpipe.pipeline.render.view_measures import (
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
 
-Pictures = tuple[tuple[Camera, Pixels, Mask | None], Pixels, Path, Mask | None]  # a view, its render, stem and inside
+Pictures = tuple[tuple[Camera, Pixels, Mask | None], Pixels, Path, Mask | None]  # view, render, stem, inside mask
 
-MEASURED_AT_ONCE = 4  # views, each with 0.3 GB of pictures in double precision
+MEASURED_AT_ONCE = 4  # views, each with 0.3 GB of images in double precision
 
 
 def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `metrics.json` and `views/`: photo, render, error and mask of every held-out view.
+    """Write `metrics.json` and `views/`: photo, render, error image and mask of every held-out view.
 
-    All of them at `JUDGED_MEGAPIXELS`, or as large as the dataset has them, whatever size was trained.
-    With a boundary, figures are those of what lies inside: pixels by the model's own depth, points by their place.
-    The pictures stay in the stored grid, not turned by EXIF's orientation: every figure comes out of them again.
+    All are at `JUDGED_MEGAPIXELS`, or at the dataset's size if that is smaller, whatever the training size. With a
+    boundary, figures cover only the inside: pixels by the model's own depth, points by their position. Images keep the
+    stored pixel grid, not rotated by the EXIF orientation, so that all figures can be recomputed from them.
     """
     views = load_views(inputs["undistort.dataset"])
     held_out = load_split(inputs["split.views"]).held_out

@@ -1,4 +1,4 @@
-"""export: the model, its cameras, the sparse points and, if asked for, the sky in the world frame; and the figures."""
+"""export: the model, its cameras, the sparse points and, if requested, the sky in the world frame; and the metrics."""
 
 from __future__ import annotations
 
@@ -49,13 +49,14 @@ VERSIONS = ("splatpipe", "torch", "pycolmap", "opencv-contrib-python-headless", 
 
 
 def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`, `viewer/`; a sky and more
-    formats if wanted.
+    """Write `splat.ply`, `georef.json`, `cameras.json`, `metrics.json`, `sparse.glb`, `viewer/`; optionally `sky/` and
+    `formats/`.
 
-    The frame is georef's: local east, north, up in metres where there are positions, of arbitrary scale elsewhere. The
-    sky is a file of its own: within `splat.ply` it would be most of its bounding box, by which programs place and tile.
+    The frame is georef's: local east, north, up in metres if it could be georeferenced, otherwise of arbitrary scale.
+    The sky is a separate file: in `splat.ply` it would dominate the bounding box, which programs use for placing and
+    tiling.
     """
-    torch.set_num_threads(1)  # matrix products may round differently on more
+    torch.set_num_threads(1)  # matrix products may round differently on more threads
     frame = load_frame(inputs["georef.frame"])
     dataset = inputs["undistort.dataset"]
     points = load_points(dataset)
@@ -73,7 +74,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     elif config.sky:
         report.warning("There is no sky to export.", hint="It needs train.sky=model, and photos that show the sky.")
     gaussians, within = inside_first(in_world(model, frame), area)
-    del model  # the next is as large, and what follows wants room
+    del model  # free its memory: `gaussians` is as large
     bounded = bounded_comments(within, len(gaussians))
     plain_ply.write(out / "splat.ply", Scene(gaussians, facts), bounded)
     report.progress(1, 4, "writing the cameras and the points", "files")
@@ -106,12 +107,12 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 
 
 def viewer_of(inputs: Inputs, gaussians: Gaussians, title: str) -> ViewerScene:
-    """What the pages show of the run besides its splat.
+    """Return what the viewer page shows of the run besides its splat.
 
     Args:
-        inputs: The stage's.
+        inputs: The stage's inputs.
         gaussians: In the world frame.
-        title: The pages'.
+        title: The page's title.
     """
     options, _ = as_trained(inputs["train.rendering"], gaussians)
     look = viewer_rendering(options, read_panorama(inputs["train.sky"]))
@@ -123,18 +124,18 @@ def viewer_of(inputs: Inputs, gaussians: Gaussians, title: str) -> ViewerScene:
 
 
 def held_out_names(inputs: Inputs) -> frozenset[str]:
-    """Names of the photos that the model was measured on."""
+    """Names of the held-out photos that the model was evaluated on."""
     return frozenset(view["name"] for view in _read_json(inputs["evaluate.metrics"])["per_view"])
 
 
 def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: int) -> Facts:
-    """The run's figures, as `metrics.json` has them.
+    """Return the run's metrics, as stored in `metrics.json`.
 
     Args:
-        inputs: The stage's.
-        points: The sparse model's.
-        registered: Photos placed.
-        gaussians: In the splat.
+        inputs: The stage's inputs.
+        points: Sparse points.
+        registered: Number of registered photos.
+        gaussians: Number of Gaussians in the splat.
     """
     measured = _read_json(inputs["evaluate.metrics"])
     train = inputs.summaries.get("train", {})
@@ -153,7 +154,7 @@ def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: 
         "judged_megapixels": measured["judged_megapixels"],
         "test_views": measured["test_views"],
         **measured["mean"],
-        **({"whole": measured["whole"]} if "whole" in measured else {}),  # with a boundary: the rest is of the inside
+        **({"whole": measured["whole"]} if "whole" in measured else {}),  # with a boundary, the rest covers the inside
         "floaters": measured["floaters"],
         "accuracy": measured["accuracy"],
         "per_view": measured["per_view"],
@@ -164,7 +165,7 @@ def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: 
 
 
 def count_photos(inputs: Inputs, registered: int) -> int:
-    """Photos that the user gave: those taken and those left out; the registered ones where the line began later."""
+    """Number of photos the user gave, used or left out; the registered ones if the run did not start from photos."""
     count = 0
     for part, name in (("ingest.photos", "photos"), ("ingest.left_out", "left_out")):
         path = inputs.parts.get(part)
@@ -177,13 +178,13 @@ def count_photos(inputs: Inputs, registered: int) -> int:
 
 
 def mean_error(model: Path) -> float | None:
-    """Mean reprojection error of the sparse points in the photos as they were taken, pixels; None without tracks.
+    """Mean reprojection error of the sparse points in the original photos, pixels; None without tracks.
 
     Args:
-        model: The COLMAP model that training's dataset was made from.
+        model: The COLMAP model that the training dataset was made from.
     """
     reconstruction = pycolmap.Reconstruction(model)
-    reconstruction.update_point_3d_errors()  # models made by other programs may not say
+    reconstruction.update_point_3d_errors()  # models from other programs may lack them
     error = float(reconstruction.compute_mean_reprojection_error())
     return round(error, 4) if math.isfinite(error) and error > 0.0 else None
 

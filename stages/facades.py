@@ -1,4 +1,4 @@
-"""facades: elevations of the walls that photos see."""
+"""facades: orthographic elevations of the walls that photos show."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from splatpipe.pipeline.surface.run_sources import open_surveyed
 
 
 def run(config: FacadesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `files/facades/`; nothing where there is no site.
+    """Write `files/facades/`; nothing if there is no site.
 
     Raises:
-        SplatpipeError: if nothing stands along a stated line, a wall has too many pixels, or depths are broken.
+        SplatpipeError: if there is no wall along a given line, a wall has too many pixels, or a depth map is broken.
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)

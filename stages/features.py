@@ -17,11 +17,11 @@ from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
 from splatpipe.pipeline.sfm.keypoints import Bytes, extract, single_threaded_opencv
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 
-LEAST_KEYPOINTS = 16  # below COLMAP's 15 inliers of a pair a photo can never be placed
+LEAST_KEYPOINTS = 16  # COLMAP needs 15 inliers per pair; with fewer keypoints a photo can never be placed
 
 
 def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write ``database.db`` and ``colours.npy``: image ids are 1, 2, … in name order, camera ids 1, 2, … by group.
+    """Write ``database.db`` and ``colours.npy``; image ids are 1, 2, … in name order, camera ids 1, 2, … by group.
 
     Raises:
         SplatpipeError: if no photo has enough keypoints.

@@ -1,4 +1,4 @@
-"""flythrough: a film along a smooth way through the real cameras, as the splat was trained to be rendered."""
+"""flythrough: a film along a smooth path through the real cameras, rendered as in training."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
 
 
 def run(config: FlythroughConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `film/flythrough.webm`; nothing where none is asked for, or the photos give no way."""
+    """Write `film/flythrough.webm`; nothing if none is requested or no path can be made through the photos."""
     folder = out / "film"
     folder.mkdir()
     if config.seconds == 0.0:

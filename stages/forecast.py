@@ -1,8 +1,8 @@
-"""What each stage will take of a machine: memory, CPU time and disk, from a capture's size and the options. Light.
+"""Forecast of each stage's memory, CPU time and disk space from the capture's size and the options. Light to import.
 
-A stage's work is counted in units (pixels looked at, pairs times keypoints, Gaussians) that follow from the size and
-the options (`work.py`); `costs.py` has what a unit costs. Texture, overlap and sky are not known beforehand: captures
-of one size differ by a factor of two in some stages and by less in the whole. Of CUDA devices nothing is known.
+A stage's work is counted in units (pixels processed, pairs times keypoints, Gaussians) that follow from the size and
+the options (`work.py`); `costs.py` has the cost per unit. Texture, overlap and sky are not known beforehand: captures
+of the same size differ by a factor of two in some stages and by less in total. There are no figures for CUDA devices.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import FEWEST_GAUSSIANS, LEAST_SHARE, MEGA, CaptureSize, CaptureWork
 
-SPEED_NUMBERS = 20_000  # of a text without repeats, whose packing is timed
-SPEED_S = 0.008  # that the machine of the costs takes to pack it, undisturbed
-SPEED_LEVEL = 6  # of the packing
-SPEED_TRIES = 5  # the best of them counts: the others met somebody else's work
-SPEED_RANGE = (0.25, 4.0)  # outside it the measurement is not believed
+SPEED_NUMBERS = 20_000  # in the text, without repeats, whose compression is timed
+SPEED_S = 0.008  # seconds of that compression on the reference machine of `costs.py`, otherwise idle
+SPEED_LEVEL = 6  # of compression
+SPEED_TRIES = 5  # the fastest counts: the others were slowed by other processes
+SPEED_RANGE = (0.25, 4.0)  # measurements are clamped to it
 
 
 def forecast(
@@ -49,25 +49,25 @@ def forecast(
     costs: Costs = REFERENCE,
     machine_bytes: int = 0,
 ) -> dict[str, Need]:
-    """What each stage takes, by its name.
+    """Return the resources that each stage needs, by stage name.
 
     Args:
-        size: Of the capture.
-        config: The options, resolved.
-        threads: That the run is given.
-        speed: Of this machine's cores, as ``machine_speed`` says.
-        costs: Of a unit of each stage's work.
-        machine_bytes: Memory of the machine that decides on blocks; 0 where nobody knows.
+        size: The capture's size.
+        config: The resolved options.
+        threads: Number of threads of the run.
+        speed: Relative speed of this machine's cores, from ``machine_speed``.
+        costs: Cost per unit of each stage's work.
+        machine_bytes: Memory of the machine that decides on blocks; 0 if unknown.
     """
     return needs_of(CaptureWork.of(size, config, costs, threads, machine_bytes), speed)
 
 
 def needs_of(work: CaptureWork, speed: float) -> dict[str, Need]:
-    """What each stage of a work takes, by its name.
+    """Return the resources that each stage needs, by stage name; training fills a time budget.
 
     Args:
-        work: The line's.
-        speed: Of this machine's cores, as ``machine_speed`` says.
+        work: The work of all stages.
+        speed: Relative speed of this machine's cores, from ``machine_speed``.
     """
     needs, threads = work.needs(speed), work.threads
     budget = work.config.train.time_budget_s
@@ -81,18 +81,18 @@ def needs_of(work: CaptureWork, speed: float) -> dict[str, Need]:
 
 
 def least_memory_bytes(config: LineConfig) -> int:
-    """Least limit of memory that a training can keep to: its libraries, the smallest window, the fewest Gaussians."""
+    """Smallest memory limit that training can keep: libraries, the smallest window, the fewest Gaussians."""
     model = FEWEST_GAUSSIANS * bytes_per_gaussian(config.train.sh_degree)
     return LIBRARIES_BYTES + FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + model
 
 
 @dataclass(frozen=True)
 class Forecaster:
-    """Forecasts for a run, as its stages finish.
+    """Forecasts for a run, refined as its stages finish.
 
     Attributes:
-        config: The options, resolved.
-        threads: That the run is given.
+        config: The resolved options.
+        threads: Number of threads of the run.
     """
 
     config: LineConfig
@@ -101,13 +101,13 @@ class Forecaster:
 
     @cached_property
     def speed(self) -> float:
-        """Of this machine, measured once."""
+        """Relative speed of this machine's cores, measured once."""
         return machine_speed()
 
     def __call__(self, summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
-        """From what ``ingest`` counted; nothing before it, nor where the photos came otherwise.
+        """Return the needs by stage name from the summary of ``ingest``; empty without one.
 
-        Once ``blocks`` is done, by what it decided, with each block's own need.
+        After ``blocks``, the forecast follows its decision and includes each block's own needs.
         """
         size = counted(summaries)
         if size is None:
@@ -118,7 +118,7 @@ class Forecaster:
         return needs_of(work, self.speed) | needs_of_blocks(work, told, self.speed)
 
     def _work(self, size: CaptureSize, decided: Summary | None) -> CaptureWork:
-        """The line's, made once as long as nothing more is known."""
+        """The work of all stages, cached until ``blocks`` has decided."""
         key = size, decided is None
         if key not in self._works:
             self._works[key] = work_as_decided(size, self.config, self.threads, decided)
@@ -126,13 +126,13 @@ class Forecaster:
 
 
 def work_as_decided(size: CaptureSize, config: LineConfig, threads: int, decided: Summary | None) -> CaptureWork:
-    """The work as the stage ``blocks`` decided on it, on whatever machine; None: as it would decide on this one.
+    """Return the work by the decision of the stage ``blocks``, made on any machine.
 
     Args:
-        size: Of the capture.
-        config: The options, resolved.
-        threads: That the run is given.
-        decided: What the stage said.
+        size: The capture's size.
+        config: The resolved options.
+        threads: Number of threads of the run.
+        decided: The stage's summary; None to decide for this machine.
     """
     if decided is None:
         return CaptureWork.of(size, config, REFERENCE, threads, available_memory_bytes())
@@ -142,12 +142,12 @@ def work_as_decided(size: CaptureSize, config: LineConfig, threads: int, decided
 
 
 def needs_of_blocks(work: CaptureWork, told: Mapping[str, Any], speed: float) -> dict[str, Need]:
-    """Each block's need by its name, and that of all of them, once it is known what each looks at and begins with.
+    """Return each block's needs by shard name, and under ``train`` those of all blocks; empty without blocks.
 
     Args:
-        work: The line's.
-        told: What ``blocks`` said of them; nothing without blocks.
-        speed: Of this machine's cores.
+        work: The work of all stages.
+        told: The blocks' figures (start, steps, limits, iterations) from the summary of ``blocks``; may be empty.
+        speed: Relative speed of this machine's cores.
     """
     blocks = work.blocks
     if blocks is None or not told:
@@ -181,7 +181,7 @@ def needs_of_blocks(work: CaptureWork, told: Mapping[str, Any], speed: float) ->
 
 
 def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
-    """The size of a capture as ``ingest`` told it, by its commonest camera; None where it did not run."""
+    """Capture size from the summary of ``ingest``, by its most common camera; None if it did not run."""
     told = summaries.get("ingest", {})
     groups = told.get("camera_groups", ())
     if not groups:
@@ -193,17 +193,17 @@ def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
 
 
 def has_control(source: RunSource) -> bool:
-    """Whether files of the user's ask for targets."""
+    """Whether the user gave control points or scale bars, for which targets are searched."""
     return any(source.named.get(part) is not None for part in ("source.control", "source.scale_bars"))
 
 
 def seconds(need: Need, threads: int) -> float:
-    """How long a stage takes with so many cores to itself."""
+    """Seconds that a stage takes with `threads` cores of its own."""
     return need.seconds(threads)
 
 
 def machine_speed() -> float:
-    """How fast a core of this machine is, against that of the costs: a fixed piece of packing, 0.05 s."""
+    """Speed of this machine's cores relative to the reference machine, from timing a compression (0.05 s in all)."""
     text = " ".join(str(number * number % 9973) for number in range(SPEED_NUMBERS)).encode()
     took = []
     for _ in range(SPEED_TRIES):

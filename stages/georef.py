@@ -1,5 +1,5 @@
-"""Georef: the frame that a model lies in, and how well: from control and the photos' positions or, without them, from
-how cameras are held. The model goes on byte for byte unless control bends it.
+"""georef: determine the model's frame and its accuracy, from control and photo positions or, without them, from how
+cameras are held. The model is copied byte for byte unless the adjustment with control changes it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from splatpipe.pipeline.survey.target_survey import (
 )
 from splatpipe.pipeline.survey.world import in_crs
 
-DATUM_STEP_M = 1.0  # between two vertical datums; less may be the receiver's error
+DATUM_STEP_M = 1.0  # least offset that suggests another vertical datum; less may be the receiver's error
 
 
 def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -51,8 +51,8 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     boundary (``boundary.json``).
 
     Raises:
-        SplatpipeError: if the model cannot be read or has no photos, the control is not of this capture, or nothing
-            lies inside the boundary.
+        SplatpipeError: if the model cannot be read or has no photos, the control does not belong to this capture, or
+            nothing lies inside the boundary.
     """
     source = inputs["sparse.model"]
     report.progress(0, 3, "reading the model", "steps")
@@ -111,7 +111,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 def _survey(
     targets: TargetSurvey, inputs: Inputs, config: GeorefConfig, report: Reporter
 ) -> tuple[Survey | None, ModelScale | None]:
-    """The survey with the marks that targets are, and what scale bars say; None where there is none."""
+    """Return the survey, with marks from detected targets, and the scale from scale bars; each None if not given."""
     control = inputs["source.control"]
     seen: list[TargetMarks] = []
     survey, marked = None, {}
@@ -128,7 +128,7 @@ def _survey(
 def _by_positions(
     config: GeorefConfig, model: SparseModel, positions: Positions, photos: Mapping[str, Photo], report: Reporter
 ) -> Frame | str:
-    """The frame that the positions give, or why they give none."""
+    """Return the frame fitted to the positions, or the reason why there is none."""
     try:
         frame, fit = georeference(model, positions, config.max_position_error_m, photos)
     except NoPlaceError as error:
@@ -138,7 +138,7 @@ def _by_positions(
 
 
 def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | None) -> Frame:
-    """The frame with the CRS and the vertical datum that were declared."""
+    """Return the frame with the declared CRS and vertical datum."""
     stated = controlled.survey.crs.text if controlled is not None else ""
     if controlled is None and config.vertical != "auto":
         frame = replace(frame, vertical_datum=parse_vertical(config.vertical))
@@ -146,7 +146,7 @@ def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | No
 
 
 def _focal_priors(path: Path, model: SparseModel, photos: Mapping[str, Photo]) -> dict[int, float]:
-    """Focal lengths that the metadata know, in the model's pixels, by COLMAP's camera id."""
+    """Focal lengths from the metadata, in the model's pixels, by COLMAP camera id."""
     try:
         groups = json.loads(path.read_text(encoding="utf-8"))["cameras"]
         known = {k: (group["focal_px"], group["width"]) for k, group in enumerate(groups) if group["has_prior"]}
@@ -168,7 +168,7 @@ def _accuracy(
     photos: Mapping[str, Photo],
     report: Reporter,
 ) -> tuple[JSON, dict[str, JSON]]:
-    """What ``control.json`` and ``accuracy.json`` hold."""
+    """Return the contents of ``control.json`` and ``accuracy.json``."""
     if controlled is not None:
         control = control_json(controlled.survey, controlled.site, controlled.placed, photos, config.mark_sigma_px)
         gsd = gsd_m(controlled.survey, controlled.placed.model, controlled.placed.world_from_model.scale)
@@ -181,7 +181,7 @@ def _accuracy(
 
 
 def _tell_heights(tables: JSON, report: Reporter) -> None:
-    """Warn of check points whose heights are in another datum than the positions', where no control joins the two."""
+    """Warn if the check points' heights seem to be in a different datum from the positions, with no control to tell."""
     check = tables["check"]
     if tables["control"] is None and check is not None and abs(check["mean_m"][2] or 0.0) > DATUM_STEP_M:
         report.warning(
@@ -203,7 +203,7 @@ def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Fram
 
 
 def _stated_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:
-    """The offsets that the fit of positions gave the flights."""
+    """(f, 3) offset of each flight from the fit of positions, metres."""
     found = {int(flight["flight"]): flight["offset_m"] for flight in frame.residuals.get("flights", [])}
     return np.array([found.get(flight, [0.0, 0.0, 0.0]) for flight in flights], dtype=np.float64).reshape(-1, 3)
 

@@ -1,4 +1,4 @@
-"""Ingest: the checked photo list, its cameras and positions, and what was left out and why."""
+"""ingest: the checked photo list, its cameras and positions, and which photos were left out and why."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     part = out / "photos"
     part.mkdir(parents=True, exist_ok=True)
     work = Preparation(config, inputs.machine.threads, part, report)
-    # Libraries warn of odd metadata tags in a text of their own; filters are process wide, so they are set only here.
+    # Libraries print their own warnings about odd metadata tags. Filters are process-wide, so they are set only here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scan = scan_folder(root)
@@ -90,7 +90,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
             report.warning(doubt.message, doubt.hint)
     described = describe_cameras(photos, groups, camera_of)
     tell_cameras(described, report)
-    if find_model(inputs.photos_dir) is None:  # a given model has its calibration
+    if find_model(inputs.photos_dir) is None:  # a given model comes with its calibration
         _tell_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
     write_json(out / "cameras.json", cameras_json(groups))
@@ -148,7 +148,7 @@ def _require_photos(
 
 
 def _tell_left_out(left_out: Sequence[ExcludedPhoto], report: Reporter) -> None:
-    """One warning a reason, naming the photos."""
+    """Issue one warning per reason, naming the photos."""
     by_reason: dict[str, list[str]] = {}
     for entry in left_out:
         by_reason.setdefault(entry.reason, []).append(entry.name)
@@ -163,7 +163,7 @@ def _lenses(
     photos: Sequence[CheckedPhoto],
     report: Reporter,
 ) -> tuple[list[CameraGroup], list[StatedLens | None]]:
-    """The groups with the lenses that are stated; a given model has its own."""
+    """Return the groups with the given lens calibrations, if any; a given model has its own."""
     if find_model(inputs.photos_dir) is not None:
         return list(groups), [None] * len(groups)
     members: dict[int, list[CheckedPhoto]] = {}
@@ -174,7 +174,7 @@ def _lenses(
 
 
 def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) -> Mapping[str, FilePlace]:
-    """What the file of positions says, where there is one."""
+    """Return the positions from the position file by photo name; empty without a file."""
     path = inputs["source.geo"]
     if not path.is_file():
         return {}
@@ -206,7 +206,7 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
 
 
 def _accuracy(positions: PositionList) -> dict[str, JSON]:
-    """How many positions there are, in how many flights, from where, and how accurate they count as."""
+    """Summarise the positions: their number, sources, flights, and assumed accuracy."""
     stated = positions.positions
     if not stated:
         return {"positions": 0}

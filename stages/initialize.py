@@ -1,4 +1,4 @@
-"""initialize: a Gaussian for each point of the sparse model and of photos' depths, as big as its neighbours are far."""
+"""initialize: a Gaussian for each sparse point and each dense point from depth maps, sized by neighbour distance."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ Singles = npt.NDArray[np.float32]
 
 SH_DEGREE = 3
 NEIGHBOURS = 3
-SMALLEST_PER_EXTENT = 1e-6  # size of a point on top of others, over the scene's size
-TINY = 1e-12  # a scene of one point at its camera has a size, too
+SMALLEST_PER_EXTENT = 1e-6  # least size of a Gaussian, relative to the scene's extent
+TINY = 1e-12  # least extent, for a scene of one point at its camera
 QUERY_CHUNK = 65_536
-MOST_DENSE = 50_000  # dense points, an even cover; what is finer, density control adds where it pays
+MOST_DENSE = 50_000  # dense points, spread evenly; density control adds finer detail where it pays
 
 
 def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `init.ply`: isotropic Gaussians at the sparse points, after them at dense ones, in the model's frame.
+    """Write `init.ply`: isotropic Gaussians at the sparse points, then at the dense ones, in the model's frame.
 
-    With a boundary, all of those inside and a backdrop's worth of the others.
+    With a boundary, all points inside are used, and of those outside only enough for a coarse backdrop.
 
     Raises:
         SplatpipeError: if the model has no points.
@@ -73,7 +73,7 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
 
 
 def _dense(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter) -> DensePoints:
-    """Dense points from the photos to train on: held-out ones must not tell what is to be judged by them."""
+    """Return dense points from the training photos only: held-out views must not influence what they evaluate."""
     cover = PointBudget(MOST_DENSE, None if area is None else area.contains)
     kept = set(load_split(inputs["split.views"]).train)
     used = [view for view in views if view.camera.name in kept]
@@ -82,12 +82,12 @@ def _dense(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, 
 
 
 def choose_points(points: Points, usable: npt.NDArray[np.int64], limit: int) -> npt.NDArray[np.int64]:
-    """At most ``limit`` of the usable points, the longest tracks first, in their old order.
+    """Return the rows of at most ``limit`` usable points, preferring the longest tracks, in their original order.
 
     Args:
-        points: All of them.
-        usable: Rows to choose from.
-        limit: How many.
+        points: All sparse points.
+        usable: (n,) rows to choose from.
+        limit: Maximum number.
     """
     if usable.size <= limit:
         return usable
@@ -101,8 +101,8 @@ def point_sizes(xyz: Doubles, centres: Doubles, max_angle: float, report: Report
     Args:
         xyz: (n, 3) points, world units.
         centres: (m, 3) camera centres, m > 0.
-        max_angle: No size above this share of the distance to the nearest camera.
-        report: Told of progress.
+        max_angle: Upper limit on size, relative to the distance to the nearest camera.
+        report: Receives progress.
 
     Returns:
         (n,) sizes, world units, all above 0.
@@ -113,7 +113,7 @@ def point_sizes(xyz: Doubles, centres: Doubles, max_angle: float, report: Report
     places, place_of = np.unique(points, axis=0, return_inverse=True)
     sizes = max_angle * _distances(cameras, places, 1)[:, 0]
     neighbours = min(NEIGHBOURS, len(places) - 1)
-    if neighbours > 0:  # the nearest place is the point's own
+    if neighbours > 0:  # the nearest position is the point's own
         sizes = np.minimum(sizes, _distances(places, places, neighbours + 1, report)[:, 1:].mean(axis=1))
     sizes = np.maximum(sizes, SMALLEST_PER_EXTENT * max(extent, TINY))
     return np.asarray(sizes[place_of.reshape(-1)])
@@ -132,7 +132,7 @@ def _distances(targets: Singles, points: Singles, count: int, report: Reporter |
 
 
 def make_gaussians(xyz: Doubles, rgb: npt.NDArray[np.uint8], sizes: Doubles, opacity: float) -> Gaussians:
-    """Isotropic Gaussians of one opacity, with the points' colours and no view dependence.
+    """Make isotropic Gaussians of equal opacity, with the points' colours and no view dependence.
 
     Args:
         xyz: (n, 3) world units.

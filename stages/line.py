@@ -1,4 +1,4 @@
-"""The line from photos to splat: every stage's contract, in order. Light to import."""
+"""The pipeline from photos to splat: every stage's contract, in order. Light to import."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""matches: which photos see the same things: pairs chosen, descriptors matched, geometry verified."""
+"""matches: choose photo pairs, match their descriptors and verify the two-view geometry."""
 
 from __future__ import annotations
 

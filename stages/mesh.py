@@ -1,4 +1,4 @@
-"""mesh: triangles on the surface that the photos' depths agree on, coloured from the photos."""
+"""mesh: a triangle mesh of the surface on which the depth maps agree, coloured from the photos."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from splatpipe.pipeline.surface.options import MeshConfig
 from splatpipe.pipeline.surface.run_sources import open_surveyed
 from splatpipe.pipeline.surface.surface_mesh import MeshTask, make_mesh
 
-VOXEL_GSD = 2.0  # of the photos
+VOXEL_GSD = 2.0  # voxel size over the photos' GSD
 
 
 def run(config: MeshConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `files/mesh/`: mesh.glb, mesh.ply and georef.json; nothing where there is no site.
+    """Write `files/mesh/`: mesh.glb, mesh.ply and georef.json; nothing if there is no site.
 
     Raises:
-        SplatpipeError: if there is no surface that enough photos see, or depths are broken.
-        MachineError: if open3d is not there, or the disk is full.
+        SplatpipeError: if no surface is seen by enough photos, or a depth map is broken.
+        MachineError: if open3d is not installed, or the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)
     opened = open_surveyed(config.enabled, inputs, report)

@@ -1,4 +1,4 @@
-"""ortho: the true orthophoto, on the surface model, from the photos as flown."""
+"""ortho: the true orthophoto, projected from the original photos onto the surface model."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from splatpipe.pipeline.surface.run_sources import open_surveyed
 
 
 def run(config: OrthoConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `files/ortho.tif`; nothing where there is no surface model.
+    """Write `files/ortho.tif`; nothing if there is no surface model.
 
     Raises:
-        SplatpipeError: if its grid would be absurdly large, a photo is no longer what it was, or depths are broken.
+        SplatpipeError: if the grid would be absurdly large, a photo has changed, or a depth map is broken.
         MachineError: if the disk is full.
     """
     (out / "files").mkdir(exist_ok=True)

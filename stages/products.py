@@ -1,4 +1,4 @@
-"""The surface products by the names that people ask for them by, and the options that this means. Light to import."""
+"""The surface products by the names users give, and the options that each name sets. Light to import."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from splatpipe.pipeline.engine.errors import UsageError
 
-CELL_PIXELS = 2.0  # of the orthophoto along a cell of the surface model, where somebody says how large pixels are
+CELL_PIXELS = 2.0  # orthophoto pixels per DSM cell side if the user sets the pixel size
 NEEDS = {
     "dsm": ("depths",),
     "ortho": ("depths", "dsm"),
@@ -14,21 +14,21 @@ NEEDS = {
     "cloud": ("depths", "dsm"),
     "mesh": ("depths", "dsm"),
 }
-"""Products, and the stages that each needs besides its own."""
+"""Products, and the stages that each needs in addition to its own."""
 
 SOURCES = {"photos": (True, False), "splat": (False, True), "both": (True, True)}
-"""Whether depths are found in photos, and whether they are rendered from the splat."""
+"""Whether depths are computed from the photos, and whether they are rendered from the splat."""
 USUAL = "ortho,dsm"
 
 NO_PRODUCTS: dict[str, Any] = {stage: {"enabled": False} for stage in ("depths", *NEEDS)}
-PRODUCTS_FROM_BUDGET_S = 3600.0  # of a whole run: a shorter one is for the splat, and products are made afterwards
+PRODUCTS_FROM_BUDGET_S = 3600.0  # of the whole run; a shorter one is spent on the splat, and products can be made later
 
 
 def parse_products(text: str) -> tuple[str, ...]:
-    """Names of products, in the line's order, of a list like ``ortho, dsm``.
+    """Return the product names in a list like ``ortho, dsm``, in the order of the stages.
 
     Raises:
-        UsageError: if there is none of that name, or none at all.
+        UsageError: if a name is unknown, or the list is empty.
     """
     asked = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in asked if name not in NEEDS]
@@ -39,12 +39,12 @@ def parse_products(text: str) -> tuple[str, ...]:
 
 
 def options_for(products: str | None, gsd_m: float | None, source: str | None) -> dict[str, Any]:
-    """Options that ask for products, over those of a run: what it makes already, it goes on making.
+    """Return options that enable products, to be laid over a run's; products already enabled stay enabled.
 
     Args:
         products: Their names, separated by commas; None for the usual ones.
-        gsd_m: Side of a pixel on the ground; None for as before.
-        source: Whose depths they are made from; None for the photos', and for the splat's, too, where a run has them.
+        gsd_m: Ground size of a pixel, metres; None to leave it unchanged.
+        source: Source of the depths; None for the photos, and also the splat if the run already uses it.
 
     Raises:
         UsageError: if there is no such product or source.

@@ -1,4 +1,4 @@
-"""sparse: cameras and points out of the verified matches, and what became of every photo."""
+"""sparse: reconstruct cameras and points from the verified matches, and report what became of every photo."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _capture(inputs: Inputs, scratch: Path) -> MappingInput:
 
 
 def _without_times(value: JSON) -> JSON:
-    """The same without CPU seconds: the part's bytes are those of the answer, and times are no part of it."""
+    """Return the value without CPU seconds: the part's bytes must depend only on the result, not on timings."""
     if isinstance(value, dict):
         return {key: _without_times(entry) for key, entry in value.items() if key != "cpu_s"}
     return [_without_times(entry) for entry in value] if isinstance(value, list | tuple) else value
@@ -88,12 +88,12 @@ def _keypoint_counts(verified: ViewGraph) -> npt.NDArray[np.int64]:
 
 
 def canonical(model: Model, colours: npt.NDArray[np.uint8], counts: npt.NDArray[np.int64]) -> Model:
-    """The same model, normalised, coloured, its points numbered in one fixed order.
+    """Return the model normalised, with coloured points numbered in a fixed order.
 
     Args:
         model: Normalised in place.
         colours: (n, 3) RGB of all keypoints, image after image.
-        counts: Keypoints of each image, by id from 1.
+        counts: Number of keypoints of each image, by image id starting at 1.
     """
     model.normalize()
     starts = np.concatenate([[0], np.cumsum(counts)])
@@ -149,7 +149,7 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
     if alone:
         report.warning(f"{len(alone)} of {summary['photos']} photos could not be placed: {some(alone)}.")
     for reason in summary["verdict"]["reasons"]:
-        if reason["kind"] != "placed":  # is told above, by name
+        if reason["kind"] != "placed":  # reported above, by name
             bad = "The camera poses are unreliable: " if reason["level"] == "bad" else ""
             report.warning(f"{bad}{reason['text']}", reason["hint"])
     if any(row.get("focal_held") for row in summary["tried"] if row["chosen"]):

@@ -29,13 +29,13 @@ RenderDepth = Callable[[Gaussians, Camera, RenderOptions], Float[np.ndarray, "h 
 
 
 def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `maps/`, in the model's frame and as `depths` does; empty where they are not asked for.
+    """Write `maps/`, in the model's frame and in the format of `depths`; empty if not requested.
 
-    Goes on where a killed run ended: from a checkpoint of the copy, from the copy, from depths that were rendered.
+    Resumes a killed run from a checkpoint of the flattened copy, the finished copy, or the depths rendered so far.
 
     Raises:
         SplatpipeError: if a file is missing or broken.
-        MachineError: if the device asked for is not there.
+        MachineError: if the requested device is not available.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     maps, rendered = out / "maps", out / "rendered"
@@ -62,9 +62,10 @@ def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) 
 
 
 def _model(inputs: Inputs, out: Path, report: Reporter) -> tuple[Gaussians, RenderDepth]:
-    """What depths are rendered from, and how.
+    """Return the Gaussians that depths are rendered from, and the function that renders them.
 
-    The flattened copy, whose mean depths are better than its medians; the splat itself where it was trained in blocks.
+    This is the flattened copy, whose mean depths are better than its medians, or the splat itself if it was trained in
+    blocks.
     """
     if is_in_blocks(inputs["blocks.plan"]):
         report.note(

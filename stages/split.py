@@ -1,4 +1,4 @@
-"""split: which photos are held out of training and measured with; the only place that decides it."""
+"""split: choose which photos are held out of training for evaluation; the only place that decides it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from splatpipe.pipeline.photos.options import SplitConfig
 
 
 def run(config: SplitConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `split.json`: the names of both kinds, in order.
+    """Write `split.json`: the names of training and held-out photos, in order.
 
     Raises:
-        SplatpipeError: if a name is unknown or not clear, or if nothing is left to train on.
+        SplatpipeError: if a name is unknown or ambiguous, or if nothing is left to train on.
     """
     names = [view.camera.name for view in load_views(inputs["undistort.dataset"])]
     found = split_views(names, config.every, config.views)

@@ -1,4 +1,4 @@
-"""Targets: coded ones and quadrants in the photos, where control points or scale bars ask for them."""
+"""targets: detect coded targets and quadrant targets in the photos, if control points or scale bars need them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from splatpipe.pipeline.survey.model import read_model
 from splatpipe.pipeline.survey.options import TargetsConfig
 from splatpipe.pipeline.survey.target_finds import QUADRANT, TargetFind, load_wanted, save_finds
 
-COVERED = 0.8  # of a coded target's size, from its centre
+COVERED = 0.8  # radius around a coded target, over its size, in which quadrants are ignored
 
 
 def run(config: TargetsConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the part found (``targets.json``): every target in the photos that have a pose; none where none is wanted.
+    """Write the part found (``targets.json``): every target in the photos that have a pose; none if none is needed.
 
     Raises:
-        SplatpipeError: if a photo is no longer what it was.
+        SplatpipeError: if a photo has changed.
     """
     wanted = load_wanted(inputs["control.points"])
     if not wanted or not config.search:
@@ -48,14 +48,14 @@ def run(config: TargetsConfig, inputs: Inputs, out: Path, report: Reporter) -> S
 
 
 def _found_in(item: tuple[Photo, Window], part: Path, photos_dir: Path) -> list[TargetFind]:
-    """The targets in a window of a photo."""
+    """Return the targets in a window of a photo, in pixels of the whole photo."""
     photo, (left, top, right, bottom) = item
     pixels = decode(photo, part, photos_dir)[top:bottom, left:right]
     finds = [
         TargetFind(photo.name, t.dictionary, t.number, t.x + left, t.y + top, t.size_px, t.sigma_px)
         for t in find_coded_targets(pixels)
     ]
-    # The cells of a large coded target meet like quadrants.
+    # The corners between cells of a large coded target look like quadrant targets.
     finds += [
         TargetFind(photo.name, QUADRANT, None, t.x + left, t.y + top, t.size_px, t.sigma_px)
         for t in find_quadrant_targets(pixels)

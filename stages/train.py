@@ -1,4 +1,4 @@
-"""train: optimises the Gaussians against the photos, all at once or block by block."""
+"""train: optimise the Gaussians against the photos, all at once or block by block."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from splatpipe.pipeline.train.options import TrainConfig
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the model, its history, its plan and side models: trained here, or merged from blocks where there are any.
+    """Write the model, its history, plan and side models: trained here, or merged from blocks if there are any.
 
     Raises:
         SplatpipeError: if nothing is left to train on, or a block is missing.
-        MachineError: if the device asked for is not there.
+        MachineError: if the requested device is not available.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     if inputs.shards:
@@ -31,39 +31,39 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
 
 
 class BlockReporter:
-    """Tells of a block as of one of several.
+    """A reporter that prefixes a block's messages with its number.
 
     Args:
-        report: Takes it.
-        block: Which it is.
+        report: Receives the messages.
+        block: The block.
     """
 
     def __init__(self, report: Reporter, block: Shard) -> None:
         self._report, self._name = report, f"block {block.number} of {block.count}"
 
     def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
-        """As of a ``Reporter``."""
+        """See ``Reporter``."""
         self._report.progress(done, total, f"{self._name}: {what}", unit)
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None:
-        """As of a ``Reporter``."""
+        """See ``Reporter``."""
         self._report.metric(name, value, step)
 
     def note(self, message: str) -> None:
-        """As of a ``Reporter``."""
+        """See ``Reporter``."""
         self._report.note(f"{self._name}: {message}")
 
     def warning(self, message: str, hint: str = "") -> None:
-        """As of a ``Reporter``."""
+        """See ``Reporter``."""
         self._report.warning(f"{self._name}: {message}", hint)
 
 
 def run_block(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write one block's model, history and plan; go on from a checkpoint where a killed run left one.
+    """Write one block's model, history and plan; resume from the checkpoint of a killed run if there is one.
 
     Raises:
-        StageError: if what `blocks` left cannot be read.
-        MachineError: if the device asked for is not there.
+        StageError: if the outputs of `blocks` cannot be read.
+        MachineError: if the requested device is not available.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     assert inputs.shard is not None

@@ -1,4 +1,4 @@
-"""undistort: the photos as pinhole cameras see them, at training resolution, with the sparse model that fits them."""
+"""undistort: resample the photos to pinhole cameras at training resolution, with the matching sparse model."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from splatpipe.pipeline.sfm.sparse_model import write_model
 
 
 def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write ``dataset/images``, ``masks`` and ``sky_masks`` where there are any, and ``sparse/0`` with PINHOLE cameras.
+    """Write ``dataset/images``, ``masks`` and ``sky_masks`` if there are any, and ``sparse/0`` with PINHOLE cameras.
 
-    Photos keep their names. No EXIF is written: an orientation tag would turn the pictures in other trainers.
+    Photos keep their names. No EXIF is written: an orientation tag would make other trainers rotate the images.
 
     Raises:
-        SplatpipeError: if the model cannot be read, or its photos are not there.
+        SplatpipeError: if the model cannot be read, or its photos are missing.
     """
     model = read_flown(inputs["georef.model"])
     photos = load_photo_list(inputs["ingest.photos"]).photos
@@ -32,7 +32,7 @@ def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) ->
         write_view(view, inputs, dataset)
 
     threads_before = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # photos are the unit of parallel work
+    cv2.setNumThreads(1)  # parallelism is over photos
     try:
         for done, _ in enumerate(ordered_map(work, placed, inputs.machine.threads), start=1):
             report.progress(done, len(placed), "undistorting", "photos")

@@ -1,4 +1,4 @@
-"""The line's work on a capture, counted in units that follow from its size and the options. Light to import."""
+"""The pipeline's work on a capture, in units that follow from its size and the options. Light to import."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ from splatpipe.stages.costs import FORMAT_COSTS, IN_LEVELS, LEVELS_CPU, WITH_PHO
 from splatpipe.stages.options import LineConfig
 
 MEGA = 1e6
-USUAL_SHAPE = 0.72  # of photos whose sides nobody asked for: between the 4:3 and the 3:2 of most cameras
-SIFT_WORK = {"opencv-sift": 1.0, "sift": 3.2}  # times the CPU seconds of OpenCV's, a pixel: 2.4 on sceaux, 4.3 on demo
-SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # the same of a thread's memory
-MOST_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times the keypoints asked for: orientations, scales taken whole
-NEIGHBOURS = 20  # of the costs' pairs a photo
-PHOTOS_OF_ONE_COST = 50  # a photo of a mapping of so many costs what the constant says, of a larger one more
-MAPPING_GROWTH = 0.5  # power of the photos that a photo's mapping costs
-PREVIEW_STEPS = 5  # of density control, which the costs' Gaussians were counted after
-STEPS_POWER = 1.3  # of the steps, that Gaussians grow with: 1.5 on brighton (946,000 at `standard`), 0.9 on the demo
-SIZE_POWER = 0.5  # of the photos' size, the same: from 0.1 to 0.3 megapixels on the demo
-PREVIEW_MEGAPIXELS = 0.3  # at which the costs' Gaussians were counted
-GAUSSIAN_MEGAPIXELS = 1.7e-6  # of a photo that cost as much in an iteration: 1.2 on seneca, 2.3 on brighton (894,000)
-UNSEEN_SHARE = 0.3  # of a Gaussian's cost is there where a window does not show it; judgement
-GROWTH_SAMPLES = 32  # of the growth of Gaussians in a stretch of the training
-PYRAMID = 4.0 / 3.0  # times a photo's pixels: with all its halves
-TARGETS_TILE = 2.4  # megapixels, that targets are looked for in at once
-START_SHARE = 0.2  # of the final Gaussians, at the start
-LEAST_SHARE = 0.1  # of a time budget for the training, even where nothing is left
-FEWEST_GAUSSIANS = 1000  # whatever the time
-PHOTO_BYTES = 3  # of a pixel, decoded
+USUAL_SHAPE = 0.72  # side ratio of photos if unknown: between the 4:3 and 3:2 of most cameras
+SIFT_WORK = {"opencv-sift": 1.0, "sift": 3.2}  # CPU seconds per pixel relative to OpenCV's: 2.4 on sceaux, 4.3 on demo
+SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # memory per thread, likewise
+MOST_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times max_features: several orientations, whole scales
+NEIGHBOURS = 20  # per photo, behind `Costs.pairs`
+PHOTOS_OF_ONE_COST = 50  # up to this many photos, mapping costs the constant per photo; with more photos it costs more
+MAPPING_GROWTH = 0.5  # exponent of the number of photos in the mapping cost per photo
+PREVIEW_STEPS = 5  # density-control steps behind `Costs.gaussians`
+STEPS_POWER = 1.3  # exponent of Gaussians over steps: 1.5 on brighton (946,000 at `standard`), 0.9 on the demo
+SIZE_POWER = 0.5  # exponent of Gaussians over photo size: from 0.1 to 0.3 megapixels on the demo
+PREVIEW_MEGAPIXELS = 0.3  # training size behind `Costs.gaussians`
+GAUSSIAN_MEGAPIXELS = 1.7e-6  # that cost as much per iteration as a Gaussian: 1.2 on seneca, 2.3 on brighton (894,000)
+UNSEEN_SHARE = 0.3  # of a Gaussian's cost that remains outside the window; an estimate
+GROWTH_SAMPLES = 32  # of the number of Gaussians within a stretch of the training
+PYRAMID = 4.0 / 3.0  # pixels of a photo's whole image pyramid over its own
+TARGETS_TILE = 2.4  # megapixels of a tile in which targets are searched
+START_SHARE = 0.2  # of the final number of Gaussians, at the start
+LEAST_SHARE = 0.1  # of a time budget that training always gets
+FEWEST_GAUSSIANS = 1000  # however short the time
+PHOTO_BYTES = 3  # per decoded pixel
 PARALLEL = {
     "ingest": 0.8,
     "features": 0.98,
@@ -77,22 +77,22 @@ PARALLEL = {
     "cloud": 0.9,
     "mesh": 0.5,
 }
-"""Of each stage's CPU seconds, what more threads divide among themselves; measured with one and two."""
+"""Parallel share of each stage's CPU seconds; measured with one and two threads."""
 
 TRAINING = {"blocks": "train", "train": "train"}
-"""Stages that train, by whose costs they go."""
+"""Stages that train, and the stage whose costs they use."""
 
 
 @dataclass(frozen=True)
 class CaptureSize:
-    """What is known of a capture before anything is done.
+    """What is known of a capture before processing.
 
     Attributes:
-        photos: How many.
-        megapixels: Of one photo as flown, the median.
-        positions: Whether most have a position.
+        photos: Number of photos.
+        megapixels: Median size of an original photo.
+        positions: Whether most photos have a position.
         shape: A photo's shorter side over its longer one.
-        control: Whether a control file or scale bars ask for targets.
+        control: Whether there is a control file or scale bars, so that targets are searched.
     """
 
     photos: int
@@ -104,12 +104,12 @@ class CaptureSize:
 
 @dataclass(frozen=True)
 class WorkUnits:
-    """A stage's work.
+    """A stage's work, in the units of its `StageCosts`.
 
     Attributes:
-        cpu: Of CPU time.
-        memory: Of what grows in memory.
-        disk: Of what it leaves.
+        cpu: Units of CPU time.
+        memory: Units of memory, beyond the constant share.
+        disk: Units of output on disk.
     """
 
     cpu: float
@@ -119,16 +119,16 @@ class WorkUnits:
 
 @dataclass(frozen=True)
 class CaptureWork:
-    """A capture and what is to be made of it.
+    """The work of a run on a capture.
 
     Attributes:
-        size: Of the capture.
-        config: The options, resolved.
-        costs: What a unit costs.
-        threads: Of the run.
-        lengths: Of the training: levels and their iterations.
-        gaussians: At its end.
-        blocks: The blocks that the scene is trained in; None where it is trained whole.
+        size: The capture's size.
+        config: The resolved options.
+        costs: Cost per unit.
+        threads: Number of threads of the run.
+        lengths: Levels of the training and their iterations.
+        gaussians: Number of Gaussians at the end of training.
+        blocks: The work of training in blocks; None if the scene is trained whole.
     """
 
     size: CaptureSize
@@ -141,14 +141,14 @@ class CaptureWork:
 
     @staticmethod
     def of(size: CaptureSize, config: LineConfig, costs: Costs, threads: int, machine_bytes: int = 0) -> CaptureWork:
-        """The work without a time budget.
+        """Return the work without a time budget.
 
         Args:
-            size: Of the capture.
-            config: The options, resolved.
-            costs: What a unit costs.
-            threads: Of the run.
-            machine_bytes: The machine's memory, where it may decide on blocks; 0 where it is not to.
+            size: The capture's size.
+            config: The resolved options.
+            costs: Cost per unit.
+            threads: Number of threads of the run.
+            machine_bytes: The machine's memory if it may decide on blocks; otherwise 0.
         """
         work = CaptureWork._undivided(size, config, costs, threads)
         division = work.division(machine_bytes)
@@ -160,14 +160,14 @@ class CaptureWork:
     def of_whole(
         size: CaptureSize, config: LineConfig, costs: Costs, threads: int, limit_bytes: int = 0
     ) -> CaptureWork:
-        """The work where the scene is trained whole, whatever its size.
+        """Return the work if the scene is trained whole, whatever its size.
 
         Args:
-            size: Of the capture.
-            config: The options, resolved.
-            costs: What a unit costs.
-            threads: Of the run.
-            limit_bytes: Of memory, that its training keeps to though nobody asked for it; 0 for none.
+            size: The capture's size.
+            config: The resolved options.
+            costs: Cost per unit.
+            threads: Number of threads of the run.
+            limit_bytes: Memory limit that training keeps although the user set none; 0 for none.
         """
         if limit_bytes:
             train = config.train.model_copy(update={"max_memory_bytes": limit_bytes})
@@ -176,7 +176,7 @@ class CaptureWork:
         return replace(work, gaussians=min(work.most_gaussians, work.grown))
 
     def divided_as(self, division: Division) -> CaptureWork:
-        """The same with the scene cut as it was decided."""
+        """Return the work with the scene divided as given."""
         if division.is_whole:
             return replace(self, gaussians=min(self.most_gaussians, self.grown), blocks=None)
         train, footage = self.config.train, replace(self.footage, window_pixels=division.window_pixels)
@@ -191,7 +191,7 @@ class CaptureWork:
         return replace(work, lengths=tuple(lengths_of(config.train, work.footage)))
 
     def division(self, machine_bytes: int) -> Division:
-        """Into how many blocks the scene is cut, by its options and what it is thought to grow to."""
+        """Return the division into blocks that follows from the options and the expected number of Gaussians."""
         train = self.config.train
         footage = replace(self.footage, window_pixels=WINDOW_PIXELS["cpu"])
         window = max(footage.largest(stretch.look) for stretch in stretches(footage, self.lengths))
@@ -201,7 +201,11 @@ class CaptureWork:
         return divided(scene, memory_limit(train.max_memory_bytes, machine_bytes), self.config.blocks.least)
 
     def filling(self, seconds: float, speed: float) -> CaptureWork:
-        """The same with a training of so many seconds: iterations by their root, and the Gaussians that then fit in."""
+        """Return the work with training to fill a time: iterations by its root, and the Gaussians that then fit.
+
+        Args:
+            seconds: Wall-clock time for training.
+            speed: Relative speed of the machine's cores."""
         longer = replace(self, lengths=tuple(lengths(self.footage, worthwhile_iterations(seconds))))
         cpu = seconds / Need(0, 1.0, 0, parallel=PARALLEL["train"]).seconds(self.threads)
         bare = replace(longer, gaussians=0.0).training
@@ -211,19 +215,19 @@ class CaptureWork:
 
     @property
     def looked_at(self) -> float:
-        """Megapixels of a photo in which keypoints are looked for."""
+        """Megapixels per photo for keypoint extraction."""
         return min(self.size.megapixels, self.size.shape * self.config.features.max_image_size**2 / MEGA)
 
     @property
     def keypoints(self) -> float:
-        """Of a photo."""
+        """Keypoints per photo."""
         options = self.config.features
         most = MOST_KEYPOINTS[options.extractor] * options.max_features
         return min(most, self.costs.keypoints[options.extractor] * self.looked_at)
 
     @property
     def pairs(self) -> float:
-        """Of photos that are matched."""
+        """Number of photo pairs that are matched."""
         photos, options = self.size.photos, self.config.matches
         every = photos * (photos - 1) / 2
         small = photos <= options.exhaustive_up_to and not self.size.positions
@@ -233,7 +237,7 @@ class CaptureWork:
 
     @property
     def trained_at(self) -> float:
-        """Megapixels of a training photo at its finest."""
+        """Megapixels of a training photo at the finest level."""
         return min(self.kept_at, self.config.train.max_megapixels or self.kept_at)
 
     @property
@@ -243,7 +247,7 @@ class CaptureWork:
 
     @property
     def footage(self) -> PhotoSizes:
-        """The photos as they are trained on, those for which memory has room windows included."""
+        """The photos at training size, and the largest window that memory allows."""
         height = math.sqrt(MEGA * self.trained_at * self.size.shape)
         window, limit = WINDOW_PIXELS["cpu"], self.config.train.max_memory_bytes
         if limit:
@@ -252,31 +256,32 @@ class CaptureWork:
 
     @property
     def window(self) -> float:
-        """Most megapixels that an iteration looks at."""
+        """Largest number of megapixels in one iteration."""
         footage = self.footage
         return max(footage.pixels(each.look) for each in stretches(footage, self.lengths)) / MEGA
 
     @property
     def iterations(self) -> int:
-        """Of the training; in blocks, of the coarse pass and all of them."""
+        """Number of training iterations; with blocks, of the coarse pass and all blocks."""
         lengths = self.lengths if self.blocks is None else (*self.blocks.coarse, *self.blocks.lengths)
         return sum(count for _level, count in lengths)
 
     @property
     def training(self) -> float:
-        """Of all iterations: megapixels, and Gaussians as megapixels that cost as much; of blocks, of all of them."""
+        """Training work of all iterations (or of all blocks), in megapixels; Gaussians count as equivalent
+        megapixels."""
         if self.blocks is None:
             return self._training(self.footage, self.lengths, self.gaussians)
         return self.blocks_training(self.blocks.lengths, self.blocks.load)
 
     def blocks_training(self, lengths: Sequence[Length], load: BlockLoad) -> float:
-        """The same of iterations of blocks that have so many Gaussians."""
+        """Training work of blocks with the given iterations and numbers of Gaussians, in megapixels."""
         assert self.blocks is not None
         return self._training(self.blocks.footage, lengths, load.trained, load.frozen)
 
     @property
     def coarse_training(self) -> float:
-        """The same of the pass over the whole before blocks; 0 without them."""
+        """Training work of the coarse pass before blocks, in megapixels; 0 without blocks."""
         if self.blocks is None:
             return 0.0
         return self._training(self.blocks.footage, self.blocks.coarse, self.blocks.coarse_gaussians)
@@ -294,7 +299,7 @@ class CaptureWork:
 
     @property
     def most_gaussians(self) -> float:
-        """That the options, a limit of memory among them, let there be."""
+        """Largest number of Gaussians that the options, including a memory limit, allow."""
         options = self.config.train
         if not options.max_memory_bytes:
             return float(options.max_gaussians)
@@ -304,7 +309,7 @@ class CaptureWork:
 
     @property
     def grown(self) -> float:
-        """Gaussians after density control, as the photos' detail asks for."""
+        """Expected number of Gaussians after density control, before limits."""
         auto, photos = self.config.train.iterations == "auto", self.size.photos
         pace, turn = (self.config.train.least_iterations, photos) if auto else (self.iterations, 1)
         first, every = max(1, min(500, pace // 5), turn), max(1, min(100, pace // 10), turn)
@@ -314,7 +319,7 @@ class CaptureWork:
 
     @property
     def film_pixels(self) -> float:
-        """Megapixels of the film's frames together."""
+        """Total megapixels of the film's frames."""
         film, budget = self.config.flythrough, self.config.train.time_budget_s
         if 0.0 < budget < FILM_FROM_BUDGET_S:
             return 0.0
@@ -323,7 +328,7 @@ class CaptureWork:
         return film.seconds * film.fps * frame
 
     def units(self) -> dict[str, WorkUnits]:
-        """By stage: CPU time, memory, disk; also of those that are turned off."""
+        """Return the units of each stage, including those that are turned off."""
         size, train = self.size, self.config.train
         photos, pixels = float(size.photos), size.photos * size.megapixels
         keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
@@ -371,13 +376,14 @@ class CaptureWork:
 
     @property
     def done(self) -> float:
-        """Share of its iterations after which a training ends; blocks see each window some ten times, and do all."""
+        """Expected share of the iterations that training runs; blocks run all, as they see each window about ten
+        times."""
         train = self.config.train
         ends_flat = train.stop_when_flat and not train.time_budget_s and self.blocks is None
         return self.costs.flat if ends_flat else 1.0
 
     def block_memory_bytes(self, load: BlockLoad) -> int:
-        """Expected of the process that trains a block with so many Gaussians; never more than its limit."""
+        """Expected memory of the process that trains a block, bytes; never more than its limit."""
         assert self.blocks is not None
         limit = self.blocks.division.limit_bytes
         taken = int(self.costs.stages["train"].resident) + self.blocks.memory_bytes(load)
@@ -385,11 +391,12 @@ class CaptureWork:
 
     @property
     def blocks_iterations(self) -> int:
-        """Of all blocks together."""
+        """Number of iterations of all blocks."""
         return 0 if self.blocks is None else sum(count for _level, count in self.blocks.lengths)
 
     def needs(self, speed: float) -> dict[str, Need]:
-        """What the units cost, by stage, on a machine of that speed; nothing where a stage is turned off."""
+        """Return the resources of each stage on a machine of the given relative speed; zero if a stage is turned
+        off."""
         most, found = self.config.train.max_memory_bytes, {}
         for stage, units in self.units().items():
             if getattr(self.config, stage).is_off:
@@ -409,7 +416,7 @@ class CaptureWork:
         return found
 
     def _beginning_s(self, stage: str) -> float:
-        """CPU seconds of blocks before their first iterations, however few these are, and of what is cut for them."""
+        """CPU seconds for laying out blocks and for starting each of them."""
         if self.blocks is None:
             return 0.0
         return {
@@ -418,26 +425,26 @@ class CaptureWork:
         }.get(stage, 0.0)
 
     def _formats_s(self, stage: str) -> float:
-        """CPU seconds of what is made of the splat besides."""
+        """CPU seconds for writing the export formats."""
         asked = format_names(self.config.export.formats) if stage == "export" else ()
         each = sum(FORMAT_COSTS[name].cpu for name in asked if name in FORMAT_COSTS)
         return self.gaussians * (each + (LEVELS_CPU if IN_LEVELS & set(asked) else 0.0))
 
     def _disk_of_formats(self, stage: str) -> int:
-        """Bytes that those leave."""
+        """Bytes on disk of the export formats."""
         asked = format_names(self.config.export.formats) if stage == "export" else ()
         photos = self.size.photos * self.kept_at if WITH_PHOTOS & set(asked) else 0.0
         each = sum(FORMAT_COSTS[name].disk for name in asked if name in FORMAT_COSTS)
         return int(self.gaussians * each + self.costs.stages["undistort"].disk * photos)
 
     def _disk_of_blocks(self, stage: str) -> int:
-        """Bytes that a stage leaves besides where the scene is trained in blocks."""
+        """Extra bytes that a stage writes if the scene is trained in blocks."""
         if self.blocks is None:
             return 0
         return {"blocks": self.blocks.coarse_bytes, "train": self.blocks.block_bytes}.get(stage, 0)
 
     def _scratch(self, stage: str, units: WorkUnits) -> int:
-        """Bytes that a stage takes while it runs: a copy of the features; decoded photos and a checkpoint."""
+        """Bytes on disk while a stage runs: a copy of the features, or decoded photos and a checkpoint."""
         if stage in ("matches", "sparse"):
             return int(self.costs.stages["features"].disk * units.disk)
         decoded = PYRAMID * PHOTO_BYTES * MEGA * self.trained_at
@@ -453,7 +460,9 @@ class CaptureWork:
 
 
 def _mean_growth(lengths: Sequence[Length], start: int, end: int) -> float:
-    """Share of the final Gaussians that iterations have on average: x (2 - x) of the growth, all of it later on."""
+    """Mean share of the final number of Gaussians in a range of iterations.
+
+    Growth follows x (2 - x), x being the share of the growth phase, and is complete after it."""
     last = max(1, growth_until(lengths))
     middles = (start + (step + 0.5) * (end - start) / GROWTH_SAMPLES for step in range(GROWTH_SAMPLES))
     shares = [min(1.0, middle / last) for middle in middles]
