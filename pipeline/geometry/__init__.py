@@ -1,1 +1,1 @@
-"""Cameras, similarities and points: the geometry that everything else stands on."""
+"""Cameras, similarity transforms and points: the geometry that everything else builds on."""

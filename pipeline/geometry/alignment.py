@@ -1,4 +1,4 @@
-"""The robust similarity between two sets of points of which some may be wrong, and how well they determine it."""
+"""Robust similarity between two point sets with outliers, and how well the points determine it."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ __all__ = [
     "turn_about_axis",
 ]
 
-MAX_HYPOTHESES = 1000  # with half the points wrong, one triple in eight is right: missing it has odds of 1e-58
+MAX_HYPOTHESES = 1000  # with half the points wrong, one triple in eight is right: odds of missing all are 1e-58
 REFINED_HYPOTHESES = 5
 LOCAL_ROUNDS = 5
-WEAK_ROTATION_RAD = math.radians(5.0)  # a rotation known less well takes a prior, where there is one
+WEAK_ROTATION_RAD = math.radians(5.0)  # a rotation known less well than this uses the prior, if there is one
 IRLS_ROUNDS = 50
 IRLS_TOLERANCE = 1e-13  # of a step, in radians and relative to the extent
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
-OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors never are so large
-LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be found
-CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at some 1 in 10,000
-OUTLIER_SIGMAS = 3.0  # and an error within what the position states is none
+OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors are never this large
+LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be estimated
+CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at about 1 in 10,000
+OUTLIER_SIGMAS = 3.0  # an error within the position's stated accuracy is not an outlier
 LEAST_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
-MOST_GROUPS = 20  # whose triples are tried: one good group is enough
+MOST_GROUPS = 20  # groups whose own triples are tried: one good group is enough
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class SimilarityFit:
 
     Attributes:
         similarity: Source to target.
-        inliers: Which points agree with the fit. These took part in it, unless they are fewer than 3: then all did, and
-            there is no fit to speak of.
-        residuals: Transformed source less target, in the target's units; the groups' shared errors are taken off.
+        inliers: Which points agree with the fit. Only these took part in it, unless they are fewer than 3: then all
+            points did, and the fit is meaningless.
+        residuals: Transformed source minus target, in the target's units, with the groups' shared errors removed.
         noise: Robust spread of the residuals over the stated sigmas: 1 where these are right.
-        sigma_scale: Standard deviation of the scale, relative; infinite where it is not determined.
-        sigma_rotation_rad: Standard deviation of the rotation about its weakest axis; infinite likewise.
-        used_prior: Whether the points left a rotation to the prior.
-        offsets: The error that each group shares (target less truth), in the target's units; empty without groups.
+        sigma_scale: Relative standard deviation of the scale; infinite where it is not determined.
+        sigma_rotation_rad: Standard deviation of the rotation about its weakest axis; infinite where undetermined.
+        used_prior: Whether the prior was needed for a rotation that the points leave free.
+        offsets: The error that each group shares (target minus truth), in the target's units; empty without groups.
     """
 
     similarity: Similarity
@@ -85,19 +85,20 @@ class SimilarityFit:
 def robust_similarity(
     points: Correspondences, max_error: float | None, prior: DirectionPrior | None = None
 ) -> SimilarityFit:
-    """Fit a similarity to points of which some may be wrong.
+    """Fit a similarity to points that may include outliers.
 
-    Triples give hypotheses (every triple of a small set, else 1000 from a fixed seed), scored by squared residuals cut
-    off at ``max_error`` and refined locally (MSAC: Torr and Zisserman 2000; LO-RANSAC: Chum, Matas and Kittler 2003).
-    From the best, reweighted least squares with the points' own sigmas and Cauchy's weights. Never a reflection, and
-    the same bits for the same input. Errors that groups share are estimated along, each with its sigma as its prior;
-    they are eliminated from the normal equations, so that what is said of accuracy holds with them.
+    Hypotheses come from triples (every triple of a small set, else 1000 from a fixed seed). They are scored by squared
+    residuals truncated at ``max_error`` and refined locally (MSAC: Torr and Zisserman 2000; LO-RANSAC: Chum, Matas and
+    Kittler 2003). The best one starts iteratively reweighted least squares with the points' own sigmas and Cauchy
+    weights. The result is never a reflection, and bit-identical for the same input. Errors shared by groups are
+    estimated as well, each with its sigma as its prior; they are eliminated from the normal equations, so the reported
+    accuracies account for them.
 
     Args:
         points: At least 3, not all in one place.
-        max_error: Points further than this from the fit, in the target's units, are left out of it. None: those that
-            are off by far more than the noise of at least half of the points, which is found.
-        prior: Directions that take part where the points leave a rotation free by more than 5° (points on a line).
+        max_error: Points further than this from the fit, in the target's units, are left out of it. If None, the noise
+            of at least half of the points is estimated, and points that are off by far more are left out.
+        prior: Directions used where the points leave a rotation uncertain by more than 5° (points on a line).
 
     Raises:
         ValueError: if there are fewer than 3 points or their source positions coincide.
@@ -121,12 +122,12 @@ def robust_similarity(
 
 
 def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: int) -> Float64[np.ndarray, "g 3"]:
-    """Standard deviations of the differences between the groups' offsets and one group's.
+    """Standard deviations of the differences between each group's offset and the reference group's.
 
     Args:
-        fit: Of the points.
-        points: With shared errors.
-        reference: The group that the others are compared with.
+        fit: The fit of these points.
+        points: Points with shared errors.
+        reference: Index of the group that the others are compared with.
     """
     assert points.shared is not None
     chosen = points.only(fit.inliers).at_noise(fit.noise)
@@ -134,7 +135,7 @@ def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: i
     problem, weights = _Problem(chosen, fit.similarity), _sigma_weights(chosen)
     membership = chosen.shared.membership()
     own = membership @ weights + 1.0 / chosen.shared.sigmas**2
-    # An offset is the mean of what is left of its points, so it moves with the similarity by their mean Jacobian.
+    # An offset is the mean residual of its points, so it moves with the similarity by their mean Jacobian.
     mean = np.einsum("gn,nk,nkp->gkp", membership, weights, problem.jacobian()) / own[:, :, None]
     steps = mean - mean[reference]
     covariance = np.linalg.pinv(_information(problem, weights, None), rcond=FREE, hermitian=True)
@@ -145,7 +146,7 @@ def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: i
 def turn_about_axis(
     similarity: Similarity, axis: Float64[np.ndarray, " 3"], pivot: Float64[np.ndarray, " 3"], prior: DirectionPrior
 ) -> Similarity:
-    """Turn the target side about an axis through a pivot so that the prior's directions agree best."""
+    """Rotate a similarity's target side about an axis through a pivot to agree best with the prior's directions."""
     across = np.eye(3) - np.outer(axis, axis)
     have, want = prior.source @ similarity.rotation.T @ across, prior.target @ across
     angle = math.atan2(float((np.cross(have, want) @ axis).sum()), float((have * want).sum()))
@@ -155,9 +156,9 @@ def turn_about_axis(
 
 @dataclass(frozen=True)
 class _Problem:
-    """Least squares about a similarity: unknowns are a rotation vector, the scale's logarithm, the translation.
+    """Least squares linearized at a similarity: unknowns are a rotation vector, the log scale and the translation.
 
-    Coordinates are taken from the points' mean, which keeps the unknowns apart.
+    Coordinates are relative to the points' mean, which decorrelates the unknowns.
     """
 
     points: Correspondences
@@ -165,27 +166,30 @@ class _Problem:
 
     @property
     def arms(self) -> Float64[np.ndarray, "n 3"]:
-        """From the mean to each transformed point."""
+        """Vectors from the mean to each transformed point."""
         source = self.points.source
         return np.asarray(self.similarity.scale * ((source - source.mean(axis=0)) @ self.similarity.rotation.T))
 
     def jacobian(self) -> Float64[np.ndarray, "n 3 7"]:
-        """Of the transformed points."""
+        """The Jacobian of the transformed points with respect to the unknowns."""
         return similarity_jacobian(self.similarity, self.points.source)
 
     def moved(self, step: Float64[np.ndarray, " 7"]) -> Similarity:
-        """The similarity after a step of the unknowns."""
+        """The similarity after a step in the unknowns."""
         return moved_similarity(self.similarity, self.points.source, step)
 
 
 def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tuple[SimilarityFit, InlierLimit]:
-    """The fit of the least limit that does not cut into the noise which it shows, with half of the points or more.
+    """The fit with the smallest inlier limit that does not cut into the noise and keeps at least half of the points.
 
-    A limit below the noise leaves points within it, spread up to it; their spread, counted by the degrees of freedom
-    that the fit leaves, says so. From some times the noise on, what is outside is no noise.
+    If the limit is below the noise, the inliers spread right up to it, which shows in their spread over the fit's
+    degrees of freedom. Beyond several times the noise, what lies outside the limit is not noise.
+
+    Returns:
+        The fit, and its limit in stated sigmas.
     """
     limit = InlierLimit(OUTLIER_SIGMAS, of_sigmas=True)
-    # Errors of all sizes have no noise that half of them share; a limit as wide as the target tells nothing.
+    # Errors of all sizes share no common noise level; a limit as wide as the target says nothing.
     widest = float(normed(points.target - points.target.mean(axis=0), points).max())
     while True:
         fit = _refine(_consensus(points, limit, hypotheses), points, limit, None)
@@ -199,7 +203,7 @@ def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tupl
 
 
 def _hypotheses(points: Correspondences) -> list[Similarity]:
-    """Similarities of triples, and of all points; accurate points count more."""
+    """Similarities fitted to triples and, last, to all points; accurate points count more."""
     weights = (np.median(points.sigmas) / points.sigmas).mean(axis=1) ** 2
     triples = _triples(points)
     found = fit_similarity(points.source[triples], points.target[triples], weights[triples])
@@ -227,7 +231,7 @@ def _consensus(points: Correspondences, limit: InlierLimit, hypotheses: list[Sim
 
 
 def _costs(points: Correspondences, limit: InlierLimit, hypotheses: list[Similarity]) -> Float64[np.ndarray, " h"]:
-    """The squares of the residuals, cut off at the limit; what groups share is taken off as their medians."""
+    """Sums of squared residuals truncated at the limit; groups' shared errors are removed as medians."""
     turned = np.stack([hypothesis.scale * hypothesis.rotation for hypothesis in hypotheses])
     residuals = np.einsum("hij,nj->hni", turned, points.source) - points.target
     residuals += np.stack([hypothesis.translation for hypothesis in hypotheses])[:, None]
@@ -242,7 +246,7 @@ def _costs(points: Correspondences, limit: InlierLimit, hypotheses: list[Similar
 def _refine(
     start: Similarity, points: Correspondences, limit: InlierLimit, prior: DirectionPrior | None
 ) -> SimilarityFit:
-    """Reweighted least squares on the points near the fit, until these stay the same."""
+    """Reweighted least squares on the points near the fit, until the inliers no longer change."""
     similarity = start
     settled = points.without(_median_offsets(start, points))
     inliers = limit.near(_residuals(start, settled), points)
@@ -277,7 +281,7 @@ def _refine(
 def _reweighted(
     similarity: Similarity, points: Correspondences, prior: DirectionPrior | None
 ) -> tuple[Similarity, float, Float64[np.ndarray, "g 3"]]:
-    """Gauss-Newton with Cauchy's weights at the residuals' own spread; returns the noise and the offsets, too."""
+    """Gauss-Newton with Cauchy weights scaled by the residuals' spread; also returns the noise and the offsets."""
     noise = 1.0
     offsets = _median_offsets(similarity, points)
     stated = points
@@ -304,7 +308,7 @@ def _reweighted(
 def _information(
     problem: _Problem, weights: Float64[np.ndarray, "n 3"], prior: DirectionPrior | None
 ) -> Float64[np.ndarray, "7 7"]:
-    """The normal matrix: points by their weights, the prior by its sigma, shared errors eliminated."""
+    """The normal matrix: points weighted, the prior added with its sigma, shared errors eliminated."""
     jacobian = problem.jacobian()
     information = np.einsum("nkp,nk,nkq->pq", jacobian, weights, jacobian)
     shared = problem.points.shared
@@ -319,7 +323,7 @@ def _information(
 
 
 def _weakest_rotation(information: Float64[np.ndarray, "7 7"]) -> tuple[float, Float64[np.ndarray, " 3"]]:
-    """Standard deviation and axis of the least determined rotation, whatever scale and translation are."""
+    """Standard deviation and axis of the least determined rotation, with scale and translation marginalized."""
     others = np.linalg.pinv(information[3:, 3:], hermitian=True)
     left = information[:3, :3] - information[:3, 3:] @ others @ information[3:, :3]
     values, vectors = np.linalg.eigh((left + left.T) / 2.0)
@@ -335,7 +339,7 @@ def _sigma_scale(information: Float64[np.ndarray, "7 7"]) -> float:
 
 
 def _triples(points: Correspondences) -> np.ndarray:
-    """Of all points; where groups share errors, half within groups, which these errors leave alone."""
+    """Triples of all points; with shared errors, half are drawn within groups, where these errors cancel."""
     everyone = np.arange(len(points))
     if points.shared is None:
         return _triples_of(everyone, MAX_HYPOTHESES)
@@ -364,7 +368,7 @@ def _residuals(similarity: Similarity, points: Correspondences) -> Float64[np.nd
 
 
 def _median_offsets(similarity: Similarity, points: Correspondences) -> Float64[np.ndarray, "g 3"]:
-    """The error that each group shares, as the median of its points' (target less transformed source)."""
+    """The error that each group shares, as the median over its points of target minus transformed source."""
     if points.shared is None:
         return np.zeros((0, 3))
     errors = -_residuals(similarity, points)
@@ -379,7 +383,7 @@ def _median_offsets(similarity: Similarity, points: Correspondences) -> Float64[
 def _offsets(
     similarity: Similarity, points: Correspondences, weights: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "g 3"]:
-    """The same by least squares, drawn to zero by the groups' sigmas."""
+    """The same by least squares, pulled towards zero by the groups' sigmas."""
     if points.shared is None:
         return np.zeros((0, 3))
     membership = points.shared.membership()

@@ -1,13 +1,13 @@
-"""A pinhole view, and the frames that the whole project uses.
+"""Pinhole cameras, and the frames that the whole project uses.
 
 Frames, stated once:
 
-- Camera: OpenCV's and COLMAP's, x right, y down, z forward.
-- Pixels: the centre of the first pixel is (0.5, 0.5), COLMAP's convention; OpenCV's keypoints need half a pixel more.
-- Rotations: quaternions are (w, x, y, z), Hamilton's.
+- Camera: as in OpenCV and COLMAP, x right, y down, z forward.
+- Pixels: the centre of the first pixel is (0.5, 0.5), COLMAP's convention; OpenCV keypoints need half a pixel added.
+- Rotations: quaternions are (w, x, y, z), Hamilton convention.
 - Poses: ``cam_from_world``; names read right to left, ``x_cam = cam_from_world @ x_world``.
-- World: up to georeferencing the normalised frame of the sparse model; after it local east, north, up in metres about
-  an origin kept in float64.
+- World: before georeferencing, the normalised frame of the sparse model; afterwards local east, north, up in metres
+  about an origin kept in float64.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from jaxtyping import Float64, Int64
 
 @dataclass(frozen=True)
 class Window:
-    """Where a part lies in the whole picture that it was cut from.
+    """Position of a crop within the full image that it was cut from.
 
     Attributes:
-        left: The whole picture's column that is the part's first.
-        top: The whole picture's row that is the part's first.
-        whole_width: Of the whole picture, pixels.
-        whole_height: Of the whole picture, pixels.
+        left: Column of the full image where the crop starts, pixels.
+        top: Row of the full image where the crop starts, pixels.
+        whole_width: Width of the full image, pixels.
+        whole_height: Height of the full image, pixels.
     """
 
     left: int
@@ -38,7 +38,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Camera:
-    """A photo's pinhole camera and where it stood.
+    """A photo's pinhole camera and its pose.
 
     Attributes:
         name: The image's name in its dataset, POSIX form.
@@ -49,7 +49,7 @@ class Camera:
         cx: Principal point x, pixels; the middle of the image is ``width / 2``.
         cy: Principal point y, pixels.
         cam_from_world: Rigid transform, world units.
-        window: Where this lies in a whole picture that it is a part of; None for a whole picture.
+        window: Where this crop lies in its full image; None for a full image.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Camera:
             height: New height, pixels.
 
         Raises:
-            ValueError: for a part of a picture, whose pixels would not fall on those of the whole.
+            ValueError: for a crop, whose pixels would not coincide with those of the full image.
         """
         if self.window is not None:
             raise ValueError(f"{self.name}: a part of a picture cannot be resampled, scale the whole and cut it")
@@ -94,19 +94,19 @@ class Camera:
         )
 
     def cut(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The view of a part of the picture: what it shows is what the whole shows there.
+        """The camera of a crop of the image, pixel for pixel the same view.
 
         Args:
-            left: First column of the part, in this picture's pixels.
+            left: First column of the crop, in this image's pixels.
             top: First row.
-            width: Its columns, at least 1.
-            height: Its rows, at least 1.
+            width: Number of columns, at least 1.
+            height: Number of rows, at least 1.
 
         Returns:
-            The part, which knows the whole picture; that itself where the part is all of it.
+            The crop's camera, with its window in the full image; this camera itself if the crop is all of it.
 
         Raises:
-            ValueError: if the part is not inside this picture.
+            ValueError: if the crop is not inside this image.
         """
         if min(left, top) < 0 or min(width, height) < 1 or left + width > self.width or top + height > self.height:
             raise ValueError(f"{width}×{height} from ({left}, {top}) is no part of {self.width}×{self.height} pixels")
@@ -123,7 +123,7 @@ class Camera:
         )
 
     def whole(self) -> Camera:
-        """The whole picture's view; itself where it is whole."""
+        """The camera of the full image; this camera itself if it is not a crop."""
         part = self.window
         if part is None:
             return self
@@ -137,7 +137,7 @@ class Camera:
         )
 
     def depths(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """Depths of world points along the view axis, world units; negative behind the camera."""
+        """Depths of world points along the optical axis, world units; negative behind the camera."""
         return np.asarray(points @ self.cam_from_world[2, :3] + self.cam_from_world[2, 3])
 
     def project(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
@@ -150,13 +150,13 @@ class Camera:
         return self.pixels_of(in_camera[:, :2] / in_camera[:, 2:])
 
     def pixels_of(self, rays: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
-        """Pixels of rays, which are x / z and y / z in the camera."""
+        """Pixels of rays given as x / z and y / z in the camera frame."""
         return np.asarray(rays * [self.fx, self.fy] + [self.cx, self.cy])
 
     def in_view(
         self, points: Float64[np.ndarray, "n 3"]
     ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
-        """Which world points lie in front of the camera and in its picture: their rows, their pixels, their depths."""
+        """World points in front of the camera and inside its image: their indices, pixels and depths (world units)."""
         depths = self.depths(points)
         rows = np.flatnonzero((depths > 0.0) & np.isfinite(depths))
         pixels = self.project(points[rows])
@@ -166,19 +166,19 @@ class Camera:
     def unproject(
         self, pixels: Float64[np.ndarray, "n 2"], depths: Float64[np.ndarray, " n"]
     ) -> Float64[np.ndarray, "n 3"]:
-        """World points of pixels at depths along the view axis: what ``project`` brings back to them."""
+        """World points of pixels at depths along the optical axis (world units): the inverse of ``project``."""
         x, y = (pixels - [self.cx, self.cy]).T / np.array([[self.fx], [self.fy]])
         rays = np.stack([x, y, np.ones(len(pixels))], axis=1)
         return np.asarray((rays * depths[:, None] - self.cam_from_world[:3, 3]) @ self.cam_from_world[:3, :3])
 
 
 def reduced_size(width: int, height: int, max_megapixels: float) -> tuple[int, int]:
-    """The largest size of a picture's shape within a limit; its own where that is within already.
+    """The largest size with an image's aspect ratio within a limit; its own size if that is within the limit.
 
     Args:
         width: Pixels.
         height: Pixels.
-        max_megapixels: Of the result, in 10⁶ pixels.
+        max_megapixels: Limit for the result, in 10⁶ pixels.
 
     Returns:
         Width and height, each rounded down so that the result is within the limit, and at least 1.

@@ -1,4 +1,4 @@
-"""Points and directions that are known in two frames, as alignment takes them."""
+"""Points and directions known in two frames, the input of alignment."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-LEAST_NOISE_FACTOR = 0.3  # GNSS errors change slowly: residuals of one flight look better than the positions are
-REDUNDANT = 8  # points from which on the residuals tell the noise better than the stated sigmas do
+LEAST_NOISE_FACTOR = 0.3  # GNSS errors drift slowly: residuals of one flight look better than the positions are
+REDUNDANT = 8  # points; from this many on, the residuals give the noise better than the stated sigmas do
 
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """Errors that points of a group have in common, e.g. those of one flight.
+    """Errors that all points of a group have in common, e.g. those of one flight.
 
     Attributes:
-        group: Of each point; -1 for those that share nothing.
+        group: Group index of each point; -1 for points without a shared error.
         sigmas: Standard deviations of each group's error, in the target's units.
     """
 
@@ -24,7 +24,7 @@ class SharedErrors:
     sigmas: Float64[np.ndarray, "g 3"]
 
     def membership(self) -> Float64[np.ndarray, "g n"]:
-        """1 where a point is of a group, else 0."""
+        """Membership matrix: 1 where a point belongs to a group, else 0."""
         return np.asarray(self.group == np.arange(len(self.sigmas))[:, None], dtype=np.float64)
 
 
@@ -33,10 +33,10 @@ class Correspondences:
     """The same points in two frames.
 
     Attributes:
-        source: In the source frame, any units.
-        target: In the target frame.
-        sigmas: Standard deviations of the target's coordinates, besides what they share.
-        shared: Errors of the target that groups of points share; None without any.
+        source: Coordinates in the source frame, any units.
+        target: Coordinates in the target frame.
+        sigmas: Standard deviations of the target's coordinates, excluding shared errors.
+        shared: Target errors that groups of points share; None if there are none.
     """
 
     source: Float64[np.ndarray, "n 3"]
@@ -48,18 +48,18 @@ class Correspondences:
         return len(self.source)
 
     def only(self, chosen: Bool[np.ndarray, " n"]) -> Correspondences:
-        """Some of them."""
+        """The chosen points."""
         shared = None if self.shared is None else SharedErrors(self.shared.group[chosen], self.shared.sigmas)
         return Correspondences(self.source[chosen], self.target[chosen], self.sigmas[chosen], shared)
 
     def without(self, offsets: Float64[np.ndarray, "g 3"]) -> Correspondences:
-        """The same without what groups have in common, which is taken off their targets."""
+        """A copy with the groups' shared errors subtracted from their targets."""
         if self.shared is None:
             return self
         return replace(self, target=self.target - self.shared.membership().T @ offsets)
 
     def at_noise(self, noise: float) -> Correspondences:
-        """The same where the stated sigmas are wrong by this factor, and those of shared errors are not."""
+        """A copy for stated sigmas that are wrong by this factor while those of shared errors are right."""
         if self.shared is None:
             return self
         return replace(self, shared=replace(self.shared, sigmas=self.shared.sigmas / max(noise, LEAST_NOISE_FACTOR)))
@@ -67,12 +67,12 @@ class Correspondences:
 
 @dataclass(frozen=True)
 class DirectionPrior:
-    """Directions known in both frames, which hold a rotation that points leave free.
+    """Directions known in both frames, which fix a rotation that the points leave free.
 
     Attributes:
-        source: (k, 3) unit vectors.
-        target: (k, 3) unit vectors.
-        sigma_rad: Standard deviation of each.
+        source: (k, 3) unit vectors in the source frame.
+        target: (k, 3) unit vectors in the target frame.
+        sigma_rad: Standard deviation of each direction.
     """
 
     source: Float64[np.ndarray, "k 3"]
@@ -82,29 +82,29 @@ class DirectionPrior:
 
 @dataclass(frozen=True)
 class InlierLimit:
-    """How far points may be from a fit that they agree with.
+    """The largest distance from a fit at which a point counts as an inlier.
 
     Attributes:
-        most: In the target's units, or times the stated sigmas.
-        of_sigmas: Whether it is the latter (root mean square of the three coordinates).
+        most: In the target's units, or in multiples of the stated sigmas.
+        of_sigmas: Whether it is the latter (root mean square over the three coordinates).
     """
 
     most: float
     of_sigmas: bool = False
 
     def squares(self, residuals: Float64[np.ndarray, "h n 3"], points: Correspondences) -> Float64[np.ndarray, "h n"]:
-        """What hypotheses are scored by; accurate points count more."""
+        """Squared residuals by which hypotheses are scored; accurate points count more."""
         if self.of_sigmas:
             return np.asarray(((residuals / points.sigmas) ** 2).mean(axis=2))
         importance = np.median(points.sigmas) / points.sigmas
         return np.asarray(((residuals * importance) ** 2).sum(axis=2))
 
     def near(self, residuals: Float64[np.ndarray, "n 3"], points: Correspondences) -> Bool[np.ndarray, " n"]:
-        """Which points agree."""
+        """Which points are inliers."""
         far = normed(residuals, points) if self.of_sigmas else np.linalg.norm(residuals, axis=1)
         return np.asarray(far <= self.most)
 
 
 def normed(residuals: Float64[np.ndarray, "n 3"], points: Correspondences) -> Float64[np.ndarray, " n"]:
-    """Residuals over their sigmas, root mean square of the three coordinates."""
+    """Residuals over their sigmas, root mean square over the three coordinates."""
     return np.asarray(np.sqrt(((residuals / points.sigmas) ** 2).mean(axis=1)))

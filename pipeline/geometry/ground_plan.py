@@ -1,4 +1,4 @@
-"""The ground seen from above in any frame: gravity's plane with two axes of its own, and lines drawn on it."""
+"""Plan view in any frame: the plane normal to gravity with two axes of its own, and lines drawn on it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class GroundPlan:
     """Plan coordinates and heights of points.
 
     Attributes:
-        axes: Unit vectors of the plan's two axes in the points' frame; with ``up`` they are right-handed.
-        up: Against gravity, a unit vector.
+        axes: Unit vectors of the plan's two axes in the points' frame; right-handed with ``up``.
+        up: Unit vector opposite to gravity.
     """
 
     axes: Float64[np.ndarray, "2 3"]
@@ -25,10 +25,10 @@ class GroundPlan:
 
     @staticmethod
     def across(up: Float64[np.ndarray, " 3"]) -> GroundPlan:
-        """The plan of a direction; its axes are as near to the frame's own as they can be.
+        """The plan perpendicular to a direction, with axes as near to the frame's own as possible.
 
         Args:
-            up: Of any length but zero.
+            up: The up direction, of any non-zero length.
         """
         z = np.asarray(up, np.float64) / np.linalg.norm(up)
         least = int(np.argmin(np.abs(z)))  # the frame's axis that lies flattest
@@ -37,12 +37,12 @@ class GroundPlan:
         return GroundPlan(np.stack([x, np.cross(z, x)]), z)
 
     def places(self, points: Float64[np.ndarray, "n 3"]) -> PlanPoints:
-        """Plan coordinates, in the points' units; the same bits of a point among any others, on any threads."""
+        """Plan coordinates, in the points' units; a point's bits depend neither on the others nor on threads."""
         x, y, z = points.T
         return np.stack([a * x + b * y + c * z for a, b, c in self.axes.tolist()], axis=1)
 
     def heights(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """How high points lie, in their units."""
+        """Heights of points along ``up``, in their units."""
         x, y, z = points.T
         a, b, c = self.up.tolist()
         return np.asarray(a * x + b * y + c * z)
@@ -54,11 +54,11 @@ class GroundPlan:
 
 @dataclass(frozen=True)
 class PlanLine:
-    """A straight line between two places of a plan, and the wall of all points above and below it.
+    """A line segment in plan, which stands for the vertical plane through it.
 
     Attributes:
         start: Plan coordinates.
-        end: Plan coordinates; another place.
+        end: Plan coordinates, different from the start.
     """
 
     start: tuple[float, float]
@@ -66,20 +66,20 @@ class PlanLine:
 
     @property
     def length(self) -> float:
-        """Plan units."""
+        """Length in plan units."""
         return math.dist(self.start, self.end)
 
     @property
     def direction(self) -> Float64[np.ndarray, " 2"]:
-        """From start to end, a unit vector."""
+        """Unit vector from start to end."""
         return (np.array(self.end) - self.start) / self.length
 
     def along(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
-        """How far along the line each place lies, 0 at the start, its length at the end."""
+        """Distance of each place along the line: 0 at the start, its length at the end."""
         return np.asarray((places - self.start) @ self.direction)
 
     def beside(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
-        """How far beside the line each place lies, positive on its left."""
+        """Perpendicular distance of each place from the line, positive on its left."""
         x, y = self.direction
         return np.asarray((places - self.start) @ np.array([-y, x]))
 

@@ -1,6 +1,6 @@
-"""The weighted similarity between a model and the world, from control and positions together; and which control is off.
+"""Weighted similarity from model to world, from control and photo positions together; finds blunders in control.
 
-Positions of one flight share an error that control can tell: each flight has an offset of its own.
+Positions of one flight share an error that control reveals, so each flight has its own offset.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ ROUNDS = 50
 TOLERANCE = 1e-12  # of a step, in radians and relative to the extent
 FREE = 1e-13  # an eigenvalue below this, relative to the largest, is rounding
 SIMILARITY = 7
-QUIET = 2.5  # times the stated sigmas: control that agrees so well has nothing to be searched for
+QUIET = 2.5  # times the stated sigmas: control that agrees this well is not searched for blunders
 CRITICAL, CRITICAL_FEW = 4.0, 24.0  # of a studentised residual; a little over Student's t at 1 in 1000, by its degrees
-MOST_PAIRED = 40  # points of which pairs are tried, too
+MOST_PAIRED = 40  # points up to which pairs are tried, too
 LEAST_LEFT = 3
-MOST_SUSPECTS = 100  # points that are tried, those with the largest residuals; one that is off is among them
-MOST_FOUND = 50  # blunders: a file with more has another fault
+MOST_SUSPECTS = 100  # points tried, those with the largest residuals; a blunder is among them
+MOST_FOUND = 50  # blunders: a file with more has some other fault
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class JointObservations:
     """The same points in the model and, as stated, in the world.
 
     Attributes:
-        source: In the model.
-        target: In the world, metres; what has an infinite sigma may be anything finite.
-        sigmas: Standard deviations of the target's coordinates; infinite where it has none.
+        source: Model coordinates.
+        target: World coordinates, metres; any finite value where the sigma is infinite.
+        sigmas: Standard deviations of the target's coordinates; infinite where a coordinate is unknown.
         group: Index of the offset that the target has; -1 for none.
-        is_control: Points that are searched for blunders.
+        is_control: Which points are control and searched for blunders.
     """
 
     source: Float64[np.ndarray, "n 3"]
@@ -50,24 +50,24 @@ class JointObservations:
         return len(self.source)
 
     def only(self, chosen: Bool[np.ndarray, " n"]) -> JointObservations:
-        """Some of them."""
+        """The chosen points."""
         return JointObservations(
             self.source[chosen], self.target[chosen], self.sigmas[chosen], self.group[chosen], self.is_control[chosen]
         )
 
     @property
     def weights(self) -> Float64[np.ndarray, "n 3"]:
-        """Of the coordinates."""
+        """Inverse variances of the target's coordinates."""
         return np.asarray(1.0 / self.sigmas**2)
 
 
 @dataclass(frozen=True)
 class Priors:
-    """What else holds the fit.
+    """Further constraints on the fit.
 
     Attributes:
-        offset_sigmas: Of each group's offset about zero, metres.
-        direction: Where the points leave a rotation free.
+        offset_sigmas: Standard deviations of each group's offset about zero, metres.
+        direction: For a rotation that the points leave free.
     """
 
     offset_sigmas: Float64[np.ndarray, "k 3"]
@@ -80,12 +80,12 @@ class JointFit:
 
     Attributes:
         similarity: World from model.
-        offsets: Of the groups: stated less true.
-        covariance: Of rotation vector, logarithm of the scale, translation at ``mean``, offsets; for right sigmas.
-        mean: In the model, the point that translations are taken at.
-        residuals: Transformed, with the offset, less the stated target; metres.
-        noise: Of the control's residuals over their sigmas; 1 where these are right, 0 without redundancy.
-        degrees: Of freedom of that.
+        offsets: Offset of each group, stated minus true, metres.
+        covariance: Of rotation vector, log scale, translation at ``mean`` and offsets, assuming the sigmas are right.
+        mean: Model point at which the translation is taken.
+        residuals: Transformed points plus offsets minus the stated target, metres.
+        noise: Spread of the control's residuals over their sigmas; 1 where these are right, 0 without redundancy.
+        degrees: Degrees of freedom of the noise.
     """
 
     similarity: Similarity
@@ -97,19 +97,19 @@ class JointFit:
     degrees: int
 
     def sigmas_at(self, source: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 3"]:
-        """Standard deviations of points that the fit takes into the world."""
+        """Standard deviations of model points transformed to the world by this fit, metres."""
         jacobian = _jacobian(self.similarity, source, self.mean)
         variances = np.einsum("nkp,pq,nkq->nk", jacobian, self.covariance[:SIMILARITY, :SIMILARITY], jacobian)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
 def fit_jointly(start: Similarity, observed: JointObservations, priors: Priors) -> JointFit:
-    """Weighted least squares of a similarity and the groups' offsets (Gauss-Newton).
+    """Fit a similarity and the groups' offsets by weighted least squares (Gauss-Newton).
 
     Args:
-        start: World from model, near.
+        start: World from model, close to the solution.
         observed: Control and positions.
-        priors: Of the offsets, and perhaps of directions.
+        priors: Priors of the offsets and, optionally, of directions.
     """
     weights = observed.weights
     share = weights.mean(axis=1)
@@ -140,16 +140,16 @@ def fit_jointly(start: Similarity, observed: JointObservations, priors: Priors) 
 
 
 def find_blunders(start: Similarity, observed: JointObservations, priors: Priors, least_m: float) -> tuple[int, ...]:
-    """Control points that contradict the others (data snooping: Baarda 1968, with the others' own noise).
+    """Find control points that contradict the others (data snooping: Baarda 1968, with the others' own noise).
 
-    A point is off where the fit without it misses it by more than the others' noise and number allow. Two at a time
-    are tried as well: a swapped pair hides itself from the search for one.
+    A point is a blunder if the fit without it misses it by more than the others' noise and number allow. Pairs are
+    tried as well: two swapped points cannot be found one at a time.
 
     Args:
         start: As in ``fit_jointly``.
-        observed: Likewise.
-        priors: Likewise.
-        least_m: Points that are off by less are not.
+        observed: As in ``fit_jointly``.
+        priors: As in ``fit_jointly``.
+        least_m: Smallest residual of a blunder, metres.
 
     Returns:
         Indices into ``observed``, sorted.
@@ -170,9 +170,9 @@ def find_blunders(start: Similarity, observed: JointObservations, priors: Priors
 def misfit(
     fit: JointFit, observed: JointObservations, index: int
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
-    """Residual of a point that took no part in a fit, and its standard deviations by the fit's own noise.
+    """Residual of a point that took no part in a fit, and its standard deviations scaled by the fit's noise, metres.
 
-    A coordinate that is not known has residual 0.
+    An unknown coordinate has residual 0.
     """
     known = np.isfinite(observed.sigmas[index])
     residual = fit.similarity.apply(observed.source[index][None])[0] - observed.target[index]
@@ -186,14 +186,14 @@ def studentised(residual: Float64[np.ndarray, " 3"], sigmas: Float64[np.ndarray,
 
 
 def critical(degrees: int) -> float:
-    """What a studentised residual has to exceed, by the degrees of freedom of its standard deviation."""
+    """Critical value of a studentised residual, by the degrees of freedom of its standard deviation."""
     return CRITICAL + CRITICAL_FEW / max(degrees, 1)
 
 
 def _worst(
     start: Similarity, observed: JointObservations, priors: Priors, found: Sequence[int], least_m: float
 ) -> list[int]:
-    """The point, or else the two, without which the others agree best, if they are off."""
+    """The point, or else the pair, without which the others agree best; empty if these are not blunders."""
     left = [int(i) for i in np.flatnonzero(observed.is_control) if i not in found]
     for size in (1, 2):
         if len(left) - size < LEAST_LEFT or (size == 2 and len(left) > MOST_PAIRED):
@@ -209,7 +209,7 @@ def _worst(
 
 
 def _suspects(start: Similarity, observed: JointObservations, priors: Priors, left: Sequence[int]) -> list[int]:
-    """The points of the largest residuals, all of them where they are few."""
+    """The points with the largest residuals, or all points where they are few."""
     if len(left) <= MOST_SUSPECTS:
         return list(left)
     others = np.flatnonzero(observed.is_control & ~np.isin(np.arange(len(observed)), left))
@@ -244,7 +244,7 @@ def _noise(residuals: Float64[np.ndarray, "n 3"], observed: JointObservations) -
 def _jacobian(
     similarity: Similarity, source: Float64[np.ndarray, "n 3"], mean: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, "n 3 7"]:
-    """Of transformed points by rotation vector, logarithm of the scale, translation."""
+    """Jacobian of transformed points with respect to rotation vector, log scale and translation."""
     arms = similarity.scale * ((source - mean) @ similarity.rotation.T)
     jacobian = np.zeros((len(arms), 3, SIMILARITY))
     jacobian[:, :, :3] = -cross_matrix(arms)
@@ -276,7 +276,7 @@ def _add_direction(
 
 
 def _inverse(information: Float64[np.ndarray, "p p"]) -> Float64[np.ndarray, "p p"]:
-    """Nothing along a direction that nothing determines; unknowns are brought to one size first."""
+    """Pseudo-inverse, zero along undetermined directions; unknowns are scaled to equal size first."""
     sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
     return np.asarray(
         np.linalg.pinv(information / np.outer(sizes, sizes), rcond=FREE, hermitian=True) / np.outer(sizes, sizes)

@@ -1,4 +1,4 @@
-"""Points through any of COLMAP's lens models, pixel centres at +0.5; ``Camera.project`` is for pinholes."""
+"""Projection through any of COLMAP's lens models, pixel centres at +0.5; ``Camera.project`` is for pinholes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ if TYPE_CHECKING:  # training and rendering do without it
 def project_through_lens(
     camera: pycolmap.Camera, cam_from_world: Float64[np.ndarray, "3 4"], points: Float64[np.ndarray, "n 3"]
 ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
-    """Where a photo shows places.
+    """Project world points into a photo with lens distortion.
 
     Args:
-        camera: Its lens.
-        cam_from_world: Its pose.
-        points: The places, world units.
+        camera: The photo's camera model.
+        cam_from_world: The photo's pose.
+        points: World points, world units.
 
     Returns:
-        Pixels, NaN behind the camera, not finite where the lens model has none; and depths along the view axis.
+        Pixels, NaN behind the camera and not finite where the lens model has no solution; and depths along the optical
+        axis, world units.
     """
     in_camera = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]
     pixels = np.full((len(points), 2), np.nan)

@@ -1,4 +1,4 @@
-"""An area drawn in plan, seen from above: which points lie inside, whatever their heights; and its file."""
+"""An area drawn in plan: which points lie inside, whatever their heights; and its file."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.similarity import Similarity
 
 Ring = Float64[np.ndarray, "_ 2"]
-Polygon = tuple[Ring, ...]  # its outline and its holes, each without its first vertex again at the end
-DIGITS = 9  # of coordinates in the file: a nanometre of a frame in metres
+Polygon = tuple[Ring, ...]  # outline and holes; the first vertex is not repeated at the end
+DIGITS = 9  # decimals of coordinates in the file: a nanometre in a metric frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class PlanArea:
 
     Attributes:
         axes: Unit vectors of the plan's two axes in the points' frame.
-        polygons: In the points' units along these axes. What lies in any of them is inside.
+        polygons: In the points' units along these axes. A point in any of them is inside.
     """
 
     axes: Float64[np.ndarray, "2 3"]
@@ -33,11 +33,11 @@ class PlanArea:
 
     @staticmethod
     def seen_from_above(polygons: Sequence[Polygon]) -> PlanArea:
-        """Polygons of a frame whose third axis is up."""
+        """The area of polygons in a frame whose third axis is up."""
         return PlanArea(np.eye(3)[:2], tuple(polygons))
 
     def contains(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points lie inside; one that is not finite does not."""
+        """Which points lie inside; non-finite points do not."""
         inside = np.zeros(len(points), np.bool_)
         usable = np.flatnonzero(np.isfinite(points).all(axis=1))
         plan = points[usable] @ self.axes.T
@@ -54,19 +54,19 @@ class PlanArea:
         """The same area for points of another frame.
 
         Args:
-            target_from_source: From that frame to this area's.
+            target_from_source: Transform from that frame to this area's.
         """
         offset = self.axes @ target_from_source.translation
         rings = [tuple((ring - offset) / target_from_source.scale for ring in polygon) for polygon in self.polygons]
         return PlanArea(self.axes @ target_from_source.rotation, tuple(rings))
 
     def size(self) -> float:
-        """Sum of the polygons' areas, the holes left out, square units."""
+        """Sum of the polygons' areas without their holes, square units."""
         sizes = [[abs(signed_area(ring)) for ring in polygon] for polygon in self.polygons]
         return float(sum(outline - sum(holes) for outline, *holes in sizes))
 
     def facts(self) -> dict[str, Any]:
-        """As JSON."""
+        """The area as JSON values."""
         rings = [[np.round(ring, DIGITS).tolist() for ring in polygon] for polygon in self.polygons]
         return {"axes": np.round(self.axes, DIGITS + 6).tolist(), "polygons": rings}
 
@@ -75,26 +75,26 @@ class PlanArea:
         """The inverse of ``facts``.
 
         Raises:
-            KeyError, TypeError, ValueError: if it is something else.
+            KeyError, TypeError, ValueError: if the value has another structure.
         """
         rings = [tuple(np.array(r, np.float64).reshape(-1, 2) for r in polygon) for polygon in facts["polygons"]]
         return PlanArea(np.array(facts["axes"], np.float64).reshape(2, 3), tuple(rings))
 
 
 def read_model_area(path: Path | None) -> PlanArea | None:
-    """The area that georef left, in the model's frame; None where no boundary was drawn.
+    """Read the area that georef wrote, in the model's frame; None if no boundary was drawn.
 
     Args:
-        path: The part `georef.boundary`; None where a dataset alone is worked on.
+        path: The part `georef.boundary`; None when there is only a dataset.
 
     Raises:
-        StageError: if it is broken.
+        StageError: if the file is broken.
     """
     return _read(path, "model")
 
 
 def read_world_area(path: Path | None) -> PlanArea | None:
-    """The same in the world frame."""
+    """Read the same area in the world frame."""
     return _read(path, "world")
 
 
@@ -109,21 +109,21 @@ def _read(path: Path | None, frame: str) -> PlanArea | None:
 
 
 def signed_area(ring: Ring) -> float:
-    """Of the shoelace formula: positive where the ring runs anticlockwise."""
+    """Area by the shoelace formula: positive for an anticlockwise ring."""
     x, y = (ring - ring[:1]).T
     return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
 
 
 def _within(plan: Float64[np.ndarray, "n 2"], ring: Ring) -> Bool[np.ndarray, " n"]:
-    """By the even-odd rule: how many edges lie right of a point; the points are sorted by their second coordinate.
+    """Which points lie in a ring, by the even-odd rule: the number of edges right of a point.
 
-    An edge is compared with the points at its height alone, so that the time grows with the points and not with the
-    product of points and vertices.
+    The points are sorted by their second coordinate. An edge is only compared with the points within its extent there,
+    so time grows with the points and not with the product of points and vertices.
     """
     inside = np.zeros(len(plan), np.bool_)
     following = np.roll(ring, -1, axis=0)
     low, high = np.minimum(ring[:, 1], following[:, 1]), np.maximum(ring[:, 1], following[:, 1])
-    first = np.searchsorted(plan[:, 1], low, side="left")  # an edge has its lower end and not its upper one
+    first = np.searchsorted(plan[:, 1], low, side="left")  # an edge includes its lower end, not its upper one
     past = np.searchsorted(plan[:, 1], high, side="left")
     for k in np.flatnonzero(past > first).tolist():
         rows = slice(first[k], past[k])

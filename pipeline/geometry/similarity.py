@@ -1,4 +1,4 @@
-"""Similarities: scale, rotation and translation; and the least-squares one between two sets of points."""
+"""Similarity transforms (scale, rotation, translation) and their least-squares fit between two point sets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-SIMILARITY = 7  # unknowns of a small change: a rotation vector, the scale's logarithm, the place of the points' mean
+SIMILARITY = 7  # unknowns of a small change: a rotation vector, the log scale, the position of the points' mean
 FREE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: its direction is not determined
 
 
@@ -18,8 +18,8 @@ class Similarity:
     """``x_target = scale * rotation @ x_source + translation``.
 
     Attributes:
-        scale: Positive.
-        rotation: (3, 3), proper.
+        scale: Positive scale factor.
+        rotation: (3, 3), proper rotation.
         translation: (3,), in the target's units.
     """
 
@@ -29,15 +29,15 @@ class Similarity:
 
     @staticmethod
     def identity() -> Similarity:
-        """The one that changes nothing."""
+        """The identity transform."""
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
     @staticmethod
     def from_matrix(matrix: Float64[np.ndarray, "4 4"]) -> Similarity:
-        """From a homogeneous matrix.
+        """The similarity of a homogeneous matrix.
 
         Raises:
-            ValueError: if it is no similarity: sheared, mirrored or not finite.
+            ValueError: if it is not a similarity: sheared, mirrored or not finite.
         """
         linear = matrix[:3, :3]
         determinant = float(np.linalg.det(linear)) if np.isfinite(matrix).all() else 0.0
@@ -57,11 +57,11 @@ class Similarity:
         return matrix
 
     def apply(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Points of the source frame in the target frame."""
+        """Transform points from the source to the target frame."""
         return np.asarray(self.scale * (points @ self.rotation.T) + self.translation)
 
     def inverse(self) -> Similarity:
-        """Target to source."""
+        """The transform from target to source."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
@@ -74,7 +74,7 @@ class Similarity:
         )
 
     def camera_pose(self, cam_from_source: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-        """A rigid camera pose with its world changed from the source to the target frame; depths grow by the scale."""
+        """A rigid camera pose relative to the target instead of the source frame; depths grow by the scale."""
         pose = np.eye(4)
         pose[:3, :3] = cam_from_source[:3, :3] @ self.rotation.T
         pose[:3, 3] = self.scale * cam_from_source[:3, 3] - pose[:3, :3] @ self.translation
@@ -106,12 +106,12 @@ def fit_similarity(
 
 
 def rotation_from_vector(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The rotation about a vector by its length in radians."""
+    """The rotation matrix of a rotation vector in radians."""
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def turn_between(have: Float64[np.ndarray, "k 3"], want: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, " 3"]:
-    """Rotation vector of the turn that brings unit vectors to others best, the least one where they leave a choice."""
+    """Rotation vector (radians) that best turns unit vectors into others; the smallest if several are equally good."""
     if len(have) == 1:
         axis = np.cross(have[0], want[0])
         sine, cosine = float(np.linalg.norm(axis)), float(have[0] @ want[0])
@@ -138,9 +138,9 @@ def cross_matrix(vectors: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray
 def similarity_jacobian(
     similarity: Similarity, source: Float64[np.ndarray, "n 3"], about: Float64[np.ndarray, " 3"] | None = None
 ) -> Float64[np.ndarray, "n 3 7"]:
-    """Derivative of the transformed points by a rotation vector, the scale's logarithm and a translation.
+    """Jacobian of the transformed points with respect to a rotation vector, the log scale and a translation.
 
-    Turned and stretched about a place of the source, else the points' mean, which keeps the unknowns apart.
+    Rotation and scale are about the given source point, or else the points' mean, which decorrelates the unknowns.
     """
     middle = source.mean(axis=0) if about is None else about
     arms = similarity.scale * ((source - middle) @ similarity.rotation.T)
@@ -154,7 +154,7 @@ def similarity_jacobian(
 def moved_similarity(
     similarity: Similarity, source: Float64[np.ndarray, "n 3"], step: Float64[np.ndarray, " 7"]
 ) -> Similarity:
-    """The similarity after a step of these unknowns."""
+    """The similarity after a step in the unknowns of ``similarity_jacobian``."""
     mean = source.mean(axis=0)
     centre = similarity.apply(mean[None])[0] + step[4:]
     rotation = rotation_from_vector(step[:3]) @ similarity.rotation
@@ -165,7 +165,7 @@ def moved_similarity(
 def solve_step(
     information: Float64[np.ndarray, "p p"], gradient: Float64[np.ndarray, " p"]
 ) -> Float64[np.ndarray, " p"]:
-    """The step; none along a direction that nothing determines. Unknowns are brought to one size first."""
+    """Solve the normal equations; zero along undetermined directions. Unknowns are scaled to equal size first."""
     sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(sizes, sizes)
     return np.asarray(np.linalg.pinv(scaled, rcond=FREE, hermitian=True) @ (gradient / sizes) / sizes)

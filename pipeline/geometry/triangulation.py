@@ -1,4 +1,4 @@
-"""Points from the rays of photos that show them, of which some may be marked wrongly."""
+"""Robust triangulation of points from marks in photos, some of which may be wrong."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-MAX_PAIRS = 400  # hypotheses of one point; with a third of its marks right, one pair in nine is
+MAX_PAIRS = 400  # hypotheses per point; with a third of its marks right, one pair in nine is right
 ROUNDS = 20
 TOLERANCE = 1e-12  # of a step, relative to the point's depth
 LEAST_PARALLAX_RAD = np.radians(1.0)  # below it the depth is a guess
@@ -19,9 +19,10 @@ class Rays:
     """One point in several photos.
 
     Attributes:
-        cam_from_world: Poses.
-        rays: Undistorted image points, x/z and y/z in the camera.
-        pixels: Derivative of the photo's pixels by them, at the marks: with the lens, as marks err in pixels.
+        cam_from_world: Camera poses.
+        rays: Undistorted image points, x/z and y/z in the camera frame.
+        pixels: Derivative of the photo's pixels with respect to ``rays`` at the marks, including lens distortion,
+            because marks err in pixels.
     """
 
     cam_from_world: Float64[np.ndarray, "n 3 4"]
@@ -32,11 +33,11 @@ class Rays:
         return len(self.rays)
 
     def only(self, chosen: Bool[np.ndarray, " n"]) -> Rays:
-        """Some of them."""
+        """The chosen rays."""
         return Rays(self.cam_from_world[chosen], self.rays[chosen], self.pixels[chosen])
 
     def residuals_px(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 2"]:
-        """Where the photos would show the point less where they do; infinite behind a camera."""
+        """Reprojection errors of a point, projected minus marked; infinite behind a camera."""
         seen = self.cam_from_world[:, :, :3] @ point + self.cam_from_world[:, :, 3]
         ahead = seen[:, 2] > 0.0
         depth = np.where(ahead, seen[:, 2], 1.0)[:, None]
@@ -44,7 +45,7 @@ class Rays:
         return np.where(ahead[:, None], residuals, np.inf)
 
     def jacobian(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 2 3"]:
-        """Of the residuals by the point."""
+        """Jacobian of the residuals with respect to the point."""
         rotations = self.cam_from_world[:, :, :3]
         seen = rotations @ point + self.cam_from_world[:, :, 3]
         in_camera = np.zeros((len(self), 2, 3))
@@ -59,19 +60,19 @@ class Rays:
         return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
     def centres(self) -> Float64[np.ndarray, "n 3"]:
-        """Of the cameras, in the world."""
+        """Projection centres in the world."""
         return np.asarray(-np.einsum("nji,nj->ni", self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]))
 
 
 @dataclass(frozen=True)
 class TriangulatedPoint:
-    """A point and what its rays say of it.
+    """A triangulated point and how its rays agree.
 
     Attributes:
-        xyz: In the world.
-        covariance: Of it, for marks of one pixel.
-        agree: Which rays meet there.
-        residuals_px: Of all of them.
+        xyz: World position.
+        covariance: Covariance of the position for marks with a standard deviation of one pixel.
+        agree: Which rays are inliers.
+        residuals_px: Reprojection errors of all rays.
     """
 
     xyz: Float64[np.ndarray, " 3"]
@@ -81,14 +82,14 @@ class TriangulatedPoint:
 
 
 def triangulate(rays: Rays, tolerance_px: float) -> TriangulatedPoint | None:
-    """The point where most of the rays meet: every pair is a hypothesis, the best is refined on those that agree.
+    """Triangulate the point where most rays meet: pairs are hypotheses, the best is refined on its inliers.
 
     Args:
         rays: At least two.
-        tolerance_px: Rays that miss the point by more take no part.
+        tolerance_px: Rays with a larger reprojection error are left out.
 
     Returns:
-        None where no two rays meet ahead of their cameras at an angle that tells the depth.
+        The point; None if no two rays meet in front of their cameras with enough parallax to fix the depth.
     """
     pairs = list(itertools.combinations(range(len(rays)), 2))
     chosen = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
@@ -108,7 +109,7 @@ def triangulate(rays: Rays, tolerance_px: float) -> TriangulatedPoint | None:
     if agree.sum() < 2:
         return None
     point = _meeting(rays.only(agree))
-    for _ in range(3):  # those that agree with the refined point
+    for _ in range(3):  # recompute the inliers at the refined point
         if point is None:
             return None
         point = _refined(rays.only(agree), point)
@@ -125,7 +126,7 @@ def triangulate(rays: Rays, tolerance_px: float) -> TriangulatedPoint | None:
 
 
 def _meeting(rays: Rays) -> Float64[np.ndarray, " 3"] | None:
-    """The point nearest to the rays; None where they are parallel, head-on or not, or meet behind a camera."""
+    """The point nearest to the rays; None if they are parallel or antiparallel, or meet behind a camera."""
     directions, centres = rays.directions(), rays.centres()
     if np.arccos(np.clip(np.abs(directions @ directions.T), 0.0, 1.0)).max() < LEAST_PARALLAX_RAD:
         return None
@@ -136,7 +137,7 @@ def _meeting(rays: Rays) -> Float64[np.ndarray, " 3"] | None:
 
 
 def _refined(rays: Rays, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
-    """Least squares of the reprojection errors (Gauss-Newton)."""
+    """The point that minimizes the squared reprojection errors (Gauss-Newton)."""
     depth = float(np.linalg.norm(rays.centres() - point, axis=1).min())
     for _ in range(ROUNDS):
         residuals = rays.residuals_px(point)

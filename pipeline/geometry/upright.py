@@ -1,4 +1,4 @@
-"""Which way is up, and north, by the cameras alone: from how photographers hold them, or from a drone's gimbal."""
+"""Up and north from the cameras alone: from how photographers hold them, or from a drone's gimbal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-# In the stored grid (x right, y down): where the top of the picture is that people are to see, by EXIF orientation.
+# Direction of the displayed image's top in the stored pixel grid (x right, y down), by EXIF orientation.
 TOP_OF_ORIENTATION = {
     1: (0.0, -1.0),
     2: (0.0, -1.0),
@@ -20,13 +20,13 @@ TOP_OF_ORIENTATION = {
     7: (1.0, 0.0),
     8: (1.0, 0.0),
 }
-UPRIGHT_AND_TURNED = (1, 6)  # EXIF orientations that stand for the two ways of holding a camera
-ALIKE = 0.9  # length of the mean of unit vectors within some 25°
-STEADY = 0.997  # within some 4°: a gimbal, which points down better than the ground is level
-PARALLEL = 0.9995  # within some 2°: no hand holds a camera so while its owner walks
-SCATTERED = 0.5  # of vectors that rather cancel
-GRID = 0.3  # spread of the cameras along the picture's height over that along its width, from which on it is a survey
-LEAST_WIDTH = 0.2  # of the fan of the cameras' horizontal axes: narrower, it does not show the plane it lies in
+UPRIGHT_AND_TURNED = (1, 6)  # EXIF orientations for landscape and portrait
+ALIKE = 0.9  # length of the mean of unit vectors within about 25°
+STEADY = 0.997  # within about 4°: a gimbal, which points down better than the ground is level
+PARALLEL = 0.9995  # within about 2°: nobody holds a camera this steady while walking
+SCATTERED = 0.5  # below this, the vectors mostly cancel
+GRID = 0.3  # least spread of the cameras along the image's height, over that along its width, of a survey
+LEAST_WIDTH = 0.2  # of the fan of the cameras' horizontal axes: a narrower one does not determine its plane
 MOST_THICKNESS = 0.35  # of that fan, over its width
 GROUND_POINTS = 5000
 LEAST_GROUND_POINTS = 50
@@ -43,8 +43,8 @@ class CameraAxes:
     """Directions of upright cameras in the model's frame, unit vectors.
 
     Attributes:
-        right: Of the picture that people are to see.
-        up: Its top.
+        right: Towards the right edge of the displayed image.
+        up: Towards its top edge.
         forward: Viewing directions.
     """
 
@@ -55,25 +55,25 @@ class CameraAxes:
 
 @dataclass(frozen=True)
 class UpEstimate:
-    """An estimate of up in the model's frame and, in a few words, what it was taken from."""
+    """An estimate of up in the model's frame (unit vector) and, in a few words, what it is based on."""
 
     up: Float64[np.ndarray, " 3"]
     source: str
 
 
 def display_from_stored(orientation: int) -> Float64[np.ndarray, "3 3"]:
-    """Rotation from the stored grid's camera frame to that of the picture turned by EXIF (mirroring left aside)."""
+    """Rotation from the stored image's camera frame to that of the image turned by EXIF (mirroring is ignored)."""
     top = np.array([*TOP_OF_ORIENTATION.get(orientation, (0.0, -1.0)), 0.0])
     forward = np.array([0.0, 0.0, 1.0])
     return np.stack([np.cross(-top, forward), -top, forward])
 
 
 def camera_axes(cam_from_world: Float64[np.ndarray, "n 3 3"], orientations: Int64[np.ndarray, " n"]) -> CameraAxes:
-    """Axes of the turned pictures in the world.
+    """Axes of the images in the world, turned as EXIF says.
 
     Args:
-        cam_from_world: Rotations of the stored grids.
-        orientations: EXIF's, 1 to 8.
+        cam_from_world: Rotations of the stored images.
+        orientations: EXIF orientations, 1 to 8.
     """
     turns = np.stack([display_from_stored(int(orientation)) for orientation in orientations])
     rows = turns @ cam_from_world
@@ -83,16 +83,16 @@ def camera_axes(cam_from_world: Float64[np.ndarray, "n 3 3"], orientations: Int6
 def up_from_cameras(
     axes: CameraAxes, centres: Float64[np.ndarray, "n 3"], points: Float64[np.ndarray, "m 3"]
 ) -> UpEstimate:
-    """Up by the habit of holding cameras level: their horizontal axes lie in one plane, whatever they look at.
+    """Estimate up from cameras held level: their horizontal axes lie in one plane, whatever they look at.
 
-    Cameras that are all turned alike do not show that plane. Then only the layout of their positions tells cameras that
-    look at a façade from those that look down: a survey spreads along both sides of its pictures. Down is where they
-    look or, when they sway (a kite), across the ground that most of the points lie on.
+    Cameras that all face the same way do not determine that plane. Then only the layout of their positions
+    distinguishes façade views from nadir views: a survey spreads along both image axes. Down is the mean viewing
+    direction or, if the cameras sway (a kite), the normal of the ground plane that most points lie on.
 
     Args:
-        axes: Of the cameras.
-        centres: Their positions in the model.
-        points: The sparse cloud.
+        axes: Axes of the cameras.
+        centres: Camera positions in the model.
+        points: The sparse point cloud.
     """
     mean_up, mean_forward = axes.up.mean(axis=0), axes.forward.mean(axis=0)
     normal, thickness, width = _plane_normal(axes.right)
@@ -116,17 +116,17 @@ def up_without_orientation(
     points: Float64[np.ndarray, "m 3"],
     brighter: Callable[[], Float64[np.ndarray, "n 2"]],
 ) -> UpEstimate:
-    """Up for photos whose EXIF orientation is not known: held upright, or all turned by a quarter in the stored grid.
+    """Estimate up for photos of unknown EXIF orientation: all upright, or all stored with a quarter turn.
 
-    The way of holding them is the one that lays the horizontal axes better into a plane. Of the two quarter turns it is
-    the one whose pictures are brighter at their top. Where neither makes a plane, they count as upright.
+    The orientation chosen is the one whose horizontal axes lie better in one plane; of the two quarter turns, the one
+    whose images are brighter at the top. If neither gives a plane, the photos count as upright.
 
     Args:
-        cam_from_world: Rotations of the stored grids.
-        centres: The cameras' positions in the model.
-        points: The sparse cloud.
-        brighter: Gives the way in which each picture gets brighter, right and down in its stored grid, of any length;
-            asked for only where the photos are turned.
+        cam_from_world: Rotations of the stored images.
+        centres: Camera positions in the model.
+        points: The sparse point cloud.
+        brighter: Returns each image's brightness gradient (right, down in the stored image), of any length; called
+            only if the photos are turned.
     """
     upright, turned = (
         camera_axes(cam_from_world, np.full(len(cam_from_world), orientation)) for orientation in UPRIGHT_AND_TURNED
@@ -150,8 +150,8 @@ def enu_from_gimbal(
 
     Args:
         yaw_deg: Clockwise from north.
-        pitch_deg: 0 level, -90 straight down (then the picture's top points to the yaw).
-        roll_deg: Clockwise seen from behind.
+        pitch_deg: 0 level, -90 straight down (then the image's top points along the yaw).
+        roll_deg: Clockwise seen from behind the camera.
     """
     yaw, pitch, roll = np.radians(yaw_deg), np.radians(pitch_deg), np.radians(roll_deg)
     forward = np.stack([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
@@ -162,7 +162,7 @@ def enu_from_gimbal(
 
 
 def mean_rotation(rotations: Float64[np.ndarray, "n 3 3"]) -> tuple[Float64[np.ndarray, "3 3"], float]:
-    """Robust mean (least sum of chordal distances, by reweighting) and the median angle to it in radians."""
+    """Robust mean rotation (least sum of chordal distances, by reweighting) and the median angle to it in radians."""
     weights = np.ones(len(rotations))
     for _ in range(ROBUST_ROUNDS):
         u, _, vt = np.linalg.svd((weights[:, None, None] * rotations).sum(axis=0))
@@ -174,7 +174,7 @@ def mean_rotation(rotations: Float64[np.ndarray, "n 3 3"]) -> tuple[Float64[np.n
 
 
 def rotation_to_up(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The least rotation that brings a unit vector to +z."""
+    """The smallest rotation that brings a unit vector to +z."""
     cosine = float(up[2])
     if cosine < -1.0 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
@@ -184,11 +184,11 @@ def rotation_to_up(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
 
 
 def _plane_normal(vectors: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarray, " 3"], float, float]:
-    """The plane that unit vectors lie in, robust to some that do not.
+    """Robust fit of the plane that unit vectors lie in.
 
     Returns:
-        Its normal; how far the vectors are from it (its thickness) and how far from one line in it (their fan's width):
-        root mean squares, as sines of angles.
+        Its normal; the RMS distance of the vectors from the plane (thickness) and from their main direction in it (the
+        fan's width), both as sines of angles.
     """
     weights = np.ones(len(vectors))
     for _ in range(ROBUST_ROUNDS):
@@ -200,10 +200,10 @@ def _plane_normal(vectors: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarr
 def _is_survey(
     centres: Float64[np.ndarray, "n 3"], mean_up: Float64[np.ndarray, " 3"], mean_forward: Float64[np.ndarray, " 3"]
 ) -> bool:
-    """Whether cameras that look one way spread along both sides of their pictures.
+    """Whether cameras that face the same way spread along both axes of their images.
 
-    Those that rather spread where they look are of a walk, unless they are as alike as a gimbal alone keeps them: on a
-    mast, or hovering.
+    If they spread mostly along the viewing direction, it is a walk, unless they are as parallel as only a gimbal keeps
+    them: on a mast, or hovering.
     """
     up, forward = _unit(mean_up), _unit(mean_forward)
     along_up, along_right, ahead = (float(np.std(centres @ axis)) for axis in (up, np.cross(forward, up), forward))
@@ -214,7 +214,7 @@ def _is_survey(
 def _ground_normal(
     points: Float64[np.ndarray, "m 3"], centres: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " 3"] | None:
-    """Normal of the plane that holds most points, by RANSAC from a fixed seed; None where no plane below holds many."""
+    """Upward normal of the plane with most points, by RANSAC from a fixed seed; None if no plane has enough."""
     if len(points) < LEAST_GROUND_POINTS:
         return None
     generator = np.random.Generator(np.random.PCG64(0))

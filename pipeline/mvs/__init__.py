@@ -1,1 +1,1 @@
-"""Depths of photos by many views."""
+"""Multi-view stereo: depth maps and dense points from photos."""

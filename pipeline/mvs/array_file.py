@@ -1,4 +1,4 @@
-"""Arrays in a file, as work under way is kept: there whole or not at all, however a process ends."""
+"""Array files for work in progress: complete or absent, however a process ends."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from splatpipe.pipeline.engine.durable import write_durably
 
 
 def save_arrays(path: Path, **arrays: np.ndarray) -> None:
-    """Write arrays by their names, for ``np.load``.
+    """Write named arrays for ``np.load``.
 
     Args:
-        path: An `.npz` in a working folder: a killed process leaves an unfinished one beside it.
-        arrays: What it holds.
+        path: An `.npz` in a working folder: a killed process leaves an unfinished file beside it.
+        arrays: The arrays, by name.
 
     Raises:
         OSError: if the disk is full or not writable.

@@ -1,4 +1,4 @@
-"""More points where the sparse cloud is thin: depths by PatchMatch, kept where other photos found the same."""
+"""Extra points where the sparse cloud is thin: PatchMatch depths, kept where other photos confirm them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch, SearchPlan
 from splatpipe.pipeline.photos.dataset import View
 
-MEGAPIXELS = 0.05  # of a photo: most depths good to half a hundredth
-WIDER = 1.25  # times nearer than its sparse points: thin places have no points yet
-NEIGHBOURS = 8  # that a photo is compared with, and whose depths are asked
+MEGAPIXELS = 0.05  # per photo: most depths are accurate to 0.5 %
+WIDER = 1.25  # search this many times nearer than the sparse points: thin places have no points yet
+NEIGHBOURS = 8  # photos that a photo is matched with, and whose depths may confirm its own
 PLAN = SearchPlan(MEGAPIXELS, WIDER, False, NEIGHBOURS, NEIGHBOURS)
-CELLS = 64  # of a photo's width; one with a sparse point in it gets no other
-GROWTH = 2.0 ** (1.0 / 3.0)  # of the voxels, until the points are few enough
+CELLS = 64  # across a photo's width; a cell with a sparse point gets no dense one
+GROWTH = 2.0 ** (1.0 / 3.0)  # factor by which voxels grow until the points are few enough
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class DensePoints:
     Attributes:
         xyz: Positions, world units.
         rgb: Colours.
-        scores: How sure each is, higher is surer.
-        spacing: Size of a photo's cell at each, world units.
+        scores: Confidence of each point; higher is better.
+        spacing: Size of a photo's cell at each point, world units.
     """
 
     xyz: Float64[np.ndarray, "n 3"]
@@ -45,17 +45,17 @@ class DensePoints:
         return len(self.xyz)
 
     def select(self, rows: Int64[np.ndarray, " k"]) -> DensePoints:
-        """Those rows of it."""
+        """The points of these rows."""
         return DensePoints(self.xyz[rows], self.rgb[rows], self.scores[rows], self.spacing[rows])
 
 
 @dataclass(frozen=True)
 class PointBudget:
-    """How the points are spread.
+    """How many points to keep, and where.
 
     Attributes:
-        most: At most so many, evenly.
-        inside: Which places count; as many again are left where none does. None where all do.
+        most: Maximum number of points, spread evenly.
+        inside: Tells which points lie in the area of interest; up to ``most`` more are kept outside. None: no area.
     """
 
     most: int
@@ -65,15 +65,15 @@ class PointBudget:
 def dense_points(
     dataset: Path, views: Sequence[View], cover: PointBudget, folder: Path, threads: int, report: Reporter
 ) -> DensePoints:
-    """Points on surfaces where the sparse model has few; the same for any number of threads.
+    """Points on surfaces where the sparse model has few; identical for any number of threads.
 
     Args:
-        dataset: The folder that `undistort` left.
-        views: Photos to use, in name order; none that are held out.
-        cover: How they are spread.
-        folder: Where there is room for a megabyte a photo meanwhile.
-        threads: Photos at a time where depths are compared, and the kernel's.
-        report: Told of progress.
+        dataset: The folder that `undistort` wrote.
+        views: Photos to use, in name order; no held-out views.
+        cover: How many points to keep, and where.
+        folder: Folder for temporary files, with room for a megabyte per photo.
+        threads: Photos compared in parallel, and threads of the kernel.
+        report: Receives progress.
 
     Raises:
         StageError: if the model or a photo cannot be read.
@@ -101,7 +101,7 @@ def _joined(parts: Sequence[DensePoints]) -> DensePoints:
 
 
 def _agreed(search: DepthSearch, number: int) -> DensePoints | None:
-    """One point for each cell of a photo that has no sparse one: the surest of those that other photos confirm."""
+    """The most confident confirmed point for each cell of a photo without a sparse point."""
     agreement = search.agreement(number)
     if agreement is None:
         return None
@@ -121,21 +121,21 @@ def _agreed(search: DepthSearch, number: int) -> DensePoints | None:
 
 
 def _cells(camera: Camera, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Number of the square cell that each pixel lies in."""
+    """Index of the square cell that each pixel lies in."""
     size = camera.width / CELLS
     return np.asarray(np.floor(y / size) * (CELLS + 1) + np.floor(x / size), np.int64)
 
 
 def thinned(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int) -> DensePoints:
-    """The surest point of each voxel without a sparse one; voxels grow until few enough are left.
+    """Keep the most confident point of each voxel without a sparse point; voxels grow until few enough points remain.
 
-    A voxel is about as large as its point's spacing, a power of two times the median's: as wide in the photos far away
-    as near by.
+    A voxel is about as large as its point's spacing, rounded to a power of two times the median spacing, so that it has
+    about the same size in the photos near and far.
 
     Args:
-        points: From all photos.
-        sparse: Points that are there already, world units.
-        most: At most so many are left, at least 1.
+        points: Points from all photos.
+        sparse: Existing points, world units.
+        most: Maximum number of points to keep, at least 1.
     """
     if len(points) == 0:
         return points
@@ -152,8 +152,8 @@ def thinned(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int) 
 def _one_each(
     points: Float64[np.ndarray, "n 3"], sizes: Float64[np.ndarray, " n"], sparse: Float64[np.ndarray, "m 3"]
 ) -> Int64[np.ndarray, " k"]:
-    """Rows of the first point in each voxel that has none of ``sparse`` in it, nor any of a smaller voxel."""
-    origin = points.min(axis=0)  # so that they share one voxel in the end
+    """Rows of the first point in each voxel that holds neither a sparse point nor one kept from a smaller voxel."""
+    origin = points.min(axis=0)  # so that all points end up in one voxel
     taken, kept = sparse, []
     for size in np.unique(sizes):
         rows = np.flatnonzero(sizes == size)

@@ -1,7 +1,7 @@
-"""A depth map for every photo, with how many others confirm each pixel: what surfaces are made from.
+"""A depth map for every photo, with how many others confirm each pixel: the input of all surfaces.
 
-Plain walls and lawns have depths as well: where two other photos found the same, a pixel is right as often as one with
-texture at hand, and without them a third of a garden is missing. Edges are put where the photo has them.
+Plain walls and lawns have depths as well: confirmed by two other photos, such a pixel is right as often as a textured
+one, and without them a third of a garden is missing. Depth edges are moved to where the photo has them.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from splatpipe.pipeline.mvs.edges import pixels_behind
 from splatpipe.pipeline.photos.dataset import View
 
 LIST = "maps.json"
-COMPARED = 16  # neighbours a photo is compared with: strips behind hedges are seen by few, and not by the nearest
-ASKED = 24  # neighbours whose depths are asked: of places that three photos see, 96 % can be confirmed by 20, 39 % by 8
-WIDER = 2.0  # times nearer than sparse points: of a tree's crown before the camera there is none
+COMPARED = 16  # neighbours a photo is matched with: strips behind hedges are seen by few, and not by the nearest
+ASKED = 24  # neighbours that may confirm: of points seen by three photos, 20 can confirm 96 %, 8 only 39 %
+WIDER = 2.0  # search this many times nearer than the sparse points: a treetop close to the camera has none
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """How deep a photo's pixels lie.
+    """Depths of a photo's pixels.
 
     Attributes:
-        depth: Along the camera's z at the pixel's centre, world units; 0 where none is confirmed.
+        depth: Depth along the camera's z at the pixel's centre, world units; 0 where none is confirmed.
         confidence: How many other photos confirm it; 0 where there is no depth.
     """
 
@@ -46,21 +46,21 @@ class DepthMap:
 
 @dataclass(frozen=True, eq=False)
 class DepthMapFile:
-    """A depth map in its file.
+    """A depth map stored in a file.
 
     Attributes:
-        camera: In the map's grid, the model's frame.
-        path: The file.
+        camera: The photo's camera at the map's resolution, in the model's frame.
+        path: Path of the file.
     """
 
     camera: Camera
     path: Path
 
     def load(self) -> DepthMap:
-        """Read it.
+        """Read the depth map.
 
         Raises:
-            StageError: if it is no map of that grid.
+            StageError: if the file is not a depth map of the camera's size.
         """
         try:
             with self.path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
@@ -73,14 +73,14 @@ class DepthMapFile:
 
 
 def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> dict[str, int | float]:
-    """Write maps as they come: `00000.npz` and so on, and `maps.json`, whose they are.
+    """Write depth maps as they arrive: `00000.npz` and so on, and `maps.json`, which lists their photos.
 
     Args:
-        folder: Where; made here.
-        maps: With their cameras.
+        folder: Folder to create.
+        maps: Depth maps with their cameras.
 
     Returns:
-        How many ``maps``, their ``megapixels``, and the share of pixels that have a depth as ``found``.
+        The number of ``maps``, their ``megapixels``, and the share of pixels with a depth as ``found``.
     """
     folder.mkdir()
     told: list[dict[str, str | int]] = []
@@ -96,14 +96,14 @@ def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> di
 
 
 def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[DepthMapFile]:
-    """What ``keep_depth_maps`` left, to be read one by one.
+    """List the depth maps that ``keep_depth_maps`` wrote, to be loaded one by one.
 
     Args:
-        folder: Where.
-        views: The dataset's, with these photos among them.
+        folder: The folder of the maps.
+        views: Views of the dataset, which include the maps' photos.
 
     Raises:
-        StageError: if they are not there.
+        StageError: if the maps are missing.
     """
     cameras = {view.camera.name: view.camera for view in views}
     try:
@@ -123,16 +123,18 @@ def _unreadable(name: str) -> StageError:
 def find_depth_maps(
     dataset: Path, views: Sequence[View], megapixels: float, folder: Path, threads: int, report: Reporter
 ) -> Iterator[tuple[Camera, DepthMap]]:
-    """The depth maps of photos, in the model's frame, in the order of the views; the same for any number of threads.
+    """Estimate the depth maps of photos by PatchMatch; identical for any number of threads.
 
     Args:
-        dataset: The folder that `undistort` left.
+        dataset: The folder that `undistort` wrote.
         views: Photos to use, in name order.
-        megapixels: Of a map at most.
-        folder: Where there is room for 9 bytes a pixel of all maps meanwhile; what a killed run left there is gone on
-            from.
-        threads: Photos at a time, and the kernel's.
-        report: Told of progress.
+        megapixels: Maximum size of a map.
+        folder: Folder for temporary files, with room for 9 bytes per pixel of all maps; a killed run resumes from it.
+        threads: Photos in parallel, and threads of the kernel.
+        report: Receives progress.
+
+    Yields:
+        Camera and depth map of each view, in order, in the model's frame.
 
     Raises:
         StageError: if the model or a photo cannot be read.
@@ -145,7 +147,7 @@ def find_depth_maps(
 
 
 def _with_edges(search: DepthSearch, numbered: tuple[int, tuple[Camera, DepthMap]]) -> tuple[Camera, DepthMap]:
-    """A map whose edges lie where its photo has them."""
+    """Move a map's depth edges to where its photo has them."""
     number, (camera, found) = numbered
     rows, columns, depth = pixels_behind(found.depth, search.colours(number))
     found.depth[rows, columns] = depth
@@ -156,13 +158,16 @@ def _with_edges(search: DepthSearch, numbered: tuple[int, tuple[Camera, DepthMap
 def confirmed_maps(
     cameras: Sequence[Camera], agreement: Callable[[int], ConfirmedDepths | None], threads: int, report: Reporter
 ) -> Iterator[tuple[Camera, DepthMap]]:
-    """Photos' depths that enough others found, too, in the order of the cameras.
+    """Keep the depths of photos that enough other photos confirm, in the order of the cameras.
 
     Args:
-        cameras: In the grids of the maps.
-        agreement: What others say of a photo's depths, by its number; None for a map without any.
-        threads: Photos at a time.
-        report: Told of progress.
+        cameras: Cameras at the maps' resolution.
+        agreement: Returns how other photos confirm a photo's depths, given its index; None for a photo without depths.
+        threads: Photos in parallel.
+        report: Receives progress.
+
+    Yields:
+        Each camera and its depth map.
     """
     maps = ordered_map(lambda number: _confirmed_map(cameras[number], agreement(number)), range(len(cameras)), threads)
     for done, (camera, found) in enumerate(zip(cameras, maps, strict=True), start=1):

@@ -1,6 +1,6 @@
-"""Depths of all photos of a capture, found one by one, and where other photos found the same.
+"""Depth estimation for all photos of a capture, one by one, and their confirmation by other photos.
 
-Photos and depths lie in a folder meanwhile, so that memory holds those of a photo and its neighbours only.
+Photos and depths are kept in a folder, so that only those of a photo and its neighbours are in memory.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.raster.threads import same_bits
 
-AGREEING = 2  # so many have to agree at least
+AGREEING = 2  # other photos that have to agree at least
 TOLERANCE = 0.01  # of the depth, within which two photos agree;
-TOLERANCE_PX = 0.5  # far away as much of it as moves the point so far in the other's photo,
-LOOSEST = 0.2  # of the depth at most
+TOLERANCE_PX = 0.5  # for far points, the share of the depth that moves the point this far in the other photo,
+LOOSEST = 0.2  # but at most this share of the depth
 
 Inverse = Float32[np.ndarray, "_ _"]
 Axes = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]
@@ -39,15 +39,15 @@ Axes = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.nd
 
 @dataclass(frozen=True)
 class ConfirmedDepths:
-    """What other photos say of a photo's depths; a row for each pixel with one.
+    """A photo's depths and how many other photos agree; one entry for each pixel with a depth.
 
     Attributes:
-        rows: Of the pixels.
-        columns: Of the pixels.
+        rows: Rows of the pixels.
+        columns: Columns of the pixels.
         inverse: Inverse depths along the camera's z, 1 / world units.
-        xyz: Mean of the places that the photo and those which agree have found, world units.
+        xyz: Mean of the positions from the photo and from those that agree, world units.
         votes: How many other photos agree.
-        cost: One minus the correlation with the two photos most alike.
+        cost: One minus the correlation with the two best-matching photos.
     """
 
     rows: Int64[np.ndarray, " n"]
@@ -60,14 +60,14 @@ class ConfirmedDepths:
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """How depths are looked for.
+    """Settings of the depth search.
 
     Attributes:
-        megapixels: Of a photo at most.
-        wider: Times nearer than its sparse points that a photo is searched.
-        plain: Whether pixels without texture at hand have depths, too: others have to confirm them.
-        compared: Neighbours that a photo is compared with, 16 at most.
-        asked: Neighbours whose depths are asked whether they agree; no fewer.
+        megapixels: Maximum size of a photo.
+        wider: How many times nearer than its sparse points a photo is searched.
+        plain: Whether pixels without texture get depths, too; others have to confirm them.
+        compared: Neighbours that a photo is matched with, at most 16.
+        asked: Neighbours whose depths may confirm a photo's; at least ``compared``.
     """
 
     megapixels: float
@@ -79,15 +79,15 @@ class SearchPlan:
 
 @dataclass(frozen=True)
 class DepthSearch:
-    """Photos of one size, who is compared with whom, and where what is found lies.
+    """A depth search over a capture: reduced photos, their neighbours, and the folder of the results.
 
     Attributes:
         views: Photos to use, in name order.
-        cameras: Theirs, in the grid that depths are found in.
-        tracks: Which saw which sparse point.
-        near: Neighbours of each that are asked, the best first.
+        cameras: Their cameras at the resolution of the depths.
+        tracks: Which photo observes which sparse point.
+        near: Neighbours of each photo that may confirm its depths, best first.
         folder: Where photos and depths are kept.
-        plan: How they are looked for.
+        plan: Settings of the search.
     """
 
     views: Sequence[View]
@@ -99,13 +99,13 @@ class DepthSearch:
 
     @classmethod
     def begin(cls, dataset: Path, views: Sequence[View], folder: Path, plan: SearchPlan) -> DepthSearch:
-        """A search that has found nothing yet.
+        """Set up a search, without any depths yet.
 
         Args:
-            dataset: The folder that `undistort` left.
+            dataset: The folder that `undistort` wrote.
             views: Photos to use, in name order.
-            folder: Where there is room meanwhile: 9 bytes a pixel.
-            plan: How they are looked for.
+            folder: Folder for temporary files, with room for 9 bytes per pixel.
+            plan: Settings of the search.
 
         Raises:
             StageError: if the model cannot be read.
@@ -115,11 +115,11 @@ class DepthSearch:
         return cls(views, cameras, tracks, neighbours(tracks, cameras, plan.asked), folder, plan)
 
     def run(self, threads: int, report: Reporter) -> None:
-        """Find the depths of every photo that has none in the folder yet; the same for any number of threads.
+        """Estimate depths for every photo without a file in the folder yet; identical for any number of threads.
 
         Args:
-            threads: Photos at a time where they are decoded, and the kernel's.
-            report: Told of progress.
+            threads: Photos decoded in parallel, and threads of the kernel.
+            report: Receives progress.
 
         Raises:
             StageError: if a photo cannot be read.
@@ -138,7 +138,7 @@ class DepthSearch:
             return np.asarray(kept["colour"], np.uint8)
 
     def depths(self, number: int) -> DepthEstimate | None:
-        """What was found in a photo; None for one that has too few neighbours or points."""
+        """The depths estimated for a photo; None if it has too few neighbours or points."""
         path = self._depths_path(number)
         if not path.is_file():
             return None
@@ -146,7 +146,7 @@ class DepthSearch:
             return DepthEstimate(kept["inverse"], kept["cost"])
 
     def inverse(self, number: int) -> Inverse | None:
-        """The inverse depths alone: what a neighbour is asked for."""
+        """A photo's inverse depths alone, which confirm a neighbour's; None if it has too few neighbours or points."""
         path = self._depths_path(number)
         if not path.is_file():
             return None
@@ -154,7 +154,7 @@ class DepthSearch:
             return np.asarray(kept["inverse"], np.float32)
 
     def agreement(self, number: int) -> ConfirmedDepths | None:
-        """What a photo's neighbours say of its depths; None where it has none."""
+        """How a photo's neighbours confirm its depths; None if it has none."""
         return agreement_of(number, self.cameras, self.near[number], (self.depths(number), self.inverse))
 
     def _photo_path(self, number: int) -> Path:
@@ -164,7 +164,7 @@ class DepthSearch:
         return self.folder / f"depths-{number}.npz"
 
     def _keep_photo(self, number: int) -> None:
-        """Make one photo small and keep it: its neighbours ask for it, too."""
+        """Reduce one photo and store it: its neighbours need it, too."""
         if self._photo_path(number).is_file():
             return
         _, colour, mask = small_view(self.views[number], self.plan.megapixels)
@@ -172,7 +172,7 @@ class DepthSearch:
         save_arrays(self._photo_path(number), colour=colour, counts=counts)
 
     def _keep_depths(self, number: int) -> None:
-        """Look at one photo and keep what it found."""
+        """Estimate one photo's depths and store them."""
         if self._depths_path(number).is_file():
             return
         bounds = inverse_depths(self.tracks, number, self.cameras[number], self.plan.wider)
@@ -195,13 +195,14 @@ def agreement_of(
     others: Sequence[int],
     depths: tuple[DepthEstimate | None, Callable[[int], Inverse | None]],
 ) -> ConfirmedDepths | None:
-    """What other photos say of a photo's depths; None where it has none.
+    """How other photos confirm a photo's depths; None if it has none.
 
     Args:
-        number: The photo's.
-        cameras: Of all photos, in the grids of their depths.
-        others: Numbers of those that are asked.
-        depths: The photo's own, and the inverse depths of another one by its number; None where there are none.
+        number: Index of the photo.
+        cameras: Cameras of all photos at the resolution of their depths.
+        others: Indices of the photos that may confirm.
+        depths: The photo's own depths, and a function that returns another photo's inverse depths by its index; None
+            where there are none.
     """
     own, inverse_of = depths
     if own is None:
@@ -226,16 +227,16 @@ def confirm(
     inverse: Float32[np.ndarray, "h w"],
     found: tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]],
 ) -> None:
-    """Ask a camera's own depths for the places of a photo's points.
+    """Check a photo's points against another camera's depths.
 
     Args:
         places: x, y, z of the points, world units.
-        photo: The camera that found them.
-        camera: The one that is asked.
-        inverse: Its inverse depths, 0 where it has none.
-        found: Where it puts them along its rays is added to the first, and a vote to the second, where that is where
-            they are.
+        photo: The camera of the photo that the points come from.
+        camera: The other camera.
+        inverse: The other camera's inverse depths, 0 where it has none.
+        found: Updated in place: where the other camera's depth agrees with a point, the position that it gives is added
+            to the first array, and a vote to the second.
     """
-    parallax = camera.fx * float(np.linalg.norm(camera.centre() - photo.centre()))  # of something one unit deep, pixels
+    parallax = camera.fx * float(np.linalg.norm(camera.centre() - photo.centre()))  # pixels, at a depth of one unit
     agreeing = TOLERANCE, TOLERANCE_PX, LOOSEST, max(parallax, 1e-9)
     _native.confirm(inverse, native_camera(camera), places, agreeing, *found)

@@ -1,7 +1,7 @@
-"""Edges of a depth map, put where the photo has them.
+"""Depth edges, moved to where the photo has them.
 
-Photos are compared by windows, so what is in front has its depth some pixels beyond its edge as well. There the photo
-looks like what lies behind, and that is how deep these pixels are.
+Photos are compared by windows, so a foreground object's depth extends some pixels beyond its edge (edge fattening).
+There the photo has the background's colour, and these pixels get the background's depth.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
-REACH_PX = 3  # beyond its edge a thing is too wide by so much at most
-AROUND_PX = 2 * REACH_PX + 1  # so far both sides are looked at,
-SIGMA_PX = REACH_PX + 1.0  # what is near counting for more
-BEHIND = 0.02  # of the depth: so much further is another thing,
-SAME = 0.01  # and within so much the same
-LEAST_APART = 30.0  # of 441, between the colours of both sides: where they look alike, a pixel tells nothing
-LIKER = 0.7  # times the difference from what is in front, the difference from what is behind at most
+REACH_PX = 3  # the most by which an object's depth extends beyond its edge
+AROUND_PX = 2 * REACH_PX + 1  # radius in which both sides of an edge are sampled,
+SIGMA_PX = REACH_PX + 1.0  # with this Gaussian weight
+BEHIND = 0.02  # of the depth: at least this much farther is another object,
+SAME = 0.01  # and within this much the same object
+LEAST_APART = 30.0  # of 441, between the colours of both sides: where these are alike, a pixel is not decidable
+LIKER = 0.7  # a background pixel's colour difference from the background, over that from the foreground, at most
 
 Pixels = tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]
 Values = Float32[np.ndarray, " n"]
@@ -28,12 +28,12 @@ Colours = Float32[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """What lies around pixels on one side of an edge, a row for each.
+    """Means around pixels on one side of an edge, a row for each pixel.
 
     Attributes:
-        weight: How much of it there is; 0 where there is nothing.
-        colour: Its mean.
-        depth: Its mean.
+        weight: Sum of the weights; 0 where there is nothing on this side.
+        colour: Weighted mean colour, RGB.
+        depth: Weighted mean depth.
     """
 
     weight: Values
@@ -44,14 +44,14 @@ class Side:
 def pixels_behind(
     depth: Float32[np.ndarray, "h w"], colour: UInt8[np.ndarray, "h w 3"]
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Values]:
-    """Pixels before an edge that look like what is behind it rather than like what they are said to belong to.
+    """Find pixels with a foreground depth whose colour is rather the background's.
 
     Args:
-        depth: Along the camera's z; 0 where there is none.
-        colour: What the photo shows, RGB.
+        depth: Depth along the camera's z; 0 where there is none.
+        colour: The photo, RGB.
 
     Returns:
-        Their rows, their columns, and how deep what is behind lies.
+        Rows and columns of the pixels, and the background's depth there.
     """
     reach = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
     at_edge = (depth > 0.0) & (cv2.dilate(depth, reach) > depth * (1.0 + BEHIND))
@@ -69,12 +69,12 @@ def _sides(
     colour: UInt8[np.ndarray, "h w 3"],
     pixels: Pixels,
 ) -> tuple[Side, Side]:
-    """Before and behind the edges beside pixels, within a circle.
+    """Foreground and background around pixels at edges, within a circle.
 
     Args:
-        inner: Depths away from edges: what pixels are said to belong to is looked for there.
-        depth: All depths.
-        colour: RGB.
+        inner: Depths away from edges, from which the foreground is sampled.
+        depth: All depths, from which the background is sampled.
+        colour: The photo, RGB.
         pixels: Rows and columns.
     """
     wide = [(AROUND_PX, AROUND_PX)] * 2
@@ -99,7 +99,7 @@ def _sides(
 
 
 def _around() -> Iterator[tuple[int, int, np.float32]]:
-    """Steps down and right within a circle, and how much what lies there counts."""
+    """Offsets down and right within a circle, and their weights."""
     steps = range(-AROUND_PX, AROUND_PX + 1)
     for down in steps:
         for right in steps:

@@ -1,8 +1,8 @@
-"""Depths found in a photo, and where there are none those of the splat.
+"""Photo depths, with gaps filled from the splat.
 
-Photogrammetry leads wherever it finds something: on the demo its depths scatter half as much as those of the splat,
-which knows more of what is plain or shiny. Its surfaces lie behind the true ones, everywhere by about the same part of
-a pixel, so that is taken off: the photo tells how much it is.
+Photogrammetry takes precedence: on the demo its depths scatter half as much as those of the splat, which covers plain
+and shiny surfaces better. The splat's surfaces lie behind the true ones, everywhere by about the same part of a pixel;
+this offset is estimated from pixels with both depths and subtracted.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import numpy as np
 from splatpipe.pipeline.mvs.depth_maps import DepthMap
 
 LEAST_CONFIDENCE = 5  # of a rendered depth: with fewer, 3 in 4 on plain walls were more than 2 GSD off, else 1 in 8
-SAME = 0.02  # of the depth, within which both mean the same surface
-FEWEST = 1000  # pixels that have both, to tell how far apart they are
+SAME = 0.02  # of the depth, within which both are on the same surface
+FEWEST = 1000  # pixels with both depths needed to estimate the offset
 
 
 def filled(found: DepthMap, rendered: DepthMap) -> DepthMap:
-    """A photo's depths from both sources.
+    """Combine a photo's depths from both sources.
 
     Args:
-        found: In the photo.
-        rendered: From the splat, in the same grid.
+        found: Depths estimated from photos.
+        rendered: Depths rendered from the splat, at the same resolution.
 
     Returns:
-        What was found, as it was, and elsewhere rendered depths that enough photos confirm, nearer by as much as they
-        are farther where both are known.
+        The photo's depths unchanged and, in their gaps, rendered depths that enough photos confirm, moved nearer by the
+        offset between both where both are known.
 
     Raises:
-        ValueError: if the grids differ.
+        ValueError: if the sizes differ.
     """
     if found.depth.shape != rendered.depth.shape:
         raise ValueError(f"depths of {found.depth.shape} and of {rendered.depth.shape} are not of one grid")
@@ -39,7 +39,7 @@ def filled(found: DepthMap, rendered: DepthMap) -> DepthMap:
 
 
 def behind(found: DepthMap, rendered: DepthMap) -> float:
-    """How far rendered depths lie behind those found, as a share of the depth: the median; 0 where few have both."""
+    """Median offset of rendered behind photo depths, as a share of the depth; 0 if few pixels have both."""
     both = (found.confidence > 0) & (rendered.confidence >= LEAST_CONFIDENCE)
     share = rendered.depth[both].astype(np.float64) / found.depth[both] - 1.0
     share = share[np.abs(share) < SAME]

@@ -1,4 +1,4 @@
-"""Which photos see the same, by the sparse points that they share, and how deep each of them has to look."""
+"""Neighbouring photos by shared sparse points, and the depth range to search in each."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 
-BEST_ANGLE_DEG = 10.0  # between two rays: less of it is imprecise, with more of it a place looks unlike
+BEST_ANGLE_DEG = 10.0  # between two rays: a smaller angle is imprecise, with a larger one appearance differs too much
 NARROW_DEG = 4.0  # spread of the weight below the best angle
 WIDE_DEG = 10.0  # and above
-LEAST_SHARED = 8  # points; two photos with fewer overlap by chance or by an edge
-LEAST_POINTS = 20  # a photo with fewer has no range of depths to trust
+LEAST_SHARED = 8  # points; two photos with fewer overlap by chance or only at an edge
+LEAST_POINTS = 20  # a photo with fewer has no reliable depth range
 PERCENTILES = (1.0, 99.0)  # of the depths: the few wrong points lie outside
-DEEPEST = 1000.0  # the far end over the near one at most, whatever the points say
-FARTHER = 10.0  # times farther than the farthest: of hills and trees behind, few points tell; a few planes more
+DEEPEST = 1000.0  # maximum ratio of far to near end
+FARTHER = 10.0  # times farther than the farthest points: hills and trees behind have few; costs only a few more planes
 
 
 @dataclass(frozen=True)
 class SparseVisibility:
-    """Which view saw which sparse point.
+    """Which view observes which sparse point.
 
     Attributes:
         xyz: Positions of all points, world units, in the order of their ids.
-        seen: For each view the rows of the points that it saw, ascending.
+        seen: For each view the rows of the points that it observes, ascending.
     """
 
     xyz: Float64[np.ndarray, "n 3"]
@@ -36,11 +36,11 @@ class SparseVisibility:
 
 
 def load_tracks(dataset: Path, names: Sequence[str]) -> SparseVisibility:
-    """The finite sparse points of a dataset and the views that saw them.
+    """Load a dataset's sparse points and which of the finite ones each view observes.
 
     Args:
-        dataset: The folder that `undistort` left.
-        names: Of the views wanted, in the order wanted.
+        dataset: The folder that `undistort` wrote.
+        names: Names of the views, in the order wanted.
 
     Raises:
         StageError: if the model is broken.
@@ -51,19 +51,19 @@ def load_tracks(dataset: Path, names: Sequence[str]) -> SparseVisibility:
 
 
 def neighbours(tracks: SparseVisibility, cameras: Sequence[Camera], most: int) -> list[list[int]]:
-    """For each view the others to compare it with, the best first.
+    """For each view, the indices of the views to match it with, best first.
 
-    A shared point counts the more, the nearer the angle between its two rays is to ``BEST_ANGLE_DEG`` (the shape of the
-    weight is that of Yao et al., "MVSNet", ECCV 2018, section 4.1; its constants are ours).
+    A shared point counts more the nearer the angle between its two rays is to ``BEST_ANGLE_DEG`` (the weight has the
+    shape of Yao et al., "MVSNet", ECCV 2018, section 4.1; its constants are ours).
 
     Args:
-        tracks: Of the same views.
-        cameras: Theirs.
-        most: At most so many neighbours a view.
+        tracks: Sparse points of the same views.
+        cameras: Cameras of the views.
+        most: Maximum number of neighbours per view.
     """
     views = np.concatenate([np.full(rows.size, view) for view, rows in enumerate(tracks.seen)] or [np.zeros(0, int)])
     rows = np.concatenate([*tracks.seen, np.zeros(0, np.int64)])
-    order = np.argsort(rows, kind="stable")  # all observations of a point lie together
+    order = np.argsort(rows, kind="stable")  # groups all observations of a point
     views, begins = views[order], np.searchsorted(rows[order], np.arange(len(tracks.xyz) + 1))
     centres = np.array([camera.centre() for camera in cameras]).reshape(-1, 3)
     found = []
@@ -84,7 +84,7 @@ def neighbours(tracks: SparseVisibility, cameras: Sequence[Camera], most: int) -
 def _angle_weights(
     points: Float64[np.ndarray, "n 3"], one: Float64[np.ndarray, " 3"], others: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, " n"]:
-    """How well two camera centres see a point between them, 0 to 1."""
+    """Weight of each point by the angle between the rays from two camera centres, 0 to 1."""
     a, b = one - points, others - points
     across = np.linalg.norm(np.cross(a, b), axis=1)
     angle = np.degrees(np.arctan2(across, (a * b).sum(axis=1)))
@@ -93,16 +93,16 @@ def _angle_weights(
 
 
 def inverse_depths(tracks: SparseVisibility, view: int, camera: Camera, wider: float) -> tuple[float, float] | None:
-    """The range of inverse depths to look at: that of the view's own points, a little nearer and much farther.
+    """The range of inverse depths to search: that of the view's own points, a little nearer and much farther.
 
     Args:
-        tracks: Of all views.
-        view: Its number.
-        camera: Its own.
-        wider: Times nearer than the nearest points.
+        tracks: Sparse points of all views.
+        view: Index of the view.
+        camera: The view's camera.
+        wider: How many times nearer than the nearest points to search.
 
     Returns:
-        Smallest and largest, in 1 / world units, both above 0; None where the view has too few points.
+        Smallest and largest inverse depth, in 1 / world units, both above 0; None if the view has too few points.
     """
     pose = camera.cam_from_world
     depths = tracks.xyz[tracks.seen[view]] @ pose[2, :3] + pose[2, 3]

@@ -1,8 +1,9 @@
-"""Depths of a photo by PatchMatch: a plane for every pixel, spread where it fits, from coarse to fine.
+"""Depths of a photo by PatchMatch: a plane for every pixel, propagated where it fits, from coarse to fine.
 
-At a quarter of the size planes begin at random, and those that fit spread (Barnes et al., "PatchMatch", SIGGRAPH 2009,
-for depths Bleyer et al., BMVC 2011, and Galliani et al., "Gipuma", ICCV 2015). Each finer size begins with the planes
-of the one before, which leaves it little to do. What one photo finds is a guess: only what others find, too, counts.
+At a quarter of the size, planes start at random, and those that fit are propagated (Barnes et al., "PatchMatch",
+SIGGRAPH 2009; for depths Bleyer et al., BMVC 2011, and Galliani et al., "Gipuma", ICCV 2015). Each finer size starts
+with the planes of the one before, so it has little left to do. A single photo's depths are only candidates until other
+photos confirm them.
 """
 
 from __future__ import annotations
@@ -17,20 +18,20 @@ from jaxtyping import Float32
 from splatpipe.pipeline.mvs.picture import Picture, relative
 from splatpipe.pipeline.raster import _native
 
-ITERATIONS = (6, 3, 1)  # from the coarsest size, each half as large as the next; beyond the last size one each
-BEGUN = (0, 1, 4)  # how often planes were changed less before: a larger photo's are nearly right
-LEAST_SIDE = 24  # pixels of a photo below which it is not halved again
-ALIKE = 0.5  # cost of the two photos most alike, up to which there is a depth
-FAR_END = 2.0  # times the smallest inverse depth; what is farther is at no distance: clouds
+ITERATIONS = (6, 3, 1)  # from the coarsest size; each size is half the next
+BEGUN = (0, 1, 4)  # how often the perturbation was already reduced: the planes of larger sizes are nearly right
+LEAST_SIDE = 24  # pixels; a photo is not halved below this
+ALIKE = 0.5  # cost for the two best-matching photos up to which there is a depth
+FAR_END = 2.0  # times the smallest inverse depth; anything farther has no usable depth: clouds
 
 
 @dataclass(frozen=True, eq=False)
 class DepthEstimate:
-    """What a photo's pixels are told.
+    """Estimated depths of a photo.
 
     Attributes:
         inverse: Inverse depth along the camera's z, 1 / world units; 0 where none was found.
-        cost: One minus the correlation with the two photos most alike.
+        cost: One minus the correlation with the two best-matching photos.
     """
 
     inverse: Float32[np.ndarray, "h w"]
@@ -40,14 +41,14 @@ class DepthEstimate:
 def find_depths(
     photo: Picture, others: Sequence[Picture], inverse_range: tuple[float, float], seed: int, plain: bool = False
 ) -> DepthEstimate:
-    """Find the depths of a photo's pixels, on the kernels' threads.
+    """Estimate the depths of a photo's pixels, on the kernels' threads.
 
     Args:
         photo: The photo.
-        others: Its neighbours; with fewer than two nothing is found.
-        inverse_range: Smallest and largest inverse depth.
-        seed: Of the random planes.
-        plain: Whether pixels have depths, too, that have nothing to compare at hand.
+        others: Its neighbours; fewer than two give no depths.
+        inverse_range: Smallest and largest inverse depth, 1 / world units.
+        seed: Seed of the random planes.
+        plain: Whether pixels without texture get depths, too.
     """
     sizes = [(photo, list(others))]
     while len(sizes) < len(ITERATIONS) and min(sizes[-1][0].grey.shape) >= 2 * LEAST_SIDE:
@@ -67,7 +68,7 @@ def find_depths(
 
 
 def _spread(planes: Float32[np.ndarray, "3 h w"], photo: Picture) -> Float32[np.ndarray, "3 h2 w2"]:
-    """Planes in the grid of a larger photo."""
+    """Upsample planes to the grid of a larger photo."""
     height, width = photo.grey.shape
     if planes.shape[1:] == (height, width):
         return planes

@@ -1,7 +1,7 @@
-"""Depth maps of photos rendered from a model, kept where other photos' maps show the same place.
+"""Depth maps rendered from a model at the photos' cameras, kept where other photos' maps confirm them.
 
-A model has one surface, but a photo may see it through a haze that is there for another photo's sake, or see a hole's
-far side: what enough others do not confirm is no depth, as with depths that are found in photos.
+A model has one surface, but a photo may see it through haze that was fitted to another photo, or see the far side of a
+hole. As with depths estimated from photos, only depths that enough others confirm are kept.
 """
 
 from __future__ import annotations
@@ -30,16 +30,18 @@ def rendered_depth_maps(
     threads: int,
     report: Reporter,
 ) -> Iterator[tuple[Camera, DepthMap]]:
-    """The depth maps of photos as a model has them, in the order of the cameras; the same for any number of threads.
+    """Render the depth maps of photos from a model; identical for any number of threads.
 
     Args:
         depth_of: Renders a camera's depths along its z, world units; 0 where the model has none.
-        dataset: The folder that `undistort` left: who is compared with whom follows from its sparse points.
-        cameras: In the grids of the maps.
-        folder: Where there is room for 4 bytes a pixel of all maps meanwhile; what a killed run left there is gone on
-            from.
-        threads: Photos at a time where they are compared.
-        report: Told of progress.
+        dataset: The folder that `undistort` wrote; its sparse points define each photo's neighbours.
+        cameras: Cameras at the maps' resolution.
+        folder: Folder for temporary files, with room for 4 bytes per pixel of all maps; a killed run resumes from it.
+        threads: Photos compared in parallel.
+        report: Receives progress.
+
+    Yields:
+        Each camera and its depth map, in order.
 
     Raises:
         StageError: if the sparse model cannot be read.
@@ -59,7 +61,7 @@ def rendered_depth_maps(
 
 
 def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
-    """Render inverse depths into a file that is there whole or not at all; one that is there is left alone."""
+    """Render inverse depths into a file that is complete or absent; an existing file is left alone."""
     if path.is_file():
         return
     depth = render()
