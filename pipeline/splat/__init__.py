@@ -1,1 +1,1 @@
-"""The splat: Gaussians, their files, what is behind them, and measures of likeness."""
+"""The splat: Gaussians, their file formats, the panorama behind them, and image similarity metrics."""

@@ -14,13 +14,13 @@ def read_archive(path: Path) -> dict[str, npt.NDArray[Any]]:
 
     Raises:
         OSError: if the file cannot be read.
-        ValueError: if it is damaged or no archive.
+        ValueError: if it is damaged or not an archive.
     """
     with path.open("rb") as file:
         try:
-            with np.load(file, allow_pickle=False) as archive:  # a lone `.npy` is no context: TypeError
+            with np.load(file, allow_pickle=False) as archive:  # a bare `.npy` is not a context manager: TypeError
                 return {name: archive[name] for name in archive.files}
         except OSError:
             raise
-        except Exception as error:  # the readers of zip, of headers and of arrays raise almost anything on broken files
+        except Exception as error:  # the zip, header and array readers raise almost anything on broken files
             raise ValueError(f"no whole archive: {' '.join(str(error).split())[:120]}") from error

@@ -1,4 +1,4 @@
-"""How much of a splat is spent on what lies outside of a boundary: a backdrop for those who look past what counts."""
+"""How many Gaussians a splat may spend outside the boundary: the backdrop behind the area of interest."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 SHARE = 0.5  # Gaussians outside for each one inside
-FEWEST = 5_000  # outside, however few are inside: fewer leave holes that photos fill from inside
+FEWEST = 5_000  # outside, however few are inside: with fewer, the inside grows to fill the holes in the photos
 
 
 def backdrop_limit(inside: int, cap: int | None = None) -> int:
-    """The most Gaussians outside of a boundary.
+    """The maximum number of Gaussians outside the boundary.
 
     Args:
-        inside: Those inside.
-        cap: On all of them, of which the backdrop gets its share at most; None for none.
+        inside: Number of Gaussians inside.
+        cap: Limit on all Gaussians, of which the backdrop gets at most its share; None for no limit.
     """
     most = max(FEWEST, int(SHARE * inside))
     return most if cap is None else min(most, int(SHARE / (1.0 + SHARE) * cap))
 
 
 def coarse_start(inside: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " k"]:
-    """Rows of points to start with: all inside and, evenly, as many of the others as a backdrop may have; in order."""
+    """Rows of the points to start with, ascending: all inside, and evenly spaced others up to the backdrop's limit."""
     rows, others = np.flatnonzero(inside), np.flatnonzero(~inside)
     count = min(len(others), backdrop_limit(len(rows)))
     evenly = others[np.arange(count) * len(others) // max(count, 1)]

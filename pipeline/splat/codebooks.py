@@ -1,4 +1,4 @@
-"""Codebooks of one number: so many values, and the nearest of them for every number; the same for any threads."""
+"""Scalar codebooks: their values, and the nearest value for every number; identical for any number of threads."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
 
 CODEBOOK_SIZE = 256
-"""Values in a codebook: what a byte tells apart."""
-_STRETCHES = 4096  # of equal numbers of values, along which their density is followed
-_ITERATIONS = 200  # from a start that is near the best the last ones move values by a thousandth of their distance
+"""Values in a codebook: one per byte value."""
+_STRETCHES = 4096  # bins of equal counts from which the density is estimated
+_ITERATIONS = 200  # starting near the optimum, the last ones move values by a thousandth of their spacing
 
 
 def fit_codebook(
     values: Float32[np.ndarray, " n"], weights: Float32[np.ndarray, " n"] | None = None, size: int = CODEBOOK_SIZE
 ) -> Float32[np.ndarray, 256]:
-    """The values whose squares of distances to all numbers sum up to little.
+    """Fit a codebook with a small sum of squared distances to all numbers.
 
-    The start has the density that is best for many values, the cube root of the numbers' own (P. F. Panter and W. Dite,
-    "Quantization distortion in pulse-count modulation with nonuniform spacing of levels", 1951); from there every value
-    moves to the mean of the numbers that are nearest to it (S. Lloyd, "Least squares quantization in PCM", 1982), which
-    for sorted numbers takes a search instead of a pass.
+    The start has the density that is optimal for many values, the cube root of the numbers' own (P. F. Panter and W.
+    Dite, "Quantization distortion in pulse-count modulation with nonuniform spacing of levels", 1951); from there every
+    value moves to the mean of the numbers nearest to it (S. Lloyd, "Least squares quantization in PCM", 1982), which
+    for sorted numbers takes a binary search instead of a pass.
 
     Args:
         values: Numbers, finite.
-        weights: Of each, positive; alike without.
-        size: Most different values.
+        weights: Positive weight of each number; None for equal weights.
+        size: Maximum number of distinct values.
 
     Returns:
-        Ascending; the last one again where fewer are needed.
+        The values, ascending; the last one is repeated if fewer are needed.
     """
     if not len(values):
         return np.zeros(CODEBOOK_SIZE, np.float32)
@@ -38,7 +38,7 @@ def fit_codebook(
         return _filled(ordered[is_new])
     mass, moment = np.zeros((2, len(ordered) + 1))
     np.cumsum(np.ones(len(ordered)) if weights is None else weights[order], out=mass[1:])
-    del order, is_new  # of the harmonics of five million Gaussians each array here is a tenth of all that they are
+    del order, is_new  # for the SH of five million Gaussians, each array here is a tenth of the whole model
     moments = np.diff(mass)
     moments *= ordered
     np.cumsum(moments, out=moment[1:])
@@ -54,14 +54,14 @@ def fit_codebook(
 def nearest_codes(
     values: Float32[np.ndarray, "*shape"], codebook: Float32[np.ndarray, 256]
 ) -> UInt8[np.ndarray, "*shape"]:
-    """Which of a codebook's values is nearest to each number."""
+    """Index of the codebook value nearest to each number."""
     return np.asarray(np.searchsorted((codebook[1:] + codebook[:-1]) / 2, values).astype(np.uint8))
 
 
 def _start(
     ordered: Float64[np.ndarray, " n"], mass: Float64[np.ndarray, " n1"], size: int
 ) -> Float64[np.ndarray, " k"]:
-    """In stretches of equal mass and width w there are best w^(2/3) of all values."""
+    """Initial values: in bins of equal mass, the optimal share of values in a bin of width w goes as w^(2/3)."""
     ends = np.searchsorted(mass[1:], np.linspace(0.0, mass[-1], _STRETCHES + 1)).clip(0, len(ordered) - 1)
     edges = ordered[ends]
     share = np.concatenate(([0.0], np.cumsum(np.diff(edges) ** (2.0 / 3.0))))

@@ -1,23 +1,23 @@
-"""Where nothing can be: the space between the photos and the points that they see, and what of a splat hangs there.
+"""Free space between the cameras and the points that they observe, and the floaters of a splat in it.
 
-A sparse point that a photo observes says that the ray up to it is free: the idea of space carving and visibility
+A sparse point that a photo observes means that the ray up to it is free: the idea of space carving and visibility
 consistency (Kutulakos, Seitz: "A Theory of Shape by Space Carving", IJCV 2000), here with the rays of few points. Each
-photo is divided into cells, and the least depth of the points that it observes in a cell and the eight around it bounds
-the surface there. All choices keep real things rather than find every floater:
+photo is divided into cells, and the least depth of the points observed in a cell and its eight neighbours bounds the
+surface there. All choices favour keeping real objects over finding every floater:
 
-- A cell says nothing without two points of its own, nor beyond the outermost of the points around it: its neighbours
-  lower its bound and do not give it one. So textureless things wider than a cell stay unjudged, and so does the ground
-  before the foot of a wall: below the wall's last points it comes nearer by a third within one cell.
-- The least depth, not a percentile: a wrong point that is too near costs a floater that stays, and no surface.
-- A Gaussian is in front where its centre and one of its standard deviations along the view axis are nearer than the
-  bound less a tenth: most of it is. A haze that three of them would let reach the wall is a floater all the same.
-- Two photos have to say so, and a well-observed point right beside the Gaussian refutes them: a post in front of a
+- A cell has a bound only with at least two points of its own, and only within the extent of the points around it: its
+  neighbours may lower its bound but never provide one. So textureless objects wider than a cell are not judged, nor is
+  the ground in front of a wall: below the wall's last points it comes nearer by a third within one cell.
+- The least depth, not a percentile: a wrong point that is too near keeps a floater but removes no surface.
+- A Gaussian is in front where its centre plus one standard deviation along the optical axis is nearer than the bound
+  less a tenth: most of it is. Haze whose three sigmas would reach the wall still counts as a floater.
+- Two photos have to agree, and a well-observed point right beside the Gaussian overrules them: a post in front of a
   wall is thinner than a cell, but has points of its own.
 
-`tests/test_truth.py` holds this against the true surface of the demo capture.
+`tests/test_truth.py` checks this against the true surface of the demo capture.
 
-Close to a camera there are hardly two photos, so one is enough: nearer than a fifth of the depth at which its points
-begin, and than all of them, there is nothing but floaters.
+Close to a camera two photos rarely overlap, so one is enough: anything nearer than a fifth of the depth at which its
+points begin, and nearer than all of them, is a floater.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.free_space_on_device import centres_before
 from splatpipe.pipeline.splat.gaussians import Gaussians, multiply_quats
 
-CELLS = 24  # along the longer side: some 30 pixels at half a megapixel, 4 % of the depth
-OWN_POINTS = 2  # of a cell whose bound is defined: one alone may look past the edge of what is in front
-POINTS_AROUND = 6  # with its eight neighbours
-MARGIN = 0.1  # of the depth: sparse points of a tenth of a pixel are much better, surfaces between them curve
-VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin thing
-SUPPORT_TRACK = 3  # photos that observe a point which refutes: those of two are the ones that hang in free space
-SUPPORT_SHARE = 0.04  # of the distance to the nearest camera, a cell: nearer to such a point is on its surface
+CELLS = 24  # along the longer side: about 30 pixels at half a megapixel, 4 % of the depth
+OWN_POINTS = 2  # that a cell needs for a bound: a single one may lie past the edge of a foreground object
+POINTS_AROUND = 6  # including its eight neighbours
+MARGIN = 0.1  # of the depth: points accurate to a tenth of a pixel are much better, but surfaces between them curve
+VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin object
+SUPPORT_TRACK = 3  # least track length of a point that overrules: two-view points themselves hang in free space
+SUPPORT_SHARE = 0.04  # of the distance to the nearest camera (one cell): nearer than this is on the point's surface
 NEAR_SHARE = 0.2  # of the depth where a photo's points begin
-NEAR_PERCENTILE = 5  # of the depths of its points: where they begin
+NEAR_PERCENTILE = 5  # percentile of its points' depths where they begin
 CHUNK = 65_536  # Gaussians at a time: a few megabytes
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoBounds:
-    """What a photo sees through, in square cells.
+    """A photo's lower bounds on surface depth, in square cells.
 
     Attributes:
-        camera: The photo's.
-        depth: No surface is nearer than that, world units along the view axis; 0 where that is not known.
-        box: Left, top, right and bottom of the points that say so, pixels: beyond them they say nothing.
-        near: Nothing is nearer to the camera than that, world units; 0 where that is not known.
+        camera: The photo's camera.
+        depth: Depth nearer than which there is no surface, world units along the optical axis; 0 where unknown.
+        box: Left, top, right and bottom of the points behind each bound, pixels; it does not apply outside of them.
+        near: Distance from the camera within which there is nothing, world units; 0 where unknown.
     """
 
     camera: Camera
@@ -67,11 +67,11 @@ class PhotoBounds:
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """What the photos see through.
+    """The free space of all photos.
 
     Attributes:
-        photos: Each one's part of it.
-        support: Points observed by `SUPPORT_TRACK` photos or more, world units.
+        photos: Bounds of each photo.
+        support: Points observed by at least `SUPPORT_TRACK` photos, world units.
     """
 
     photos: tuple[PhotoBounds, ...]
@@ -79,7 +79,7 @@ class FreeSpace:
 
     @property
     def known(self) -> bool:
-        """Whether there are photos enough, with points enough, to call anything free."""
+        """Whether enough photos have enough points to identify free space."""
         return sum(bool(photo.depth.any()) for photo in self.photos) >= VIEWS
 
 
@@ -89,7 +89,7 @@ def free_space(
     """Bound the surface from the sparse points that each photo observes.
 
     Args:
-        cameras: Those whose observations count; in training, its own.
+        cameras: Cameras whose observations count; in training, the training views.
         xyz: All sparse points, world units.
         seen: Rows of the points that each camera's photo observes.
     """
@@ -101,13 +101,13 @@ def free_space(
 
 
 def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = VIEWS) -> Bool[Tensor, " n"]:
-    """Which Gaussians are floaters: in free space, or right before a camera.
+    """Which Gaussians are floaters: in free space, or right in front of a camera.
 
     Args:
-        gaussians: In the frame of the cameras; one that is not finite is in front of nothing.
-        space: Of ``free_space``.
-        views: Photos in which one has to hang in front of all that is observed there; beside a well-observed point none
-            counts.
+        gaussians: In the frame of the cameras; non-finite ones are not floaters.
+        space: Result of ``free_space``.
+        views: Photos in which a Gaussian has to lie in front of all that is observed there; none count beside a
+            well-observed point.
     """
     judge = _judge if gaussians.means.device.type == "cpu" else _judge_on_device
     through, near = judge(gaussians, space)
@@ -115,14 +115,14 @@ def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = VIEWS) -> 
 
 
 def share_of_opacity(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> float:
-    """The chosen Gaussians' part of the sum of all opacities, 0..1; 0 without any.
+    """The chosen Gaussians' share of the sum of all opacities, 0..1; 0 if there are none.
 
-    Each Gaussian counts once, whatever its size: sizes differ by powers of ten, and by the world's size one sky of a
-    few huge Gaussians would outweigh all else. What a floater covers is measured where it is seen, in renders.
+    Each Gaussian counts once, whatever its size: sizes differ by powers of ten, and weighted by size in the world, a
+    sky of a few huge Gaussians would outweigh all else. The area that floaters cover is measured in renders.
 
     Args:
-        gaussians: The model; Gaussians that are not finite do not count.
-        chosen: Which.
+        gaussians: The model; non-finite Gaussians do not count.
+        chosen: Mask of the chosen Gaussians.
     """
     opacity = torch.sigmoid(gaussians.opacity_logits.detach().to(torch.float64))
     opacities = torch.where(_usable(gaussians), opacity, 0.0).numpy(force=True)  # torch's sums depend on its threads
@@ -131,10 +131,10 @@ def share_of_opacity(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> float:
 
 
 def _bounds(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> PhotoBounds:
-    """A photo's bounds from the points (finite) that it observes."""
+    """A photo's bounds from the (finite) points that it observes."""
     rows, columns = _grid(camera)
     own = np.zeros((rows, columns), np.int64)
-    around = np.zeros((rows + 2, columns + 2), np.int64)  # a ring around, so that every cell has eight neighbours
+    around = np.zeros((rows + 2, columns + 2), np.int64)  # padded, so that every cell has eight neighbours
     least = np.full((5, rows + 2, columns + 2), np.inf)  # of depth, x, y, -x, -y
     _, pixels, cells, depths = _cells(camera, points)
     values = np.stack((depths, pixels[:, 0], pixels[:, 1], -pixels[:, 0], -pixels[:, 1]))
@@ -164,21 +164,21 @@ def _grid(camera: Camera) -> tuple[int, int]:
 def _cells(
     camera: Camera, points: Float64[np.ndarray, "n 3"]
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"], Int64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
-    """Which points fall into a photo: their rows, their pixels, their cells (row, column), and their depths."""
+    """Points inside a photo: their indices, pixels, cells (row, column) and depths."""
     rows, pixels, depths = camera.in_view(points)
     cells = (pixels[:, ::-1] * (CELLS / max(camera.width, camera.height))).astype(np.int64)
     return rows, pixels, np.minimum(cells, np.array(_grid(camera)) - 1), depths
 
 
 def _judge(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """In how many photos each Gaussian hangs in front of what they observe, and which are right before a camera."""
+    """In how many photos each Gaussian lies in front of the observed points, and which are right before a camera."""
     through, near = np.zeros(len(gaussians), np.int64), np.zeros(len(gaussians), np.bool_)
     for chunk in _chunks(np.flatnonzero(_usable(gaussians).numpy(force=True))):
         means = gaussians.means[torch.from_numpy(chunk)].detach().cpu().numpy().astype(np.float64)
         for photo in space.photos:
             rows, pixels, cells, depths = _cells(photo.camera, means)
             front = np.flatnonzero(depths < (1.0 - MARGIN) * photo.depth[cells[:, 0], cells[:, 1]])
-            front = front[_within(pixels[front], cells[front], photo)]  # few: only of them is the spread looked at
+            front = front[_within(pixels[front], cells[front], photo)]  # few, so the spread is only computed for these
             spread = spread_along(gaussians, chunk[rows[front]], photo.camera.cam_from_world[2, :3])
             limits = (1.0 - MARGIN) * photo.depth[cells[front, 0], cells[front, 1]]
             through[chunk[rows[front[depths[front] + spread < limits]]]] += 1
@@ -190,7 +190,7 @@ def _judge(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " 
 
 
 def _judge_on_device(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """The same of Gaussians on a device."""
+    """The same for Gaussians on a device."""
     through, near = np.zeros(len(gaussians), np.int64), np.zeros(len(gaussians), np.bool_)
     means, usable = gaussians.means.detach().to(torch.float64), _usable(gaussians)
     for photo in space.photos:
@@ -205,14 +205,14 @@ def _judge_on_device(gaussians: Gaussians, space: FreeSpace) -> tuple[Int64[np.n
 def _within(
     pixels: Float64[np.ndarray, "k 2"], cells: Int64[np.ndarray, "k 2"], photo: PhotoBounds
 ) -> Bool[np.ndarray, " k"]:
-    """Which pixels lie among the points that bound their cell."""
+    """Which pixels lie within the box of the points that bound their cell."""
     left, top, right, bottom = photo.box[:, cells[:, 0], cells[:, 1]]
     x, y = pixels.T
     return np.asarray((x >= left) & (x <= right) & (y >= top) & (y <= bottom))
 
 
 def _usable(gaussians: Gaussians) -> Bool[Tensor, " n"]:
-    """Which Gaussians have a finite place, size, turn and opacity; their colours, most of the memory, are not read."""
+    """Which Gaussians have finite means, scales, rotations and opacities; SH, most of the memory, is not read."""
     tensors = (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits[:, None])
     return torch.stack([torch.isfinite(tensor.detach()).all(1) for tensor in tensors]).all(0)
 
@@ -224,7 +224,7 @@ def _chunks(rows: Int64[np.ndarray, " _"]) -> Iterator[Int64[np.ndarray, " _"]]:
 def spread_along(
     gaussians: Gaussians, rows: Int64[np.ndarray, " k"], axis: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " k"]:
-    """Standard deviation along an axis of the world, world units: |S Rᵀ axis|."""
+    """Standard deviation of the given Gaussians along a world axis, world units: |S Rᵀ axis|."""
     index = torch.from_numpy(rows)
     quats = gaussians.quats[index].detach().cpu().to(torch.float64)
     length = torch.linalg.vector_norm(quats, dim=1, keepdim=True)
@@ -238,7 +238,7 @@ def spread_along(
 
 
 def _supported(gaussians: Gaussians, rows: Int64[np.ndarray, " k"], space: FreeSpace) -> Int64[np.ndarray, " _"]:
-    """Those of the rows that lie beside a well-observed point."""
+    """The rows whose Gaussians lie beside a well-observed point."""
     if rows.size == 0 or len(space.support) == 0:
         return rows[:0]
     trees = cKDTree(space.support), cKDTree(np.array([photo.camera.centre() for photo in space.photos]))

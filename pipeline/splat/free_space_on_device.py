@@ -1,4 +1,4 @@
-"""``free_space``'s look at many Gaussians where they lie on a device: few of them come to the host."""
+"""The device part of ``free_space``: tests Gaussians where they are stored and copies only a few to the host."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class GaussiansInFront:
-    """Gaussians whose centres hang before what a photo sees.
+    """Gaussians whose centres lie in front of a photo's bounds.
 
     Attributes:
-        rows: Theirs.
-        depths: Of their centres, world units.
-        limits: What lies nearer is before the surface, world units.
-        close: Rows of those right before the camera.
+        rows: Their rows.
+        depths: Depths of their centres, world units.
+        limits: Depths nearer than which they are in front of the surface, world units.
+        close: Rows of the Gaussians right in front of the camera.
     """
 
     rows: Int64[np.ndarray, " k"]
@@ -34,20 +34,20 @@ class GaussiansInFront:
 def centres_before(
     means: Float64[Tensor, "n 3"], usable: Bool[Tensor, " n"], photo: PhotoBounds, share: float, cells_a_side: int
 ) -> GaussiansInFront:
-    """Which centres hang before a photo's bounds, as ``free_space._judge`` asks on the CPU.
+    """Find centres in front of a photo's bounds, as ``free_space._judge`` does on the CPU.
 
     Args:
-        means: On the device.
-        usable: Those that are finite.
-        photo: With its bounds.
-        share: Of a bound's depth that is before it for sure.
-        cells_a_side: Of the photo's longer side.
+        means: Centres on the device.
+        usable: Mask of the finite Gaussians.
+        photo: The photo's bounds.
+        share: Share of a bound's depth up to which a point is certainly in front.
+        cells_a_side: Number of cells along the photo's longer side.
     """
     camera = photo.camera
     x, y, z = (_along(means, camera.cam_from_world[axis]) for axis in range(3))
     u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
     inside = usable & (z > 0.0) & (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
-    rows = torch.nonzero(inside).flatten()  # how many they are is asked of the device
+    rows = torch.nonzero(inside).flatten()  # synchronizes: the count comes from the device
     u, v, z = u[rows], v[rows], z[rows]
     side = cells_a_side / max(camera.width, camera.height)
     grid_rows, grid_columns = photo.depth.shape
@@ -62,7 +62,7 @@ def centres_before(
 
 
 def _along(means: Float64[Tensor, "n 3"], row: Float64[np.ndarray, " 4"]) -> Float64[Tensor, " n"]:
-    """A row of a pose times each point: by the host's numbers, one product after the other."""
+    """A row of a pose times each point, one product after another, with scalars from the host."""
     a, b, c, d = (float(value) for value in row)
     return means[:, 0] * a + means[:, 1] * b + means[:, 2] * c + d
 

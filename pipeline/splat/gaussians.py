@@ -1,4 +1,4 @@
-"""The scene: 3D Gaussians with their raw optimised parameters, as 3D Gaussian splatting trains and stores them."""
+"""The scene: 3D Gaussians with the raw optimised parameters that 3D Gaussian splatting trains and stores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from splatpipe.pipeline.splat.sh import MAX_DEGREE, check_rotation, coefficient_
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 """The parameters' names, in the order of the fields."""
 
-_ROWS_AT_ONCE = 1 << 16  # torch looks for what is not finite in a copy
+_ROWS_AT_ONCE = 1 << 16  # torch.isfinite makes a copy
 
 
 @dataclass(eq=False)
@@ -26,7 +26,7 @@ class Gaussians:
     Attributes:
         means: Centres, world frame and units.
         log_scales: Natural logarithms of the standard deviations along the Gaussian's own axes, world units.
-        quats: Rotations world from Gaussian (w, x, y, z), not necessarily of unit length.
+        quats: World-from-Gaussian rotations (w, x, y, z), not necessarily of unit length.
         opacity_logits: Logits of the opacities.
         sh: Spherical harmonics, k = (degree + 1)² coefficients of red, green and blue; see ``splat.sh``.
     """
@@ -49,7 +49,7 @@ class Gaussians:
 
     @classmethod
     def empty(cls, n: int, sh_degree: int, dtype: torch.dtype = torch.float32) -> Gaussians:
-        """n Gaussians at the origin: zeros, with the identity for a rotation."""
+        """n Gaussians at the origin: all zeros, with identity rotations."""
         quats = torch.zeros(n, 4, dtype=dtype)
         quats[:, 0] = 1.0
         zeros = torch.zeros(n, 3, dtype=dtype)
@@ -74,7 +74,7 @@ class Gaussians:
         return math.isqrt(self.sh.shape[1]) - 1
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
-        """On another device or in another dtype; differentiable, shared where nothing changes."""
+        """The Gaussians on another device or in another dtype; differentiable, shared where nothing changes."""
         return self._map(lambda tensor: tensor.to(device=device, dtype=dtype))
 
     def detach(self) -> Gaussians:
@@ -90,21 +90,21 @@ class Gaussians:
         return self._map(lambda tensor: tensor[index])
 
     def first(self, count: int) -> Gaussians:
-        """The first so many, not copied."""
+        """The first ``count`` Gaussians, not copied."""
         return self._map(lambda tensor: tensor[:count])
 
     def after(self, count: int) -> Gaussians:
-        """Those after the first so many, not copied."""
+        """The Gaussians after the first ``count``, not copied."""
         return self._map(lambda tensor: tensor[count:])
 
     def pieces(self, rows: int = _ROWS_AT_ONCE) -> Iterator[Gaussians]:
-        """All of them, so many at a time, not copied: what is made of a piece is small."""
+        """Iterate over all Gaussians in views of ``rows`` rows, so that temporaries stay small."""
         for start in range(0, len(self), rows):
             yield self._map(lambda tensor, start=start: tensor[start : start + rows])  # type: ignore[misc]
 
     @staticmethod
     def gathered(parts: Iterable[Gaussians], like: Gaussians) -> Gaussians:
-        """Pieces one after another, none of which is kept; of another's degree and type, and at most as many."""
+        """Concatenate pieces without keeping them; at most as many as ``like``, with its SH degree and dtype."""
         found, count = Gaussians.empty(len(like), like.sh_degree, like.means.dtype), 0
         for part in parts:
             for name, tensor in found.tensors().items():
@@ -114,7 +114,7 @@ class Gaussians:
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
-        """One after another; all of one SH degree.
+        """Concatenate Gaussians of one SH degree.
 
         Raises:
             ValueError: if there are none, or their SH degrees differ.
@@ -139,15 +139,15 @@ class Gaussians:
         return finite
 
     def transformed(self, scale: float, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"]) -> Gaussians:
-        """In another frame, x_new = scale · rotation @ x + translation; means are computed in float64.
+        """Transform to another frame, x_new = scale · rotation @ x + translation; means are computed in float64.
 
         Args:
-            scale: New units a unit, > 0.
+            scale: New units per unit, > 0.
             rotation: New frame from this one.
-            translation: Where this frame's origin lies in the new one, new units.
+            translation: This frame's origin in the new frame, new units.
 
         Returns:
-            New Gaussians that look the same from a camera that moved along, SH included.
+            New Gaussians that look the same from a camera transformed likewise, SH included.
 
         Raises:
             ValueError: if the scale is not positive and finite, or ``rotation`` is not a rotation.
@@ -173,7 +173,7 @@ class Gaussians:
 
 
 def multiply_quats(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
-    """Hamilton product a b, (w, x, y, z): the rotation b, then a."""
+    """Hamilton product a b, (w, x, y, z): rotation b first, then a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(

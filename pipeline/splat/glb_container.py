@@ -1,4 +1,4 @@
-"""GLB, the container of binary glTF: a JSON document and one chunk of numbers; written for us, read from anybody.
+"""GLB, the container of binary glTF: a JSON document and one binary chunk; writes our own, reads anybody's.
 
 Specification: Khronos, "glTF 2.0", section 4 (the GLB file format) and 3.6 (buffers, buffer views and accessors).
 """
@@ -22,9 +22,9 @@ from splatpipe.pipeline.splat.formats.bounded import file_bytes, read_exactly
 MAGIC, VERSION = 0x46546C67, 2  # "glTF"
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942  # "JSON", "BIN\0"
 MOST_BYTES = 2**32 - 1
-"""Of a file: its length is told in 32 bits."""
+"""Largest file: its length is stored in 32 bits."""
 MOST_JSON_BYTES = 1 << 22
-"""A splat's document has some kB; Python's objects of one take twenty times its bytes."""
+"""A splat's document has a few kB; parsed into Python objects, it takes twenty times its size."""
 BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5120, 5121, 5122, 5123, 5125, 5126
 _NUMBERS = {BYTE: "<i1", UNSIGNED_BYTE: "<u1", SHORT: "<i2", UNSIGNED_SHORT: "<u2", UNSIGNED_INT: "<u4", FLOAT: "<f4"}
 _COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -34,21 +34,21 @@ _AGAIN = "Export it again."
 
 
 def padded(count: int) -> int:
-    """A number of bytes, up to the next multiple of 4, at which chunks and what is in them begin."""
+    """A byte count rounded up to a multiple of 4, the alignment of chunks and their contents."""
     return -(-count // 4) * 4
 
 
 def write_head(file: BufferedIOBase, document: Mapping[str, Any], binary_bytes: int) -> None:
-    """Write a GLB up to where its binary chunk's bytes begin.
+    """Write a GLB up to the start of its binary chunk's data.
 
     Args:
-        file: At its beginning.
-        document: glTF's JSON.
-        binary_bytes: Of the binary chunk; a multiple of 4.
+        file: Positioned at its beginning.
+        document: The glTF JSON document.
+        binary_bytes: Size of the binary chunk; a multiple of 4.
 
     Raises:
         SplatpipeError: if the file would be larger than a GLB can be.
-        ValueError: if the document holds a number that is not finite, or the chunk's size is no multiple of 4.
+        ValueError: if the document has a non-finite number, or the chunk's size is not a multiple of 4.
     """
     if binary_bytes % 4:
         raise ValueError(f"a chunk of {binary_bytes} bytes does not end at a multiple of 4")
@@ -67,15 +67,15 @@ def write_head(file: BufferedIOBase, document: Mapping[str, Any], binary_bytes: 
 
 @dataclass(frozen=True)
 class Accessor:
-    """Where an attribute's rows lie in a file, known to be inside it.
+    """Location of an attribute's rows in a file, checked to be inside it.
 
     Attributes:
-        count: Of the rows.
-        components: Of a row.
-        number: Of a component.
+        count: Number of rows.
+        components: Components per row.
+        number: Type of a component.
         normalized: Whether integers stand for 0..1, or −1..1.
-        offset: Of the first row, from the file's beginning, bytes.
-        stride: From row to row, bytes.
+        offset: Offset of the first row from the file's beginning, bytes.
+        stride: Distance from row to row, bytes.
     """
 
     count: int
@@ -86,13 +86,13 @@ class Accessor:
     stride: int
 
     def rows(self, path: Path, file: BufferedIOBase, start: int, count: int) -> Float32[np.ndarray, "n c"]:
-        """Some of the rows.
+        """Read some of the rows.
 
         Args:
-            path: For the error.
-            file: That the accessor lies in.
+            path: For the error message.
+            file: The file that contains the rows.
             start: The first row.
-            count: How many, at least one: so many that their bytes are few.
+            count: Number of rows, at least one; few enough to fit in memory.
 
         Raises:
             SplatpipeError: if the file cannot be read.
@@ -109,14 +109,14 @@ class Accessor:
 
 @dataclass(frozen=True)
 class Container:
-    """A GLB that was opened.
+    """An open GLB.
 
     Attributes:
         path: Its path.
-        file: Open.
-        document: glTF's JSON, whose values may be anything.
-        start: Of the binary chunk's bytes, from the file's beginning.
-        length: Of them.
+        file: The open file.
+        document: The glTF JSON document, with unchecked values.
+        start: Offset of the binary chunk's data from the file's beginning, bytes.
+        length: Length of that data, bytes.
     """
 
     path: Path
@@ -126,7 +126,7 @@ class Container:
     length: int
 
     def refuse(self, what: str) -> NoReturn:
-        """Say what is wrong with it.
+        """Report the file as damaged.
 
         Raises:
             SplatpipeError: always.
@@ -137,11 +137,11 @@ class Container:
         """One of the document's objects.
 
         Args:
-            name: Of the list that it is in.
-            index: Its place there, as a file states it.
+            name: Name of the list that contains it.
+            index: Its index in the list, as the file states it.
 
         Raises:
-            SplatpipeError: if there is none.
+            SplatpipeError: if it does not exist.
         """
         entries = self.document.get(name)
         if not isinstance(entries, list) or not _is_whole(index) or index >= len(entries):
@@ -178,11 +178,11 @@ class Container:
         """An accessor whose rows lie inside the file.
 
         Args:
-            index: As a file states it.
-            kinds: Of rows that are taken: ``SCALAR``, ``VEC3``, ``VEC4``.
+            index: Its index, as the file states it.
+            kinds: Accepted types: ``SCALAR``, ``VEC3``, ``VEC4``.
 
         Raises:
-            SplatpipeError: if there is none, of another kind, sparse, or outside of its data.
+            SplatpipeError: if it does not exist, has another type, is sparse, or lies outside of its data.
         """
         found = self.entry("accessors", index)
         if "bufferView" not in found or "sparse" in found:
@@ -202,14 +202,14 @@ class Container:
 
 
 def open_container(path: Path, file: BufferedIOBase) -> Container:
-    """Read a GLB's document, and where its data lie.
+    """Read a GLB's document and the location of its data.
 
     Args:
-        path: For the errors.
-        file: At its beginning.
+        path: For the error messages.
+        file: Positioned at its beginning.
 
     Raises:
-        SplatpipeError: if it is no GLB, or its lengths are not of this file.
+        SplatpipeError: if it is not a GLB, or its lengths do not match the file.
     """
     magic, version, total = _HEADER.unpack(read_exactly(path, file, _HEADER.size))
     if magic != MAGIC:
@@ -245,5 +245,5 @@ def _parsed(path: Path, text: bytes) -> Mapping[str, Any]:
 
 
 def _is_whole(value: Any) -> TypeGuard[int]:
-    """Whether it is an integer that is not negative: JSON's true is one to Python, and 1e400 would be a float."""
+    """Whether a value is a non-negative integer: to Python, JSON's true is an int, and 1e400 a float."""
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0

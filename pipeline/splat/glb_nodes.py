@@ -1,7 +1,7 @@
-"""What a glTF's scene draws, and where: its nodes walked from the roots, once each, however they are tangled.
+"""The primitives that a glTF scene draws, and their transforms: visits each node once from the roots.
 
 Specification: Khronos, "glTF 2.0", section 3.5 (scenes): nodes form trees; a node's matrix, or its translation,
-rotation (x, y, z, w) and scale, place it in its parent.
+rotation (x, y, z, w) and scale, is relative to its parent.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from scipy.spatial.transform import Rotation
 from splatpipe.pipeline.splat.glb_container import Container
 
 MOST_PRIMITIVES = 1000
-"""That are read of one file: each costs time, however little it draws."""
+"""Limit per file: each primitive costs time, however little it draws."""
 _MOST_NUMBER = 1e12
 _IDENTITY = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 
 Drawn = tuple[Mapping[str, Any], Float64[np.ndarray, "4 4"]]
-"""A mesh's primitive and the matrix that places it in the scene."""
+"""A mesh primitive and its matrix, scene from primitive."""
 
 
 def drawn_primitives(container: Container, extension: str) -> list[Drawn]:
-    """What the scene draws of primitives with an extension.
+    """The scene's primitives that use an extension, with their transforms.
 
     Args:
         container: The file.
-        extension: Its name.
+        extension: Name of the extension.
 
     Raises:
-        SplatpipeError: if the scene or a node is damaged, or there is too much.
+        SplatpipeError: if the scene or a node is damaged, or there are too many primitives.
     """
     waiting = [(index, np.eye(4)) for index in reversed(_roots(container))]
     visited: set[int] = set()
@@ -60,7 +60,7 @@ def _has(primitive: Any, extension: str) -> bool:
 
 
 def _roots(container: Container) -> list[Any]:
-    """The nodes of the scene that is shown; of a file without scenes, those that are no one's children."""
+    """The default scene's root nodes; in a file without scenes, all nodes without a parent."""
     if "scenes" in container.document:
         return _listed(container, container.entry("scenes", container.document.get("scene", 0)), "nodes")
     nodes = _listed(container, container.document, "nodes")
@@ -77,7 +77,7 @@ def _listed(container: Container, holder: Mapping[str, Any], name: str) -> list[
 
 
 def _matrix(container: Container, node: Mapping[str, Any]) -> Float64[np.ndarray, "4 4"]:
-    """Parent from node."""
+    """The matrix of a node, parent from node."""
     if "matrix" in node:
         return _numbers(container, node["matrix"], 16).reshape(4, 4).T  # column by column
     parts = {name: _numbers(container, node.get(name, rest), len(rest)) for name, rest in _IDENTITY.items()}
