@@ -179,7 +179,7 @@ class FilmFile:
 
     Attributes:
         path: A WebM or an MP4.
-        fps: Frames a second.
+        fps: Frames per second.
     """
 
     path: Path

@@ -92,7 +92,7 @@ class Keyframes:
 
         Args:
             distance: Of what is looked at, world units: see ``Route.steps``.
-            fps: Frames a second.
+            fps: Frames per second.
             seconds: That it lasts, where the file has no times.
 
         Returns:

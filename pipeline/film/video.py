@@ -36,7 +36,7 @@ class VideoWriter:
         Args:
             path: Ends in `.webm` or `.mp4`; its folder is there. What is there is replaced at the end.
             size: Width and height, pixels, both even.
-            fps: Frames a second.
+            fps: Frames per second.
 
         Raises:
             ValueError: if a side is odd, or the suffix another one.

@@ -235,7 +235,7 @@ class CellVotes:
             window: Left, top, right, bottom of the pixels that may lie in the tile.
 
         Raises:
-            ValueError: if sizes do not fit.
+            ValueError: if sizes do not match.
         """
 
     def layers(self, height: np.ndarray, count: np.ndarray, cover: np.ndarray) -> None:
@@ -271,7 +271,7 @@ def look(
         said: Written: bits as above; uint8.
 
     Raises:
-        ValueError: if sizes do not fit.
+        ValueError: if sizes do not match.
     """
 
 def confirm(
@@ -294,14 +294,14 @@ def confirm(
         votes: (n,), uint8; grows by one there.
 
     Raises:
-        ValueError: if sizes do not fit.
+        ValueError: if sizes do not match.
     """
 
 def rate(camera: _Camera, places: _Places, cell: float, said: np.ndarray, cost: np.ndarray, seen: np.ndarray) -> int:
     """What it costs to colour places by a photo, and whether it sees them; returns how many it sees.
 
     Args:
-        camera: The photo's.
+        camera: The photo's camera.
         places: As above.
         cell: Side of their cells, metres.
         said: What its depths say of them.
@@ -328,7 +328,7 @@ def sample_photo(
         colour: Written: uint8, three a place; black where none is wanted.
 
     Raises:
-        ValueError: if sizes do not fit.
+        ValueError: if sizes do not match.
     """
 
 def keep_best(seen: np.ndarray, cost: np.ndarray, most: int, seen_by: np.ndarray) -> None:
@@ -341,7 +341,7 @@ def keep_best(seen: np.ndarray, cost: np.ndarray, most: int, seen_by: np.ndarray
         seen_by: Written: how many photos saw the cell, 255 at most; uint8 (h, w).
 
     Raises:
-        ValueError: if sizes do not fit.
+        ValueError: if sizes do not match.
     """
 
 def compose_mosaic(
@@ -363,5 +363,5 @@ def compose_mosaic(
         blended: Written: uint8 (h, w, 3).
 
     Raises:
-        ValueError: if sizes do not fit.
+        ValueError: if sizes do not match.
     """

@@ -80,7 +80,7 @@ class CudaLibrary:
         """Bytes of memory, by one of ``SIZES``.
 
         Raises:
-            ValueError: if an argument makes no sense.
+            ValueError: if an argument is invalid.
         """
         result = int(getattr(self._functions, name)(*arguments))
         if result < 0:
@@ -91,7 +91,7 @@ class CudaLibrary:
         """One of ``CALLS``.
 
         Raises:
-            ValueError: if an argument makes no sense.
+            ValueError: if an argument is invalid.
             MachineError: if the device fails.
         """
         code = int(getattr(self._functions, name)(*arguments))

@@ -48,7 +48,7 @@ def laid_over_nodes(
 
     Args:
         colour: Rendered over ``behind.background``.
-        alpha: The render's.
+        alpha: Alpha of the render.
         nodes: What is behind it.
         behind: How.
     """

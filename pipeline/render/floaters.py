@@ -46,7 +46,7 @@ def measure_floaters(
         held_out: Names of the photos that were not trained on.
         dataset: Their dataset, with the sparse points.
         options: How the model is rendered.
-        area: That counts, in the model's frame; None where all does.
+        area: Area of interest, in the model's frame; None for everything.
     """
     points, tracks = load_points_and_tracks(dataset)
     seen = [tracks[camera.name] for camera in cameras]

@@ -35,7 +35,7 @@ class Rendering:
         antialias: With opacities that allow for the blur on screen.
         background: What is behind it, red, green, blue, 0..1.
         near: Of the near plane, world units.
-        megapixels: Photos are reduced to at most so many; None where they keep the dataset's size.
+        megapixels: Photos are reduced to at most this size; None keeps the dataset's size.
     """
 
     antialias: bool
@@ -62,7 +62,7 @@ def load_rendering(path: Path) -> Rendering:
     """Read what `train` left.
 
     Raises:
-        StageError: if it is not that.
+        StageError: if it is not such a file.
     """
     try:
         fields = json.loads(path.read_text(encoding="utf-8"))

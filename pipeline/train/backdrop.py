@@ -1,6 +1,6 @@
-"""Outside of a boundary the splat stays coarse: density control gives what is there no more than a backdrop's share.
+"""Backdrop: outside a boundary the splat stays coarse, because density control limits Gaussians there to a share.
 
-Where Gaussians may be, they go by the same score as everywhere. Those of the inside that wander out count as outside.
+Within that share they are ranked by the same score as elsewhere. Gaussians that move out of the area count as outside.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from splatpipe.pipeline.train.hooks import Technique
 
 
 class Backdrop(Technique):
-    """Keeps what is outside coarse.
+    """Keeps the model coarse outside an area.
 
     Args:
-        area: What counts, in the model's frame.
-        density: The training's schedule of density control.
+        area: The area of interest, in the model's frame.
+        density: The training's density-control schedule.
     """
 
     name = "backdrop"
@@ -32,7 +32,7 @@ class Backdrop(Technique):
     def ranked(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
     ) -> Float[Tensor, " n"]:
-        """The same, but 0 for those outside that would be more than the backdrop has room for."""
+        """The same score, but 0 for Gaussians outside for which the backdrop has no room."""
         outside = self._outside_of(gaussians)
         room = max(0, self._limit(outside) - int(outside.sum()))
         wanted = torch.nonzero(outside & (score > schedule.gradient)).flatten()
@@ -42,7 +42,7 @@ class Backdrop(Technique):
         return score
 
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
-        """The least opaque of those outside that are more than the backdrop's share; None between steps of density."""
+        """The least opaque Gaussians outside in excess of the backdrop's share; None between density-control steps."""
         if not self._density.is_step(iteration):
             return None
         outside = self._outside_of(gaussians)

@@ -35,8 +35,8 @@ def exposure_spread(views: Sequence[View], dataset: Path, threads: int) -> float
 
     Args:
         views: Photos.
-        dataset: That they are of, for its sparse points.
-        threads: That read photos.
+        dataset: The photos' dataset, for its sparse points.
+        threads: Number of threads that read photos.
 
     Raises:
         StageError: if a photo or the model is broken.
@@ -57,11 +57,11 @@ def decided_exposure(
     """The options with ``exposure`` decided, where that is `auto`: modelled where the photos' exposures differ.
 
     Args:
-        config: The options.
-        views: To be trained on.
+        config: The training options.
+        views: Views to train on.
         dataset: As for ``exposure_spread``.
-        threads: That read photos.
-        report: Told of what was found.
+        threads: Number of threads that read photos.
+        report: Receives the result.
     """
     if config.exposure != "auto":
         return config

@@ -131,7 +131,7 @@ class BudgetTask:
         sparse: Gaussians of sparse points at the start, which every plan keeps where it can.
         dense: Gaussians of dense points, which only fill what room a cap leaves.
         sizes: Width and height of the photos in the dataset, and how many have them.
-        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
+        window_pixels: Most pixels of a photo that an iteration uses; 0 for the whole photo.
         speed: Of this machine on this scene.
         prepare_s: Decoding every photo once, whatever sizes are made of it.
         seconds: What is left for the training.

@@ -1,10 +1,10 @@
-"""Adaptive density control: how Gaussians are cloned, split, pruned and their opacity reset, and how many there may be.
+"""Adaptive density control: cloning, splitting, pruning, opacity resets and the cap on the number of Gaussians.
 
 Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023,
-section 5 and its published settings, changed in two ways whatever the score (see `density.py`).
-The number of Gaussians rises to a hard cap by a schedule, those of the largest score first (the idea of Mallick et al.,
-"Taming 3DGS", SIGGRAPH Asia 2024). And two that take the place of one have the opacity that lets as much light through
-as the one did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024).
+section 5 and its published settings, with two changes for either score (see `density.py`).
+The number of Gaussians rises to a hard cap on a schedule, largest scores first (the idea of Mallick et al.,
+"Taming 3DGS", SIGGRAPH Asia 2024). And two Gaussians that replace one get the opacity that lets through as much light
+as the original did (Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024).
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from splatpipe.pipeline.train.draws import SPLIT_POSITION, normal
 
 MIN_AFTER_PRUNE = 1  # a model is never emptied: there would be nothing left to learn from
 
-# All published.
+# All published values.
 SPLIT_EXTENT = 0.01  # share of the scene's extent: larger Gaussians are split, smaller ones cloned
-SPLIT_SHRINK = 1.6  # the two halves of a split are so many times smaller
+SPLIT_SHRINK = 1.6  # both halves of a split are smaller by this factor
 PRUNE_OPACITY = 0.005  # Gaussians below it are removed: no pixel shows them
 PRUNE_EXTENT = 0.1  # share of the extent: larger ones are removed after the first opacity reset
-PRUNE_SCREEN_PX = 20.0  # larger ones on screen, too; of the published method alone, for it eats aerial ground
+PRUNE_SCREEN_PX = 20.0  # radius on screen; larger ones are removed too, in the published method only: it erodes ground
 RESET_OPACITY = 0.01  # an opacity reset leaves no Gaussian above it
 
 
@@ -38,19 +38,19 @@ class DensitySchedule:
     """When and how density control acts.
 
     Attributes:
-        on: Whether it does.
-        seed: Names the random numbers.
-        cap: The most Gaussians.
-        first: First iteration that it may act after.
-        last: Last one.
+        on: Whether density control acts at all.
+        seed: Seed of the random numbers.
+        cap: Maximum number of Gaussians.
+        first: First iteration after which it may act.
+        last: Last such iteration.
         every: Iterations between its steps.
         gradient: Score above which Gaussians are densified.
         reset_every: Iterations between opacity resets; 0 for none.
-        reset_until: None after this iteration: windows of finer sizes come back too seldom; 0 for no such limit.
+        reset_until: No resets after this iteration: windows of finer sizes recur too seldom; 0 for no such limit.
         prune_screen_px: Radius on screen above which Gaussians are removed; 0 for never.
-        prune_free_space: Gaussians before the surface for so many photos are removed; 0 for never.
+        prune_free_space: Gaussians in front of the surface in this many photos are removed; 0 for never.
         prune_opacity: Opacity below which Gaussians are removed.
-        prune_extent: Share of the scene's extent above which they are; 0 for never.
+        prune_extent: Size, as a share of the scene's extent, above which Gaussians are removed; 0 for never.
     """
 
     on: bool
@@ -79,11 +79,11 @@ class DensitySchedule:
 
 @dataclass(frozen=True)
 class DensifiedGaussians:
-    """New rows for the model: which old Gaussian each is made from, and what differs.
+    """New rows for the model: the old Gaussian that each is made from, and the parameters that differ.
 
     Attributes:
         source: (m,) old row of each new Gaussian.
-        fresh: (m,) True where it is new, so that its optimiser state starts at zero.
+        fresh: (m,) True for new Gaussians, whose optimizer state starts at zero.
         means: (m, 3) world units.
         log_scales: (m, 3).
         opacity_logits: (m,).
@@ -96,22 +96,22 @@ class DensifiedGaussians:
     opacity_logits: Float[Tensor, " m"]
 
     def select(self, rows: Bool[Tensor, " m"] | Int64[Tensor, " k"]) -> DensifiedGaussians:
-        """The rows of a mask or an index."""
+        """The rows selected by a mask or an index."""
         return DensifiedGaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def unchanged(gaussians: Gaussians, rows: Bool[Tensor, " n"]) -> DensifiedGaussians:
-    """The Gaussians of a mask, as they are."""
+    """The Gaussians selected by a mask, unchanged."""
     source = torch.nonzero(rows).flatten()
     fresh = torch.zeros(len(source), dtype=torch.bool, device=source.device)
-    kept = (gaussians.means, gaussians.log_scales, gaussians.opacity_logits)  # not the harmonics, most of the memory
+    kept = (gaussians.means, gaussians.log_scales, gaussians.opacity_logits)  # not SH, which is most of the memory
     return DensifiedGaussians(source, fresh, *(tensor[source] for tensor in kept))
 
 
 def along_curve(growth: DensifiedGaussians) -> DensifiedGaussians:
-    """The same rows in the order of their places on a Morton curve: what is near in space is near in memory.
+    """The same rows in Morton order: what is near in space is near in memory.
 
-    Threads of a CUDA device then read neighbouring memory, and a CPU what a window shows, row after row.
+    Threads of a CUDA device then read neighbouring memory, and a CPU reads what a window shows in consecutive rows.
     """
     if len(growth.means) == 0:
         return growth
@@ -127,15 +127,15 @@ def along_curve(growth: DensifiedGaussians) -> DensifiedGaussians:
 
 @dataclass(frozen=True)
 class DensityEvent:
-    """What a step of density control did.
+    """The result of a step of density control.
 
     Attributes:
-        iteration: When.
+        iteration: The iteration it followed.
         cloned: Gaussians copied.
         split: Gaussians replaced by two.
         pruned: Gaussians removed.
         held_back: Gaussians that the schedule kept from being densified.
-        gaussians: How many there are now.
+        gaussians: Number of Gaussians after the step.
     """
 
     iteration: int
@@ -146,16 +146,16 @@ class DensityEvent:
     gaussians: int
 
     def to_json(self) -> dict[str, int]:
-        """For `history.json`."""
+        """The event as stored in `history.json`."""
         return asdict(self)
 
 
 class DensityStatistics:
-    """Running sums over the photos since the last step.
+    """Running sums over the photos since the last step of density control.
 
     Attributes:
         score_sum: (n,) sum of the photos' scores.
-        seen: (n,) photos that saw the Gaussian.
+        seen: (n,) number of photos that saw the Gaussian.
         max_radius_px: (n,) largest radius on screen.
     """
 
@@ -167,46 +167,46 @@ class DensityStatistics:
     def observe(
         self, gradient_px: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"], width: float, height: float
     ) -> None:
-        """Add an iteration's image-plane gradients, by their norm in NDC.
+        """Add the NDC norm of an iteration's image-plane gradients.
 
         Args:
-            gradient_px: dL/d(mean2D) summed over the pixels, or its magnitudes, x and y apart.
+            gradient_px: dL/d(mean2D) summed over the pixels, or the sum of its magnitudes, separately in x and y.
             visible: Which Gaussians the photo saw.
-            width: Of the whole picture, pixels, times the part in its loss that the render has.
-            height: The same.
+            width: Width of the whole image, pixels, times the render's share in the image's loss.
+            height: The same for the height.
         """
         self.add(_in_ndc(gradient_px, width, height), visible)
 
     def observe_rows(
         self, rows: Int64[Tensor, " k"], gradient_px: Float[Tensor, "k 2"], width: float, height: float
     ) -> None:
-        """The same of the Gaussians that the photo saw alone.
+        """The same, given only the Gaussians that the photo saw.
 
         Args:
-            rows: Which these are, each once.
-            gradient_px: As of ``observe``, theirs.
-            width: As of ``observe``.
-            height: The same.
+            rows: Their rows, each once.
+            gradient_px: Their gradients, as in ``observe``.
+            width: As in ``observe``.
+            height: As in ``observe``.
         """
         score = _in_ndc(gradient_px, width, height).nan_to_num_(0.0, 0.0, 0.0)
         self.score_sum.index_add_(0, rows, score)
         self.seen.index_add_(0, rows, torch.ones_like(score))
 
     def add(self, score: Float[Tensor, " n"], visible: Bool[Tensor, " n"]) -> None:
-        """Add an iteration's scores, which are overwritten; those that are not finite count as 0."""
+        """Add an iteration's scores; non-finite ones count as 0. ``score`` is overwritten."""
         self.score_sum += score.nan_to_num_(0.0, 0.0, 0.0).mul_(visible)
         self.seen += visible
 
     def observe_radii(self, radii_px: Float[Tensor, " n"]) -> None:
-        """Add an iteration's sizes on screen, pixels (0 where unseen)."""
+        """Add an iteration's radii on screen, pixels (0 where unseen)."""
         torch.maximum(self.max_radius_px, radii_px, out=self.max_radius_px)
 
     def score(self) -> Float[Tensor, " n"]:
-        """The statistic: averaged over the photos that saw the Gaussian."""
+        """Mean score over the photos that saw the Gaussian."""
         return self.score_sum / self.seen.clamp(min=1.0)
 
     def to_arrays(self) -> dict[str, Tensor]:
-        """Its tensors by name, for a checkpoint."""
+        """The tensors by name, for a checkpoint."""
         return {"score_sum": self.score_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
 
 
@@ -215,15 +215,15 @@ def _in_ndc(gradient_px: Float[Tensor, "k 2"], width: float, height: float) -> F
 
 
 def room_at(schedule: DensitySchedule, initial: int, iteration: int) -> int:
-    """The most Gaussians that density control leaves: up to the cap, fast at first and slower towards its last step.
+    """Number of Gaussians allowed at an iteration: rises to the cap, fast at first and slower towards the last step.
 
-    What comes early has time to be trained; what comes late has the better score. With x the share of the steps done,
-    the share of the growth is x (2 - x).
+    Gaussians added early have time to be trained; those added late are chosen by better scores. With x the share of
+    steps done, the share of growth done is x (2 - x).
 
     Args:
-        schedule: Of density control.
-        initial: Gaussians at the start.
-        iteration: Now.
+        schedule: The density-control schedule.
+        initial: Number of Gaussians at the start.
+        iteration: The current iteration.
     """
     first, last, every = schedule.first, schedule.last, schedule.every
     initial = min(initial, schedule.cap)
@@ -241,17 +241,17 @@ def grow(
     extent: float,
     iteration: int,
 ) -> tuple[DensifiedGaussians, dict[str, int]]:
-    """Clone the small and split the large Gaussians whose score asks for it.
+    """Clone small and split large Gaussians whose score exceeds the threshold.
 
-    Those whose halved opacity would be under the pruning limit are left: both halves would go in the next step.
+    Those whose halved opacity would be below the pruning limit are left alone: the next step would prune both halves.
 
     Args:
         gaussians: The model.
-        score: ``DensityStatistics.score`` of each.
+        score: ``DensityStatistics.score`` of each Gaussian.
         room: How many Gaussians may be added.
-        schedule: Of density control.
-        extent: Of the scene, world units.
-        iteration: Names the random numbers.
+        schedule: The density-control schedule.
+        extent: Scene extent, world units.
+        iteration: Current iteration; selects the random numbers.
 
     Returns:
         The new rows (kept ones in their order, then clones, then two children for each split), and the counts
@@ -280,23 +280,23 @@ def grow(
 
 
 def half_opacity(logits: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """The logit of the opacity of which two let as much light through as one of the given: 1 - √(1 - α).
+    """The logit of the opacity 1 - √(1 - α): two such Gaussians let through as much light as one of opacity α.
 
     Rota Bulò et al., "Revising Densification in Gaussian Splatting", ECCV 2024.
     """
     log_through = 0.5 * torch.nn.functional.logsigmoid(-logits)  # ln √(1 - α), finite for any logit
-    # 1 - √(1 - α) = α / (1 + √(1 - α)), which does not cancel for small α.
+    # 1 - √(1 - α) = α / (1 + √(1 - α)), which has no cancellation for small α.
     return torch.nn.functional.logsigmoid(logits) - torch.log1p(torch.exp(log_through)) - log_through
 
 
 def lowest_logit_to_halve(limit: float) -> float:
-    """The logit of the opacity whose half, by ``half_opacity``, is the limit: 1 - (1 - α)²."""
+    """The logit of the opacity that ``half_opacity`` reduces to the limit α: 1 - (1 - α)²."""
     opacity = limit * (2.0 - limit)
     return math.log(opacity / (1.0 - opacity)) if opacity > 0.0 else -math.inf
 
 
 def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit: int) -> Int64[Tensor, " k"]:
-    """Up to ``limit`` candidates of the largest value (ties: the first row), in row order."""
+    """The up to ``limit`` candidates of largest value (ties: lowest row first), in row order."""
     if len(candidates) <= limit:
         return candidates
     ranked = torch.argsort(value[candidates], descending=True, stable=True)
@@ -304,7 +304,7 @@ def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit:
 
 
 def _split_offsets(gaussians: Gaussians, rows: Int64[Tensor, " s"], seed: int, iteration: int) -> Float[Tensor, "t 3"]:
-    """Draw two positions within each parent, relative to its mean: the first of all, then the second of all."""
+    """Draw two positions within each parent, relative to its mean: all first ones, then all second ones."""
     if (kernels := kernels_of(rows.device)) is not None:
         return kernels.split_offsets((seed, iteration, SPLIT_POSITION), rows, gaussians.log_scales, gaussians.quats)
     parents = rows.numpy().astype(np.uint64)
@@ -317,7 +317,7 @@ def _split_offsets(gaussians: Gaussians, rows: Int64[Tensor, " s"], seed: int, i
 
 
 def rotate(quats: Float[Tensor, "k 4"], vectors: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
-    """Turn each vector by its quaternion, which need not be a unit one."""
+    """Rotate each vector by its quaternion, which need not be normalized."""
     w, axis = quats[:, :1], quats[:, 1:]  # q v q⁻¹ = v + 2 u×(u×v + w v) for |q| = 1
     norm = quats.norm(dim=1, keepdim=True).clamp(min=1e-12)
     w, axis = w / norm, axis / norm
@@ -331,14 +331,14 @@ def prune_mask(
     iteration: int,
     radius_px: Float[Tensor, " n"],
 ) -> Bool[Tensor, " n"]:
-    """Which Gaussians go: nearly transparent, too large in the world (after the first reset), or broken.
+    """Gaussians to prune: nearly transparent, too large (after the first reset), or not finite.
 
     Args:
         gaussians: The model.
-        schedule: Of density control.
-        extent: Of the scene, world units.
-        iteration: Now.
-        radius_px: Largest radius on screen since the last step, pixels; 0 for new ones.
+        schedule: The density-control schedule.
+        extent: Scene extent, world units.
+        iteration: The current iteration.
+        radius_px: Largest radius on screen since the last step, pixels; 0 for new Gaussians.
     """
     gone = torch.sigmoid(gaussians.opacity_logits) < schedule.prune_opacity
     size = gaussians.log_scales.amax(dim=1)
@@ -354,5 +354,5 @@ def prune_mask(
 
 
 def reset_opacity(opacity_logits: Float[Tensor, " n"], limit: float) -> None:
-    """Leave no opacity above ``limit``, in place."""
+    """Clamp all opacities to at most ``limit``, in place."""
     opacity_logits.clamp_(max=math.log(limit / (1.0 - limit)))

@@ -1,12 +1,13 @@
-"""Density control by the gradient of the loss by a Gaussian's place on the image plane: what it observes, its steps.
+"""Density control by the gradient of the loss with respect to a Gaussian's image-plane mean: statistics and steps.
 
 `train.density=published`: Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field
 Rendering", SIGGRAPH 2023, section 5: the norm of the gradient, summed with its sign over the pixels. `absolute`: Ye et
-al., "AbsGS", ACM MM 2024: the pixels' magnitudes are summed, which do not cancel in a Gaussian that is too large for
-what it covers.
+al., "AbsGS", ACM MM 2024: the magnitudes of the pixels' gradients are summed, which do not cancel in a Gaussian that
+is too large for the detail it covers.
 
-Both keep to our cap, our schedule of growth and our opacity of two that take the place of one (see `densify.py`);
-published are what is ranked and its threshold, the learning rates, the opacity resets and the pruning by size.
+Both use our cap, our growth schedule and our opacity for two Gaussians that replace one (see `densify.py`). With
+`published`, the ranked score and its threshold, the learning rates, the opacity resets and the pruning by size are
+those of the paper.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ class DensityStep:
     """A step of density control.
 
     Attributes:
-        schedule: Of density control.
-        extent: Of the scene, world units.
-        limit: The most Gaussians that may be left, where any are added.
-        iteration: The one that ends.
-        unwanted: (n,) Gaussians that have to go, whatever their size and opacity.
-        ranked: What techniques make of the score; None for nothing.
+        schedule: The density-control schedule.
+        extent: Scene extent, world units.
+        limit: Maximum number of Gaussians after the step, if any are added.
+        iteration: The iteration that ends.
+        unwanted: (n,) Gaussians to remove, whatever their size and opacity.
+        ranked: How techniques modify the score; None for unmodified.
     """
 
     schedule: DensitySchedule
@@ -46,12 +47,12 @@ class DensityStep:
 
 
 class Density:
-    """Density control, with what it has observed since its last step.
+    """Density control, with the statistics since its last step.
 
     Args:
-        count: Gaussians in the model.
-        magnitudes: Ranked by the sum of the pixels' magnitudes, not of their gradients.
-        device: Where the model is; None for the CPU.
+        count: Number of Gaussians in the model.
+        magnitudes: Rank by the summed magnitudes of the pixels' gradients, not by their signed sum.
+        device: The model's device; None for the CPU.
 
     Attributes:
         statistics: The score's sums.
@@ -68,17 +69,17 @@ class Density:
         schedule: DensitySchedule,
         photo: TrainingPhoto,
     ) -> None:
-        """Add an iteration after its step, which leaves the gradient on the image plane.
+        """Add an iteration's statistics, after its step has produced the image-plane gradient.
 
-        A window's gradients count as its part in those of the whole photo: what is ranked and its threshold mean the
+        A window's gradients are scaled to its share of the whole photo, so that the score and its threshold mean the
         same however a photo is divided.
 
         Args:
-            rendered: What was compared with the photo, of the n Gaussians that are trained.
-            gradient_px: By the means on the image plane, pixels; with ``magnitudes`` the sums of those. Sparse, of what
-                is trained and visible, or of all that was drawn, those n first.
-            schedule: Of density control.
-            photo: What was trained on.
+            rendered: The render compared with the photo, cut down to the n trained Gaussians.
+            gradient_px: With respect to the image-plane means, pixels; with ``magnitudes``, the summed magnitudes.
+                Either sparse, of the trained and visible Gaussians, or of all rendered ones, the n trained ones first.
+            schedule: The density-control schedule.
+            photo: The photo trained on.
         """
         whole = photo.camera.whole()
         size = (photo.share * whole.width, photo.share * whole.height)
@@ -90,10 +91,10 @@ class Density:
             self.statistics.observe_radii(rendered.radii)
 
     def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[DensifiedGaussians, dict[str, int]]:
-        """Prune, then clone or split the Gaussians of the largest mean score, up to the limit.
+        """Prune, then clone or split the Gaussians of largest mean score, up to the limit; changes nothing itself.
 
         Returns:
-            The new rows of the model, and the counts of a ``DensityEvent``; nothing is changed.
+            The new rows of the model, and the counts of a ``DensityEvent``.
         """
         schedule, extent, iteration = step.schedule, step.extent, step.iteration
         gone = prune_mask(gaussians, schedule, extent, iteration, self.statistics.max_radius_px)
@@ -106,7 +107,7 @@ class Density:
         return growth.select(~gone[growth.source]), {**counts, "pruned": pruned}
 
     def restart(self, count: int) -> None:
-        """Forget what was observed: the model has new rows."""
+        """Reset the statistics, because the model has new rows."""
         self.statistics = DensityStatistics(count, self.statistics.seen.device)
 
     def to_arrays(self) -> dict[str, Tensor]:
@@ -118,7 +119,7 @@ class Density:
 
         Raises:
             KeyError: if something is missing.
-            RuntimeError: if it is of another number of Gaussians.
+            RuntimeError: if it is for a different number of Gaussians.
         """
         for name, tensor in self.statistics.to_arrays().items():
             if arrays[name].shape != tensor.shape:

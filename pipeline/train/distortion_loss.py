@@ -34,7 +34,7 @@ class DistortionLoss(Technique):
     """Adds the spread of the depths along each ray to the loss.
 
     Args:
-        weight: In the loss.
+        weight: Weight in the loss.
         after: Iterations of the schedule that pass without it.
         about_median: As of ``spread_loss``.
     """
@@ -104,7 +104,7 @@ def spread_loss(
     Args:
         rendered: With depths, squared from ``origin``.
         origin: World units along the view axis.
-        camera: The photo's.
+        camera: The photo's camera.
         inside: Rows and columns that count.
         about_median: Depths are to lie at the ray's median, not at their mean, which what shines through from far
             behind draws behind the surface.

@@ -1,7 +1,7 @@
-"""Counter-based random numbers: a value depends on (seed, step, stream, index) alone, so a resumed run repeats.
+"""Counter-based random numbers: a value depends only on (seed, step, stream, index), so a resumed run repeats them.
 
 The generator is SplitMix64's output function over a Weyl sequence (Steele, Lea, Flood: "Fast splittable pseudorandom
-number generators", OOPSLA 2014), applied once a key word.
+number generators", OOPSLA 2014), applied once per key word.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _MULTIPLY_2 = np.uint64(0x94D049BB133111EB)
 _WORD = (1 << 64) - 1
 _TO_UNIT = 2.0**-53
 
-# Streams: one a use, so that no two uses share their numbers.
+# Streams: one per use, so that no two uses share numbers.
 PHOTO_ORDER = 1
 SPLIT_POSITION = 2
 BACKGROUND = 3

@@ -36,7 +36,7 @@ def dropped(gaussians: Gaussians, schedule: Schedule, iteration: int) -> Gaussia
 
     Args:
         gaussians: The model.
-        schedule: The training's.
+        schedule: The training schedule.
         iteration: From 1; with the seed and a Gaussian's row it names the random number.
     """
     share = share_at(schedule, iteration)
@@ -51,7 +51,7 @@ class Dropout(Technique):
     """Leaves a random share of the Gaussians out of each iteration.
 
     Args:
-        schedule: The training's.
+        schedule: The training schedule.
     """
 
     name = "dropout"

@@ -33,7 +33,7 @@ class Exposure(SideModel, Technique):
     """An affine map of the colours for each photo.
 
     Args:
-        names: Of the photos trained on.
+        names: Names of the photos trained on.
         first_rate: Learning rate at the start.
         decay: How strongly the maps are drawn to the identity.
     """
@@ -84,7 +84,7 @@ class Exposure(SideModel, Technique):
 
         Args:
             name: The photo's.
-            share: Of the schedule that is done.
+            share: Fraction of the schedule done, 0..1.
         """
         deviations, row = self._deviations(), self._row[name]
         if deviations.grad is not None:
@@ -122,7 +122,7 @@ def read_exposures(path: Path, stage: str) -> dict[str, list[list[float]]]:
         stage: That left it.
 
     Raises:
-        StageError: if it is not that.
+        StageError: if it is not such a file.
     """
     try:
         found = json.loads(path.read_text(encoding="utf-8"))["views"]

@@ -28,7 +28,7 @@ def settled_from(schedule: Schedule) -> int:
     """Iteration after which only the rates change: all Gaussians, all degrees and the photos' finest size are there.
 
     Args:
-        schedule: The training's.
+        schedule: The training schedule.
     """
     density = schedule.density.last if schedule.density.on else 0
     return max(density, schedule.finest_from, schedule.sh_degree * schedule.sh_every)
@@ -40,8 +40,8 @@ def judged_from(schedule: Schedule, iteration: int, resets: Sequence[int]) -> in
     Before the finest size growth has to have begun only: what it adds later, it adds to larger photos as well.
 
     Args:
-        schedule: The training's.
-        iteration: Now.
+        schedule: The training schedule.
+        iteration: The current iteration.
         resets: Iterations after which opacities were reset.
     """
     number = schedule.stretch_at(iteration)
@@ -78,7 +78,7 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: TrainingPlan, iteration: 
 
     Args:
         epochs: Middle iteration and mean loss of all since ``judged_from``.
-        plan: The training's.
+        plan: The training plan.
         iteration: Now, the last one of an epoch.
     """
     scheduled = plan.schedule.iterations
@@ -97,7 +97,7 @@ def end_epoch(history: History, plan: TrainingPlan, iteration: int, length: int)
 
     Args:
         history: Changed in place.
-        plan: The training's, as it is by now.
+        plan: The current training plan.
         iteration: The last one of an epoch.
         length: Iterations that the epoch has.
     """
@@ -115,7 +115,7 @@ def ends_at(plan: TrainingPlan, flat_at: int) -> int:
     """The last iteration.
 
     Args:
-        plan: The training's.
+        plan: The training plan.
         flat_at: Iteration after which the tail began; 0 where it did not.
     """
     return min(plan.last_iteration, flat_at + tail_of(flat_at)) if flat_at else plan.last_iteration

@@ -1,10 +1,11 @@
-"""A copy of a trained model, flattened: every ray meets one even surface, for depths to be rendered from.
+"""A flattened copy of a trained model, in which every ray meets one smooth surface, for rendering depths.
 
-A splat is trained for pictures. Its surfaces are clouds of Gaussians which shine through, and where a wall is plain
-they hang before and behind it: nothing in a photo tells. The copy is trained on for some hundred iterations, at the
-size at which photos are seen whole, with what draws all that a ray meets to one depth (``distortion``, about the
-median) and depths to those around them (``evenness``). Density control is off, sky and exposures stay as they were
-trained. That costs its pictures some decibels, so the delivered splat stays as it is.
+A splat is trained for images. Its surfaces are translucent clouds of Gaussians, and on textureless walls they hang in
+front of and behind the surface, because no photo constrains them. The copy is trained further for some hundred
+iterations, at the size at which a whole photo fits in one window, with a distortion loss about the median, which
+pulls everything along a ray to one depth, and a smoothness loss between neighbouring depths.
+Density control is off, sky and exposures stay as they were
+trained. This costs some decibels of image quality, so the delivered splat is not changed.
 """
 
 from __future__ import annotations
@@ -35,10 +36,13 @@ from splatpipe.pipeline.train.visits import PhotoVisits, Visits
 from splatpipe.pipeline.train.windows import TrainingSize
 
 VISITS = 8  # of every photo
-LEAST_ITERATIONS = 300  # where photos are few
-SPREAD_WEIGHT = 0.5  # ten times what a splat for pictures is trained with
+LEAST_ITERATIONS = 300  # if there are few photos
+SPREAD_WEIGHT = 0.5  # ten times that of a splat trained for images
 EVENNESS_WEIGHT = 0.1
-FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6  # of positions, times the extent: the published ones' later half
+FIRST_MEANS_RATE, LAST_MEANS_RATE = (
+    1.6e-5,
+    1.6e-6,
+)  # of positions, times the extent: the later half of the published ones
 OPACITY_RATE = 0.05  # as published
 
 FLATTENED = "flattened.ply"
@@ -46,15 +50,15 @@ FLATTENED = "flattened.ply"
 
 @dataclass(frozen=True)
 class TrainedParts:
-    """What is flattened, and what it was trained on.
+    """The trained model to flatten, and what it was trained on.
 
     Attributes:
         model: The splat.
         rendering: How it is to be rendered.
         sky: Its panorama.
-        exposures: The photos'.
+        exposures: The photos' exposures.
         dataset: Photos and sparse points.
-        split: Which photos were trained on: those that were not are none to the copy either.
+        split: Which photos were trained on; the copy is not trained on the others either.
     """
 
     model: Path
@@ -66,19 +70,19 @@ class TrainedParts:
 
 
 def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter) -> Gaussians:
-    """The flattened copy, kept in `flattened.ply`; goes on from a checkpoint where a killed run left one.
+    """Return the flattened copy, kept in `flattened.ply`; resumes from the checkpoint of a killed run.
 
-    The same bits for any number of threads, and for a run that was killed.
+    The result is bit-identical for any number of threads and for a resumed run.
 
     Args:
-        trained: What is flattened.
-        machine: Changes only speed.
-        out: Has the copy, a checkpoint and decoded photos meanwhile; the copy is taken as it is where it is there.
-        report: Takes what people want to know.
+        trained: The model to flatten.
+        machine: Affects only speed.
+        out: Folder of the copy and, meanwhile, a checkpoint and decoded photos; an existing copy is reused.
+        report: Receives progress and messages.
 
     Raises:
         SplatpipeError: if a file is missing or broken.
-        MachineError: if the device asked for is not there.
+        MachineError: if the requested device is not available.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     path = out / FLATTENED
@@ -95,7 +99,7 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
 
 
 def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetup:
-    """What the copy goes through."""
+    """The training setup of the copy."""
     views, split = load_views(trained.dataset), load_split(trained.split)
     exposures = read_exposures(trained.exposures, "train")
     gaussians, rendering = read_splat(trained.model), load_rendering(trained.rendering)
@@ -120,7 +124,7 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetu
 
 
 def _sky(trained: TrainedParts, views: Sequence[View], threads: int) -> SkyModel | None:
-    """The trained panorama, with the skies found in the photos again; None where there is none."""
+    """The trained panorama, with the photos' sky masks detected again; None if there is no sky."""
     panorama = read_panorama(trained.sky)
     if panorama is None:
         return None
@@ -129,7 +133,7 @@ def _sky(trained: TrainedParts, views: Sequence[View], threads: int) -> SkyModel
 
 
 def options_of(gaussians: Gaussians, rendering: Rendering, has_exposures: bool) -> TrainConfig:
-    """A training's that goes on with a model as it is: as many Gaussians to the end.
+    """Options of a training that continues a model with the same number of Gaussians.
 
     Args:
         gaussians: The model.
@@ -151,14 +155,14 @@ def options_of(gaussians: Gaussians, rendering: Rendering, has_exposures: bool) 
 def flattening_plan(
     options: TrainConfig, views: Sequence[View], split: Split, gaussians: int, window_pixels: int
 ) -> TrainingPlan:
-    """What the copy is trained with.
+    """The training plan of the copy.
 
     Args:
-        options: As of ``options_of``.
+        options: From ``options_of``.
         views: All photos of the dataset.
         split: Which of them are trained on.
-        gaussians: Of the model.
-        window_pixels: Of a photo, that an iteration looks at at most; photos are halved until they fit into that.
+        gaussians: Number of Gaussians in the model.
+        window_pixels: Most pixels of a photo that an iteration uses; photos are halved until they fit into that.
     """
     plan = make_plan(options, views, split, gaussians, window_pixels)
     footage = plan.footage

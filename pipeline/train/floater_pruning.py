@@ -1,7 +1,7 @@
-"""Gaussians that hang where photos look through, or right before a camera, are removed in training.
+"""Floater pruning: remove Gaussians in free space or directly in front of a camera during training.
 
-The published trainer has only an opacity reset against them. That photos see sparse points through a place says more:
-`splat.free_space` has the test, here with the photos trained on alone, so that no held-out one has a say.
+The published trainer only has opacity resets against floaters. A place through which photos see sparse points is
+stronger evidence: `splat.free_space` has the test, here with training photos only, never held-out ones.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.hooks import Technique
 from splatpipe.pipeline.train.schedule import Schedule
 
-STEPS_BETWEEN = 5  # steps of density control from one look to the next: a look takes as long as several iterations
+STEPS_BETWEEN = 5  # steps of density control between checks: a check takes as long as several iterations
 LAST_LOOK = 0.9  # of the run: the rest closes the holes
 
 
 def free_space_of(views: Sequence[View], dataset: Path) -> FreeSpace:
-    """What the photos say is free.
+    """The free space seen by the photos.
 
     Args:
-        views: The photos trained on.
-        dataset: Theirs, with the sparse points.
+        views: The training photos.
+        dataset: Their dataset, with the sparse points.
 
     Raises:
         StageError: if the dataset is broken.
@@ -38,11 +38,11 @@ def free_space_of(views: Sequence[View], dataset: Path) -> FreeSpace:
 
 
 class FloaterPruning(Technique):
-    """Looks for Gaussians in free space now and then.
+    """Removes Gaussians in free space from time to time.
 
     Args:
-        space: What is free.
-        schedule: The training's.
+        space: The free space.
+        schedule: The training schedule.
     """
 
     name = "clearing"
@@ -51,17 +51,17 @@ class FloaterPruning(Technique):
         self._space, self._schedule = space, schedule
 
     def is_due(self, iteration: int) -> bool:
-        """Whether it looks after an iteration (from 1).
+        """Whether floaters are pruned after an iteration (from 1).
 
-        Density control has its own beginning and end. Looking goes on after it: what is left fits the photos by
-        hanging before the surface, most of all where they are few.
+        Pruning begins with density control but continues after its end: later floaters fit the photos by hanging in
+        front of the surface, above all where there are few photos.
         """
         density = self._schedule.density
         due = iteration % (STEPS_BETWEEN * density.every) == 0 and iteration <= LAST_LOOK * self._schedule.iterations
         return density.on and due and density.first <= iteration
 
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
-        """Those that hang in free space; None where it does not look."""
+        """Gaussians in free space; None if it is not time to check."""
         if not self.is_due(iteration):
             return None
         return near_or_free(gaussians, self._space, self._schedule.density.prune_free_space)

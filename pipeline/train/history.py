@@ -1,4 +1,4 @@
-"""What happened in a training, without clocks: the same for every run of a plan."""
+"""The training history, without clock times: identical for every run of a plan."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from torch import Tensor
 
 from splatpipe.pipeline.train.densify import DensityEvent
 
-CURVE_EVERY = 50  # iterations that a point of the curve is the mean of
+CURVE_EVERY = 50  # iterations averaged in a point of the curve
 
 
 @dataclass
 class History:
-    """The curve of the loss and the events of density control.
+    """The loss curve and the events of density control.
 
-    Losses are read from the device in bunches, when somebody asks what they come to: an iteration waits for none.
+    Losses are read from the device in batches, when their sum is needed: no iteration waits for them.
 
     Attributes:
-        curve: Points of iteration, mean loss since the point before, Gaussians, SH degree and width of the
-            whole photo.
+        curve: Points with iteration, mean loss since the previous point, number of Gaussians, SH degree and width of
+            the whole photo.
         density: Steps of density control.
         resets: Iterations after which opacities were reset.
-        growth_ended: Iteration from which memory allowed no more Gaussians; 0 where it did.
-        skipped_gradients: Gaussians' gradients left out because they were not finite, over all iterations.
-        loss_sum: Of the losses since the last point.
-        loss_count: How many those are.
-        epochs: With `stop_when_flat`, middle iteration and mean loss of those to judge by.
-        epoch_sum: Of the losses in the epoch that runs.
-        epoch_count: How many those are.
-        sizes_ended: Iterations after which larger photos came before their time because the loss was flat.
-        flat_at: Iteration after which the schedule was run down because the loss was flat; 0 where it was not.
+        growth_ended: Iteration from which memory allowed no more Gaussians; 0 if memory never ended growth.
+        skipped_gradients: Gaussians' gradients skipped because they were not finite, over all iterations.
+        loss_sum: Sum of the losses since the last point.
+        loss_count: Their number.
+        epochs: With `stop_when_flat`, middle iteration and mean loss of the epochs to judge by.
+        epoch_sum: Sum of the losses in the current epoch.
+        epoch_count: Their number.
+        sizes_ended: Iterations after which a flat loss ended a photo size early.
+        flat_at: Iteration after which a flat loss started the tail of the schedule; 0 if none did.
     """
 
     curve: list[dict[str, float | int | None]] = field(default_factory=list)
@@ -55,11 +55,11 @@ class History:
         self._unread: list[Tensor] = []
 
     def add_loss(self, loss: Tensor) -> None:
-        """Count an iteration's loss, a scalar on any device; one that is not finite is left out."""
+        """Count an iteration's loss, a scalar on any device; a non-finite loss is left out."""
         self._unread.append(loss)
 
     def _read_losses(self) -> None:
-        """Add up what was counted, one after the other in float64: the same sums whenever they are asked for."""
+        """Add up the counted losses in order, in float64: the sums do not depend on when they are read."""
         if not self._unread:
             return
         losses, self._unread = torch.stack(self._unread).tolist(), []
@@ -70,16 +70,16 @@ class History:
             self.epoch_count += 1
 
     def add_density(self, event: DensityEvent) -> None:
-        """Note a step of density control."""
+        """Record a step of density control."""
         self.density.append(event.to_json())
 
     def end_iteration(self, iteration: int, last: bool, facts: Mapping[str, int]) -> None:
-        """Close a point of the curve where one is due.
+        """Add a point to the curve if one is due.
 
         Args:
-            iteration: Now.
+            iteration: The current iteration.
             last: Whether the training ends here.
-            facts: What else the point says.
+            facts: The point's other values.
         """
         closed = bool(self.curve) and self.curve[-1]["iteration"] == iteration
         if closed or (iteration % CURVE_EVERY != 0 and not last):
@@ -94,7 +94,7 @@ class History:
 
         Args:
             middle: Its middle iteration.
-            judged: Whether it is one to judge the end of training by.
+            judged: Whether it counts for judging the end of training.
         """
         self._read_losses()
         if judged and self.epoch_count:
@@ -102,16 +102,16 @@ class History:
         self.epoch_sum, self.epoch_count = 0.0, 0
 
     def recent_loss(self) -> float | int | None:
-        """Mean loss since the last point of the curve, or that point's."""
+        """Mean loss since the last point of the curve, or that point's loss if there is none since."""
         self._read_losses()
         return self.loss_sum / self.loss_count if self.loss_count else self.last_loss()
 
     def last_loss(self) -> float | int | None:
-        """The curve's last value."""
+        """The loss of the curve's last point; None without points."""
         return self.curve[-1]["loss"] if self.curve else None
 
     def state(self) -> dict[str, Any]:
-        """All of it as JSON values, for a checkpoint."""
+        """The whole history as JSON values, for a checkpoint."""
         self._read_losses()
         return {
             "curve": self.curve,

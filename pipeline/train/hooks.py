@@ -1,4 +1,4 @@
-"""What an optional technique may do in an iteration of training, and what it is told."""
+"""The hooks of optional techniques in a training iteration, and the data that they receive."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from splatpipe.pipeline.train.stream import TrainingPhoto
 
 @dataclass(frozen=True)
 class Shot:
-    """A photo and its view, rendered.
+    """A photo and its rendered view.
 
     Attributes:
-        photo: What to compare with.
-        rendered: The Gaussians alone.
-        settings: How they were rendered.
-        now: What the schedule says.
+        photo: The photo to compare with.
+        rendered: The render of the Gaussians alone.
+        settings: How it was rendered.
+        now: The schedule's values for this iteration.
     """
 
     photo: TrainingPhoto
@@ -36,75 +36,75 @@ class Shot:
 
 
 class Technique:
-    """What takes part in training besides the Gaussians, off where nobody asks for it.
+    """An optional part of training besides the Gaussians, off by default.
 
-    The hooks are in the order in which an iteration calls them; each does nothing here.
+    The hooks are listed in the order in which an iteration calls them; here each does nothing.
 
     Attributes:
-        name: Of its tensors in a checkpoint.
+        name: Prefix of its tensors in a checkpoint.
     """
 
     name: ClassVar[str]
 
     def move_to(self, device: torch.device) -> None:
-        """Take what is kept as tensors to where the model is trained; before the first iteration."""
+        """Move the technique's tensors to the training device; called before the first iteration."""
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
-        """How to render, e.g. with depths."""
+        """Return the render options for this iteration, e.g. with depths."""
         return settings
 
     def before_render(self, model: Gaussians, now: ScheduleStep) -> Gaussians:
-        """The model as it is rendered in this iteration."""
+        """Return the model as rendered in this iteration."""
         return model
 
     def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
-        """The render as the photo would show it."""
+        """Return the render as the photo would show it."""
         return picture
 
     def counted(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
-        """The photo with what of it counts.
+        """Return the photo, masked to the pixels that count.
 
         Args:
-            photo: As the techniques before left it.
-            picture: What it is compared with.
-            shot: The iteration's.
+            photo: The photo as returned by the previous techniques.
+            picture: The render that it is compared with.
+            shot: The iteration's photo and render.
         """
         return photo
 
     def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
-        """What is added to the photo's loss; one on the Gaussians themselves keeps the model of `before_render`."""
+        """Return a loss term or None; a penalty on the Gaussians themselves must keep the model of `before_render`."""
         return None
 
     def begin_again(self) -> None:
-        """The iteration is begun again, for memory was short before its step: undo what its hooks have changed."""
+        """Undo what the hooks changed: the iteration restarts because memory ran out before its step."""
 
     def after_step(self, shot: Shot) -> None:
-        """Step what is trained beside the Gaussians."""
+        """Take an optimizer step for the technique's own parameters."""
 
     def after_epoch(self, iteration: int) -> None:
-        """Every photo was trained on once more, with all of its windows."""
+        """Called when every photo, with all of its windows, has been trained on once more."""
 
     def ranked(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
     ) -> Float[Tensor, " n"]:
-        """The score by which density control ranks Gaussians; 0 for one that is not to be cloned or split."""
+        """Return the score by which density control ranks Gaussians; 0 for one that must not be cloned or split."""
         return score
 
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
-        """Which Gaussians have to go after an iteration; None where it is not one to look."""
+        """Return the Gaussians to remove after an iteration; None if this iteration does not check."""
         return None
 
     def summary(self) -> dict[str, int | float]:
-        """What the stage's summary says of it."""
+        """Return the technique's entries in the stage's summary."""
         return {}
 
     def to_arrays(self) -> dict[str, Tensor]:
-        """All that changes, by name, for a checkpoint; not copied."""
+        """Mutable state by name, for a checkpoint; not copied."""
         return {}
 
     def load(self, arrays: Mapping[str, Tensor]) -> None:
         """The inverse of ``to_arrays``.
 
         Raises:
-            KeyError, ValueError: if something is missing or has another shape.
+            KeyError, ValueError: if a tensor is missing or has a different shape.
         """

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM between iterations instead of within one, so that what is saved then is consistent."""
+"""Defer Ctrl-C and SIGTERM to the end of an iteration, so that the state saved then is consistent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from types import FrameType
 
 @dataclass
 class Interrupt:
-    """Whether the run was asked to end."""
+    """Whether the run was asked to stop."""
 
     requested: bool = False
 
@@ -24,7 +24,7 @@ class Interrupt:
 def deferred_interrupts() -> Iterator[Interrupt]:
     """Hold back SIGINT and SIGTERM: they only set ``requested``, and the body raises KeyboardInterrupt itself.
 
-    Signals can be handled in the main thread only; elsewhere nothing is held back.
+    Signals can only be handled in the main thread; elsewhere nothing is held back.
     """
     interrupt = Interrupt()
     if threading.current_thread() is not threading.main_thread():

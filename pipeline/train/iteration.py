@@ -1,9 +1,9 @@
 """One iteration of training, from top to bottom.
 
-What is not always there is a technique: an object with the hooks of ``hooks.Technique``, which ``iterate`` calls where
-it stands. To add one, write it in a file of its own with the hooks that it needs, and list it in ``techniques.py``; an
-option in ``options.py`` turns it on. What it trains is kept in checkpoints through ``to_arrays`` and ``load``.
-What changes with the iteration is told by ``Schedule.at``, resolved before the first one.
+Every optional part is a technique: an object with the hooks of ``hooks.Technique``, which ``iterate`` calls in turn.
+To add one, write it in a file of its own with the hooks that it needs and list it in ``techniques.py``; an option in
+``options.py`` turns it on. Its trained state is kept in checkpoints through ``to_arrays`` and ``load``.
+Whatever changes with the iteration comes from ``Schedule.at``, resolved before the first iteration.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
-SSIM_WEIGHT = 0.2  # share of 1 - SSIM in the loss, the rest is L1: published
+SSIM_WEIGHT = 0.2  # weight of 1 - SSIM in the loss, the rest is L1; published
 
 
 def iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
-    """Render, compare, step the parameters, then density control where it is due.
+    """Render, compare, step the parameters, then run density control if it is due.
 
     Args:
-        state: Changed in place; afterwards it is of the next iteration.
-        plan: The training's, as it is by now.
-        photo: What to compare with.
+        state: Changed in place; ready for the next iteration afterwards.
+        plan: The current training plan.
+        photo: The photo to compare with.
     """
     now = plan.schedule.at(state.iteration + 1, state.history.flat_at)
     if not photo.is_empty:
@@ -42,13 +42,13 @@ def iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None
 
 
 def learn(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: ScheduleStep) -> None:
-    """Render, compare, step; what that makes is gone afterwards, for density control wants the memory.
+    """Render, compare, step; all intermediate tensors are freed on return, because density control needs the memory.
 
     Args:
         state: Changed in place.
-        plan: The training's.
-        photo: What to compare with.
-        now: What the schedule says.
+        plan: The training plan.
+        photo: The photo to compare with.
+        now: The schedule's values for this iteration.
     """
     techniques = state.techniques
     # Render.
@@ -78,7 +78,7 @@ def learn(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: Sche
 
 
 def render_options(plan: TrainingPlan, now: ScheduleStep, magnitudes: bool) -> rasterizer.RenderOptions:
-    """How an iteration renders; with ``magnitudes`` of the screen gradient where density control looks on."""
+    """The render options of an iteration; ``magnitudes`` also sums the screen gradient's magnitudes."""
     return rasterizer.RenderOptions(
         sh_degree=now.sh_degree,
         background=now.background,
@@ -90,10 +90,10 @@ def render_options(plan: TrainingPlan, now: ScheduleStep, magnitudes: bool) -> r
 
 
 def close(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: ScheduleStep) -> None:
-    """Count the iteration, and note what followed from it: the memory's end of growth, a flat loss, the curve."""
+    """Count the iteration and record its consequences: growth ended by memory, a flat loss, the curve."""
     history = state.history
     if not history.growth_ended and plan.schedule.density.is_step(now.iteration):
-        # A device's memory is looked at before anything grows (see ``within_room``).
+        # A device's memory is checked before anything grows (see ``within_room``).
         on_cpu = state.gaussians.means.device.type == "cpu"
         history.growth_ended = now.iteration if on_cpu and over_memory(plan.options) else 0
     state.iteration = now.iteration
@@ -104,7 +104,7 @@ def close(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: Sche
 
 
 def curve_facts(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> dict[str, int]:
-    """What a point of the history's curve says besides the loss."""
+    """The values of a point of the history's curve besides the loss."""
     return {
         "gaussians": len(state.gaussians),
         "sh_degree": plan.schedule.sh_degree_at(state.iteration),

@@ -60,7 +60,7 @@ class PhotoSizes:
 
     Attributes:
         sizes: Width and height at the finest size, pixels, and how many photos have it.
-        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
+        window_pixels: Most pixels of a photo that an iteration uses; 0 for the whole photo.
     """
 
     sizes: tuple[tuple[int, int, int], ...]

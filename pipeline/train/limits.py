@@ -1,22 +1,22 @@
-"""What limits of memory and time allow a training, as plain arithmetic. Light to import.
+"""What memory and time limits allow in training, as plain arithmetic; cheap to import.
 
-| of a Gaussian with SH of degree 3 (59 numbers, float32) | bytes |
+| per Gaussian with degree-3 SH (59 numbers, float32) | bytes |
 |---|---|
 | parameters | 236 |
 | Adam's two moments | 472 |
 | statistics of density control | 12 |
-| **state of training** | **720** |
-| a frame that shows it, with its pairs; or, later, what density control copies | 576 |
+| **training state** | **720** |
+| a frame that shows it, with its pairs; or, later, the copies made by density control | 576 |
 
 Gradients are never stored. On a CUDA device density control moves one tensor at a time:
 
-| of the same Gaussian on a CUDA device | bytes |
+| per Gaussian on a CUDA device | bytes |
 |---|---|
 | parameters and moments | 708 |
 | statistics of density control | 12 |
-| **state of training** | **720** |
-| a frame with its pairs in the smallest chunks (see `frame.h`), radii, gradients on the screen | 201 |
-| or, later, density control: a copy of the harmonics, places, scores, an index and its sort | 320 |
+| **training state** | **720** |
+| a frame with its pairs in the smallest chunks (see `frame.h`), radii, screen-space gradients | 201 |
+| or, later, density control: a copy of SH, positions, scores, an index and its sort | 320 |
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ import math
 
 FLOAT_BYTES = 4
 SHAPE_NUMBERS = 11  # of a Gaussian besides its colour: position, scales, rotation, opacity
-STATE_COPIES = 3  # a parameter has two moments
+STATE_COPIES = 3  # a parameter and its two moments
 STATISTICS_BYTES = 12
-PEAK_SHARE = 0.8  # of the state: a frame of all, or what density control copies; measured: 0.6 to 0.76, with waste
-PIXEL_BYTES = 300  # of what an iteration looks at: read thrice ahead, rendered, compared, each with its gradient
-DEVICE_PASSING_BYTES = 320  # the larger of what a frame and density control take
-FIXED_BYTES = 120_000_000  # buffers of the kernels, of torch and of decoders, whatever the size
+PEAK_SHARE = 0.8  # of the state: a frame of all, or density control's copies; measured: 0.6 to 0.76, with waste
+PIXEL_BYTES = 300  # per pixel of an iteration: three photos read ahead, render and loss, with gradients
+DEVICE_PASSING_BYTES = 320  # transient: the larger of a frame and density control
+FIXED_BYTES = 120_000_000  # buffers of the kernels, torch and decoders, whatever the size
 
-LIBRARIES_BYTES = 576_000_000  # of a training's process, whatever it trains: interpreter, torch, what comes with it
-MACHINE_SHARE = 0.8  # of a machine's memory, that a training may take where nobody gave a limit: others want some
+LIBRARIES_BYTES = 576_000_000  # base of a training process: interpreter, torch and its dependencies
+MACHINE_SHARE = 0.8  # of the machine's memory that a training may use without a given limit: leaves room for others
 
-SMALLEST_WINDOW = 60_000  # pixels: below it margins, 5 pixels a side, and the Gaussians' own cost are what is paid for
-WINDOW_SHARE = 0.25  # of the memory for pixels and Gaussians, that a window takes at most
+SMALLEST_WINDOW = 60_000  # pixels: below it the 5-pixel margins and the per-Gaussian cost dominate
+WINDOW_SHARE = 0.25  # largest share of the memory for pixels and Gaussians that a window may take
 
-FIRST_ITERATIONS = 1500  # a training of FIRST_SECONDS shall have as many: below it the colours have not settled
+FIRST_ITERATIONS = 1500  # wanted within FIRST_SECONDS: with fewer the colours have not settled
 FIRST_SECONDS = 30.0
-LONGEST = 30_000  # iterations, as published: beyond them little is learnt
-FEWEST = 300  # iterations, however short the time: fewer do not leave the initial blur
+LONGEST = 30_000  # iterations, as published: little is gained beyond
+FEWEST = 300  # iterations, however short the time: with fewer the model stays as blurred as it began
 
 
 def numbers_of(sh_degree: int) -> int:
-    """Of a Gaussian: its shape, and three colours of as many coefficients as its harmonics have."""
+    """Number of parameters of a Gaussian: its shape, and the SH coefficients of three colours."""
     return SHAPE_NUMBERS + 3 * (sh_degree + 1) ** 2
 
 
 def bytes_per_gaussian(sh_degree: int) -> int:
-    """Most that a Gaussian takes at any time of a training on the CPU."""
+    """Peak memory per Gaussian in training on the CPU, bytes."""
     state = STATE_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + STATISTICS_BYTES
     return int(state * (1.0 + PEAK_SHARE))
 
@@ -61,23 +61,23 @@ def device_bytes_per_gaussian(sh_degree: int) -> int:
 
 
 def window_within(room_bytes: int, window_pixels: int) -> int:
-    """Pixels of the windows that a training with so much memory for pixels and Gaussians looks through.
+    """Window size, pixels, that fits the memory available for pixels and Gaussians.
 
-    Smaller ones show as much in more iterations; Gaussians that have no room are never there.
+    Smaller windows only need more iterations to cover the same area; Gaussians without room cannot be recovered.
 
     Args:
-        room_bytes: For them.
-        window_pixels: Of a window where memory is no matter; 0: photos are looked at whole, whatever the room.
+        room_bytes: Memory available for pixels and Gaussians.
+        window_pixels: Window size if memory does not matter; 0: photos are used whole, whatever the memory.
     """
     within = int(WINDOW_SHARE * max(0, room_bytes) / PIXEL_BYTES)
     return min(window_pixels, max(SMALLEST_WINDOW, within))
 
 
 def worthwhile_iterations(seconds: float) -> int:
-    """Iterations that a training of so many seconds shall have at least, from ``FEWEST`` to ``LONGEST``.
+    """Minimum iterations worth doing in a training of ``seconds``, from ``FEWEST`` to ``LONGEST``.
 
-    They grow with the root of the time, so that what they work on grows as much; with it 10 minutes give about the
-    7,000 of the standard preset.
+    They grow with the square root of the time, so that the work per iteration grows as much; 10 minutes give about
+    the 7,000 iterations of the standard preset.
     """
     wanted = FIRST_ITERATIONS * math.sqrt(max(seconds, 1.0) / FIRST_SECONDS)
     return int(min(LONGEST, max(FEWEST, wanted)))

@@ -1,4 +1,4 @@
-"""train: from the sparse points to a splat, one photo an iteration."""
+"""The train stage: from sparse points to a splat, one photo per iteration."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ from splatpipe.pipeline.train.visits import PhotoVisits, Visits
 from splatpipe.pipeline.train.windows import TrainingSize
 
 CHECKPOINT = "checkpoint.npz"
-CHECKPOINT_SECONDS = 20.0  # between checkpoints: what a kill may cost
-CHECKPOINT_SHARE = 0.02  # of the time at most goes into them
+CHECKPOINT_SECONDS = 20.0  # minimum time between checkpoints: what a kill may cost
+CHECKPOINT_SHARE = 0.02  # maximum share of training time spent on checkpoints
 REPORT_EVERY = 10  # iterations
-CUDA_REPORT_EVERY = 50  # the same where telling the loss waits for the device
+CUDA_REPORT_EVERY = 50  # same on CUDA, where reading the loss synchronizes with the device
 
 
 @dataclass(frozen=True)
 class TrainingSetup:
-    """What a training goes through.
+    """Everything that a training run needs.
 
     Attributes:
-        plan: What it does.
-        device: What it is computed on.
-        views: To train on.
-        visits: What iterations with such looks look at of them.
-        techniques: Makes the plan's, nothing of them trained.
-        start: Makes the Gaussians that it begins with.
-        frozen: Makes those that are drawn besides and stay as they are; None for none.
+        plan: The training plan.
+        device: The compute device.
+        views: Views to train on.
+        visits: Makes the visits of the views from the training size of each iteration.
+        techniques: Makes the plan's techniques, untrained.
+        start: Makes the initial Gaussians.
+        frozen: Makes the Gaussians that are rendered too but not trained; None for none.
     """
 
     plan: TrainingPlan
@@ -69,21 +69,21 @@ class TrainingSetup:
     frozen: Callable[[], Gaussians | None] = lambda: None
 
     def placed_frozen(self) -> Gaussians | None:
-        """The frozen ones on the device."""
+        """The frozen Gaussians on the device."""
         frozen = self.frozen()
         return None if frozen is None else frozen.to(self.device.tensors)
 
 
 Fit = Callable[[TrainingPlan, PlanningInput, Step, Reporter], TrainingPlan]
-"""Fits a plan to its scene, before the first iteration."""
+"""Adapts a plan to its scene, before the first iteration."""
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the model, its history, its plan and side models; go on from a checkpoint where a killed run left one.
+    """Write the model, history, plan and side models; resume from the checkpoint of a killed run if there is one.
 
     Raises:
-        SplatpipeError: if nothing is left to train on.
-        MachineError: if the device asked for is not there.
+        SplatpipeError: if there is nothing to train on.
+        MachineError: if the requested device is not available.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     _, summary = train_whole(config, inputs, out, report, under_budgets)
@@ -93,14 +93,17 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
 def train_whole(
     config: TrainConfig, inputs: Inputs, out: Path, report: Reporter, fit: Fit
 ) -> tuple[TrainState, Summary]:
-    """Train the whole scene as ``run`` does, by another plan.
+    """Train the whole scene as ``run`` does, with another plan.
 
     Args:
-        config: The options.
-        inputs: Those of the stage.
-        out: Takes the files.
-        report: Takes what people want to know.
+        config: The training options.
+        inputs: The stage's inputs.
+        out: Output folder.
+        report: Receives progress and messages.
         fit: Makes the plan from one without budgets.
+
+    Returns:
+        The final state and the stage's summary.
 
     Raises:
         SplatpipeError, MachineError, KeyboardInterrupt: as ``run``.
@@ -152,12 +155,12 @@ def train_whole(
 
 
 def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState:
-    """Train from the start, or from the checkpoint that a killed run left, to the end.
+    """Train to the end, from the start or from a killed run's checkpoint, and return the final state.
 
     Args:
-        course: Of the training.
-        out: Has the checkpoint, and the decoded photos meanwhile.
-        report: Takes what people want to know.
+        course: The training setup.
+        out: Folder of the checkpoint and, during training, the decoded photos.
+        report: Receives progress and messages.
 
     Raises:
         MachineError, KeyboardInterrupt: as ``run``.
@@ -170,7 +173,7 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
     clock, visits = Clock(seconds), course.visits(training_sizes(plan, history))
     with PhotoStream(course.views, visits, first, out).to(device.tensors) as photos:
         photos.tell(report)
-        photos.fill(report)  # before there is a model, if it is not there already: both want memory
+        photos.fill(report)  # before the model exists, unless it was resumed: both need memory
         if state is None:
             begun = course.start().to(device.tensors)
             state = TrainState.begin(begun, plan, course.techniques(), course.placed_frozen())
@@ -182,14 +185,14 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
 
 
 def write_side_models(out: Path, techniques: Techniques) -> None:
-    """Write what was trained beside the Gaussians, where it was."""
+    """Write the side models (sky, exposures); a model that was not trained is written as absent."""
     sky = techniques.find(SkyModel)
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "exposures.json").write_text(exposures_json(techniques.find(Exposure)), encoding="utf-8")
 
 
 def summary_of(state: TrainState, plan: TrainingPlan) -> dict[str, JSON]:
-    """What the stage says of a training that is done."""
+    """The stage's summary of a finished training."""
     found: dict[str, JSON] = {
         "iterations": state.iteration,
         "planned_iterations": plan.schedule.iterations,
@@ -209,26 +212,26 @@ def summary_of(state: TrainState, plan: TrainingPlan) -> dict[str, JSON]:
 
 
 def training_sizes(plan: TrainingPlan, history: History) -> list[TrainingSize]:
-    """What every iteration looks at, as far as is known by now.
+    """The training size of every iteration, as far as it is known now.
 
     Args:
-        plan: The training's, as it was made.
-        history: Of the training.
+        plan: The training plan, as first made.
+        history: The training's history.
     """
     now = plan.after(history.sizes_ended)
     return now.schedule.looks_to(ends_at(now, history.flat_at))
 
 
 def budgeted(plan: TrainingPlan) -> bool:
-    """Whether a budget had a say in the plan, so that people want to see it."""
+    """Whether a budget shaped the plan, so that it is worth showing."""
     return bool(plan.options.time_budget_s or plan.options.max_memory_bytes)
 
 
 class Clock:
-    """Seconds of a training over all its runs, and when a checkpoint is due.
+    """Training time over all runs, in seconds, and when a checkpoint is due.
 
     Args:
-        before: Seconds of the runs before.
+        before: Seconds spent in earlier runs.
     """
 
     def __init__(self, before: float = 0.0) -> None:
@@ -237,20 +240,20 @@ class Clock:
         self._cost = 0.0
 
     def seconds(self) -> float:
-        """Spent so far."""
+        """Seconds spent so far, over all runs."""
         return time.monotonic() - self._began
 
     def is_up(self, plan: TrainingPlan) -> bool:
-        """Whether a time budget is spent."""
+        """Whether the time budget is used up."""
         return 0.0 < plan.train_seconds <= self.seconds()
 
     def checkpoint_due(self) -> bool:
-        """Whether the last checkpoint is old enough."""
+        """Whether it is time for the next checkpoint."""
         return time.monotonic() - self._last >= max(CHECKPOINT_SECONDS, self._cost / CHECKPOINT_SHARE)
 
     @contextmanager
     def checkpointing(self) -> Iterator[None]:
-        """Take what a checkpoint costs."""
+        """Measure the cost of the checkpoint saved in the body."""
         started = time.monotonic()
         yield
         self._last = time.monotonic()
@@ -259,13 +262,13 @@ class Clock:
 
 @dataclass(frozen=True)
 class Training:
-    """One that runs.
+    """A running training.
 
     Attributes:
         state: Changed in place.
-        course: What it goes through.
-        path: Of its checkpoint.
-        clock: Its time.
+        course: The training setup.
+        path: Path of the checkpoint.
+        clock: The training's clock.
     """
 
     state: TrainState
@@ -274,32 +277,32 @@ class Training:
     clock: Clock
 
     def save(self) -> None:
-        """Leave a checkpoint."""
+        """Write a checkpoint."""
         save_checkpoint(self.path, self.course.plan.digest(), self.state.checkpoint(self.course.device.kernels))
 
     @property
     def now(self) -> TrainingPlan:
-        """The plan, as it is by now."""
+        """The current plan."""
         return self.course.plan.after(self.state.history.sizes_ended)
 
     @property
     def last(self) -> int:
-        """Its last iteration, as far as is known by now."""
+        """The last iteration, as far as it is known now."""
         return ends_at(self.now, self.state.history.flat_at)
 
     def is_told(self) -> bool:
-        """Whether it is reported how far it is."""
+        """Whether progress is reported after this iteration."""
         every = REPORT_EVERY if self.course.device.name == "cpu" else CUDA_REPORT_EVERY
         return self.state.iteration % every == 0 or self.state.iteration == self.last
 
 
 def resume(path: Path, course: TrainingSetup, report: Reporter) -> TrainState | None:
-    """The state that a killed run left, or None; a broken one is told and ignored.
+    """The state that a killed run left, or None; a broken checkpoint is reported and ignored.
 
     Args:
         path: The checkpoint.
-        course: The training's; it goes on on its device, whatever it was begun on.
-        report: Takes warnings.
+        course: The training setup; training resumes on its device, whichever device it began on.
+        report: Receives warnings.
     """
     device = course.device
     try:
@@ -321,14 +324,14 @@ def resume(path: Path, course: TrainingSetup, report: Reporter) -> TrainState | 
 
 
 def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
-    """Train to the plan's last iteration or last second, leaving checkpoints on the way.
+    """Train to the plan's last iteration or last second, writing checkpoints on the way.
 
     The clock decides when a checkpoint is written and, under a time budget, after which iteration the training ends.
     What an iteration computes does not depend on it.
 
     Raises:
-        KeyboardInterrupt: when asked to end, after a checkpoint.
-        MachineError: if a device's memory is too small for it.
+        KeyboardInterrupt: on a request to stop, after a checkpoint.
+        MachineError: if the device's memory is too small.
     """
     state, plan, clock = training.state, training.now, training.clock
     with deferred_interrupts() as interrupt:
@@ -354,13 +357,13 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
                 tell(state, plan, report)
             if state.iteration == training.last:
                 break
-    if interrupt.requested:  # asked of once more: it may have come after the last iteration's look
+    if interrupt.requested:  # checked again: the request may have come after the last iteration's check
         training.save()
         raise KeyboardInterrupt
 
 
 def tell_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
-    """Warn that memory keeps the model from growing."""
+    """Warn that memory stops the model from growing."""
     limited = plan.options.max_memory_bytes > 0
     report.warning(
         f"The {'memory limit is close' if limited else 'device has no memory left'}, "
@@ -371,7 +374,7 @@ def tell_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -
 
 
 def tell_larger_photos(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
-    """Say that a size ended before its time, and what that leaves to do."""
+    """Report that a photo size ended early, and how many iterations there are now in total."""
     report.note(
         f"flat after {state.iteration:,} iterations: continuing with larger photos, to "
         f"{plan.schedule.iterations:,} in all"
@@ -379,7 +382,7 @@ def tell_larger_photos(state: TrainState, plan: TrainingPlan, report: Reporter) 
 
 
 def end_now(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter) -> None:
-    """Close the history of a training whose time is up, and say where that cut the schedule."""
+    """Close the history of a training whose time is up, and report where the schedule was cut."""
     state.history.end_iteration(state.iteration, True, curve_facts(state, plan, photo))
     tell(state, plan, report)
     if state.iteration < plan.schedule.iterations:
@@ -390,7 +393,7 @@ def end_now(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report:
 
 
 def tell(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
-    """Report how far the training is."""
+    """Report the training's progress."""
     planned = min(plan.schedule.iterations, ends_at(plan, state.history.flat_at))
     report.progress(state.iteration, max(state.iteration, planned), "training", "iterations")
     if (loss := state.history.recent_loss()) is not None:

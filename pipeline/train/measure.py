@@ -72,8 +72,8 @@ class TimedScene:
 
     Attributes:
         start: The initial Gaussians.
-        views: To train on.
-        device: What it is computed on.
+        views: Views to train on.
+        device: The compute device.
         sky: As training begins with; a copy is trained.
     """
 

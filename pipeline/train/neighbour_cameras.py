@@ -1,4 +1,4 @@
-"""What the photos nearest to one have of the places that it shows; made where their cells are kept, nothing waits."""
+"""Values that a photo's nearest neighbours have at the places it shows; computed without synchronizing the device."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from splatpipe.pipeline.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class NeighbourCameras:
-    """Cameras of some photos, of any size, and which of them stood near each other.
+    """Cameras of some photos, of any image size, and each one's nearest neighbours.
 
     Attributes:
-        rotations: (n, 3, 3) to the cameras.
-        shifts: (n, 3) of ``cam_from_world``.
-        lenses: (n, 4) fx, fy, cx, cy in widths and heights of the picture.
-        nearest: (n, k) the other photos, the nearest first.
+        rotations: (n, 3, 3) rotations of ``cam_from_world``.
+        shifts: (n, 3) translations of ``cam_from_world``.
+        lenses: (n, 4) fx, fy, cx, cy as fractions of the image's width and height.
+        nearest: (n, k) indices of the other photos, nearest first.
     """
 
     rotations: Float64[Tensor, "n 3 3"]
@@ -31,7 +31,7 @@ class NeighbourCameras:
 
     @staticmethod
     def of(cameras: Sequence[Camera], most: int) -> NeighbourCameras:
-        """Of at least one camera, with up to ``most`` near each."""
+        """Build from at least one camera, with up to ``most`` neighbours each."""
         poses = torch.from_numpy(np.stack([camera.cam_from_world for camera in cameras]))
         lenses = [
             [camera.fx / camera.width, camera.fy / camera.height, camera.cx / camera.width, camera.cy / camera.height]
@@ -54,7 +54,7 @@ class NeighbourCameras:
         return NeighbourCameras(*(each.to(device) for each in (self.rotations, self.shifts, self.lenses, self.nearest)))
 
     def places(self, row: int, shown: Float64[Tensor, "m 2"], depths: Float64[Tensor, " m"]) -> Float64[Tensor, "m 3"]:
-        """World points of what a photo shows, in widths and heights of it, at depths along its axis."""
+        """World points at image positions, in fractions of width and height, and depths along the viewing axis."""
         rays = (shown - self.lenses[row, 2:]) / self.lenses[row, :2]
         in_camera = torch.cat((rays * depths[:, None], depths[:, None]), dim=1) - self.shifts[row]
         return in_camera @ self.rotations[row]
@@ -62,13 +62,13 @@ class NeighbourCameras:
     def agree(
         self, row: int, places: Float64[Tensor, "m 3"], scores: Float[Tensor, "n g g"], limit: Float[Tensor, " 1"]
     ) -> Bool[Tensor, " m"]:
-        """Where more of the photos nearest to one have a score up to a limit at a place than above, of those that do.
+        """Whether most of the nearest photos that have a score at a place have one of at most ``limit``.
 
         Args:
-            row: The photo that is not asked.
-            places: World points; what is not finite is shown by none.
-            scores: Each photo's, in cells; negative where it has none.
-            limit: As said.
+            row: The photo whose neighbours are compared.
+            places: World points; no photo shows a non-finite one.
+            scores: Each photo's scores by cell; negative if unknown.
+            limit: Largest score that agrees.
         """
         others, grid = self.nearest[row], scores.shape[1]
         in_camera = self.rotations[others] @ places.T + self.shifts[others][:, :, None]  # (k, 3, m)

@@ -1,11 +1,11 @@
-"""How far a step moves a Gaussian: what is far moves as many pixels of its photo as what is near.
+"""Step lengths by distance: far Gaussians move as many pixels in their photo as near ones.
 
-Learning rates of positions are published as a share of the scene's extent: a step is as many millimetres on a façade
-as on the hills behind it, where these are a small part of a pixel. What is far then never comes to the depth at which
-its photos agree, and is learned as so many pictures, one for each of them: good in what is trained on, wrong between
-them. Here, beyond the extent, a step across the ray grows with the distance, the same angle everywhere; along the ray
-it grows with its square, as the depth does that a pixel of parallax leaves open. Nearer it stays as published: shorter
-steps over ground that is flown over straight down left it a little softer.
+The published learning rates of positions are a share of the scene's extent: a step is as many millimetres on a façade
+as on the hills behind it, where that is a small fraction of a pixel. Distant objects then never reach the depth at
+which their photos agree, and are learned as separate images, one per photo: good in the training views, wrong between
+them. Here, beyond the extent, a step across the ray grows with the distance (the same angle everywhere) and along the
+ray with its square, as the depth uncertainty of a pixel of parallax does. Nearer steps stay as published: shorter ones
+made ground in nadir flights slightly softer.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ from splatpipe.pipeline.raster.cuda import kernels_of
 def by_distance(
     means: Float[Tensor, "n 3"], rows: Bool[Tensor, " n"] | None, camera: Camera, unit: float
 ) -> Iterator[None]:
-    """Positions that are stepped in the body go further where they are further than the unit from the camera.
+    """Lengthen the steps taken in the body for positions farther than ``unit`` from the camera.
 
     Args:
-        means: Changed in place, world units.
-        rows: Those that are stepped; None for all.
-        camera: Of the photo that asks for the step.
-        unit: Distance at which a step is as long as its rate says, world units.
+        means: Positions, world units; changed in place.
+        rows: Rows that are stepped; None for all.
+        camera: Camera of the photo that causes the step.
+        unit: Distance up to which a step has the length given by its rate, world units.
     """
-    on_device = kernels_of(means.device) is not None  # there, to count rows is to wait, and all of them cost little
+    on_device = (
+        kernels_of(means.device) is not None
+    )  # there, counting rows would synchronize, and using all of them costs little
     chosen = slice(None) if rows is None or on_device else torch.nonzero(rows).flatten()
     ray = means[chosen].clone()
     for axis, value in enumerate(camera.centre().tolist()):

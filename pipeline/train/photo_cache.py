@@ -1,4 +1,4 @@
-"""Decoded photos in a file without a name, read through windows that are mapped only while they are read."""
+"""Decoded photos in an unnamed file, read through windows that are mapped only while in use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.train.windows import PixelRectangle
 
-SHARE_OF_FREE = 0.5  # of the disk's free space at most: checkpoints and the model need room too
+SHARE_OF_FREE = 0.5  # largest share of the disk's free space: checkpoints and the model need room too
 
 
 @dataclass(frozen=True)
@@ -31,22 +31,22 @@ class _CachedPhoto:
 
 
 def stored_bytes(camera: Camera, has_mask: bool) -> int:
-    """What a photo takes in the file: three bytes a pixel, one more with a mask, to a whole number of pages."""
+    """Bytes that a photo takes in the file: three per pixel, one more with a mask, rounded up to whole pages."""
     used = camera.width * camera.height * (4 if has_mask else 3)
     return -(-used // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
 
 
 class PhotoCache:
-    """Photos of 8 bits, each stored once and read any number of times.
+    """8-bit photos, each stored once and read any number of times.
 
-    The file has no name, so the system frees it when it is closed or its process dies, however that dies; another run
-    never sees it. What is read is mapped for that read alone: mapped pages count as the process's memory.
+    The file has no name, so the system frees it when it is closed or the process dies in any way; another run never
+    sees it. A window is mapped only while it is in use, because mapped pages count as the process's memory.
 
     Args:
-        folder: On whose disk the file lies.
+        folder: Folder on the disk to use.
 
     Attributes:
-        room_bytes: How large the file may grow, from the disk's free space when it was made.
+        room_bytes: Maximum file size, from the disk's free space at creation.
 
     Raises:
         MachineError: if the folder cannot be written.
@@ -61,15 +61,15 @@ class PhotoCache:
             self._file = tempfile.TemporaryFile(dir=folder, prefix="photos-", buffering=0)  # noqa: SIM115
 
     def close(self) -> None:
-        """Give the disk's space back. What was read stays valid."""
+        """Free the disk space. Arrays already read stay valid."""
         self._file.close()
 
     def put(self, key: tuple[int, int], camera: Camera, colour: Pixels, mask: Mask | None) -> None:
         """Store a photo if it fits in ``room_bytes``; otherwise nothing happens.
 
         Args:
-            key: To ask for it by.
-            camera: Of the photo's size.
+            key: Key of the photo.
+            camera: The photo's camera, at this size.
             colour: (h, w, 3), contiguous.
             mask: (h, w), contiguous.
 
@@ -88,7 +88,7 @@ class PhotoCache:
         self._end = slot.offset + stored_bytes(camera, slot.has_mask)
 
     def has_room(self, camera: Camera, has_mask: bool) -> bool:
-        """Whether a photo would still be stored."""
+        """Whether there is room for a photo."""
         return self._end + stored_bytes(camera, has_mask) <= self.room_bytes
 
     def __contains__(self, key: tuple[int, int]) -> bool:
@@ -102,11 +102,11 @@ class PhotoCache:
     def get(self, key: tuple[int, int], frame: PixelRectangle) -> tuple[Pixels, Mask | None]:
         """A window of a stored photo.
 
-        The arrays are the file itself, of which its rows alone are mapped, not to be written to; with the last of them
-        goes the mapping.
+        The arrays are read-only views of the file, of which only the window's rows are mapped; the mapping ends with
+        the last of them.
 
         Args:
-            key: Of a photo that is stored.
+            key: Key of a stored photo.
             frame: The window, in the photo's pixels.
 
         Raises:
@@ -121,7 +121,7 @@ class PhotoCache:
         return colour, self._rows(slot.offset + 3 * width * height, frame, width).view(np.bool_)[:, columns]
 
     def _rows(self, offset: int, frame: PixelRectangle, row_bytes: int) -> npt.NDArray[np.uint8]:
-        """A frame's rows of the plane that begins at a place in the file."""
+        """A frame's rows of the plane at ``offset`` in the file."""
         begin = offset + frame.top * row_bytes
         before = begin % mmap.ALLOCATIONGRANULARITY
         length = frame.height * row_bytes

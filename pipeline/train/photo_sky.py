@@ -36,7 +36,7 @@ class PhotoSkies:
     """The skies of all photos.
 
     Args:
-        masks: By the photos' names; those without sky may be left out.
+        masks: Sky masks by photo name; photos without sky may be left out.
 
     Attributes:
         masks: Those with sky.
@@ -110,7 +110,7 @@ def photo_sky_on_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camer
     Args:
         bits: ``SkyMask.bits``.
         shape: ``SkyMask.shape``.
-        camera: A training photo's.
+        camera: Camera of a training photo.
     """
     places = torch.arange(7, -1, -1, dtype=torch.uint8, device=bits.device)  # the first pixel is the highest bit
     flat = torch.bitwise_and(torch.bitwise_right_shift(bits[:, None], places), 1).flatten()

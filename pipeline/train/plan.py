@@ -1,4 +1,4 @@
-"""The plan of a training: every schedule resolved, written once before it begins and taken as it is on resume."""
+"""The training plan: every schedule resolved, written once before training begins and reused on resume."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from splatpipe.pipeline.train.windows import TrainingSize
 
 PLAN_FORMAT = 4
 EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
-NEAR_PER_EXTENT = 0.01  # 3DGS has 0.2 world units at extents of about 5; drones see nothing that near
+NEAR_PER_EXTENT = 0.01  # 3DGS uses 0.2 world units at extents of about 5; drones see nothing that near
 
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What a training does, resolved.
+    """A resolved training plan.
 
     Attributes:
-        options: The configuration, with what a budget planned.
-        schedule: That follows from them.
-        extent: Radius of the cameras, world units.
+        options: The configuration, including what a budget set.
+        schedule: The schedule that follows from the options.
+        extent: Radius of the camera positions, world units.
         near: Near plane, world units.
         train_views: Names of the photos trained on, sorted.
-        test_views: Names of those held out, sorted.
+        test_views: Names of the held-out views, sorted.
         train_megapixels: Mean size of the training photos, as they are trained on in the end.
-        initial_gaussians: Gaussians at the start.
-        megapixels: Photos are reduced to at most so many; None where they keep the dataset's size.
-        last_iteration: The training ends here at the latest. Iterations after the schedule's, if any, fill a time
-            budget: they are computed with its last rates.
-        train_seconds: The training ends after so many, done or not; 0 for when it is done.
-        forecast_seconds: When it should be done; 0 where nothing was measured.
-        sizes: Width and height of the dataset's training photos, and how many have them; none where they do not matter.
-        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
-        ends_when_flat: Whether `stop_when_flat` ends the training, or no more than the sizes before the finest.
+        initial_gaussians: Number of Gaussians at the start.
+        megapixels: Photos are reduced to at most this size; None keeps the dataset's size.
+        last_iteration: The training ends here at the latest. Iterations beyond the schedule, if any, fill a time
+            budget: they use its final rates.
+        train_seconds: The training ends after this time, done or not; 0 for no limit.
+        forecast_seconds: Forecast of the training time; 0 if nothing was measured.
+        sizes: Width, height and count of the dataset's training photos; empty if they do not matter.
+        window_pixels: Most pixels of a photo that an iteration uses; 0 for the whole photo.
+        ends_when_flat: Whether `stop_when_flat` may end the training itself, or only the sizes before the finest.
     """
 
     options: TrainConfig
@@ -73,12 +73,12 @@ class TrainingPlan:
         return json.dumps(fields, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
 
     def rendering(self) -> Rendering:
-        """How the model is to be rendered: a random background is black."""
+        """How the model is to be rendered; a random background becomes black."""
         behind = self.schedule.background or (0.0, 0.0, 0.0)
         return Rendering(self.options.antialias, behind, self.near, self.megapixels)
 
     def figures(self) -> dict[str, JSON]:
-        """Options and schedule as one flat table, for people."""
+        """Options and schedule as one flat table, for display."""
         schedule = asdict(self.schedule)
         parts = {f"{part}_{name}": value for part in ("rates", "density") for name, value in schedule.pop(part).items()}
         found = parts | self.options.model_dump(mode="json") | schedule
@@ -86,11 +86,11 @@ class TrainingPlan:
         return found | {"initial_gaussians": self.initial_gaussians, "stretches": "; ".join(looks)}
 
     def digest(self) -> str:
-        """sha256 of ``to_json``: names the plan in its checkpoints."""
+        """SHA-256 of ``to_json``: identifies the plan in its checkpoints."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
     def of(self, options: TrainConfig) -> TrainingPlan:
-        """The same training with other options, and what follows from them."""
+        """The same training with other options and everything that follows from them."""
         sizes = self.sizes or ((1, 1, len(self.train_views)),)
         limit = options.max_megapixels or None
         largest = max(width * height for width, height, _count in sizes)
@@ -107,14 +107,14 @@ class TrainingPlan:
         )
 
     def within_windows(self, pixels: int) -> TrainingPlan:
-        """The same training with windows of at most so many pixels."""
+        """The same training with windows of at most ``pixels`` pixels."""
         return replace(self, window_pixels=pixels).of(self.options)
 
     def after(self, sizes_ended: Sequence[int]) -> TrainingPlan:
-        """The plan once sizes ended before their time: the finest has what they spare, counted by pixels.
+        """The plan after sizes ended early: the finest size gets the time they saved, counted in pixels.
 
         Args:
-            sizes_ended: As the history says.
+            sizes_ended: Iterations after which sizes ended early, from the history.
         """
         schedule, footage = self.schedule, self.footage
         for iteration in sizes_ended:
@@ -125,7 +125,7 @@ class TrainingPlan:
 
     @property
     def footage(self) -> PhotoSizes:
-        """The photos as they are trained on."""
+        """The photos at their training sizes."""
         return footage_of(self.sizes or ((1, 1, len(self.train_views)),), self.megapixels, self.window_pixels)
 
     def _told_sizes(self) -> tuple[list[str], tuple[Stretch, ...]]:
@@ -135,7 +135,7 @@ class TrainingPlan:
         return [f"{size:.2f} MP{window}" for size, window in zip(whole, windows, strict=True)], stretches
 
     def described(self) -> str:
-        """The plan in a line for people."""
+        """The plan as one readable line."""
         options = self.options
         parts = [
             self._told_size(),
@@ -150,7 +150,7 @@ class TrainingPlan:
         return "plan: " + ", ".join(parts)
 
     def _told_size(self) -> str:
-        """Of the photos, from the first size to the last, and of the windows on it."""
+        """The photos' size, from first to last, and that of the windows."""
         footage, finest = self.footage, self.schedule.finest
         first = 1e-6 * footage.pixels(TrainingSize(self.schedule.stretches[0].level))
         told = f"{self.train_megapixels:.2f} MP"
@@ -165,7 +165,7 @@ class TrainingPlan:
         """Read ``to_json``'s text back.
 
         Raises:
-            ValueError: if it is no plan of this format.
+            ValueError: if it is not a plan of this format.
         """
         fields = json.loads(text)
         if not isinstance(fields, dict) or fields.pop("format", None) != PLAN_FORMAT:
@@ -182,7 +182,7 @@ class TrainingPlan:
 
 
 def duration(seconds: float) -> str:
-    """Seconds for people: `45 s`, `6 min 40 s`, `2 h 05 min`."""
+    """Seconds as readable text: `45 s`, `6 min 40 s`, `2 h 05 min`."""
     minutes, rest = divmod(round(seconds), 60)
     if minutes == 0:
         return f"{rest} s"
@@ -192,25 +192,25 @@ def duration(seconds: float) -> str:
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 times the largest distance of a camera from the cameras' mean, world units."""
+    """1.1 times the largest distance of a camera from the mean camera position, world units."""
     centres = np.array([camera.centre() for camera in cameras])
     radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     return EXTENT_MARGIN * radius
 
 
 def sizes_of(cameras: Sequence[Camera]) -> tuple[tuple[int, int, int], ...]:
-    """Width and height of photos, and how many have it; sorted."""
+    """Width, height and count of photos of each size, sorted."""
     counted = Counter((camera.width, camera.height) for camera in cameras)
     return tuple((*size, counted[size]) for size in sorted(counted))
 
 
 def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window_pixels: int) -> PhotoSizes:
-    """Photos as they are trained on.
+    """Photos at their training sizes.
 
     Args:
-        sizes: Width and height in the dataset, and how many photos have it.
-        most: They are reduced to so many megapixels; None: they are as the dataset has them.
-        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
+        sizes: Width and height in the dataset, and the count of photos of that size.
+        most: Photos are reduced to at most this many megapixels; None keeps the dataset's size.
+        window_pixels: Most pixels of a photo that an iteration uses; 0 for the whole photo.
     """
     if most is None:
         return PhotoSizes(tuple(sizes), window_pixels)
@@ -221,17 +221,17 @@ def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window
 def make_plan(
     config: TrainConfig, views: Sequence[View], split: Split, gaussians: int, window_pixels: int = WINDOW_PIXELS["cpu"]
 ) -> TrainingPlan:
-    """Resolve a training's plan.
+    """Resolve the plan of a training.
 
     Args:
-        config: The options.
+        config: The training options.
         views: All photos of the dataset.
-        split: Which of them are trained on.
-        gaussians: Gaussians at the start.
-        window_pixels: Of a photo, that an iteration looks at at most; 0 for all of it.
+        split: Which photos are trained on.
+        gaussians: Number of Gaussians at the start.
+        window_pixels: Most pixels of a photo that an iteration uses; 0 for the whole photo.
 
     Raises:
-        SplatpipeError: if all cameras stand in one place.
+        SplatpipeError: if all cameras are at one position.
     """
     kept = set(split.train)
     cameras = [view.camera for view in views if view.camera.name in kept]
@@ -260,11 +260,11 @@ def make_plan(
 def load_or_write_plan(path: Path, make: Callable[[], TrainingPlan]) -> TrainingPlan:
     """The plan already at ``path``, or a new one, written there before anything is trained.
 
-    The folder belongs to one key of configuration and inputs, so a plan in it is of this training.
+    The folder belongs to one key of configuration and inputs, so a plan found in it belongs to this training.
 
     Args:
-        path: Where the plan is.
-        make: Makes one; called only where there is none, for it may measure for a while.
+        path: Path of the plan.
+        make: Makes a plan; called only if there is none, because it may take measurements for a while.
     """
     try:
         return TrainingPlan.from_json(path.read_text(encoding="utf-8"))

@@ -65,7 +65,7 @@ def under_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: 
         plan: With resolved schedules.
         scene: What is trained.
         step: An iteration of training, to be measured.
-        report: Takes warnings.
+        report: Receives warnings.
 
     Raises:
         MachineError: if the memory is too small for any training.

@@ -1,4 +1,4 @@
-"""Learning rates: the published ones, and what shorter runs make of them.
+"""Learning rates: the published ones, and their scaling for shorter runs.
 
 Kerbl, Kopanas, Leimkühler, Drettakis: "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023.
 """
@@ -9,29 +9,29 @@ import math
 from dataclasses import dataclass
 
 PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
-LARGEST_BOOST = 4.0  # of learning rates: measured best at 1,500 iterations, and beyond it Gaussians overshoot
+LARGEST_BOOST = 4.0  # of learning rates: best in measurements at 1,500 iterations; beyond it Gaussians overshoot
 
 PUBLISHED_OPACITY_RATE = 0.05
-OPACITY_RATE = 0.15  # at the published one surfaces become opaque too late
+OPACITY_RATE = 0.15  # at the published rate surfaces become opaque too late
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Learning rates of the Gaussians' parameters; those not said to be ours are the published ones.
+    """Learning rates of the Gaussians' parameters; all are the published ones unless marked as ours.
 
     Attributes:
         means: Of positions at the start, times the scene's extent.
         means_final: The same at the schedule's end; exponential in between.
         sh: Of colour, degree 0.
-        sh_rest_divisor: Higher degrees learn this many times slower.
+        sh_rest_divisor: Divisor of the rate for the higher degrees.
         opacity: Of opacity logits; ours.
         scales: Of log-scales.
         quats: Of rotations.
-        boost: All but opacity's are multiplied by this, the last one of positions by its square; ours.
-        sparse: Only the Gaussians that the photo saw are stepped; else all of them, as published, whose momentum goes
-            on unseen. Ours.
-        by_distance: Positions far from the photo's camera step further (see `paces.py`), not all as far, as published.
-            Ours.
+        boost: Factor on all rates but opacity's; the final rate of positions is multiplied by its square; ours.
+        sparse: Step only the Gaussians that the photo saw; otherwise all, as published, so that unseen ones move on by
+            momentum. Ours.
+        by_distance: Positions far from the photo's camera take longer steps (see `paces.py`) instead of equal ones, as
+            published. Ours.
     """
 
     means: float = 1.6e-4
@@ -46,7 +46,7 @@ class Rates:
     by_distance: bool = True
 
     def means_at(self, share: float) -> float:
-        """That of positions at a share of the schedule, times the scene's extent."""
+        """Learning rate of positions at a share of the schedule, to be multiplied by the scene's extent."""
         share = min(1.0, share)
         first, last = self.boost * self.means, self.boost * self.boost * self.means_final
         return math.exp(math.log(first) * (1.0 - share) + math.log(last) * share)
@@ -56,5 +56,5 @@ PUBLISHED = Rates(opacity=PUBLISHED_OPACITY_RATE, sparse=False, by_distance=Fals
 
 
 def rates_of(iterations: int) -> Rates:
-    """Those of a run: a short one needs longer steps to get as far, by the root of how much shorter it is."""
+    """Learning rates of a run: a short one takes longer steps, by the square root of the ratio of lengths."""
     return Rates(boost=round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / iterations))), 4))

@@ -1,16 +1,16 @@
-"""Moving things: leave out of the loss what a photo shows and the other photos contradict.
+"""Moving objects: leave out of the loss what one photo shows and the other photos contradict.
 
-Trimming a photometric loss by the residual's quantile, with votes in a neighbourhood, is the idea of Sabour et al.,
+Trimming a photometric loss by the residual's quantile, with neighbourhood votes, is the idea of Sabour et al.,
 "RobustNeRF: Ignoring Distractors with Robust Losses" (CVPR 2023); residuals remembered by photo, and a trimmed share
-that grows in training, are of Sabour et al., "SpotLessSplats: Ignoring Distractors in 3D Gaussian Splatting" (2024).
-Neither learned features nor weights are used here. What fine detail and unlearned places look like is told apart from
-motion by three tests of our own:
+that grows in training, are from Sabour et al., "SpotLessSplats: Ignoring Distractors in 3D Gaussian Splatting" (2024).
+Neither learned features nor weights are used here. Fine detail and areas not learned yet are told apart from motion by
+three tests of our own:
 
-- residuals are compared between cells, not pixels, less the photo's median (exposure), and a difference that a cell
-  beside would explain does not count: edges and texture a little off are no car; nor does a hole in the model;
-- a cell's residual is a mean over the visits to its photo;
-- the other photos that see a cell's surface, as the model has it, have to agree with the model there: where they do not
-  either, the place is hard or not learnt yet, and nobody has contradicted.
+- residuals are compared between cells, not pixels, less the photo's median (exposure), and a difference that a
+  neighbouring cell explains does not count (edges and texture slightly off are not a car), nor does a model's hole;
+- a cell's residual is a running mean over the visits to its photo;
+- the other photos that see the cell's surface, as modelled, have to agree with the model there: if they do not either,
+  the place is hard or not learned yet, and nothing contradicts the photo.
 """
 
 from __future__ import annotations
@@ -33,44 +33,44 @@ from splatpipe.pipeline.train.photo_cells import PhotoCells
 from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
-GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone's photo is two of them
-LEAST_CELL_PX = 4  # smaller photos have fewer: a cell has to average out detail
-MEMORY = 0.5  # of a cell's residual, that the visits before keep
-NEARBY = 1  # cells: what the model shows so near may be what the photo shows here
-LEAST_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: less than this is shading, not another thing
-VOTES = 4  # of a cell and its eight neighbours: two by two are a thing, one alone is noise
-RIM = 0.5  # of the threshold: what lies beside a left-out cell and is above that goes, too
-MOST_OF_A_PHOTO = 0.25  # may be left out: more than that is no passer-by but a model that is wrong
-MOST_WITNESSES = 24  # nearest photos that are asked about a place
-LEAST_ALPHA = 0.8  # of a pixel that is judged: below it the model has a hole, not another opinion
-SURFACE_ALPHA = 0.5  # of a cell with a depth
+GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone photo spans two
+LEAST_CELL_PX = 4  # smaller photos have fewer cells: a cell has to average out detail
+MEMORY = 0.5  # weight of earlier visits in a cell's residual
+NEARBY = 1  # cells: the model may show this far away what the photo shows here
+LEAST_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: anything less is shading, not another object
+VOTES = 4  # minimum among a cell and its eight neighbours: two by two are an object, a single one is noise
+RIM = 0.5  # of the threshold: neighbours of a left-out cell above this are left out too
+MOST_OF_A_PHOTO = 0.25  # may be left out: more than that is a wrong model, not a passer-by
+MOST_WITNESSES = 24  # nearest photos that are compared at a place
+LEAST_ALPHA = 0.8  # of a judged pixel: below it the model has a hole rather than a contradiction
+SURFACE_ALPHA = 0.5  # of a cell with a valid depth
 UNKNOWN = -1.0  # residual of a cell that no visit has shown
 
 
 def share_at(robust: float, begin: int, iteration: int) -> float:
-    """The share left out at an iteration: it rises from the first step of density control on.
+    """The share left out at an iteration: it rises from the first step of density control.
 
     Args:
-        robust: The most, reached at twice that.
-        begin: First iteration of density control: before it, no photo is told well enough to be contradicted.
-        iteration: From 1.
+        robust: The maximum, reached at twice ``begin``.
+        begin: First iteration of density control: before it, the model is too rough to contradict a photo.
+        iteration: Its number, from 1.
     """
     return robust * min(1.0, max(0.0, iteration / begin - 1.0))
 
 
 class RobustMask(Technique):
-    """What is known of every photo's residuals, and what follows for its pixels.
+    """The residuals of every photo, and the pixels that they leave out of the loss.
 
     Args:
-        names: Of the photos trained on.
-        most: Share of the cells that stand out at most.
+        names: Names of the photos trained on.
+        most: Maximum share of the cells that may stand out.
         begin: First iteration of density control.
 
     Attributes:
         scores: (n, GRID, GRID) residual of each cell, ``UNKNOWN`` where there is none.
-        threshold: (1,) above which a cell stands out among all photos' cells; infinite before the first epoch's end.
-        left_out: (n,) share of each photo that its last visit left out.
-        witnesses: The photos' cameras in the order of ``scores``; not in the checkpoint, None where they are unknown.
+        threshold: (1,) residual above which a cell stands out among all photos' cells; infinite in the first epoch.
+        left_out: (n,) share of each photo left out at its last visit.
+        witnesses: The photos' cameras in the order of ``scores``; not in the checkpoint; None if unknown.
     """
 
     name = "robust"
@@ -82,50 +82,50 @@ class RobustMask(Technique):
         self.threshold = torch.full((1,), torch.inf)
         self.left_out = torch.zeros(len(names))
         self.witnesses: NeighbourCameras | None = None
-        self._before: tuple[int, Tensor, Tensor] | None = None  # this iteration's row, and what it had until then
+        self._before: tuple[int, Tensor, Tensor] | None = None  # this iteration's row, and its values before
 
     def watch(self, cameras: Iterable[Camera]) -> None:
-        """Say where the photos were taken, of any size; without it nothing is contradicted, so nothing left out."""
+        """Set the photos' cameras, of any image size; without them nothing is contradicted or left out."""
         ordered = sorted(cameras, key=lambda camera: self._row[camera.name])
         self.witnesses = NeighbourCameras.of(ordered, MOST_WITNESSES) if ordered else None
 
     def move_to(self, device: torch.device) -> None:
-        """Take all to where photos are looked at."""
+        """Move all tensors to the training device."""
         self.scores, self.threshold = self.scores.to(device), self.threshold.to(device)
         self.left_out = self.left_out.to(device)
         self.witnesses = None if self.witnesses is None else self.witnesses.to(device)
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
-        """With depths, by which the photos' places are compared."""
+        """Turn on depths, which locate the cells' surfaces in other photos."""
         self._before = None
         return replace(settings, depth=True)
 
     def begin_again(self) -> None:
-        """Forget what was seen of the photo: it will be looked at again."""
+        """Undo what was recorded of the photo: it will be visited again."""
         if self._before is not None:
             row, scores, left_out = self._before
             self.scores[row], self.left_out[row] = scores, left_out
             self._before = None
 
     def counted(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
-        """The photo without what the others contradict."""
+        """The photo without what the other photos contradict."""
         return self.look(photo, shot.rendered, picture)
 
     def after_epoch(self, iteration: int) -> None:
-        """Take the threshold for the next one."""
+        """Set the threshold for the next epoch."""
         self.end_epoch(share_at(self._most, self._begin, iteration))
 
     def summary(self) -> dict[str, int | float]:
-        """What the last visits left out."""
+        """The share that the last visits left out."""
         return {"robust_left_out": round(self.share_left_out(), 5)}
 
     def look(self, photo: TrainingPhoto, rendered: Render, shown: Float[Tensor, "h w 3"]) -> TrainingPhoto:
-        """Remember a photo's residuals; the photo without what the others contradict, or itself.
+        """Record a photo's residuals and return it without what the other photos contradict, or unchanged.
 
         Args:
-            photo: As it is.
-            rendered: Its view, with depths.
-            shown: The render as it is compared with the photo.
+            photo: The photo.
+            rendered: Its rendered view, with depths.
+            shown: The render as compared with the photo.
         """
         with torch.no_grad():
             row = self._row[photo.camera.name]
@@ -136,15 +136,15 @@ class RobustMask(Technique):
             cells = PhotoCells(photo.camera, GRID, GRID)
             out = cells.spread(self._left_out_cells(row, rendered, cells))
             self.left_out[row] = out.float().mean()
-        if out.device.type == "cpu" and not bool(out.any()):  # on a device, to ask is to wait
+        if out.device.type == "cpu" and not bool(out.any()):  # on a device, the check would synchronize
             return photo
         return replace(photo, mask=~out if photo.mask is None else photo.mask & ~out)
 
     def _remember(self, row: int, now: Float[Tensor, "g g"], judged: Bool[Tensor, "g g"] | None) -> None:
-        """Mix a visit's residuals with what is known; what its window does not show stays as it is."""
+        """Blend a visit's residuals into the stored ones; cells that its window does not show stay unchanged."""
         before = self.scores[row]
         mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
-        faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: nothing held against it
+        faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: the old residual fades
         after = torch.where(now < 0.0, faded, mixed)
         self.scores[row] = after if judged is None else torch.where(judged, after, before)
 
@@ -159,7 +159,7 @@ class RobustMask(Technique):
     def _contradicted(
         self, row: int, core: Bool[Tensor, "g g"], rendered: Render, cells: PhotoCells
     ) -> Bool[Tensor, "g g"]:
-        """Of some cells, those where more of the other photos that see the place agree with the model than not."""
+        """Those of the cells where most of the other photos that see the place agree with the model."""
         if self.witnesses is None:
             return torch.zeros_like(core)
         alpha, depth_sum = cells.means(torch.stack((rendered.alpha, rendered.depth_sum))).double()
@@ -176,10 +176,10 @@ class RobustMask(Technique):
         return result.view_as(core)
 
     def end_epoch(self, share: float) -> None:
-        """Take the threshold from all photos' cells.
+        """Set the threshold from all photos' cells.
 
         Args:
-            share: Of the cells that stand out at most.
+            share: Maximum share of the cells that may stand out.
         """
         known = self.scores[self.scores >= 0.0].cpu().numpy()
         if share <= 0.0 or len(known) == 0:
@@ -189,18 +189,18 @@ class RobustMask(Technique):
         self.threshold.fill_(max(LEAST_RESIDUAL, float(np.partition(known, place)[place])))
 
     def share_left_out(self) -> float:
-        """Mean over the photos of what their last visits left out."""
+        """Mean over the photos of the share left out at their last visits."""
         return float(self.left_out.mean())
 
     def to_arrays(self) -> dict[str, Tensor]:
-        """All that changes, by name, for a checkpoint; not copied."""
+        """Mutable state by name, for a checkpoint; not copied."""
         return {"scores": self.scores, "threshold": self.threshold, "left_out": self.left_out}
 
     def load(self, arrays: Mapping[str, Tensor]) -> None:
         """The inverse of ``to_arrays``.
 
         Raises:
-            KeyError, ValueError: if something is missing or has another shape.
+            KeyError, ValueError: if a tensor is missing or has a different shape.
         """
         for name, tensor in self.to_arrays().items():
             if arrays[name].shape != tensor.shape:
@@ -211,22 +211,23 @@ class RobustMask(Technique):
 def cell_residuals(
     shown: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"], camera: Camera
 ) -> tuple[Float[Tensor, "g g"], Bool[Tensor, "g g"] | None]:
-    """How far each cell's mean colour is from the nearest of the model's there and nearby, averaged over the channels.
+    """Difference between each cell's mean colour and the closest one of the model there and nearby, mean of channels.
 
     Args:
-        shown: The model's picture.
-        colour: The photo's.
+        shown: The model's render.
+        colour: The photo's colours.
         counts: The pixels to compare.
-        camera: The photo's, or its window's.
+        camera: The photo's camera, or its window's.
 
     Returns:
-        ``UNKNOWN`` where less than half of a cell counts; and the cells that the window judges, None for all.
+        The residuals, ``UNKNOWN`` where less than half of a cell counts; and the cells that the window judges, None for
+        all.
     """
     whole = camera.whole()
     size = (min(GRID, max(1, whole.height // LEAST_CELL_PX)), min(GRID, max(1, whole.width // LEAST_CELL_PX)))
     cells = PhotoCells(camera, *size)
     weight, judged = cells.means(counts[None].float()), cells.judged(shown)
-    known = weight[0] >= 0.5  # of what is shown: the rim of a cell beside says something, too
+    known = weight[0] >= 0.5  # of the visible part: the rim of a neighbouring cell is evidence too
     chosen = known if judged is None else known & judged
     model, picture = (
         cells.means(picture.permute(2, 0, 1) * counts) / weight.clamp(min=1e-6) for picture in (shown, colour)
@@ -243,27 +244,27 @@ def _over_grid(cells: Float[Tensor, "gh gw"]) -> Float[Tensor, "g g"]:
 
 
 def _medians(planes: Float[Tensor, "c gh gw"], known: Bool[Tensor, "gh gw"]) -> Float[Tensor, " c"]:
-    """The lower median of each plane's known cells, without asking how many those are; infinite if there are none."""
+    """The lower median of each plane's known cells, without synchronizing to count them; infinite if there are none."""
     ordered = torch.where(known, planes, torch.inf).flatten(1).sort(dim=1).values
     middle = (known.sum() - 1).clamp(min=0) // 2
     return ordered.index_select(1, middle[None])[:, 0]
 
 
 def _worth_asking(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
-    """Numbers of the cells to work on: of those asked, but of all on a device, where to know how many is to wait."""
+    """Indices of the cells to work on: the requested ones, or all on a device, where counting would synchronize."""
     if asked.device.type == "cpu":
         return torch.nonzero(asked).flatten()
     return torch.arange(len(asked), device=asked.device)
 
 
 def _nearby(planes: Float[Tensor, "c gh gw"]) -> Float[Tensor, "c k gh gw"]:
-    """What lies up to ``NEARBY`` cells from each; zeros beyond the rim."""
+    """The values up to ``NEARBY`` cells around each cell; zeros beyond the border."""
     side = 2 * NEARBY + 1
     return functional.unfold(planes[None], side, padding=NEARBY).view(len(planes), side * side, *planes.shape[1:])
 
 
 def _voted(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
-    """Those with enough of their neighbourhood."""
+    """The cells that have enough of their neighbourhood with them."""
     votes = 9.0 * functional.avg_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0]
     return cells & (votes > VOTES - 0.5)
 

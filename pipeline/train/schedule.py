@@ -1,4 +1,4 @@
-"""The schedule of a training: what is done from which iteration on, resolved once from options and photos."""
+"""The training schedule: what changes at which iteration, resolved once from options and photos."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
 from splatpipe.pipeline.train.windows import TrainingSize
 
-FEW_PHOTOS, MANY_PHOTOS = 16, 32  # trained on: up to where a model leans on single photos, from where it does not
+FEW_PHOTOS, MANY_PHOTOS = 16, 32  # training photos: overfitting to single photos up to the first, none from the second
 FEW_DROPOUT = 0.2
-RESET_EVERY = 3000  # iterations, published: what is reset needs them to come back
+RESET_EVERY = 3000  # iterations, published: opacities need them to recover from a reset
 GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified
-PUBLISHED_GRADIENT = 2e-4  # the same of the signed sum
+PUBLISHED_GRADIENT = 2e-4  # the same for the signed sum
 BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the forecast, but not into noise
-RESET_VISITS = 15  # of every photo between two resets at least: the same, on the captures of that method
-TAIL_SHARE = 0.1  # of the iterations done when the loss is flat: what the rest of the schedule is compressed into
+RESET_VISITS = 15  # of every photo between two resets, at least: what RESET_EVERY is on the published captures
+TAIL_SHARE = 0.1  # length of the tail after a flat loss, as a share of the iterations done by then
 
 UNKNOWN = PhotoSizes(((1, 1, MANY_PHOTOS),))
-"""Photos that fit into a window and are neither few nor many."""
+"""Photos that fit into one window and are not few."""
 
 RGB = tuple[float, float, float]
 BACKGROUNDS: dict[str, RGB | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
@@ -31,17 +31,17 @@ BACKGROUNDS: dict[str, RGB | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1
 
 @dataclass(frozen=True)
 class ScheduleStep:
-    """What the schedule says of one iteration.
+    """The schedule's values for one iteration.
 
     Attributes:
-        iteration: Which, from 1.
-        place: The iteration of the schedule whose rates it has: in the tail of a flat training it runs ahead.
-        share: Of the schedule that is done, 0..1.
-        seed: Of everything random.
-        sh_degree: That is trained.
-        background: What is behind the Gaussians, red, green, blue.
-        means_rate: Learning rate of positions, times the scene's extent.
-        is_observed: Whether density control looks on.
+        iteration: Its number, from 1.
+        place: The schedule's iteration whose rates apply: it runs ahead in the tail after a flat loss.
+        share: Fraction of the schedule done, 0..1.
+        seed: Seed of all random numbers.
+        sh_degree: SH degree being trained.
+        background: Colour behind the Gaussians: red, green, blue.
+        means_rate: Learning rate of positions, to be multiplied by the scene's extent.
+        is_observed: Whether density control collects statistics.
     """
 
     iteration: int
@@ -54,7 +54,7 @@ class ScheduleStep:
     is_observed: bool
 
     def colour(self, stream: int) -> RGB:
-        """A random colour of the iteration's own; ``stream`` as in ``draws``."""
+        """A random colour for this iteration; ``stream`` as in ``draws``."""
         return random_colour(self.seed, self.iteration, stream)
 
 
@@ -63,15 +63,15 @@ class Schedule:
     """What changes in the course of a training, and when.
 
     Attributes:
-        iterations: Until the rates' last values.
-        seed: Of everything random.
+        iterations: Number of iterations until the rates reach their final values.
+        seed: Seed of all random numbers.
         sh_degree: Degree of the spherical harmonics at the end.
-        sh_every: Iterations until one degree more is trained.
-        stretches: What iterations look at of their photos, in order; what comes after the last one is as it.
-        dropout: Share of the Gaussians left out at the end.
-        background: What is behind the Gaussians, red, green, blue; None for another colour each iteration.
+        sh_every: Iterations between increments of the trained SH degree.
+        stretches: Training sizes with their iteration ranges, in order; the last one also covers everything after it.
+        dropout: Share of the Gaussians dropped at the end.
+        background: Colour behind the Gaussians: red, green, blue; None for a random colour each iteration.
         rates: Learning rates.
-        density: Of density control.
+        density: The density-control schedule.
     """
 
     iterations: int
@@ -86,10 +86,10 @@ class Schedule:
 
     @staticmethod
     def from_json(fields: Mapping[str, Any]) -> Schedule:
-        """Read ``dataclasses.asdict``'s values back.
+        """Rebuild a schedule from ``dataclasses.asdict``'s values.
 
         Raises:
-            KeyError, TypeError: if they are no schedule's.
+            KeyError, TypeError: if they are not those of a schedule.
         """
         parts = {"rates": Rates(**fields["rates"]), "density": DensitySchedule(**fields["density"])}
         parts |= {"stretches": tuple(Stretch(**each) for each in fields["stretches"])}
@@ -97,11 +97,11 @@ class Schedule:
         return Schedule(**{**fields, **parts, "background": None if behind is None else tuple(behind)})
 
     def at(self, iteration: int, flat_at: int = 0) -> ScheduleStep:
-        """What holds in an iteration.
+        """The schedule's values for an iteration.
 
         Args:
-            iteration: From 1.
-            flat_at: Iteration after which the tail of a flat training began; 0 where it did not.
+            iteration: Its number, from 1.
+            flat_at: Iteration after which the tail of a flat training began; 0 if it has not.
         """
         place = self.place(iteration, flat_at)
         share = min(1.0, place / self.iterations)
@@ -117,7 +117,7 @@ class Schedule:
         )
 
     def place(self, iteration: int, flat_at: int) -> int:
-        """The iteration of the schedule whose rates an iteration has: in the tail it runs ahead, to the last."""
+        """The schedule's iteration whose rates apply: in the tail it runs ahead, up to the last one."""
         if flat_at == 0 or iteration <= flat_at:
             return iteration
         return flat_at + (iteration - flat_at) * (self.iterations - flat_at) // tail_of(flat_at)
@@ -127,20 +127,20 @@ class Schedule:
         return min(self.sh_degree, iteration // self.sh_every)
 
     def look_at(self, iteration: int) -> TrainingSize:
-        """What an iteration (from 1) looks at of its photo."""
+        """The training size of an iteration (from 1)."""
         return self.stretches[self.stretch_at(iteration)].look
 
     def stretch_at(self, iteration: int) -> int:
-        """The number of the stretch that an iteration (from 1) is in."""
+        """The index of the stretch that contains an iteration (from 1)."""
         untils = (number for number, each in enumerate(self.stretches) if iteration <= each.until)
         return next(untils, len(self.stretches) - 1)
 
     def without_rest(self, iteration: int, worth: float) -> Schedule:
-        """The schedule where the next stretch begins after this iteration; the last one gets what that spares.
+        """The schedule with the next stretch starting after this iteration; the last one gets the time saved.
 
         Args:
             iteration: In any stretch but the last.
-            worth: Iterations of the last stretch that one of this costs as much as.
+            worth: Number of iterations of the last stretch that cost as much as one of this stretch.
         """
         number = self.stretch_at(iteration)
         spared = self.stretches[number].until - iteration
@@ -159,12 +159,12 @@ class Schedule:
         return replace(self, iterations=total, stretches=tuple(changed), density=density)
 
     def looks_to(self, last: int) -> list[TrainingSize]:
-        """``look_at`` for every iteration up to the last."""
+        """``look_at`` for every iteration from 1 to ``last``."""
         return [self.look_at(iteration) for iteration in range(1, last + 1)]
 
     @property
     def finest(self) -> TrainingSize:
-        """What iterations look at in the end."""
+        """The training size at the end."""
         return self.stretches[-1].look
 
     @property
@@ -174,38 +174,38 @@ class Schedule:
 
 
 def tail_of(flat_at: int) -> int:
-    """Iterations that a training goes on for after its loss was flat."""
+    """Length of the tail after the loss became flat, iterations."""
     return max(1, round(TAIL_SHARE * flat_at))
 
 
 def random_colour(seed: int, iteration: int, stream: int) -> RGB:
-    """A colour of its own for every iteration; ``stream`` as in ``draws``."""
+    """A random colour per iteration; ``stream`` as in ``draws``."""
     red, green, blue = uniform(seed, iteration, stream, [0, 1, 2]).tolist()
     return red, green, blue
 
 
 def share_of_few(photos: int) -> float:
-    """How much of what few photos need a training takes: all of it up to FEW_PHOTOS, nothing from MANY_PHOTOS on."""
+    """Weight of the few-photos settings: 1 up to FEW_PHOTOS, falling to 0 at MANY_PHOTOS."""
     return min(1.0, max(0.0, (MANY_PHOTOS - photos) / (MANY_PHOTOS - FEW_PHOTOS)))
 
 
 def resolve_schedule(config: TrainConfig, footage: PhotoSizes = UNKNOWN) -> Schedule:
-    """The published schedule, changed for short runs, few photos and many.
+    """The published schedule, adapted to short runs and to few or many photos.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: The photos that are trained on.
     """
     return schedule_of(config, footage, lengths_of(config, footage))
 
 
 def schedule_of(config: TrainConfig, footage: PhotoSizes, each: list[Length]) -> Schedule:
-    """The same for sizes and iterations that are given.
+    """The same for given sizes and iterations.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: The photos that are trained on.
-        each: Levels and their iterations, the first one first.
+        each: Levels and their iterations, in training order.
     """
     pace = Pace.of(config, footage)
     few = FEW_DROPOUT * share_of_few(footage.photos)
@@ -224,14 +224,14 @@ def schedule_of(config: TrainConfig, footage: PhotoSizes, each: list[Length]) ->
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a model is made.
+    """How fast a model is trained.
 
-    A site of more photos takes more iterations, but a Gaussian is seen no more often: what is made in so many steps
-    keeps its pace, only that all photos have their turn first.
+    A site with more photos takes more iterations, but each Gaussian is seen no more often: phases keep their length,
+    except that every photo must have its turn in each.
 
     Attributes:
-        iterations: That the learning rates are for.
-        photos: That have their turn in every phase at least.
+        iterations: Number of iterations that the learning rates are for.
+        photos: Number of photos that each phase must at least visit.
     """
 
     iterations: int
@@ -239,13 +239,13 @@ class Pace:
 
     @staticmethod
     def of(config: TrainConfig, footage: PhotoSizes) -> Pace:
-        """That of a training; one whose length was given keeps the published lengths, whatever the photos."""
+        """The pace of a training; one with a given length keeps the published phase lengths, whatever the photos."""
         if config.iterations == "auto":
             return Pace(config.least_iterations, footage.photos)
         return Pace(config.iterations, 1)
 
     def lasting(self, published: int, shares: int) -> int:
-        """How long a phase is: as published, in a short run one of so many shares."""
+        """Length of a phase, iterations: as published, or 1/``shares`` of a short run; at least one visit per photo."""
         return max(1, min(published, self.iterations // shares), self.photos)
 
 

@@ -1,8 +1,7 @@
-"""What is done where a device's memory does not hold an iteration: less at a time, then fewer Gaussians, always told.
+"""When an iteration does not fit in a device's memory: smaller chunks, then fewer Gaussians, always with a warning.
 
-Before its step an iteration changes nothing that cannot be undone, and what it takes the most memory for comes before
-that: so it is begun again with less. Growth that does not fit is no such case: it is foreseen (see
-``memory.within_room``).
+Before its step an iteration changes nothing that cannot be undone, and its peak of memory comes before the step, so it
+can be restarted with less. Growth that does not fit is not such a case: it is foreseen (see ``memory.within_room``).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
-KEPT_SHARE = 0.9  # of the Gaussians each time, the most opaque: what is lost is what shows least
+KEPT_SHARE = 0.9  # of the Gaussians are kept each time, the most opaque: those lost are the least visible
 HINT = "Lower train.max_megapixels or train.max_gaussians, or close other programs that use the graphics card."
 
 Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
@@ -29,25 +28,25 @@ Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 def iterate_within_memory(
     step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter
 ) -> None:
-    """An iteration, begun again with less where the device's memory is too small for it.
+    """Run an iteration, restarting it with less if the device's memory is too small.
 
     Args:
         step: The iteration.
-        state: As of ``iteration.iterate``.
-        plan: The training's.
-        photo: To train on.
-        report: Is told what there is less of.
+        state: As for ``iteration.iterate``.
+        plan: The training plan.
+        photo: The photo to train on.
+        report: Receives warnings about what was reduced.
 
     Raises:
-        MachineError: if there is nothing left to make smaller.
+        MachineError: if there is nothing left to reduce.
     """
     kernels, now = kernels_of(state.gaussians.means.device), state.iteration + 1
     pairs = 0 if kernels is None else kernels.forecast.most_pairs
     while not _fits(step, state, plan, photo):
-        # Not while the error is handled: it holds on to all that the iteration had.
+        # Not inside the except block: the error keeps the iteration's tensors alive.
         state.begin_again()
         if state.gaussians.means.device.type == "cuda":
-            torch.cuda.empty_cache()  # in pieces, what torch keeps may be of no use for what is asked for next
+            torch.cuda.empty_cache()  # torch's cached blocks may be too fragmented for the next request
         _take_less(state, kernels, report)
     if kernels is not None and kernels.forecast.most_pairs < pairs:  # once, however often they were halved
         report.warning(
@@ -59,7 +58,7 @@ def iterate_within_memory(
 
 def _fits(step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> bool:
     steps, count = state.adam.step_count, len(state.gaussians)
-    model = weakref.ref(state.gaussians)  # density control wants the old one's memory
+    model = weakref.ref(state.gaussians)  # weak, because density control needs the old model's memory
     try:
         step(state, plan, photo)
     except torch.OutOfMemoryError as error:
@@ -70,7 +69,7 @@ def _fits(step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhot
 
 
 def _take_less(state: TrainState, kernels: CudaKernels | None, report: Reporter) -> None:
-    """The next smaller thing: chunks of pairs first, then the model."""
+    """Reduce the next thing: chunks of pairs first, then the model."""
     count, now = len(state.gaussians), state.iteration + 1
     if kernels is not None and kernels.forecast.shrink():
         return

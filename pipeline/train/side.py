@@ -1,4 +1,4 @@
-"""Small models that are trained beside the Gaussians and belong to the photos, not to the building."""
+"""Side models: small models trained beside the Gaussians that describe the photos, not the scene."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _MOMENTS = "adam."
 
 
 class SideModel:
-    """Named tensors, leaves of autograd, that share their rows, with their moments.
+    """Named tensors (autograd leaves) with a common row index, and their Adam moments.
 
     Args:
-        tensors: As they begin; copied.
-        epsilon: Adam's.
+        tensors: Initial values; copied.
+        epsilon: Epsilon of Adam.
 
     Attributes:
         tensors: (n, ...) each; changed in place.
-        adam: Their optimiser.
-        is_given: They take part as they are; nothing of them is trained.
+        adam: Their optimizer.
+        is_given: Whether the tensors are fixed and not trained.
     """
 
     is_given = False
@@ -33,40 +33,40 @@ class SideModel:
         self.adam = Adam(self.tensors, epsilon=epsilon)
 
     def give(self) -> None:
-        """From now on nothing of them is trained: they were, elsewhere."""
+        """Freeze the tensors: they were trained elsewhere."""
         self.is_given = True
         for tensor in self.tensors.values():
             tensor.requires_grad_(False)
 
     def move_to(self, device: torch.device) -> None:
-        """Take the tensors, nothing of them trained, to where they are trained."""
+        """Move the still untrained tensors to the training device."""
         if any(tensor.device != device for tensor in self.tensors.values()):
             moved = {name: tensor.detach().to(device) for name, tensor in self.tensors.items()}
             self.tensors = {name: tensor.requires_grad_(not self.is_given) for name, tensor in moved.items()}
             self.adam = Adam(self.tensors, epsilon=self.adam.epsilon)
 
     def descend(self, rates: Mapping[str, Rate], rows: Bool[Tensor, " n"] | None = None) -> None:
-        """Step the tensors against their gradients, which are dropped.
+        """Take an optimizer step, then drop the gradients.
 
         Args:
-            rates: Learning rate of each.
-            rows: Rows that take part; None: all.
+            rates: Learning rate of each tensor.
+            rows: Rows to step; None for all.
         """
         if all(tensor.grad is not None for tensor in self.tensors.values()):
             self.adam.step(self.tensors, rates, rows)
         self.drop_gradients()
 
     def begin_again(self) -> None:
-        """Forget what a backward pass that came to no end has left."""
+        """Drop what an incomplete backward pass left behind."""
         self.drop_gradients()
 
     def drop_gradients(self) -> None:
-        """Forget the tensors' gradients."""
+        """Drop the tensors' gradients."""
         for tensor in self.tensors.values():
             tensor.grad = None
 
     def to_arrays(self) -> dict[str, Tensor]:
-        """All that changes, by name, for a checkpoint; not copied."""
+        """Mutable state by name, for a checkpoint; not copied."""
         moments = {_MOMENTS + name: tensor for name, tensor in self.adam.state_dict().items()}
         return {name: tensor.detach() for name, tensor in self.tensors.items()} | moments
 
@@ -74,7 +74,7 @@ class SideModel:
         """The inverse of ``to_arrays``.
 
         Raises:
-            KeyError, ValueError: if something is missing or has another shape; nothing is changed, then.
+            KeyError, ValueError: if a tensor is missing or has a different shape; nothing is changed then.
         """
         for name, tensor in self.tensors.items():
             if arrays[name].shape != tensor.shape:

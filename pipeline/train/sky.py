@@ -1,10 +1,10 @@
-"""The sky in training: a panorama of its own behind the Gaussians, and no Gaussians where photos show it.
+"""The sky in training: a panorama behind the Gaussians, and no Gaussians where photos show sky.
 
-A colour by direction alone behind the scene, and a loss on the opacity of rays into the sky, are those of Rematas et
-al., "Urban Radiance Fields", CVPR 2022; beside Gaussians, as an explicit map of directions, of Yan et al., "Street
-Gaussians", ECCV 2024. Here the sky is found without a network (``splat.sky_mask``), the map has cells of some
-degrees and starts at what the photos show, and only pixels known to be sky train it: a wall that the Gaussians do not
-cover yet is not painted into the sky. Away from the sky a random colour takes its place: no wall can borrow the sky's.
+A colour that depends on direction only, and a loss on the opacity of rays into the sky, are from Rematas et al., "Urban
+Radiance Fields", CVPR 2022; an explicit map of directions behind Gaussians is from Yan et al., "Street Gaussians", ECCV
+2024. Here the sky is segmented without a network (``splat.sky_mask``), the map has cells of a few degrees and starts
+from the colours in the photos, and only pixels known to be sky train it: a wall that the Gaussians do not cover yet is
+not painted into the sky. Away from the sky a random colour replaces it, so that no wall can borrow the sky's colour.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from splatpipe.pipeline.train.photo_sky import PhotoSkies, PhotoSky
 from splatpipe.pipeline.train.side import SideModel
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
-LEAST_TRACK = 3  # photos of a point that the search for the sky believes in
+LEAST_TRACK = 3  # minimum track length of points used in sky detection
 MOST_ERROR_PX = 2.0
-OPACITY_WEIGHT = 0.1  # of the mean opacity before the sky in the loss; judgement
-SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills what no photo shows
-FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # of the colours, a step, from the start to the end of the schedule
-EPSILON = 1e-8  # Adam's: cells that hardly any pixel pulls at stay where they are
-FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: what is unseen above the horizon is smooth by then
-LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour is the mean of
+OPACITY_WEIGHT = 0.1  # of the mean opacity in front of the sky in the loss; judgement
+SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills areas no photo covers
+FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # learning rates of the colours at the start and end of the schedule
+EPSILON = 1e-8  # Adam's: cells with hardly any gradient stay where they are
+FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: unseen cells above the horizon are smooth by then
+LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour must at least average
 
 RGB = tuple[float, float, float]
 
@@ -48,10 +48,10 @@ _COLOURS = "colours"
 
 
 class SkyModel(SideModel, Technique):
-    """The panorama that is trained, and the sky's masks.
+    """The trained panorama and the photos' sky masks.
 
     Attributes:
-        panorama: Its colours are a leaf of autograd.
+        panorama: Its colours are an autograd leaf.
     """
 
     name = "sky"
@@ -59,53 +59,53 @@ class SkyModel(SideModel, Technique):
     def __init__(
         self, up: Float64[np.ndarray, " 3"], colours: Float32[np.ndarray, "cells 3"], masks: Mapping[str, SkyMask]
     ) -> None:
-        """Begin with some colours.
+        """Begin with the given colours.
 
         Args:
-            up: Against gravity.
-            colours: Of the panorama's cells.
-            masks: By the photos' names; those without sky may be left out.
+            up: Unit vector against gravity.
+            colours: Initial colours of the panorama's cells.
+            masks: Sky masks by photo name; photos without sky may be left out.
         """
         super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
         self.panorama = Panorama(up, self.tensors[_COLOURS])
         self._skies = PhotoSkies(masks)
-        self._seen: PhotoSky | None = None  # of the photo that is trained on
+        self._seen: PhotoSky | None = None  # of the current photo
 
     def copied(self) -> SkyModel:
-        """The same with tensors of its own; the masks, which nothing changes, are shared."""
+        """A copy with its own tensors; the immutable masks are shared."""
         return copy.deepcopy(self, {id(self._skies): self._skies})
 
     def move_to(self, device: torch.device) -> None:
-        """Take the colours and the masks to where they are trained."""
+        """Move the colours and the masks to the training device."""
         super().move_to(device)
         self.panorama = Panorama(self.panorama.up, self.tensors[_COLOURS])
         self._skies = self._skies.on(device)
 
     @property
     def photos(self) -> int:
-        """In how many photos there is sky."""
+        """Number of photos that show sky."""
         return len(self._skies)
 
     @property
     def masks(self) -> Mapping[str, SkyMask]:
-        """The skies, by the names of the photos that have one."""
+        """The sky masks, by the names of the photos that show sky."""
         return self._skies.masks
 
     @staticmethod
     def given(panorama: Panorama, masks: Mapping[str, SkyMask]) -> SkyModel:
-        """A panorama that was trained elsewhere, of which nothing is trained."""
+        """A panorama trained elsewhere and now fixed."""
         found = SkyModel(panorama.up, panorama.colours.detach().cpu().numpy(), masks)
         found.give()
         return found
 
     @staticmethod
     def begin(views: Sequence[View], dataset: Path, threads: int) -> SkyModel | None:
-        """Find the sky in photos and start with the colours that it has there; None where none of them shows any.
+        """Detect the sky in photos and start with its colours there; None if no photo shows sky.
 
         Args:
-            views: To be trained on.
-            dataset: That they are of, for its sparse points.
-            threads: That read photos.
+            views: Views to train on.
+            dataset: The photos' dataset, for its sparse points.
+            threads: Number of threads that read photos.
 
         Raises:
             StageError: if a photo is missing or broken.
@@ -128,13 +128,13 @@ class SkyModel(SideModel, Technique):
         return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
 
     def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
-        """The render before the sky, or before another colour where the photo shows none."""
+        """The render over the sky, or over another colour where the photo shows none."""
         camera, behind = shot.photo.camera, shot.settings.background
         self._seen = self.seen(camera)
         return self.composite(shot.rendered, camera, self._seen, behind, shot.now.colour(ELSEWHERE))
 
     def penalty(self, shot: Shot) -> Float[Tensor, ""]:
-        """Opacity before the sky, and the sky's roughness."""
+        """Opacity in front of the sky, and the sky's roughness."""
         return self.loss(shot.rendered.alpha, self._seen, shot.photo.inside)
 
     def after_step(self, shot: Shot) -> None:
@@ -143,22 +143,22 @@ class SkyModel(SideModel, Technique):
             self.step(shot.now.share)
 
     def summary(self) -> dict[str, int | float]:
-        """In how many photos it is."""
+        """Number of photos that show sky."""
         return {"sky_photos": self.photos}
 
     def composite(
         self, rendered: Render, camera: Camera, seen: PhotoSky | None, background: RGB, elsewhere: RGB
     ) -> Float[Tensor, "h w 3"]:
-        """The render as the photo shows it: before the sky where that may be seen, before ``elsewhere`` where not.
+        """The render as the photo shows it: over the sky where the sky may be visible, over ``elsewhere`` otherwise.
 
-        With the sky behind a wall, too, whatever of the wall is as bright as the sky would be left transparent.
+        If the sky were behind walls too, any part of a wall as bright as the sky would stay transparent.
 
         Args:
             rendered: Over ``background``.
-            camera: A training photo's.
+            camera: Camera of a training photo.
             seen: Its sky, from ``seen``.
             background: Stays behind everything below the horizon.
-            elsewhere: Another colour each time, so that nothing but an opaque wall looks like the photo's.
+            elsewhere: A different colour each time, so that only an opaque wall can match the photo.
         """
         look = self.panorama.look(camera)
         nodes, how = look.at_nodes(self.panorama.colours, background), SkyLayer(background)
@@ -169,10 +169,10 @@ class SkyModel(SideModel, Technique):
     def loss(
         self, alpha: Float[Tensor, "h w"], seen: PhotoSky | None, inside: tuple[slice, slice] = EVERYWHERE
     ) -> Float[Tensor, ""]:
-        """What is added to the photo's loss: opacity before the sky, a pixel of the photo, and the sky's roughness.
+        """The term added to the photo's loss: opacity in front of the sky, per pixel, and the sky's roughness.
 
         Args:
-            alpha: The render's.
+            alpha: Alpha of the render.
             seen: The photo's sky, from ``seen``.
             inside: Rows and columns that count.
         """
@@ -182,14 +182,14 @@ class SkyModel(SideModel, Technique):
         return loss + OPACITY_WEIGHT * torch.where(seen.mask, alpha, 0.0)[inside].mean()
 
     def seen(self, camera: Camera) -> PhotoSky | None:
-        """The sky of a training photo at the size of ``camera``; None where it shows none."""
+        """The sky of a training photo at the size of ``camera``; None if it shows none."""
         return self._skies.seen(camera)
 
     def step(self, share: float) -> None:
-        """Step the colours against their gradient, which is dropped.
+        """Take an optimizer step on the colours, then drop their gradient.
 
         Args:
-            share: Of the schedule that is done, 0..1.
+            share: Fraction of the schedule done, 0..1.
         """
         rate = math.exp(math.log(FIRST_RATE) * (1.0 - share) + math.log(LAST_RATE) * share)
         self.descend({_COLOURS: rate})
@@ -197,7 +197,7 @@ class SkyModel(SideModel, Technique):
 
 
 def roughness(colours: Float[Tensor, "cells 3"]) -> Float[Tensor, ""]:
-    """Mean squared difference between neighbouring cells, all around and up and down."""
+    """Mean squared difference between neighbouring cells, along rows (wrapping around) and columns."""
     grid = colours.reshape(ROWS, COLUMNS, 3)
     along, up = grid - grid.roll(1, dims=1), grid[1:] - grid[:-1]
     return 0.5 * (along.square().mean() + up.square().mean())
@@ -206,10 +206,10 @@ def roughness(colours: Float[Tensor, "cells 3"]) -> Float[Tensor, ""]:
 def first_colours(
     skies: Iterable[tuple[SkyPhoto, Bool[np.ndarray, "h w"]]], up: Float64[np.ndarray, " 3"]
 ) -> Float32[np.ndarray, "cells 3"]:
-    """Each cell's mean colour over the photos' skies; the others' filled smoothly from their neighbours.
+    """Each cell's mean colour over the photos' skies; cells without colours are filled smoothly from their neighbours.
 
     Args:
-        skies: Photos and their masks; what the user's masks leave out has no colour.
+        skies: Photos and their sky masks; pixels excluded by the user's masks have no colour.
         up: The panorama's pole.
     """
     total = np.zeros((ROWS * COLUMNS, 4))
@@ -238,4 +238,4 @@ def filled(total: Float64[np.ndarray, "cells 4"]) -> Float32[np.ndarray, "cells 
 
 def _sums(cells: Int64[np.ndarray, "n 4"], values: Shaped[np.ndarray, "n 4"]) -> Float64[np.ndarray, " cells"]:
     sums = np.bincount(cells.ravel(), values.ravel(), minlength=ROWS * COLUMNS)
-    return sums.astype(np.float64)  # of nothing, they are integers
+    return sums.astype(np.float64)  # without input, bincount returns integers

@@ -28,7 +28,7 @@ class SmoothnessLoss(Technique):
     """Adds how uneven the depths are to the loss; used with ``Distortion``, which asks for them.
 
     Args:
-        weight: In the loss.
+        weight: Weight in the loss.
     """
 
     name = "evenness"
@@ -50,7 +50,7 @@ def unevenness(
 
     Args:
         rendered: With depths.
-        camera: The photo's.
+        camera: The photo's camera.
         inside: Rows and columns that count.
         reaches: Pixels between a place and its neighbours; one that the picture is too small for is left out.
     """

@@ -1,4 +1,4 @@
-"""What training starts with, as the cap allows: a start that fills it leaves density control nothing to place."""
+"""The initial Gaussians within the cap: a start that fills it would leave density control nothing to place."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header
 from splatpipe.pipeline.splat.sparse_count import sparse_count
 
-START_SHARE = 0.5  # of the cap, that the start may fill with dense points: the rest is for where detail is
+START_SHARE = 0.5  # of the cap that the start may fill with dense points: the rest is for detail
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class InitialGaussians:
     """The initial Gaussians.
 
     Attributes:
-        gaussians: Those of the sparse points first, then the dense ones.
-        sparse: How many are of sparse points.
+        gaussians: From sparse points first, then from dense points.
+        sparse: Number of Gaussians from sparse points.
     """
 
     gaussians: Gaussians
@@ -28,14 +28,14 @@ class InitialGaussians:
 
     @property
     def dense(self) -> int:
-        """How many are dense points."""
+        """Number of Gaussians from dense points."""
         return len(self.gaussians) - self.sparse
 
     def within(self, cap: int) -> Gaussians:
-        """Those that training starts with: taken evenly from the dense ones, and from the sparse ones beyond the cap.
+        """The Gaussians to start with: the dense ones are thinned evenly, and above the cap the sparse ones too.
 
         Args:
-            cap: Most Gaussians of the training.
+            cap: Maximum number of Gaussians in the training.
         """
         count = started(self.sparse, self.dense, cap)
         if count == len(self.gaussians):
@@ -51,22 +51,22 @@ def _evenly(rows: int, count: int) -> torch.Tensor:
 
 
 def started(sparse: int, dense: int, cap: int) -> int:
-    """How many Gaussians training starts with: the dense ones leave room to grow, and go before any sparse point does.
+    """Number of Gaussians at the start: dense ones leave room to grow, and are dropped before any sparse one.
 
     Args:
-        sparse: Gaussians of sparse points.
-        dense: Those of dense points.
-        cap: Most Gaussians of the training.
+        sparse: Number of Gaussians from sparse points.
+        dense: Number of Gaussians from dense points.
+        cap: Maximum number of Gaussians in the training.
     """
     room = max(0, int(START_SHARE * cap) - sparse)
     return min(cap, sparse + min(dense, room))
 
 
 def read_start(path: Path) -> InitialGaussians:
-    """Read what `initialize` left.
+    """Read the output of `initialize`.
 
     Raises:
-        SplatpipeError: if it is no splat.
+        SplatpipeError: if it is not a splat.
     """
     gaussians = read_splat(path)
     return InitialGaussians(gaussians, sparse_count(read_splat_header(path).comments, len(gaussians)))

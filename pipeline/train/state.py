@@ -1,4 +1,4 @@
-"""The state of a training after a whole iteration: everything a resumed run needs to end with the same bits."""
+"""The state of a training between iterations: everything a resumed run needs for a bit-identical result."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.techniques import Techniques
 
-SMALLEST_SCALE = 1e-6  # of a Gaussian over the scene's extent: float32 covariances stay regular
-LARGEST_SCALE = 1e2  # a sky is no farther than that
+SMALLEST_SCALE = 1e-6  # of a Gaussian, relative to the scene's extent: float32 covariances stay non-singular
+LARGEST_SCALE = 1e2  # the sky is no farther than that
 
 _ADAM = "adam."
 _DENSITY = "density."
@@ -44,19 +44,19 @@ _DENSITY = "density."
 
 @dataclass
 class TrainState:
-    """Parameters, moments, statistics and history.
+    """Parameters, optimizer moments, density statistics and history.
 
     Attributes:
-        gaussians: The model, raw; its tensors are leaves of autograd.
-        adam: The optimiser's moments.
+        gaussians: The model's raw parameters; its tensors are autograd leaves.
+        adam: The optimizer's moments.
         density: Density control, with what it has observed since its last step.
-        history: What happened so far.
-        iteration: The last whole one.
-        seconds: Spent so far, over all runs; of no influence.
+        history: The training's history so far.
+        iteration: The last completed iteration.
+        seconds: Spent so far, over all runs; does not influence the result.
         buffers: Memory of the gradients.
-        techniques: What takes part besides the Gaussians.
-        whole: What is drawn where frozen Gaussians are: leaves of autograd, whose first rows are those of
-            ``gaussians``, in the same memory; None where there are none.
+        techniques: The optional techniques in use.
+        whole: What is rendered if there are frozen Gaussians: autograd leaves whose first rows are those of
+            ``gaussians``, in the same memory; None without frozen Gaussians.
     """
 
     gaussians: Gaussians
@@ -76,10 +76,10 @@ class TrainState:
         """The state before the first iteration.
 
         Args:
-            start: The Gaussians to start with, as ``Start.within`` the plan's cap, where they are trained.
-            plan: The training's.
-            techniques: The plan's, nothing of them trained.
-            frozen: Gaussians of the plan's degree that are drawn besides and stay as they are; None for none.
+            start: The initial Gaussians, from ``InitialGaussians.within`` the plan's cap, on the training device.
+            plan: The training plan.
+            techniques: The plan's techniques, untrained.
+            frozen: Gaussians of the plan's SH degree that are rendered too but not trained; None for none.
         """
         columns = coefficient_count(plan.options.sh_degree)
         sh = torch.zeros(len(start), columns, 3, device=start.sh.device)
@@ -97,14 +97,14 @@ class TrainState:
         techniques: Techniques,
         frozen: Gaussians | None = None,
     ) -> TrainState:
-        """Gaussians with everything that the plan wants beside them, nothing of it trained."""
+        """A state of these Gaussians with everything else that the plan needs, untrained."""
         density = Density(len(gaussians), plan.options.density == "absolute", gaussians.means.device)
         state = TrainState(gaussians, Adam(gaussians.tensors()), density, history, techniques=techniques)
         state._draw(gaussians, frozen)
         return state
 
     def _draw(self, trained: Gaussians, frozen: Gaussians | None) -> None:
-        """Take these for what is trained and drawn."""
+        """Set the Gaussians that are trained and rendered."""
         if frozen is None or len(frozen) == 0:
             self.gaussians, self.whole = trained.requires_grad_(), None
             return
@@ -113,30 +113,32 @@ class TrainState:
 
     @property
     def drawn(self) -> Gaussians:
-        """What is rendered: the Gaussians that are trained, then the frozen ones."""
+        """The rendered Gaussians: the trained ones, then the frozen ones."""
         return self.gaussians if self.whole is None else self.whole
 
     def of_trained(self, rendered: Render) -> Render:
-        """A render of ``drawn`` with what it says of the Gaussians that are trained alone."""
+        """A render of ``drawn`` whose per-Gaussian values are cut down to the trained Gaussians."""
         if self.whole is None:
             return rendered
         count = len(self.gaussians)
         return replace(rendered, visible=rendered.visible[:count], radii=rendered.radii[:count])
 
     def screen_probe(self) -> Float[Tensor, "n 2"]:
-        """Zeros whose gradient is that of what is drawn by its places on the screen, once the parameters are stepped:
-        those of the Gaussians that are trained come first."""
+        """Zeros that receive the gradient with respect to the rendered Gaussians' image-plane means.
+
+        It is there once the parameters are stepped; the trained Gaussians come first.
+        """
         zero = torch.zeros(1, 2, device=self.gaussians.means.device)
-        return zero.expand(len(self.drawn), 2).requires_grad_()  # nobody reads its values
+        return zero.expand(len(self.drawn), 2).requires_grad_()  # its values are never read
 
     def step(self, gradient_rows: Bool[Tensor, " n"], now: ScheduleStep, plan: TrainingPlan, camera: Camera) -> None:
-        """Step the parameters against their gradients, which are dropped; those that ``buffers`` hold, too.
+        """Take an optimizer step, then drop the gradients, including those in ``buffers``.
 
         Args:
             gradient_rows: The Gaussians that the photo saw.
-            now: What the schedule says of the iteration.
-            plan: The training's.
-            camera: Of the photo.
+            now: The schedule's values for this iteration.
+            plan: The training plan.
+            camera: The photo's camera.
         """
         given, extent = plan.schedule.rates, plan.extent
         colour = given.boost * given.sh
@@ -156,7 +158,7 @@ class TrainState:
         self._drop_gradients()
 
     def _hand_gradients(self) -> None:
-        """Give the Gaussians that are trained their part of the gradients of all that was drawn."""
+        """Give the trained Gaussians their part of the gradients of everything rendered."""
         if self.whole is None:
             return
         drawn = self.whole.tensors()
@@ -169,17 +171,17 @@ class TrainState:
             tensor.grad = None
 
     def begin_again(self) -> None:
-        """Forget an iteration that did not come to its step, and what its backward pass has left, whole or not."""
+        """Discard an iteration that did not reach its step, and whatever its backward pass left behind."""
         self.buffers = GradientBuffers()
         self._drop_gradients()
         self.techniques.begin_again()
 
     def control_density(self, plan: TrainingPlan, iteration: int) -> None:
-        """Grow, prune and reset where this iteration is one for it; only prune and reset once growth has ended.
+        """Grow, prune and reset if this iteration calls for it; once growth has ended, only prune and reset.
 
         Args:
-            plan: The training's.
-            iteration: The one that ends.
+            plan: The training plan.
+            iteration: The iteration that ends.
         """
         density = plan.schedule.density
         with torch.no_grad():
@@ -198,18 +200,18 @@ class TrainState:
                 self.history.resets.append(iteration)
 
     def _densify(self, plan: TrainingPlan, limit: int, iteration: int) -> None:
-        """Give the model the rows that density control chooses, at most ``limit`` where it adds any."""
-        free_frames()  # of another size by the end of this, and memory is tight meanwhile
+        """Give the model the rows that density control chooses, at most ``limit`` if it adds any."""
+        free_frames()  # they change size in this step, and memory is tight until then
         try:
             growth, counts = self._growth(plan, limit, iteration)
-        except torch.OutOfMemoryError:  # of a device: not even room to look for what to grow
+        except torch.OutOfMemoryError:  # of a device: not even room to select what to grow
             self.history.growth_ended = self.history.growth_ended or iteration
             return
         self._become(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
 
     def _growth(self, plan: TrainingPlan, limit: int, iteration: int) -> tuple[DensifiedGaussians, dict[str, int]]:
-        """The rows that density control chooses, and its counts; nothing is changed."""
+        """The rows that density control chooses, and its counts; changes nothing."""
         gaussians = self.gaussians.detach()
         gone = self.techniques.unwanted(gaussians, iteration)
         if gone is None:
@@ -221,16 +223,16 @@ class TrainState:
         return along_curve(growth), counts
 
     def _clear(self, iteration: int) -> None:
-        """Remove what a technique does not want, after the last step of density control, too."""
+        """Remove the Gaussians that a technique rejects; this goes on after the last step of density control."""
         try:
             gone = self.techniques.unwanted(self.gaussians.detach(), iteration)
-        except torch.OutOfMemoryError:  # of a device: the next look finds them
+        except torch.OutOfMemoryError:  # of a device: the next check finds them
             return
         if gone is not None and bool(gone.any()) and not bool(gone.all()):
             self._remove(gone, iteration)
 
     def keep_most_opaque(self, count: int) -> None:
-        """Remove all Gaussians but so many, between two iterations."""
+        """Keep only the ``count`` most opaque Gaussians; call it between two iterations."""
         order = torch.argsort(self.gaussians.opacity_logits.detach().cpu(), descending=True, stable=True)
         gone = torch.ones(len(order), dtype=torch.bool)
         gone[order[:count]] = False
@@ -242,7 +244,7 @@ class TrainState:
         self.history.add_density(DensityEvent(iteration, 0, 0, int(gone.sum()), 0, gaussians=len(self.gaussians)))
 
     def _become(self, growth: DensifiedGaussians) -> None:
-        """Take the rows of a growth, with their moments; one tensor after the other, for memory is tight."""
+        """Adopt the rows of a growth with their moments, one tensor after the other because memory is tight."""
         self.buffers = GradientBuffers()
         frozen = None if self.whole is None else self.whole.detach().after(len(self.gaussians)).clone()
         rest = {name: getattr(self.gaussians, name).detach() for name in ("quats", "sh")}
@@ -258,20 +260,20 @@ class TrainState:
         """The trained model, on the CPU: finite, with unit quaternions."""
         model = self.gaussians.detach().to(CPU)
         finite = model.finite()
-        model = model if bool(finite.all()) else model.select(finite)  # a copy is as much memory as the model
+        model = model if bool(finite.all()) else model.select(finite)  # a copy takes as much memory as the model
         model.quats = model.quats / torch.linalg.vector_norm(model.quats, dim=1, keepdim=True).clamp(min=1e-30)
         return model
 
     def whole_history(self) -> History:
-        """The history with what the optimiser has counted; waits for the device."""
+        """The history with the optimizer's count of skipped gradients; waits for the device."""
         self.history.skipped_gradients += self.adam.take_skipped()
         return self.history
 
     def checkpoint(self, instruction_set: str) -> Checkpoint:
-        """All of it for a file; not copied.
+        """The whole state as a checkpoint; not copied.
 
         Args:
-            instruction_set: That it was computed with.
+            instruction_set: The instruction set it was computed with.
         """
         tensors = dict(self.gaussians.detach().tensors())
         tensors |= {_ADAM + name: tensor for name, tensor in self.adam.state_dict().items()}
@@ -292,15 +294,15 @@ class TrainState:
         """The inverse of ``checkpoint``.
 
         Args:
-            checkpoint: As it was written.
-            plan: The training's.
-            techniques: The plan's, which take what the checkpoint has of them; not to be used where that fails.
-            device: Where it goes on, whatever it was written on.
-            frozen: As it was begun with, on the device.
+            checkpoint: The checkpoint, as written.
+            plan: The training plan.
+            techniques: The plan's techniques, which load their state from the checkpoint; unusable if that fails.
+            device: Where training resumes, whichever device the checkpoint was written on.
+            frozen: The frozen Gaussians that the training began with, on the device.
 
         Raises:
-            BrokenCheckpointError: if something is missing or does not fit.
-            torch.OutOfMemoryError: if the device has no room for it; nothing is wrong with the checkpoint, then.
+            BrokenCheckpointError: if something is missing or does not match.
+            torch.OutOfMemoryError: if the device has no room for it; the checkpoint itself is fine then.
         """
         try:
             tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}

@@ -1,4 +1,4 @@
-"""Photos in the order of training, read a little ahead; memory does not grow with their number."""
+"""Photos in training order, read slightly ahead; memory use does not grow with their number."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ READ_AHEAD = 3  # photos in flight: hides a slow decode behind an iteration
 
 @dataclass(frozen=True)
 class TrainingPhoto:
-    """A photo, or a window of one, as the loss wants it.
+    """A photo, or a window of one, as used by the loss.
 
     Attributes:
-        camera: Its camera, at the size of ``colour``; a window's knows the whole photo.
+        camera: Its camera, at the size of ``colour``; a window's camera knows the whole photo.
         colour: In [0, 1].
-        mask: True where the photo counts; None where all of it does.
-        is_empty: Nothing of it counts; known without asking the device.
-        inner: Left, top, right and bottom of what counts, in the pixels of ``colour``: around it is what SSIM looks at
-            beside; None where all is inside.
-        share: Of the pixels of the whole photo that count, how many are inside: a window's part in the photo's loss.
-        round: How many visits the round took that ends with it, as of ``Visit``; 0 where none does.
+        mask: True where the photo counts; None if all of it does.
+        is_empty: Whether no pixel counts; known without synchronizing with the device.
+        inner: Left, top, right and bottom of the part that counts, in pixels of ``colour``; around it is the margin for
+            SSIM. None if everything is inside.
+        share: Share of the whole photo's counting pixels that are inside: the window's part in the photo's loss.
+        round: Number of visits in the round that ends with this photo, as in ``Visit``; 0 if none ends.
     """
 
     camera: Camera
@@ -51,7 +51,7 @@ class TrainingPhoto:
 
     @property
     def inside(self) -> tuple[slice, slice]:
-        """Rows and columns of what counts."""
+        """Rows and columns of the part that counts."""
         if self.inner is None:
             return EVERYWHERE
         left, top, right, bottom = self.inner
@@ -60,7 +60,7 @@ class TrainingPhoto:
 
 @dataclass(frozen=True)
 class _PendingPhoto:
-    """A photo on its way, and what it will be."""
+    """A photo being uploaded, with its other fields."""
 
     camera: Camera
     upload: Upload
@@ -71,18 +71,18 @@ class _PendingPhoto:
 
 
 class PhotoStream:
-    """Iterates over the photos of training, from one iteration to the last.
+    """Iterates over the training photos, from one iteration to the last.
 
-    Photos are decoded once, for all the levels that are wanted of them, into a file without a name that is gone with
-    the stream or its process; memory holds the windows in flight and no more. A photo that is wanted only once is not
-    stored. Where the disk has no room for all, those that fit are stored and the others decoded each time: slower, with
-    the same result, and ``tell`` says so. What ``fill`` has not stored is decoded when it is first wanted.
+    Photos are decoded once, for all levels needed, into an unnamed file that disappears with the stream or its process;
+    memory holds only the windows in flight. A photo that is needed only once is not stored. If the disk has no room for
+    all, those that fit are stored and the others are decoded each time: slower, with the same result, and ``tell``
+    warns about it. Photos that ``fill`` has not stored are decoded on first use.
 
     Args:
         views: The photos to train on.
-        visits: What each iteration looks at of them.
+        visits: The visits of all iterations.
         first: The first iteration, from 1.
-        cache: Folder on whose disk the decoded photos lie meanwhile.
+        cache: Folder on whose disk the decoded photos are kept.
 
     Raises:
         MachineError: if the folder cannot be written; from ``next``, if the disk is full all the same.
@@ -104,15 +104,15 @@ class PhotoStream:
         self.go_on(visits, first)
 
     def go_on(self, visits: Visits, first: int) -> None:
-        """Go on with other visits, as if the stream had been begun with them; what was read ahead is dropped.
+        """Switch to other visits, as if the stream had started with them; photos read ahead are dropped.
 
         Args:
-            visits: Of all iterations from 1.
+            visits: The visits of all iterations, from 1.
             first: The next iteration.
         """
         for each in self._pending:
             each.cancel()
-        wait(self._pending)  # the reader uses what changes now
+        wait(self._pending)  # the reader uses the fields changed below
         self._pending.clear()
         self._visits, self._next = visits, first
         wanted = visits.levels_wanted(first).items()
@@ -128,12 +128,12 @@ class PhotoStream:
         cache: Path,
         max_megapixels: float | None = None,
     ) -> PhotoStream:
-        """All that the photos show; arguments as of the stream and of ``PhotoVisits``."""
+        """A stream over whole photos; arguments as for the class and ``PhotoVisits``."""
         visits = PhotoVisits([view.camera for view in views], looks, seed, max_megapixels)
         return PhotoStream(views, visits, first, cache)
 
     def to(self, device: torch.device) -> PhotoStream:
-        """Itself, with photos on a device; before the first of them."""
+        """Return itself, set to put photos on a device; call it before taking the first photo."""
         self._uploader = Uploader(device)
         return self
 
@@ -158,7 +158,7 @@ class PhotoStream:
         return TrainingPhoto(sent.camera, *pixels, sent.is_empty, sent.inner, sent.share, sent.round)
 
     def fill(self, report: Reporter) -> None:
-        """Decode all photos before the first iteration: one at full size beside the model would take more memory.
+        """Decode all photos before the first iteration: a full-size photo beside the model would take more memory.
 
         Raises:
             MachineError: if the disk is full.
@@ -170,7 +170,7 @@ class PhotoStream:
             report.progress(done, len(views), "decoding photos", "photos")
 
     def wanted_bytes(self) -> int:
-        """What all photos that are wanted more than once, and are not stored yet, take on the disk."""
+        """Disk space for all photos that are needed more than once and not stored yet, bytes."""
         return sum(
             stored_bytes(self._visits.camera(view, level), self._views[view].mask_path is not None)
             for view, levels in self._unread.items()
@@ -178,7 +178,7 @@ class PhotoStream:
         )
 
     def tell(self, report: Reporter) -> None:
-        """Warn where the disk has no room for all decoded photos."""
+        """Warn if the disk has no room for all decoded photos."""
         wanted, room = self.wanted_bytes(), self._cache.room_bytes
         if wanted > room:
             report.warning(
@@ -188,7 +188,7 @@ class PhotoStream:
             )
 
     def _store(self, index: int) -> None:
-        """Store a photo at all the levels that are wanted and have room."""
+        """Store a photo at all needed levels that fit."""
         view, levels = self._views[index], self._unread.pop(index, [])
         has_mask = view.mask_path is not None
         fitting = [level for level in levels if self._cache.has_room(self._visits.camera(index, level), has_mask)]
@@ -215,7 +215,7 @@ class PhotoStream:
         )
 
     def _decoded(self, visit: Visit, cut: PixelRectangle) -> tuple[Pixels, Mask | None, int]:
-        """A part of a photo, and how many of the whole photo's pixels count."""
+        """A part of a photo, its mask, and the number of the whole photo's pixels that count."""
         if visit.view in self._unread:
             self._store(visit.view)
         key = (visit.view, visit.level)

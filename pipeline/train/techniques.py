@@ -1,4 +1,4 @@
-"""The optional techniques of training, made in one place; each has a file of its own."""
+"""The optional training techniques, created in one place; each has a file of its own."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ def make_techniques(
     device: torch.device | None = None,
     area: PlanArea | None = None,
 ) -> Techniques:
-    """Those that a plan asks for, nothing of them trained.
+    """Create the techniques that a plan requires, untrained.
 
-    The order is that in which an iteration calls them: the sky lies behind what exposure changes, and what is moving
-    is told from the picture that both have made.
+    They are in the order in which an iteration calls them: the sky lies behind what exposure changes, and moving
+    objects are detected in the image that both have produced.
 
     Args:
-        plan: The training's.
-        sky: As it begins; copied.
-        views: Those trained on.
-        dataset: Theirs, with the sparse points; None for a training that is thrown away.
-        device: Where the model is trained; None for the CPU.
+        plan: The training plan.
+        sky: The initial sky; copied.
+        views: The training views.
+        dataset: Their dataset, with the sparse points; None for a throw-away training.
+        device: The training device; None for the CPU.
         area: That counts; None where all does.
 
     Raises:
@@ -84,7 +84,7 @@ def make_techniques(
 def begin_sky(
     config: TrainConfig, views: Sequence[View], dataset: Path, threads: int, report: Reporter
 ) -> SkyModel | None:
-    """The sky to be trained; None where it is off or none of the photos shows any."""
+    """The initial sky model; None if it is off or no photo shows sky."""
     if config.sky == "off":
         return None
     sky = SkyModel.begin(views, dataset, threads)
@@ -95,10 +95,10 @@ def begin_sky(
 
 @dataclass(frozen=True)
 class Techniques:
-    """All of a training's, one after the other.
+    """All techniques of a training, called one after the other.
 
     Attributes:
-        each: In the order in which they are called.
+        each: The techniques, in call order.
     """
 
     each: tuple[Technique, ...] = ()
@@ -107,21 +107,21 @@ class Techniques:
         return iter(self.each)
 
     def find(self, kind: type[Kind]) -> Kind | None:
-        """The one of a kind; None where it is off."""
+        """The technique of a class; None if it is off."""
         return next((technique for technique in self.each if isinstance(technique, kind)), None)
 
     def with_given(self, given: Technique) -> Techniques:
-        """The same with another one in the place of that of its kind."""
+        """The same with ``given`` in place of the technique of its class."""
         return Techniques(tuple(given if type(given) is type(each) else each for each in self.each))
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
-        """How to render."""
+        """The render options."""
         for technique in self.each:
             settings = technique.settings(settings, model, camera, now)
         return settings
 
     def before_render(self, model: Gaussians, now: ScheduleStep) -> Gaussians:
-        """The model as it is rendered in this iteration."""
+        """The model as rendered in this iteration."""
         for technique in self.each:
             model = technique.before_render(model, now)
         return model
@@ -134,31 +134,31 @@ class Techniques:
         return picture
 
     def counted(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
-        """The photo with what of it counts."""
+        """The photo, masked to the pixels that count."""
         photo = shot.photo
         for technique in self.each:
             photo = technique.counted(photo, picture, shot)
         return photo
 
     def with_penalties(self, loss: Float[Tensor, ""], shot: Shot) -> Float[Tensor, ""]:
-        """The photo's loss and what is added to it."""
+        """The photo's loss plus the penalties."""
         for technique in self.each:
             penalty = technique.penalty(shot)
             loss = loss if penalty is None else loss + penalty
         return loss
 
     def begin_again(self) -> None:
-        """The iteration is begun again."""
+        """Undo what the hooks changed: the iteration restarts."""
         for technique in self.each:
             technique.begin_again()
 
     def after_step(self, shot: Shot) -> None:
-        """Step what is trained beside the Gaussians."""
+        """Step the techniques' own parameters."""
         for technique in self.each:
             technique.after_step(shot)
 
     def after_epoch(self, iteration: int) -> None:
-        """Every photo was trained on once more."""
+        """Called when every photo has been trained on once more."""
         for technique in self.each:
             technique.after_epoch(iteration)
 
@@ -171,17 +171,17 @@ class Techniques:
         return score
 
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
-        """Which Gaussians have to go after an iteration; None where it is not one to look."""
+        """The Gaussians to remove after an iteration; None if no technique checks in this iteration."""
         found = [technique.unwanted(gaussians, iteration) for technique in self.each]
         masks = [mask.to(gaussians.means.device) for mask in found if mask is not None]
         return torch.stack(masks).any(dim=0) if masks else None
 
     def summary(self) -> dict[str, int | float]:
-        """What the stage's summary says of them."""
+        """The techniques' entries in the stage's summary."""
         return {name: value for technique in self.each for name, value in technique.summary().items()}
 
     def to_arrays(self) -> dict[str, Tensor]:
-        """All that changes, for a checkpoint: ``technique.tensor``."""
+        """Mutable state for a checkpoint, named ``technique.tensor``."""
         return {
             f"{technique.name}.{name}": tensor
             for technique in self.each
@@ -189,10 +189,10 @@ class Techniques:
         }
 
     def load(self, arrays: Mapping[str, Tensor]) -> None:
-        """The inverse of ``to_arrays``; may have changed some where it fails.
+        """The inverse of ``to_arrays``; on failure, some techniques may have changed already.
 
         Raises:
-            KeyError, ValueError: if something is missing or has another shape.
+            KeyError, ValueError: if a tensor is missing or has a different shape.
         """
         for technique in self.each:
             under = f"{technique.name}."

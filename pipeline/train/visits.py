@@ -1,4 +1,4 @@
-"""Which photo, at which size, and which window of it each iteration looks at: known before the first one."""
+"""The photo, size and window that each iteration trains on, known before the first iteration."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from splatpipe.pipeline.photos.images import Mask, reduced_camera
 from splatpipe.pipeline.train.draws import WINDOW_ORDER, permutation, random_bits
 from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize, windows_of
 
-MOST_WINDOWS = 1 << 20  # of a photo: where the next one's random numbers begin
+MOST_WINDOWS = 1 << 20  # per photo: offset of the next photo's random numbers
 
 
 @dataclass(frozen=True)
 class Visit:
-    """What an iteration looks at.
+    """What an iteration trains on.
 
     Attributes:
-        view: The photo's number.
-        level: How often it is halved.
-        camera: The whole photo's, of that size.
-        window: What counts.
-        cells: What of the whole photo counts besides its mask, by the cells of a grid over it; None where all does.
-        round: Where all that there is to see at this size has been seen once since the last such visit: how many visits
-            that took; 0 elsewhere. What a change of size cuts short counts as a round, too.
+        view: Index of the photo.
+        level: Number of times the photo is halved.
+        camera: Camera of the whole photo at that size.
+        window: The window that counts.
+        cells: The part of the whole photo that counts besides its mask, as a grid of cells; None for all of it.
+        round: If this visit completes a round (everything at this size seen once), the round's number of visits; 0
+            otherwise. A round cut short by a change of size also counts.
     """
 
     view: int
@@ -41,10 +41,10 @@ class Visit:
     round: int = field(default=0, compare=False)
 
     def counted(self, mask: Mask | None, cut: PixelRectangle) -> Mask | None:
-        """Which pixels of a part count; None where all do.
+        """Mask of the pixels that count in a part of the photo; None if all do.
 
         Args:
-            mask: The photo's in that part.
+            mask: The photo's mask in that part.
             cut: The part, in the camera's pixels.
         """
         if self.cells is None:
@@ -63,7 +63,7 @@ class Visits(Protocol):
     """The visits of a training.
 
     Attributes:
-        max_megapixels: The photos are first reduced to this size; None: they are as the dataset has them.
+        max_megapixels: The photos are first reduced to this size; None keeps the dataset's size.
     """
 
     max_megapixels: float | None
@@ -78,21 +78,21 @@ class Visits(Protocol):
         """A photo's camera at a level."""
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
-        """The levels of each photo that is looked at more than once from an iteration on, finest first."""
+        """The levels of each photo visited more than once from an iteration onward, finest first."""
 
 
 class PhotoVisits(Visits):
-    """Visits of all that photos show: they depend on the cameras, the looks, the seed and the iteration alone.
+    """Visits of whole photos: they depend only on the cameras, the training sizes, the seed and the iteration.
 
-    Photos go by epochs, each once; the windows of a photo at a level go by rounds, each once; every epoch and every
-    round has an order of its own. Where photos have different numbers of windows, the windows of all go by rounds, or
+    An epoch visits each photo once; a round visits each window of a photo at a level once; every epoch and round is
+    shuffled anew. If photos have different numbers of windows, rounds run over the windows of all photos; otherwise
     those of the larger photos would be seen less often.
 
     Args:
-        cameras: Of the photos.
-        looks: Of each iteration, ``looks[i]`` for iteration ``i`` + 1.
-        seed: Of the orders.
-        max_megapixels: The photos are first reduced to this size; None: they are as the dataset has them.
+        cameras: The photos' cameras.
+        looks: Training size of each iteration, ``looks[i]`` for iteration ``i`` + 1.
+        seed: Seed of the random order.
+        max_megapixels: The photos are first reduced to this size; None keeps the dataset's size.
     """
 
     def __init__(
@@ -102,14 +102,14 @@ class PhotoVisits(Visits):
         photos = len(cameras)
         epochs = [permutation(seed, epoch, photos) for epoch in range(-(-len(looks) // max(1, photos)))]
         self._views = np.concatenate(epochs)[: len(looks)] if epochs else np.zeros(0, np.int64)
-        self._turns = np.zeros(len(looks), np.int64)  # visits of the same photo with the same look before each
+        self._turns = np.zeros(len(looks), np.int64)  # earlier visits of the same photo at the same size
         sizes = {
             (camera.width, camera.height, look.window_pixels)
             for look in set(looks)
             for camera in (self.camera(view, look.level) for view in range(photos))
         }
         self._windows = {size: windows_of(*size) for size in sizes}
-        self._given = np.full(len(looks), -1, np.int64)  # windows that do not follow from the turn
+        self._given = np.full(len(looks), -1, np.int64)  # windows that do not follow from the turn; -1: they do
         for look in sorted(set(looks), key=lambda look: (look.level, look.window_pixels)):
             self._mix(look)
         before: Counter[tuple[int, TrainingSize]] = Counter()
@@ -119,11 +119,11 @@ class PhotoVisits(Visits):
         self._rounds = rounds_ended(self._ends(), len(looks))
 
     def _ends(self) -> Iterable[int]:
-        """The iterations that end rounds: of photos, then of their windows where they have several."""
+        """The iterations that end rounds: of photos, or of their windows if they have several."""
         photos = max(1, len(self._cameras))
         for look, begun, until in runs(self._looks):
             counts = {len(self._windows_at(view, look)) for view in range(len(self._cameras))}
-            if len(counts) == 1:  # photos go on by epochs, which a change of size does not begin anew
+            if len(counts) == 1:  # epochs of photos, which a change of size does not restart
                 begun = photos * -(-begun // photos)
             yield from range(begun, until + 1, self._count(look))
 
@@ -131,7 +131,7 @@ class PhotoVisits(Visits):
         return max(1, sum(len(self._windows_at(view, look)) for view in range(len(self._cameras))))
 
     def _mix(self, look: TrainingSize) -> None:
-        """Let the windows of all photos go by rounds, where photos have different numbers of them."""
+        """Run rounds over the windows of all photos, if photos have different numbers of them."""
         counts = [len(self._windows_at(view, look)) for view in range(len(self._cameras))]
         if len(set(counts)) < 2:
             return
@@ -164,22 +164,22 @@ class PhotoVisits(Visits):
         return reduced_camera(self._cameras[view], self.max_megapixels, level)
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
-        """The levels of each photo that is looked at more than once from an iteration on, finest first."""
+        """The levels of each photo visited more than once from an iteration onward, finest first."""
         return _wanted_again(self._views[first - 1 :].tolist(), self._looks[first - 1 :])
 
 
 class PartVisits(Visits):
-    """Visits of some windows of photos: they depend on these, the looks, the seed and the iteration alone.
+    """Visits of given windows of photos: they depend only on these, the training sizes, the seed and the iteration.
 
-    The windows of a level go by rounds, each once, whatever photo they are of; every round has an order of its own.
+    A round visits each window of a level once, whichever photo it is from; every round is shuffled anew.
 
     Args:
-        cameras: Of the photos.
-        looks: Of each iteration, ``looks[i]`` for iteration ``i`` + 1.
-        seed: Of the orders.
+        cameras: The photos' cameras.
+        looks: Training size of each iteration, ``looks[i]`` for iteration ``i`` + 1.
+        seed: Seed of the random order.
         max_megapixels: As for ``PhotoVisits``.
-        parts: By the level, each a photo's number and a window of it at that level; at least one where a look wants it.
-        cells: What of photos counts, by their numbers, as of ``Visit``; all of one that is not there.
+        parts: By level: pairs of a photo's index and a window at that level; at least one for each level in ``looks``.
+        cells: The part of each photo that counts, by photo index, as in ``Visit``; photos not listed count whole.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class PartVisits(Visits):
         self._cameras, self._looks, self.max_megapixels, self._parts = cameras, looks, max_megapixels, parts
         self._cells = cells or {}
         levels = np.array([look.level for look in looks], np.int64)
-        self._rows = np.zeros(len(looks), np.int64)  # of the level's parts
+        self._rows = np.zeros(len(looks), np.int64)  # rows of the level's parts
         for level in np.unique(levels).tolist():
             wanted, count = np.flatnonzero(levels == level), len(parts[level])
             self._rows[wanted] = in_rounds(seed, count, len(wanted))
@@ -217,19 +217,19 @@ class PartVisits(Visits):
         return reduced_camera(self._cameras[view], self.max_megapixels, level)
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
-        """The levels of each photo that is looked at more than once from an iteration on, finest first."""
+        """The levels of each photo visited more than once from an iteration onward, finest first."""
         looks, rows = self._looks[first - 1 :], self._rows[first - 1 :].tolist()
         return _wanted_again([self._parts[look.level][row][0] for look, row in zip(looks, rows, strict=True)], looks)
 
 
 def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"]:
-    """Numbers below a count, each once a round; every round has an order of its own."""
+    """Indices below ``count``, each once per round; every round is shuffled anew."""
     rounds = [permutation(seed, turn, count) for turn in range(-(-visits // count))]
     return np.concatenate(rounds)[:visits]
 
 
 def runs(looks: Sequence[TrainingSize]) -> Iterable[tuple[TrainingSize, int, int]]:
-    """The looks one after the other, each with the iterations that were done before it and that are done after it."""
+    """Runs of equal training sizes, each with the number of iterations done before it and by its end."""
     done = 0
     for look, same in groupby(looks):
         begun, done = done, done + sum(1 for _ in same)
@@ -237,11 +237,11 @@ def runs(looks: Sequence[TrainingSize]) -> Iterable[tuple[TrainingSize, int, int
 
 
 def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits"]:
-    """For each visit that ends a round the visits since the one before; 0 for all others.
+    """For each visit that ends a round, the number of visits since the previous one; 0 for all others.
 
     Args:
-        ends: The iterations that end rounds, from 1, in any order and number; 0 is none.
-        visits: How many there are.
+        ends: The iterations that end rounds, from 1, in any order and possibly repeated; 0 is ignored.
+        visits: Number of visits.
     """
     found = np.zeros(visits, np.int64)
     places = np.array(sorted({0, *ends}), np.int64)
@@ -250,7 +250,7 @@ def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits
 
 
 def _wanted_again(views: Sequence[int], looks: Sequence[TrainingSize]) -> dict[int, list[int]]:
-    """Of some iterations' photos those that are looked at more than once, with their levels."""
+    """The photos visited more than once in these iterations, with their levels."""
     times: Counter[int] = Counter()
     levels: defaultdict[int, set[int]] = defaultdict(set)
     for view, look in zip(views, looks, strict=True):

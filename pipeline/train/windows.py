@@ -1,7 +1,7 @@
-"""What an iteration looks at of its photo: how often it is halved, and which window of that counts.
+"""The part of a photo that an iteration trains on: how often the photo is halved, and which window of it counts.
 
-Windows are the cells of a grid over the photo. Their borders lie where a window that is grown by the reach of SSIM
-begins on a node of the sky's grid, so that what is interpolated between nodes is the same in a window and in the whole.
+Windows are the cells of a grid over the photo. Their borders are placed so that a window grown by the reach of SSIM
+begins on a node of the sky's grid: values interpolated between nodes are then the same in a window as in the whole.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-REACH_PX = 5  # of SSIM: half its window, which looks so far over a border
-NODES_PX = 8  # apart: the panorama's `STEP_PX`
-LEAST_SIDE_PX = 2 * NODES_PX  # of a cell: borders are moved by half the nodes' distance at most
-MOST_OBLONG = 2.5  # sides of a cell: strips cost more at their borders than a few cells more
+REACH_PX = 5  # of SSIM: half its window, which reaches this far over a border
+NODES_PX = 8  # node spacing: the panorama's `STEP_PX`
+LEAST_SIDE_PX = 2 * NODES_PX  # of a cell: borders move by at most half the node spacing
+MOST_OBLONG = 2.5  # aspect ratio of a cell: the borders of strips cost more than a few extra cells
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class TrainingSize:
     """A size to train at.
 
     Attributes:
-        level: How often the photo is halved.
-        window_pixels: Of the halved photo, that count in an iteration at most; 0 for all of it, however large.
+        level: Number of times the photo is halved.
+        window_pixels: Most pixels of the halved photo that count in an iteration; 0 for all of it, however large.
     """
 
     level: int = 0
@@ -30,13 +30,13 @@ class TrainingSize:
 
 @dataclass(frozen=True)
 class PixelRectangle:
-    """A rectangle of a picture, pixels.
+    """A rectangle in an image, pixels.
 
     Attributes:
-        left: Its first column.
-        top: Its first row.
-        right: The column after its last.
-        bottom: The row after its last.
+        left: First column.
+        top: First row.
+        right: One past the last column.
+        bottom: One past the last row.
     """
 
     left: int
@@ -46,25 +46,25 @@ class PixelRectangle:
 
     @property
     def width(self) -> int:
-        """Its columns."""
+        """Number of columns."""
         return self.right - self.left
 
     @property
     def height(self) -> int:
-        """Its rows."""
+        """Number of rows."""
         return self.bottom - self.top
 
     @property
     def pixels(self) -> int:
-        """How many it has."""
+        """Number of pixels."""
         return self.width * self.height
 
     def grown(self, width: int, height: int) -> PixelRectangle:
-        """With all that SSIM sees from inside, as far as the picture goes.
+        """The rectangle grown by the reach of SSIM, clipped to the image.
 
         Args:
-            width: Of the picture.
-            height: Of the picture.
+            width: Width of the image.
+            height: Height of the image.
         """
         return PixelRectangle(
             max(0, self.left - REACH_PX),
@@ -74,7 +74,7 @@ class PixelRectangle:
         )
 
     def within(self, other: PixelRectangle) -> tuple[int, int, int, int]:
-        """Its left, top, right and bottom in the pixels of another frame."""
+        """Its left, top, right and bottom relative to another rectangle."""
         return (
             self.left - other.left,
             self.top - other.top,
@@ -84,12 +84,13 @@ class PixelRectangle:
 
 
 def windows_of(width: int, height: int, window_pixels: int) -> list[PixelRectangle]:
-    """The windows of a picture, row by row: as few as there can be of nearly equal, nearly square cells.
+    """The windows of an image, row by row: the fewest possible of nearly equal, nearly square cells.
 
     Args:
-        width: Of the picture, pixels.
-        height: Of the picture, pixels.
-        window_pixels: Of a window at most; 0 for the whole picture in one. Cells are never under ``LEAST_SIDE_PX``.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        window_pixels: Most pixels of a window; 0 for one window over the whole image. Sides never fall below
+            ``LEAST_SIDE_PX``.
     """
     if window_pixels == 0 or width * height <= window_pixels:
         return [PixelRectangle(0, 0, width, height)]
@@ -101,7 +102,7 @@ def windows_of(width: int, height: int, window_pixels: int) -> list[PixelRectang
 
 
 def _divisions(width: int, height: int, window_pixels: int) -> tuple[int, int]:
-    """How many rows and columns of cells: as few cells as fit, of those the most nearly square."""
+    """Number of rows and columns of cells: the fewest cells that fit, and of those the most nearly square."""
     most_rows, most_columns = max(1, height // LEAST_SIDE_PX), max(1, width // LEAST_SIDE_PX)
     found: list[tuple[int, bool, int, float, int, int]] = []
     for rows in range(1, most_rows + 1):
@@ -122,6 +123,6 @@ def _longest(size: int, parts: int) -> int:
 
 
 def _borders(size: int, parts: int) -> list[int]:
-    """Where the cells along a side end, from 0 to its size."""
+    """The cells' borders along a side, from 0 to its size."""
     inner = [NODES_PX * round((size * part / parts - REACH_PX) / NODES_PX) + REACH_PX for part in range(1, parts)]
     return [0, *inner, size]

@@ -28,7 +28,7 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
     Args:
         inputs: The stage's.
         out: Where to.
-        report: Told of progress.
+        report: Receives progress.
 
     Raises:
         StageError: if a block is missing, or a part of one is broken.

@@ -34,7 +34,7 @@ class TrainingLimits:
 
     Attributes:
         gaussians: At most.
-        window_pixels: Of a photo, that an iteration looks at at most.
+        window_pixels: Most pixels of a photo that an iteration uses.
     """
 
     gaussians: int
@@ -49,7 +49,7 @@ def train_coarse(config: TrainConfig, inputs: Inputs, limits: TrainingLimits, ou
         inputs: Those of the stage `train`.
         limits: Of this pass.
         out: Takes the files, and has its checkpoint meanwhile.
-        report: Takes what people want to know.
+        report: Receives progress and messages.
 
     Raises:
         SplatpipeError, MachineError, KeyboardInterrupt: as ``loop.run``.
@@ -71,7 +71,7 @@ def coarse_iterations(config: TrainConfig, cameras: Sequence[Camera], window_pix
     Args:
         config: The options of the whole training.
         cameras: Of the photos trained on.
-        window_pixels: Of a photo, that an iteration looks at at most.
+        window_pixels: Most pixels of a photo that an iteration uses.
     """
     footage, _most = footage_on(config, cameras, window_pixels)
     return sum(count for _level, count in coarse_lengths(config, footage))

@@ -39,7 +39,7 @@ class SceneSize:
         cap: On Gaussians.
         expected: Gaussians that its photos are thought to ask for.
         window_pixels: That an iteration looks at, at most, where memory is no matter.
-        sh_degree: Of the model.
+        sh_degree: SH degree of the model.
         photos: That are trained on.
     """
 

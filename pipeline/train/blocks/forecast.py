@@ -50,7 +50,7 @@ class WindowScheme:
         """That of a training's blocks.
 
         Args:
-            config: The options.
+            config: The training options.
             footage: All photos.
             max_megapixels: That they are reduced to.
         """
@@ -153,7 +153,7 @@ def block_outlooks(
         seen: What they see, in their order.
         xyz: All sparse points.
         partition: The cells.
-        window_pixels: Of a photo, that an iteration looks at at most.
+        window_pixels: Most pixels of a photo that an iteration uses.
     """
     footage, most = footage_on(config, [view.camera for view in views], window_pixels)
     cut = WindowScheme.of(config, footage, most)
@@ -213,7 +213,7 @@ def coarse_sights(
 
     Raises:
         SplatpipeError: if a file is missing or broken.
-        MachineError: if the device asked for is not there.
+        MachineError: if the requested device is not available.
     """
     device = choose_device(machine.device)
     with same_bits(machine.threads), device.one_order():

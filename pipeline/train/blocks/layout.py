@@ -106,7 +106,7 @@ def _look_around(
         outlooks: What blocks do.
         scene: The coarse model, what all photos see, all sparse points.
         folder: Takes the files.
-        report: Told of progress.
+        report: Receives progress.
     """
     found = []
     for number, outlook in enumerate(outlooks):

@@ -19,7 +19,7 @@ def coarse_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
     """Iterations of the coarse pass.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: All photos.
     """
     (first, count), *finer = lengths_of(config, footage)
@@ -30,7 +30,7 @@ def finer_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
     """Iterations of all that comes after the coarse pass, if no window were in two blocks, the first size first.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: All photos.
     """
     (first, count), *finer = lengths_of(config, footage)

@@ -68,7 +68,7 @@ def block_need(trained: int, frozen: int, window_pixels: int, sh_degree: int) ->
         trained: Gaussians that it trains, at most.
         frozen: Gaussians that it draws besides, at most.
         window_pixels: Of the largest window.
-        sh_degree: Of the model.
+        sh_degree: SH degree of the model.
     """
     of_gaussians = trained * bytes_per_gaussian(sh_degree) + frozen * frozen_bytes(sh_degree)
     return BlockNeed(trained, frozen, FIXED_BYTES + PIXEL_BYTES * window_pixels + of_gaussians)
@@ -81,7 +81,7 @@ def need_of_blocks(blocks: int, cap: int, window_pixels: int, sh_degree: int) ->
         blocks: At least 1.
         cap: Gaussians of the whole scene.
         window_pixels: Of the largest window.
-        sh_degree: Of the model.
+        sh_degree: SH degree of the model.
     """
     if blocks == 1:
         return block_need(cap, 0, window_pixels, sh_degree)
@@ -96,7 +96,7 @@ def fewest_blocks(cap: int, room_bytes: int, window_pixels: int, sh_degree: int)
         cap: Gaussians of the whole scene.
         room_bytes: Of the limit, what the process has not taken already.
         window_pixels: Of the largest window.
-        sh_degree: Of the model.
+        sh_degree: SH degree of the model.
     """
     for blocks in range(1, MOST_BLOCKS + 1):
         if need_of_blocks(blocks, cap, window_pixels, sh_degree).memory_bytes <= room_bytes:

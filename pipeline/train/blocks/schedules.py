@@ -26,7 +26,7 @@ def block_lengths(config: TrainConfig, footage: PhotoSizes, parts: Mapping[int, 
     """Iterations of a block, the first size first; a size at which it sees nothing is left out.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: All photos.
         parts: The block's windows at each level.
     """
@@ -41,7 +41,7 @@ def coarse_schedule(config: TrainConfig, footage: PhotoSizes) -> Schedule:
     """That of the coarse pass.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: All photos.
     """
     return schedule_of(config, footage, coarse_lengths(config, footage))
@@ -53,7 +53,7 @@ def block_schedule(
     """That of a block.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: All photos.
         seen: Those that the block sees.
         parts: The block's windows at each level.
@@ -73,7 +73,7 @@ def share_at(config: TrainConfig, footage: PhotoSizes, begun: float) -> float:
     blocks begin.
 
     Args:
-        config: The options.
+        config: The training options.
         footage: All photos.
         begun: The part, 0..1.
     """

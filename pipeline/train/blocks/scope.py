@@ -99,7 +99,7 @@ class BlockScope:
         """The inverse of ``write``.
 
         Raises:
-            StageError: if it is not there, or broken.
+            StageError: if it is missing or broken.
         """
         path = _path(folder, block)
         try:
@@ -139,7 +139,7 @@ class ScopeReader:
         """What the block looks at.
 
         Raises:
-            StageError: if it is not there, or broken.
+            StageError: if it is missing or broken.
         """
         return BlockScope.read(self.prospects, self.number)
 
@@ -192,7 +192,7 @@ def read_free_space(folder: Path, cameras: Sequence[Camera]) -> FreeSpace:
         cameras: Of all photos trained on, in their order.
 
     Raises:
-        StageError: if it is not there, or broken.
+        StageError: if it is missing or broken.
     """
     try:
         arrays = read_archive(folder / FREE)

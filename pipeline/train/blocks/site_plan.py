@@ -40,7 +40,7 @@ class SitePlan:
     Attributes:
         partition: The cells.
         blocks: What each may take, in the cells' order.
-        window_pixels: Of a photo, that an iteration looks at at most.
+        window_pixels: Most pixels of a photo that an iteration uses.
         limit_bytes: Of memory; 0 for none.
     """
 
@@ -104,7 +104,7 @@ def load_site_plan(path: Path) -> SitePlan:
     """Read what `blocks` left of a scene that is trained in blocks.
 
     Raises:
-        StageError: if it is not that.
+        StageError: if it is not such a file.
     """
     try:
         fields: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -122,7 +122,7 @@ def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[flo
 
     Args:
         division: How the scene is divided.
-        sh_degree: Of the model.
+        sh_degree: SH degree of the model.
         counted: Of each block its weight, and the coarse model's Gaussians in its cell, and in cell and margin.
     """
     cap, most = division.cap, _most(division, sh_degree)

@@ -48,7 +48,7 @@ class SiteParts:
         coarse: The folder that the coarse pass left.
         prospects: The folder of what each block looks at.
         partition: The cells.
-        area: That counts, in the model's frame; None where all does.
+        area: Area of interest, in the model's frame; None for everything.
     """
 
     dataset: Path
@@ -68,7 +68,7 @@ class BlockTask:
         share: Gaussians that its cell gets at most.
         trained: Gaussians that it trains at most, with those of the margin.
         frozen: Gaussians that it draws besides at most.
-        window_pixels: Of a photo, that an iteration looks at at most.
+        window_pixels: Most pixels of a photo that an iteration uses.
     """
 
     number: int
@@ -89,7 +89,7 @@ def train_block(
         task: The block.
         machine: Changes only speed.
         out: Takes the files, and has checkpoint and decoded photos meanwhile.
-        report: Takes what people want to know.
+        report: Receives progress and messages.
 
     Raises:
         SplatpipeError: if a file is missing or broken.
@@ -118,7 +118,7 @@ class Block:
     Attributes:
         parts: The scene's files.
         task: Which block.
-        device: What it is computed on.
+        device: The compute device.
         whole: The plan of the whole scene, with the block's options.
         surveyor: Knows its windows and surroundings.
         exposures: The photos' maps, as `exposures.json` has them.
