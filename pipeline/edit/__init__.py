@@ -1,1 +1,1 @@
-"""Splats as they are handed over: cleaned, cut, moved, merged, reduced."""
+"""Edits finished splats before delivery: clean, crop, move, merge, reduce."""

@@ -1,4 +1,4 @@
-"""Cleaning as a step: with the photos of the run, where the splat is a run's and nothing was merged into it."""
+"""Cleaning as an edit step: uses the run's cameras if the splat is a run's and nothing was merged into it."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ from splatpipe.pipeline.splat.scene import turn_of
 
 @dataclass(frozen=True)
 class Clean:
-    """What is no part of the scene is removed; see ``edit.cleaning``.
+    """Removes what is not part of the scene; see ``edit.cleaning``.
 
     Attributes:
-        cameras: Of the photos that the splat was trained on, in its frame as it was read, z up; none where nobody
-            knows them.
+        cameras: Cameras of the training photos, in the splat's frame as read, z up; empty if unknown.
     """
 
     cameras: Sequence[Camera] = ()
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Clean; what is recorded of it.
+        """Clean the splat; returns the record of the step.
 
         Raises:
             SplatpipeError: if nothing is left.
@@ -52,7 +51,7 @@ class Clean:
 
 
 def _seen_by(camera: Camera, piece: Workpiece) -> Camera:
-    """A small camera that went with the splat, in its own axes."""
+    """The camera at reduced size, moved with the splat, in the splat's own axes."""
     pose = piece.travelled.camera_pose(camera.cam_from_world)
     pose[:3, :3] = pose[:3, :3] @ turn_of("z up", piece.facts.axes).numpy()
     return replace(reduced_camera(camera, SEEN_MEGAPIXELS), cam_from_world=pose)

@@ -1,11 +1,11 @@
-"""What of a splat is no part of the scene: floaters, haze, and what no photo vouches for.
+"""Finds what in a splat is not part of the scene: floaters, haze, and what no photo supports.
 
-Where the photos are known, a Gaussian is suspected of floating if it lies before all that is around it where it is seen
-(``depth_islands``). Where their pictures are known, too, what they are worth with it and without decides, together with
-how far it hangs before the scene and by what (``floaters``); else whether it hangs together with the scene at all
-(``isolation``). Without photos, what goes are the few that hang together apart from all others.
+If the cameras are known, a Gaussian is suspected of floating if it lies in front of everything around it in the photos
+(``depth_islands``). If the images are known too, the change of their error with and without it decides, together with
+how far in front of the scene it hangs and how it is held (``floaters``); else whether it is connected to the scene at
+all (``isolation``). Without photos, small groups apart from all others are removed.
 
-All limits keep real things rather than find every floater: leaves, wires, and what only one photo shows.
+All limits are set to keep real objects rather than to find every floater: leaves, wires, what only one photo shows.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ Flags = Bool[np.ndarray, " n"]
 Told = Callable[[int, int], None]
 
 TRANSPARENT = 0.01
-"""Opacity that nobody sees, two and a half steps of an 8-bit picture, and that no overlap of a few makes visible."""
-FAINT = 0.03  # opacity that is nothing where no photo shows it: seven steps of an 8-bit picture at its very centre
-SOLID = 0.1  # opacity that things are made of: haze holds nothing
-SEEN_PIXELS = 1.0  # of all photos' pictures, that say anything of a Gaussian
+"""Invisible opacity: two and a half steps of an 8-bit image, and a few overlapping ones stay invisible."""
+FAINT = 0.03  # opacity negligible where no photo shows it: seven steps of an 8-bit image at its very centre
+SOLID = 0.1  # least opacity of solid objects: haze holds nothing
+SEEN_PIXELS = 1.0  # visible pixels, over all photos, that make a Gaussian count as seen
 UNSEEN_PIXELS = 0.1
-FLOATING = 0.5  # share of what is seen of one that is before all around it
-SUSPECTED = 0.3  # the same, where pictures decide: most of it is real, and they keep it
-FEW_PHOTOS = 2.0  # that see what hangs loosely: one photo makes up anything before its own picture
-OVERSIZED = 0.2  # times the distance to the nearest camera, that a floating Gaussian's standard deviation is large
-HAZE = 0.3  # opacity below which a very large Gaussian is no thing, where there are no photos to say so
-EXTENT = (0.05, 0.95)  # quantiles of the centres, between which a scene extends
-BORDER = 0.8  # share of what is seen of one at the borders of pictures: hardly covered
-FEW = 100  # that hang together and are no scene
+FLOATING = 0.5  # share of a Gaussian's visible area that lies in front of everything around it
+SUSPECTED = 0.3  # the same if images decide: most of these are real, and the images keep them
+FEW_PHOTOS = 2.0  # that see a loose Gaussian: training can put anything in front of a single photo
+OVERSIZED = 0.2  # times the distance to the nearest camera: a floating Gaussian's large standard deviation
+HAZE = 0.3  # opacity below which a very large Gaussian is not an object, if there are no photos to tell
+EXTENT = (0.05, 0.95)  # quantiles of the centres that bound the scene's extent
+BORDER = 0.8  # share of a Gaussian's visibility at image borders above which it is hardly covered
+FEW = 100  # Gaussians in a connected group too small to be the scene
 
 
 @dataclass(frozen=True, eq=False)
 class CleaningResult:
-    """What is to be removed.
+    """The result of cleaning.
 
     Attributes:
-        keep: Which Gaussians stay.
-        removed: How many go, by reason; every reason that was looked at.
+        keep: Which Gaussians to keep.
+        removed: Number to remove by reason, for every reason checked.
     """
 
     keep: Bool[Tensor, " n"]
@@ -56,12 +56,12 @@ class CleaningResult:
 
 
 def clean_scene(gaussians: Gaussians, photos: TrainingPhotos | None = None, told: Told | None = None) -> CleaningResult:
-    """Tell which Gaussians are floaters, haze, or beyond the photos.
+    """Find which Gaussians are floaters, haze, or beyond the photos.
 
     Args:
-        gaussians: Finite; where they are to be rendered if there are photos, else on the CPU.
-        photos: That it was trained on, and no others; None where nobody knows them.
-        told: Called with steps done, of how many.
+        gaussians: Finite Gaussians, on the device that renders them if there are photos, else on the CPU.
+        photos: Exactly the photos it was trained on; None if unknown.
+        told: Called with the steps done and their total.
 
     Raises:
         ValueError: if a Gaussian is not finite.
@@ -76,7 +76,7 @@ def clean_scene(gaussians: Gaussians, photos: TrainingPhotos | None = None, told
 
 
 def removals_in_words(cleaned: CleaningResult) -> str:
-    """What was removed and why, for people; that nothing was, where it is so."""
+    """A sentence for people on what was removed and why."""
     count, total = sum(cleaned.removed.values()), len(cleaned.keep)
     if not count:
         return "Nothing had to be removed."
@@ -86,11 +86,11 @@ def removals_in_words(cleaned: CleaningResult) -> str:
 
 
 def _untold(_done: int, _total: int) -> None:
-    """Where nobody listens."""
+    """Ignore progress."""
 
 
 def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> Iterator[tuple[str, Flags]]:
-    """Reasons, and whom they hit."""
+    """Yield the reasons for removal and the Gaussians each applies to."""
     opacity = torch.sigmoid(gaussians.opacity_logits.detach()).numpy(force=True)
     yield "transparent", opacity < TRANSPARENT
     shapes, solid = GaussianShapes.of(gaussians), opacity >= SOLID
@@ -111,7 +111,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> I
     yield "seen by none", unseen & ((opacity < FAINT) | ~held(shapes, LOOSE, seen & solid, unseen))
     yield "beyond the photos", _at_edges(found, shapes, seen & solid)
     if photos.picture is None:
-        yield "floating", loose & solid & ~large  # which may be all that shows what is far behind
+        yield "floating", loose & solid & ~large  # large ones may be all that represents the far background
         return
     suspected = seen & (found.floating > SUSPECTED)
     suspects = Suspects(gaussians, shapes, suspected, seen & ~suspected & solid, found)
@@ -122,7 +122,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> I
 
 
 def _oversized(shapes: GaussianShapes, photos: TrainingPhotos) -> Flags:
-    """Which Gaussians are very large for where they are."""
+    """Which Gaussians are very large for their distance to the nearest camera."""
     nearest = np.full(len(shapes.centres), np.inf)
     for camera in photos.cameras:
         np.minimum(nearest, np.linalg.norm(shapes.centres - camera.centre(), axis=1), out=nearest)
@@ -130,12 +130,12 @@ def _oversized(shapes: GaussianShapes, photos: TrainingPhotos) -> Flags:
 
 
 def _haze(shapes: GaussianShapes, opacity: Float32[np.ndarray, " n"]) -> Flags:
-    """Which Gaussians are very large for the scene and hardly there; large solid ones may be its sky."""
+    """Which Gaussians are very large for the scene and faint; large solid ones may be its sky."""
     low, high = np.quantile(shapes.centres, EXTENT, axis=0) if len(shapes.centres) else (np.zeros(3), np.zeros(3))
     return np.asarray((shapes.largest > OVERSIZED * float(np.linalg.norm(high - low))) & (opacity < HAZE))
 
 
 def _at_edges(found: GaussianVisibility, shapes: GaussianShapes, solid: Flags) -> Flags:
-    """Which Gaussians only the borders of a photo or two show, and what is better covered does not hold."""
+    """Which Gaussians only the borders of one or two photos show and are not held by better covered ones."""
     rough = solid & (found.border > BORDER) & (found.photos < FEW_PHOTOS)
     return np.asarray(rough & ~held(shapes, LOOSE, solid & ~rough, rough))

@@ -1,4 +1,4 @@
-"""How places are stated: in the CRS of a splat that lies on the earth, or in the splat's own frame."""
+"""Coordinates in which positions are given: a georeferenced splat's CRS, or the splat's own frame."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from splatpipe.pipeline.splat.scene import SceneFacts, turn_of
 from splatpipe.pipeline.survey.handover import frame_of
 from splatpipe.pipeline.survey.world import World, open_world
 
-LARGEST = 1e9  # of a coordinate: beyond it there is no earth
+LARGEST = 1e9  # of a coordinate: no place on the earth has a larger one
 OWN, LOCAL = "own", "local"
 LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """What numbers mean. The frame that steps work in is the splat's, turned to z up.
+    """The meaning of coordinates that a user gives. Steps work in the splat's frame, rotated to z up.
 
     Attributes:
-        name: ``own`` (the file's axes), ``local`` (metres east, north, up of the place), or the CRS.
-        world: Where they are a CRS's; None else.
-        frame_from_stated: Turns the axes that directions are stated along, and places without a CRS.
+        name: ``own`` (the file's axes), ``local`` (metres east, north, up of the origin), or the CRS.
+        world: Converts between the CRS and the frame; None if the coordinates are not in a CRS.
+        frame_from_stated: Rotation of directions, and of positions without a CRS, into the frame.
     """
 
     name: str
@@ -35,11 +35,11 @@ class Coordinates:
 
     @staticmethod
     def of(facts: SceneFacts, local: bool) -> Coordinates:
-        """Those that places are stated in for a splat.
+        """The coordinates in which positions are given for a splat.
 
         Args:
-            facts: The splat's.
-            local: Numbers are metres from its place, not coordinates of its CRS.
+            facts: The splat's facts.
+            local: Numbers are metres from its origin, not coordinates in its CRS.
 
         Raises:
             SplatpipeError: if its CRS cannot be used there.
@@ -52,13 +52,13 @@ class Coordinates:
         return Coordinates(world.crs.text, world, np.eye(3))
 
     def stated(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Points of the frame as people state them."""
+        """Convert points from the frame to the coordinates the user gives."""
         if self.world is not None:
             return self.world.crs_from_local(points)
         return np.asarray(points @ self.frame_from_stated)
 
     def in_frame(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Stated points in the frame.
+        """Convert points from the coordinates the user gives to the frame.
 
         Raises:
             UsageError: if the CRS has no such place.
@@ -75,16 +75,16 @@ class Coordinates:
 
 
 def parse_numbers(text: str, option: str, counts: Sequence[int], form: str) -> tuple[float, ...]:
-    """Numbers with commas between them.
+    """Parse comma-separated numbers.
 
     Args:
         text: What the user wrote.
-        option: Where, for the message.
-        counts: How many there may be.
-        form: How it is written, for the hint.
+        option: The option's name, for the message.
+        counts: The allowed numbers of values.
+        form: The expected form, for the hint.
 
     Raises:
-        UsageError: if it is anything else, or a number is larger than any of this earth.
+        UsageError: if it is anything else, or a number is beyond ``LARGEST``.
     """
     numbers = [_number(part) for part in text.split(",")[: max(counts) + 1]]
     if len(numbers) not in counts or not all(abs(number) <= LARGEST for number in numbers):

@@ -1,4 +1,4 @@
-"""Crops: what lies inside a box, a polygon or heights is kept, or taken out. A Gaussian is where its centre is."""
+"""Crops to a box, a polygon or a height range, or cuts these out. A Gaussian's centre decides."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.survey.boundary import WITHOUT, placed, placed_area
 from splatpipe.pipeline.survey.boundary_file import BoundaryFile, read_boundary
 
-DIGEST_CHARACTERS = 16  # of a polygon's file in a splat's record: enough to know it again
+DIGEST_CHARACTERS = 16  # of a polygon file's digest in a splat's record: enough to identify it
 SHOWN_DIGITS = 3  # of coordinates in messages
 Inside = Callable[[Float64[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
 BOX_FORM = "X1,Y1,X2,Y2 or X1,Y1,Z1,X2,Y2,Z2"
@@ -27,13 +27,13 @@ BOX_FORM = "X1,Y1,X2,Y2 or X1,Y1,Z1,X2,Y2,Z2"
 
 @dataclass(frozen=True)
 class CropBox:
-    """A box along the axes of the coordinates it is stated in.
+    """A box along the axes of the coordinates in which it is given.
 
     Attributes:
-        low: Least x, y and perhaps z.
-        high: Largest.
-        local: As of ``Coordinates.of``.
-        inside: Keep what lies in it; else what does not.
+        low: Minimum x, y and optionally z.
+        high: Maximum x, y and optionally z.
+        local: As for ``Coordinates.of``.
+        inside: Keep the inside if true, else the outside.
     """
 
     low: tuple[float, ...]
@@ -43,7 +43,7 @@ class CropBox:
 
     @staticmethod
     def parse(text: str, option: str, local: bool, inside: bool) -> CropBox:
-        """Two opposite corners, of two or three numbers each.
+        """Parse two opposite corners, of two or three numbers each.
 
         Raises:
             UsageError: if it is anything else, or the box is empty.
@@ -57,7 +57,7 @@ class CropBox:
         return CropBox(low, high, local, inside)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Crop; what is recorded of it.
+        """Crop the splat; returns the record of the step.
 
         Raises:
             SplatpipeError: if nothing is left.
@@ -78,12 +78,12 @@ class CropBox:
 
 @dataclass(frozen=True)
 class CropHeights:
-    """A band of heights.
+    """A height range.
 
     Attributes:
-        low: Least; −∞ where it is open.
-        high: Largest; ∞ where it is open.
-        local: As of ``Coordinates.of``.
+        low: Lower limit; −∞ if open.
+        high: Upper limit; ∞ if open.
+        local: As for ``Coordinates.of``.
     """
 
     low: float
@@ -92,10 +92,10 @@ class CropHeights:
 
     @staticmethod
     def parse(text: str, option: str, local: bool) -> CropHeights:
-        """Two heights; one of them may be left out.
+        """Parse two heights; one of them may be left out.
 
         Raises:
-            UsageError: if it is anything else, or the band is empty.
+            UsageError: if it is anything else, or the range is empty.
         """
         form = "LOW,HIGH (or LOW, or ,HIGH)"
         first, comma, second = (part.strip() for part in text.partition(","))
@@ -110,7 +110,7 @@ class CropHeights:
         return CropHeights(low, high, local)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Crop; what is recorded of it.
+        """Crop the splat; returns the record of the step.
 
         Raises:
             SplatpipeError: if nothing is left.
@@ -118,7 +118,7 @@ class CropHeights:
         coordinates = Coordinates.of(piece.facts, self.local)
 
         def within(places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-            # Heights are along up, whichever of a file's axes that is.
+            # Heights are along the up direction, whichever of the file's axes that is.
             heights = places[:, 2] if coordinates.world is None else coordinates.stated(places)[:, 2]
             return np.asarray((heights >= self.low) & (heights <= self.high))
 
@@ -129,12 +129,12 @@ class CropHeights:
 
 @dataclass(frozen=True)
 class CropPolygon:
-    """The polygons of a GeoJSON file, in whatever CRS.
+    """The polygons of a GeoJSON file, in any CRS.
 
     Attributes:
         path: The file.
-        local: Its numbers are metres east and north in the splat's frame.
-        inside: Keep what lies in it; else what does not.
+        local: Its coordinates are metres east and north in the splat's frame.
+        inside: Keep the inside if true, else the outside.
     """
 
     path: Path
@@ -142,10 +142,10 @@ class CropPolygon:
     inside: bool = True
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Crop; what is recorded of it.
+        """Crop the splat; returns the record of the step.
 
         Raises:
-            SplatpipeError: if the file is broken, the splat lies nowhere on the earth, or nothing is left.
+            SplatpipeError: if the file is broken, the splat is not georeferenced, or nothing is left.
         """
         drawing = read_boundary(self.path)
         area = self._area(drawing, piece)
@@ -186,7 +186,7 @@ class CropPolygon:
 
 
 def _for_edits(error: SplatpipeError) -> SplatpipeError:
-    """A boundary's error without what only a run can do about it."""
+    """A boundary's error without the part of the hint that applies only to a run."""
     return SplatpipeError(error.message, error.hint.replace(WITHOUT, "").strip())
 
 
@@ -200,7 +200,7 @@ def _crop(piece: Workpiece, within: Inside, inside: bool, nothing: Callable[[], 
 
 
 def _nothing(what: str, piece: Workpiece, coordinates: Coordinates) -> SplatpipeError:
-    """That nothing is left, and where the splat is."""
+    """The error that nothing is left; it says where the splat is."""
     ends = np.quantile(coordinates.stated(piece.sample()), MIDDLE, axis=0)
     low, high = (",".join(f"{number:.{_digits(coordinates)}f}" for number in end) for end in ends)
     named = {"own": "in its own coordinates", "local": "in metres from its origin"}

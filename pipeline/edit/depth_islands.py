@@ -1,8 +1,8 @@
-"""A depth map without its islands: what is small and nearer than all around it is replaced by what is around.
+"""Removes islands from a depth map: small regions nearer than everything around them get the surrounding depth.
 
-A grey-scale closing (the largest depth within a line, then the least of those) fills what is shorter than the line. Of
-lines in several directions the least counts, so that a pole or an eave, long in one direction, stays: the infimum of
-closings by segments (P. Soille, "Morphological Image Analysis", 2nd ed. 2004).
+A grey-scale closing (the largest depth along a line segment, then the least of those) fills what is shorter than the
+segment. The minimum over several directions is used, so that a pole or an eave, long in one direction, stays: the
+infimum of closings by segments (P. Soille, "Morphological Image Analysis", 2nd ed. 2004).
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 LINE_SHARE = 0.1
-"""Of a picture's longer side, that an island is shorter than: 63 pixels of 0.3 megapixels."""
+"""Largest extent of an island as a share of an image's longer side: 63 pixels at 0.3 megapixels."""
 DIRECTIONS = 8
-BEYOND = 4.0  # times the farthest depth, where a picture shows no surface: the sky is behind everything
+BEYOND = 4.0  # times the farthest depth, the depth of pixels without a surface: the sky is behind everything
 
 
 def without_islands(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Depths of what is behind islands; elsewhere about the map's own, never nearer.
+    """The depth map with islands replaced by the depth behind them; elsewhere about unchanged, never nearer.
 
     Args:
-        depth: World units along the view axis; 0 where there is no surface.
+        depth: Depths along the view axis, world units; 0 where there is no surface.
     """
     farthest = float(depth.max(initial=0.0))
     if farthest <= 0.0:
@@ -37,7 +37,7 @@ def without_islands(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h
 
 
 def _lines(length: int) -> list[UInt8[np.ndarray, "k k"]]:
-    """Segments through the middle of a square, one pixel wide."""
+    """Structuring elements: segments through the centre of a square, one pixel wide, in ``DIRECTIONS`` directions."""
     side = length | 1
     lines = []
     for turn in range(DIRECTIONS):

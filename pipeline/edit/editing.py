@@ -1,4 +1,4 @@
-"""An edit from a splat's file to another: its steps in their order, what is written, and the pictures of it."""
+"""Runs an edit from one splat file to another: the steps in order, the output, the record and the images."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ class Step(Protocol):
     """One step of an edit."""
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Do it; what is recorded of it: JSON, small."""
+        """Apply the step; returns its record as a small JSON object."""
         ...
 
 
 @dataclass(frozen=True)
 class EditTask:
-    """What is asked for.
+    """An edit to run.
 
     Attributes:
-        source: What is edited.
-        output: What is written.
-        steps: In their order.
-        pictures: Whether there are to be any.
+        source: The splat to edit.
+        output: The file to write.
+        steps: The steps, in order.
+        pictures: Whether to write before-and-after images.
     """
 
     source: SplatSource
@@ -55,14 +55,14 @@ class EditTask:
     pictures: bool = True
 
     def beside(self, ending: str) -> Path:
-        """A file beside the output, called like it."""
+        """Path of a file beside the output, with the same stem and another ending."""
         path = self.output.path
         return path.with_name(path.name.removesuffix(self.output.kind.ending) + ending)
 
 
 @dataclass(frozen=True, eq=False)
 class _SplatExtent:
-    """Where a splat lies, for pictures."""
+    """A splat's sampled centres, place and size, for the images."""
 
     points: Points
     place: SplatOrigin | None
@@ -70,17 +70,17 @@ class _SplatExtent:
 
 
 def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
-    """Edit a splat: read it, take the steps, write it, what was done to it, and pictures.
+    """Edit a splat: read it, apply the steps, and write the result, the record and the images.
 
     Args:
-        task: What is asked for.
-        report: Told of the steps, and of what may surprise.
+        task: The edit.
+        report: Receives the progress and warnings.
 
     Returns:
-        What was done, for programs.
+        A summary as a JSON object.
 
     Raises:
-        SplatpipeError: if a step cannot be taken; then nothing is written.
+        SplatpipeError: if a step cannot be applied; then nothing is written.
         MachineError: if something cannot be written.
     """
     require_free(task)
@@ -106,7 +106,7 @@ def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
         views = _views(task, before, after)
         try:
             right = picture(scene, views.after, after.points, f"after: {after.count:,} Gaussians")
-            del scene  # the next is as large
+            del scene  # the one read next is as large
             _write_picture(task, views, before, right)
             outputs.append(task.beside(PICTURE))
         except SplatpipeError as error:
@@ -134,10 +134,10 @@ def _made(task: EditTask, count: int) -> dict[str, Any]:
 
 
 def require_free(task: EditTask) -> None:
-    """Refuse to do nothing, and to write over what is edited, what is merged, or anything of a run.
+    """Check that there are steps and that the output overwrites neither an input nor anything of a run.
 
     Raises:
-        UsageError: if there is no step, or the output is any of these, or a folder with something in it.
+        UsageError: if there is no step, or the output is any of these or a non-empty folder.
     """
     if not task.steps:
         raise UsageError("No edit step is given.", hint="Give a step, such as --crop-polygon FILE; see --help.")
@@ -171,7 +171,7 @@ def _require_finite(scene: Scene) -> None:
 
 
 def _write(task: EditTask, scene: Scene) -> None:
-    """Let the output take its place at once, or not at all."""
+    """Write the output atomically."""
     path = task.output.path
     aside = path.with_name(f".{os.getpid()}.new.{path.name}")
     try:
@@ -179,7 +179,7 @@ def _write(task: EditTask, scene: Scene) -> None:
         if aside.is_dir():
             sync_tree(aside)
             if path.is_dir():
-                path.rmdir()  # an empty one, or this fails
+                path.rmdir()  # must be empty, or this fails
         else:
             with aside.open("rb") as file:
                 os.fsync(file.fileno())
@@ -195,7 +195,7 @@ def _write(task: EditTask, scene: Scene) -> None:
 
 
 def _views(task: EditTask, before: _SplatExtent, after: _SplatExtent) -> PictureCameras:
-    """Both in the frame of what it has become."""
+    """Choose the viewpoints; each is returned in the frame of the splat it shows."""
     to_after = _between(before.place, after.place)
     poses = ((camera, to_after.camera_pose(camera.cam_from_world)) for camera in task.source.cameras())
     cameras = [replace(camera, cam_from_world=pose) for camera, pose in poses]
@@ -205,7 +205,7 @@ def _views(task: EditTask, before: _SplatExtent, after: _SplatExtent) -> Picture
 
 
 def _write_picture(task: EditTask, views: PictureCameras, before: _SplatExtent, right: Pixels) -> None:
-    """Read what it was once more, and draw it beside what it has become."""
+    """Read the original again, and write its image beside that of the result."""
     left = picture(task.source.read(), views.before, before.points, f"before: {before.count:,} Gaussians")
     try:
         write_side_by_side(task.beside(PICTURE), left, right)

@@ -1,10 +1,11 @@
-"""What suspected Gaussians are worth to the photos: by how much these are more like renders with them than without.
+"""Attributes the change in photometric error to suspected Gaussians: how much closer renders with them are to photos.
 
 Many are suspected at once, and what hides a surface shares its pixels with what lies behind it. So the difference
-between the squared errors with and without them all is divided as A. E. Aumann and L. S. Shapley do ("Values of
-Non-Atomic Games", 1974): each is paid the derivative by its own opacity along the way from none of them to all. Of one
-Gaussian alone a pixel's colour is linear in its opacity, the squared error quadratic, and the derivative at the middle
-is the difference itself; so all suspected ones are rendered at half of their opacity, and one backward pass pays them.
+between the squared errors with and without all of them is attributed by Aumann-Shapley values (A. E. Aumann and L. S.
+Shapley, "Values of Non-Atomic Games", 1974): each gets the integral of the derivative with respect to its own opacity
+along the path from none of them to all. For a single Gaussian a pixel's colour is linear in its opacity, the squared
+error is quadratic, and the derivative at the midpoint equals the difference; so all suspected ones are rendered at half
+their opacity, and one backward pass gives all values.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import composite_over
 
 Picture = Float32[np.ndarray, "h w 3"]
-FITTED_PIXELS = 4  # every so manieth pixel along both sides is enough for a colour map
+FITTED_PIXELS = 4  # the colour map is fitted to every fourth pixel in both directions
 HALFWAY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoErrorChange:
-    """Sums over the photos of squared errors (of pixels of 0..1, three channels).
+    """Changes of the squared error with each Gaussian (pixels 0..1, three channels), summed over the photos.
 
     Attributes:
-        better: How much smaller they are with a Gaussian, in the photos where they are.
-        worse: How much larger, in the others.
+        better: Total decrease, over the photos in which the error decreases.
+        worse: Total increase, over the others.
     """
 
     better: Float32[np.ndarray, " n"]
@@ -45,18 +46,18 @@ class PhotoErrorChange:
 def error_change_in_photos(
     gaussians: Gaussians, asked: Bool[np.ndarray, " n"], photos: TrainingPhotos, told: Callable[[int], None]
 ) -> PhotoErrorChange:
-    """By how much photos are more like renders with each Gaussian, and by how much others are less.
+    """Compute how much each Gaussian decreases and increases the photos' error.
 
-    Exposure differs between photos and is forgiven: a colour map is fitted to each, as ``metrics.psnr_cc`` does.
+    Exposure differences between photos are compensated: a colour map is fitted to each, as in ``metrics.psnr_cc``.
 
     Args:
-        gaussians: Where they are rendered, all of them; finite.
-        asked: Those whose worth is wanted.
-        photos: With pictures.
-        told: Called with the number of photos that were looked through.
+        gaussians: All Gaussians, finite, on the device that renders them.
+        asked: Which Gaussians to evaluate.
+        photos: The training photos, with images.
+        told: Called with the number of photos done.
 
     Returns:
-        0 of those that nobody asked for, and of the unseen.
+        The changes; 0 for Gaussians not asked for or not seen.
     """
     assert photos.picture is not None
     options = replace(photos.options, depth=False, magnitudes=False)
@@ -87,7 +88,7 @@ def _rendered(model: Gaussians, camera: Camera, photos: TrainingPhotos, options:
 
 
 def _error_slope(colour: Tensor, photo: Pixels, mask: Mask | None) -> Tensor:
-    """Derivative of a render's squared error by its pixels; none where the photo does not count."""
+    """Gradient of a render's squared error with respect to its pixels; 0 where the photo is masked."""
     picture = np.asarray(colour.detach().clamp(0.0, 1.0).numpy(force=True))
     target = photo.astype(np.float32) / np.float32(255.0)
     colours = _colour_map(picture, target, mask)
@@ -98,7 +99,7 @@ def _error_slope(colour: Tensor, photo: Pixels, mask: Mask | None) -> Tensor:
 
 
 def _colour_map(picture: Picture, target: Picture, mask: Mask | None) -> Float64[np.ndarray, "4 3"]:
-    """The affine map of colours that fits a picture to another best."""
+    """The least-squares affine colour map from one image to another."""
     some = slice(FITTED_PIXELS // 2, None, FITTED_PIXELS)
     counts = np.ones(picture[some, some].shape[:2], np.bool_) if mask is None else mask[some, some]
     source = picture[some, some][counts].astype(np.float64)

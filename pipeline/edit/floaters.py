@@ -1,9 +1,9 @@
-"""How likely what hangs in the air is a floater, by the photos and by where it is.
+"""Classifies suspected Gaussians as floaters, from the photos and from their surroundings.
 
-Evidence is added up as a logistic regression does (D. R. Cox, "The regression analysis of binary sequences", 1958): how
-much worse photos are with a Gaussian than without, how far before everything else it hangs, how opaque it is, and
-whether it hangs together with what nobody doubts. The weights were fitted to floaters planted into two captures, and
-tried on others and on a third capture (`benchmarks/planted_floaters.py`, trials.md).
+Evidence is combined by logistic regression (D. R. Cox, "The regression analysis of binary sequences", 1958): how much
+a Gaussian increases the photos' error, how far in front of everything else it hangs, how opaque it is, and whether it
+is connected to undoubted parts of the scene. The weights were fitted to floaters planted into two captures, and tested
+on other planted floaters and on a third capture (`benchmarks/planted_floaters.py`, trials.md).
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ Flags = Bool[np.ndarray, " n"]
 Figures = Float32[np.ndarray, " n"]
 
 LOOSE = TouchRule(sigmas=2.0, size_ratio=4.0)
-"""What does not hang together even like this with the scene hangs apart."""
+"""Gaussians not connected to the scene even by this rule are loose."""
 LIGHTLY_HELD = TouchRule(sigmas=2.0, size_ratio=1.0, needed=3)
-"""What does not hang together like this does at most as leaves and edges do, and floaters near a surface."""
+"""Gaussians not connected by this stricter rule are held only lightly, as leaves, edges and near-surface floaters are."""
 LIMITS = ((0.02, 0.05), (0.008, 0.015), (0.003, 0.005))
-"""Squared error of a pixel (0..3), by a Gaussian's mean weight, look after look: what makes photos worse by more than
-the first is left out of the next look, since it makes what is behind look bad; what makes them better by more than the
-second is cleared, and shown in full."""
-LOOKS = len(LIMITS) + 1  # at all photos: those that are likely floaters are looked at once more, by themselves
-LEAST_GAP = 0.003  # share of the depth: how far before the rest one is, is not known better
-NOISE = 1.0 / 30.0  # of the sum of squared errors of one pixel; it grows with the root of their number
+"""Limits per pass on the change of a pixel's squared error (0..3) per unit of a Gaussian's weight. A Gaussian that
+worsens the photos by more than the first is left out of later passes, since it makes what is behind it look bad; one
+that improves them by more than the second is cleared and rendered at full opacity."""
+LOOKS = len(LIMITS) + 1  # passes over all photos: likely floaters get one more, by themselves
+LEAST_GAP = 0.003  # share of the depth: the accuracy of the gap
+NOISE = 1.0 / 30.0  # of one pixel's summed squared errors; it grows with the square root of the number of pixels
 EVIDENCE = {
     "worse on the whole": 1.45,
     "worse in some": 1.4,
@@ -44,20 +44,20 @@ EVIDENCE = {
     "lightly held": 1.3,
     "opacity": -2.4,
 }
-"""What each of the figures of ``evidence`` adds to the logarithm of the odds that one is a floater."""
+"""Weight of each feature of ``evidence`` in the log-odds that a Gaussian is a floater."""
 PRIOR = -6.3
 
 
 @dataclass(frozen=True, eq=False)
 class Suspects:
-    """Who may float, and what is known of all.
+    """The suspected floaters, and what is known of all Gaussians.
 
     Attributes:
-        gaussians: All, finite; where they are rendered.
-        shapes: Theirs.
-        suspected: Who is asked about.
-        ground: Whom nobody doubts, and who is solid enough to hold others.
-        sightings: What photos see.
+        gaussians: All Gaussians, finite, on the device that renders them.
+        shapes: Their shapes.
+        suspected: Which are suspected.
+        ground: Which are undoubted and solid enough to hold others.
+        sightings: Their visibility in the photos.
     """
 
     gaussians: Gaussians
@@ -69,11 +69,11 @@ class Suspects:
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """What photos say of each suspect, in the look in which it was worst; 0 of those that nobody suspects.
+    """The effect of each suspect on the photos, in its worst pass; 0 for Gaussians that are not suspected.
 
     Attributes:
-        worse: By how much the photos' squared errors are larger with it, where they are.
-        better: By how much they are smaller, where they are.
+        worse: Total increase of squared errors with it, over the photos in which they increase.
+        better: Total decrease with it, over the other photos.
     """
 
     worse: Figures
@@ -81,15 +81,15 @@ class Verdicts:
 
 
 def likely_floaters(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int], None]) -> Flags:
-    """Which of the suspects are floaters rather than not.
+    """Which of the suspects are more likely floaters than not.
 
     Args:
-        suspects: And what is known of them.
-        photos: With pictures.
-        told: Called with the number of pictures that were looked at, ``LOOKS`` times all at most.
+        suspects: The suspects and what is known of them.
+        photos: The training photos, with images.
+        told: Called with the number of images processed, at most ``LOOKS`` times the number of photos.
     """
     if suspects.ground.sum() <= NEIGHBOURS:
-        return np.zeros(len(suspects.ground), np.bool_)  # that is no scene before which anything hangs
+        return np.zeros(len(suspects.ground), np.bool_)  # not enough of a scene for anything to float in front of
     figures = evidence(suspects, verdicts_of(suspects, photos, told))
     odds = PRIOR + sum(EVIDENCE[name] * figure for name, figure in figures.items())
     likely = np.asarray(suspects.suspected & (odds > 0.0))
@@ -98,16 +98,16 @@ def likely_floaters(suspects: Suspects, photos: TrainingPhotos, told: Callable[[
     looks = len(LIMITS) * len(photos.cameras)
     worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, told, looks))
     missed = (worth.better - worth.worse) / _pixels(suspects) > LIMITS[-1][1]
-    return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # what hangs apart may hide more of its own kind
+    return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # a loose one may hide other floaters
 
 
 def _pixels(suspects: Suspects) -> Figures:
-    """That show each."""
+    """Effective number of pixels that show each Gaussian, at least 1."""
     return np.asarray(np.maximum(suspects.sightings.weight, np.float32(1.0)))
 
 
 def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
-    """The figures that are weighed."""
+    """The features of the logistic regression by name, as in ``EVIDENCE``."""
     suspected, seen = suspects.suspected, suspects.sightings
     noise = NOISE * np.sqrt(_pixels(suspects))
     loose, light = (
@@ -125,7 +125,7 @@ def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
 
 
 def verdicts_of(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int], None]) -> Verdicts:
-    """Ask the photos, the worst suspects first."""
+    """Measure the suspects' effect on the photos in several passes, excluding the worst suspects after each."""
     gaussians, pixels = suspects.gaussians, _pixels(suspects)
     n = len(gaussians)
     worse, better, least = np.zeros(n, np.float32), np.zeros(n, np.float32), np.full(n, np.inf, np.float32)

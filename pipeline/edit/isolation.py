@@ -1,8 +1,9 @@
-"""Which Gaussians hang together, and which few hang apart from all others.
+"""Finds which Gaussians are connected, and which small groups are apart from all others.
 
-Two Gaussians touch where their ellipsoids, some standard deviations large, meet along the line between their centres.
-Surfaces, poles and wires are chains of Gaussians that touch; a floater touches nothing, or a few others that touch
-nothing else. Sizes count along that line: a flat Gaussian of a wall reaches far within the wall and hardly before it.
+Two Gaussians touch if their ellipsoids, some standard deviations large, meet along the line between their centres.
+Surfaces, poles and wires are chains of touching Gaussians; a floater touches nothing, or a few others that touch
+nothing else. Sizes are measured along that line: a flat Gaussian of a wall reaches far within the wall but hardly off
+it.
 """
 
 from __future__ import annotations
@@ -19,20 +20,20 @@ from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-NEIGHBOURS = 12  # of each Gaussian, that are asked whether they touch it
-GAP_SIGMAS = 4.0  # of an isolated one's own: things that surfaces are made of lie denser
+NEIGHBOURS = 12  # nearest neighbours of each Gaussian that are tested for contact
+GAP_SIGMAS = 4.0  # of an isolated Gaussian's own size: Gaussians of a surface lie closer to each other
 CHUNK = 1 << 16  # Gaussians at a time: tens of megabytes
 
 
 @dataclass(frozen=True)
 class TouchRule:
-    """What touching is.
+    """The definition of touching.
 
     Attributes:
-        sigmas: Standard deviations that ellipsoids are large.
-        size_ratio: Times the smaller one's reach along the line, that the larger one's counts at most: a small thing
-            within the haze of a large one is not held by it.
-        needed: Others that one has to touch to be held.
+        sigmas: Size of the ellipsoids in standard deviations.
+        size_ratio: The larger one's reach along the line counts at most this many times the smaller one's: a small
+            Gaussian within the haze of a large one is not held by it.
+        needed: Number of others that one has to touch to be held.
     """
 
     sigmas: float
@@ -42,10 +43,10 @@ class TouchRule:
 
 @dataclass(frozen=True, eq=False)
 class GaussianShapes:
-    """Where Gaussians are and how large, on the CPU.
+    """Positions and sizes of Gaussians, on the CPU.
 
     Attributes:
-        centres: World units.
+        centres: Centres, world units.
         axes: Matrices R diag(s): the standard deviation along a unit vector u is |(R diag(s))ᵀ u|.
         largest: The largest standard deviation.
     """
@@ -56,7 +57,7 @@ class GaussianShapes:
 
     @staticmethod
     def of(gaussians: Gaussians) -> GaussianShapes:
-        """Of finite Gaussians, on the CPU or a device."""
+        """The shapes of finite Gaussians, which may be on the CPU or a device."""
         largest = np.exp(gaussians.log_scales.detach().amax(1).numpy(force=True))
         return GaussianShapes(gaussians.means.detach().double().numpy(force=True), half_axes(gaussians), largest)
 
@@ -64,13 +65,13 @@ class GaussianShapes:
 def far_groups(
     shapes: GaussianShapes, touch: TouchRule, solid: Bool[np.ndarray, " n"], few: int
 ) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians hang together in few, far from all others.
+    """Which Gaussians form small connected groups far from all others.
 
     Args:
-        shapes: Of all.
-        touch: What holds them together.
-        solid: Those that count: haze holds nothing, and is not told of.
-        few: The most that are no scene. Where no group is larger, all of it is the scene.
+        shapes: Shapes of all Gaussians.
+        touch: The contact rule.
+        solid: Which ones count: haze holds nothing, and is never reported.
+        few: Largest size of a group that is not the scene. If no group is larger, everything is the scene.
     """
     rows = np.flatnonzero(solid)
     found = np.zeros(len(solid), np.bool_)
@@ -92,7 +93,7 @@ def far_groups(
 def _near(
     shapes: GaussianShapes, touch: TouchRule, asked: Int64[np.ndarray, " m"], scene: Int64[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " m"]:
-    """Which of a few Gaussians are near the scene: they touch it, or are no farther than a gap in it may be wide."""
+    """Which Gaussians are near the scene: they touch it, or are within ``GAP_SIGMAS`` of it."""
     distance = cKDTree(shapes.centres[scene]).query(shapes.centres[asked])[0]
     return np.asarray(touch_any(shapes, touch, asked, scene) | (distance <= GAP_SIGMAS * shapes.largest[asked]))
 
@@ -100,16 +101,16 @@ def _near(
 def held(
     shapes: GaussianShapes, touch: TouchRule, ground: Bool[np.ndarray, " n"], asked: Bool[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians hold on to the ground, by as many others as are needed that are ground or hold on to it.
+    """Which Gaussians are held by the ground, directly or through other held ones.
 
     Args:
-        shapes: Of all.
-        touch: What holds.
-        ground: Which nobody doubts.
-        asked: Of which it is asked.
+        shapes: Shapes of all Gaussians.
+        touch: The contact rule; each needs ``touch.needed`` contacts that are ground or held.
+        ground: Which Gaussians are undoubted.
+        asked: Which Gaussians to test.
 
     Returns:
-        Those asked for that are held.
+        Those of ``asked`` that are held.
     """
     rows, solid = np.flatnonzero(asked), np.flatnonzero(ground | asked)
     if len(solid) <= NEIGHBOURS:
@@ -129,9 +130,9 @@ def held(
 def touch_any(
     shapes: GaussianShapes, touch: TouchRule, asked: Int64[np.ndarray, " m"], others: Int64[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " m"]:
-    """Which Gaussians touch any of others, the large ones with far centres among them.
+    """Which Gaussians touch any of the others, including large ones whose centres are far away.
 
-    Each size has a tree of its own, in which those that could reach are among the nearest.
+    Each size class has its own tree, in which those that could reach are among the nearest.
     """
     found = np.zeros(len(asked), np.bool_)
     if not len(others):
@@ -158,7 +159,7 @@ def half_axes(gaussians: Gaussians) -> Float32[np.ndarray, "n 3 3"]:
 def _contacts(
     shapes: GaussianShapes, touch: TouchRule, rows: Int64[np.ndarray, " m"], others: Int64[np.ndarray, " s"]
 ) -> tuple[Int32[np.ndarray, "m k"], Bool[np.ndarray, "m k"]]:
-    """The nearest others of some Gaussians, and whether they touch; a Gaussian does not touch itself."""
+    """The nearest others of some Gaussians, and whether they touch; a Gaussian never touches itself."""
     tree = cKDTree(shapes.centres[others])
     k = min(NEIGHBOURS + 1, len(others))
     neighbours, touching = np.empty((len(rows), k), np.int32), np.empty((len(rows), k), np.bool_)
@@ -171,7 +172,7 @@ def _contacts(
 def _touching(
     shapes: GaussianShapes, touch: TouchRule, one: Int64[np.ndarray, " c"], others: Int64[np.ndarray, "c k"]
 ) -> Bool[np.ndarray, "c k"]:
-    """Whether Gaussians touch others, k of which are asked of each."""
+    """Whether Gaussians touch others, k of which are tested for each."""
     apart = (shapes.centres[others] - shapes.centres[one, None]).astype(np.float32)
     distance = np.linalg.norm(apart, axis=2)
     touching = np.zeros(distance.shape, np.bool_)
@@ -185,12 +186,12 @@ def _touching(
 
 
 def _sigma(axes: Float32[np.ndarray, "m 3 3"], along: Float32[np.ndarray, "m 3"]) -> Float32[np.ndarray, " m"]:
-    """Standard deviation along unit vectors."""
+    """Standard deviations along unit vectors."""
     return np.asarray(np.linalg.norm(np.einsum("mij,mi->mj", axes, along), axis=1))
 
 
 def _labels(neighbours: Int32[np.ndarray, "n k"], touching: Bool[np.ndarray, "n k"]) -> Int32[np.ndarray, " n"]:
-    """Numbers of the groups that touching makes."""
+    """Labels of the connected groups."""
     n = len(neighbours)
     starts = np.concatenate(([0], np.cumsum(touching.sum(1)))).astype(np.int64)
     graph = csr_matrix((np.ones(starts[-1], np.uint8), neighbours[touching], starts), shape=(n, n))

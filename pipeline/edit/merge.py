@@ -1,4 +1,4 @@
-"""Merges: another splat beside what there is, each where it lies on the earth."""
+"""Merges another splat into the edited one, each at its georeferenced position."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, turn_
 from splatpipe.pipeline.survey.crs import UNKNOWN, describe_vertical, parse_vertical, same_datum
 from splatpipe.pipeline.survey.frames import Origin
 
-MOST_APART_M = 30_000.0  # of two splats in one file: float32's step is 2 mm there
+MOST_APART_M = 30_000.0  # between two splats in one file: float32 has steps of 2 mm there
 
 
 @dataclass(frozen=True)
 class Merge:
-    """Another splat, as it is: earlier steps are not done to it.
+    """Another splat to merge unchanged: earlier steps do not apply to it.
 
     Attributes:
         path: Its file, or a run's OUT.
@@ -33,10 +33,10 @@ class Merge:
     path: Path
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Merge; what is recorded of it.
+        """Merge the other splat; returns the record of the step.
 
         Raises:
-            SplatpipeError: if it cannot be read, or it is not known where the two lie to each other.
+            SplatpipeError: if it cannot be read, or the relative position of the two is unknown.
         """
         source = open_source(self.path)
         digest = source.digest()
@@ -55,13 +55,13 @@ class Merge:
 
 
 def _joined(ours: Scene, other: Scene, moved: Similarity) -> Gaussians:
-    """Both in our axes, in one new set: nothing besides is as large."""
+    """Both sets in our axes in one new set; no further copy of that size is made."""
     first, second = ours.gaussians, other.gaussians
     joined = Gaussians.empty(len(first) + len(second), max(first.sh_degree, second.sh_degree))
     to_own, to_up = turn_of(ours.facts.axes, "z up"), turn_of("z up", other.facts.axes)
     rotation = to_own @ torch.from_numpy(np.ascontiguousarray(moved.rotation)) @ to_up
     translation = to_own @ torch.from_numpy(np.ascontiguousarray(moved.translation))
-    stays = bool((rotation == torch.eye(3)).all() and (translation == 0.0).all())  # then not a bit changes
+    stays = bool((rotation == torch.eye(3)).all() and (translation == 0.0).all())  # then it is copied bit by bit
     start = 0
     for part, as_it_is in ((first, True), (second, stays)):
         for piece in part.pieces():
@@ -75,10 +75,10 @@ def _joined(ours: Scene, other: Scene, moved: Similarity) -> Gaussians:
 
 
 def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similarity:
-    """From the other's frame to ours, both turned to z up.
+    """The transform from the other's frame to ours, both rotated to z up.
 
     Raises:
-        SplatpipeError: if that is not known, or they are too far apart.
+        SplatpipeError: if it is unknown, or they are too far apart.
     """
     if (ours.place is None) != (other.place is None):
         without = name if other.place is None else "the splat"
@@ -121,5 +121,5 @@ def _on_earth(ours: SplatOrigin, other: SplatOrigin, name: str) -> Similarity:
 
 
 def origin_of(place: SplatOrigin) -> Origin:
-    """Where a splat has its zero."""
+    """The origin of a splat's frame."""
     return Origin(place.latitude, place.longitude, place.height_m)

@@ -1,8 +1,8 @@
-"""Motions: moved, turned and scaled, with what that means for a splat's place and for its metres.
+"""Motions: move, rotate and scale, and their effect on a splat's georeference and metric scale.
 
 The frame stays and the splat moves within it, so a georeferenced splat moves on the earth and its heading and height
-can be put right. Lengths are another matter: two measured points say what a metre is, and the splat keeps its place; a
-bare factor makes its lengths mean nothing on the earth, and drops the place and the metres.
+can be corrected. Scaling differs: with the measured distance between two points, the scale is metric and the splat
+keeps its place; with a bare factor, the scale is no longer metric, and the place and the metres are dropped.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ Point = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Pivot:
-    """What stays where it is.
+    """The fixed point of a motion.
 
     Attributes:
-        point: Stated coordinates; None for the splat's middle.
-        local: As of ``Coordinates.of``.
+        point: Its coordinates as given; None for the splat's middle.
+        local: As for ``Coordinates.of``.
     """
 
     point: Point | None = None
@@ -42,7 +42,7 @@ class Pivot:
 
     @staticmethod
     def parse(text: str, option: str, local: bool) -> Pivot:
-        """A point, or ``middle``.
+        """Parse a point, or ``middle``.
 
         Raises:
             UsageError: if it is anything else.
@@ -52,25 +52,25 @@ class Pivot:
         return Pivot(parse_numbers(text, option, (3,), f"{POINT_FORM} or {option} middle"), local)
 
     def place(self, piece: Workpiece) -> Float64[np.ndarray, " 3"]:
-        """Where it is, in the frame."""
+        """The pivot's position in the frame."""
         if self.point is None:
             return piece.middle()
         return np.asarray(Coordinates.of(piece.facts, self.local).in_frame(np.array([self.point]))[0])
 
     def as_text(self) -> str | list[float]:
-        """For the record."""
+        """The pivot for the record of the step."""
         return "middle" if self.point is None else list(self.point)
 
 
 @dataclass(frozen=True)
 class Move:
-    """By so many metres (units of a splat without them) east, north and up, or along a file's own axes."""
+    """An offset in metres (in a splat's units if not metric) east, north and up, or along the file's own axes."""
 
     offset: Point
 
     @staticmethod
     def parse(text: str, option: str) -> Move:
-        """Three lengths.
+        """Parse three lengths.
 
         Raises:
             UsageError: if it is anything else.
@@ -78,10 +78,10 @@ class Move:
         return Move(parse_numbers(text, option, (3,), "EAST,NORTH,UP"))
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Move; what is recorded of it.
+        """Move the splat; returns the record of the step.
 
         Raises:
-            SplatpipeError: if a georeferenced splat is moved so far that up is another direction there.
+            SplatpipeError: if a georeferenced splat is moved so far that the up direction differs.
         """
         offset = Coordinates.of(piece.facts, local=True).in_frame(np.array([self.offset]))[0]
         if piece.facts.place is not None and float(np.linalg.norm(offset)) > FAR_M:
@@ -95,12 +95,12 @@ class Move:
 
 @dataclass(frozen=True)
 class MoveTo:
-    """The pivot comes to stated coordinates; a georeferenced splat stands upright there and keeps its heading.
+    """Moves the pivot to given coordinates; a georeferenced splat is upright there and keeps its heading.
 
     Attributes:
-        point: The coordinates; without a height it stays at its own.
-        pivot: What of the splat comes there.
-        local: As of ``Coordinates.of``.
+        point: The target coordinates; without a height, the pivot keeps its own.
+        pivot: The point of the splat to move there.
+        local: As for ``Coordinates.of``.
     """
 
     point: Point
@@ -109,7 +109,7 @@ class MoveTo:
 
     @staticmethod
     def parse(text: str, option: str, pivot: Pivot, local: bool) -> MoveTo:
-        """Two or three coordinates.
+        """Parse two or three coordinates.
 
         Raises:
             UsageError: if it is anything else.
@@ -117,7 +117,7 @@ class MoveTo:
         return MoveTo(parse_numbers(text, option, (2, 3), "X,Y or X,Y,Z"), pivot, local)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Move; what is recorded of it.
+        """Move the splat; returns the record of the step.
 
         Raises:
             SplatpipeError: if the CRS has no such place.
@@ -153,12 +153,12 @@ def _origin_at(origin: Origin, place: Float64[np.ndarray, " 3"]) -> Origin:
 
 @dataclass(frozen=True)
 class Rotate:
-    """By an angle about an axis through the pivot, anticlockwise as seen from the axis' tip.
+    """A rotation about an axis through the pivot, anticlockwise as seen from the axis' tip.
 
     Attributes:
         degrees: The angle.
         axis: A direction along the axes of ``Move``; None for up.
-        pivot: What stays.
+        pivot: The fixed point.
     """
 
     degrees: float
@@ -167,7 +167,7 @@ class Rotate:
 
     @staticmethod
     def parse(text: str, option: str, pivot: Pivot) -> Rotate:
-        """An angle, and perhaps an axis: its name or three numbers.
+        """Parse an angle and optionally an axis: its name or three numbers.
 
         Raises:
             UsageError: if it is anything else.
@@ -181,7 +181,7 @@ class Rotate:
         return Rotate(degrees, axis, pivot)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Turn; what is recorded of it."""
+        """Rotate the splat; returns the record of the step."""
         axis = np.array([0.0, 0.0, 1.0])
         if self.axis is not None:
             axis = Coordinates.of(piece.facts, local=True).in_frame(np.array([self.axis]))[0]
@@ -197,11 +197,11 @@ class Rotate:
 
 @dataclass(frozen=True)
 class ScaleBy:
-    """By a factor about the pivot. What a metre is is not known any more, so neither is where it lies.
+    """Scaling by a factor about the pivot. The scale is no longer metric, so the georeference is lost too.
 
     Attributes:
-        factor: New lengths an old one.
-        pivot: What stays.
+        factor: Ratio of new to old lengths.
+        pivot: The fixed point.
     """
 
     factor: float
@@ -209,10 +209,10 @@ class ScaleBy:
 
     @staticmethod
     def parse(text: str, option: str, pivot: Pivot) -> ScaleBy:
-        """A factor.
+        """Parse a factor.
 
         Raises:
-            UsageError: if it is none, or absurd.
+            UsageError: if it is not a number or out of range.
         """
         factor = parse_numbers(text, option, (1,), "FACTOR")[0]
         if not FACTORS[0] <= factor <= FACTORS[1]:
@@ -222,7 +222,7 @@ class ScaleBy:
         return ScaleBy(factor, pivot)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Scale; what is recorded of it."""
+        """Scale the splat; returns the record of the step."""
         piece.move(_about(self.pivot.place(piece), self.factor, np.eye(3)))
         if piece.facts.place is not None:
             piece.notes.append("Scaling by a factor drops the splat's georeference. --scale-from A B LENGTH keeps it.")
@@ -232,13 +232,13 @@ class ScaleBy:
 
 @dataclass(frozen=True)
 class ScaleFrom:
-    """By what the distance between two of its points is in truth. The first of them stays; lengths are metres then.
+    """Scaling by the true distance between two points. The first stays fixed; lengths are metres afterwards.
 
     Attributes:
-        first: Stated coordinates.
-        second: The same.
+        first: Coordinates of the first point.
+        second: Coordinates of the second point.
         length_m: Their true distance.
-        local: As of ``Coordinates.of``.
+        local: As for ``Coordinates.of``.
     """
 
     first: Point
@@ -248,7 +248,7 @@ class ScaleFrom:
 
     @staticmethod
     def parse(texts: tuple[str, str, str], option: str, local: bool) -> ScaleFrom:
-        """Two points and a length with its unit.
+        """Parse two points and a length with its unit.
 
         Raises:
             UsageError: if it is anything else.
@@ -260,10 +260,10 @@ class ScaleFrom:
         return ScaleFrom(first, second, length_m, local)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Scale; what is recorded of it.
+        """Scale the splat; returns the record of the step.
 
         Raises:
-            SplatpipeError: if the points are one, or the factor is absurd.
+            SplatpipeError: if the points coincide, or the factor is out of range.
         """
         coordinates = Coordinates.of(piece.facts, self.local)
         first, second = coordinates.in_frame(np.array([self.first, self.second]))

@@ -1,4 +1,4 @@
-"""A splat before and after: side by side, from a photo of its run that shows it, else obliquely from above."""
+"""Before-and-after images of a splat, side by side, from a photo's viewpoint or else obliquely from above."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from splatpipe.pipeline.photos.images import Pixels
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.scene import Scene, turn_of
 
-WIDTH, HEIGHT = 960, 720  # pixels of one picture
-FIELD_DEG = 45.0  # of an oblique view, across the picture's height
-ELEVATION_DEG, HEADING_DEG = 35.0, 30.0  # it looks down by that, and north by east by that
-SEEN = 0.3  # least share of a splat's centres within a picture that is said to show it
-AS_MANY = 0.95  # of the most: among such photos the one that shows it largest
-LARGER = 3.0  # times a splat's own size, that a picture may show and it is still to be seen
-NEAR = 0.005  # of the distance to what is looked at
-BACKGROUND = (0.82, 0.84, 0.86)  # neither white walls nor dark roofs are lost in it
+WIDTH, HEIGHT = 960, 720  # pixels of one image
+FIELD_DEG = 45.0  # vertical field of view of an oblique view
+ELEVATION_DEG, HEADING_DEG = 35.0, 30.0  # its angle below the horizon, and its heading clockwise from north
+SEEN = 0.3  # least share of a splat's centres within an image for it to count as shown
+AS_MANY = 0.95  # of the largest share: among such photos, the one that shows the splat largest is used
+LARGER = 3.0  # times a splat's own size: the most that an image may cover with the splat still recognisable
+NEAR = 0.005  # near plane as a share of the distance to the splat
+BACKGROUND = (0.82, 0.84, 0.86)  # contrasts with both white walls and dark roofs
 GAP_PX = 8
 LABEL_PX = 28
 
@@ -35,19 +35,19 @@ Points = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class PictureCameras:
-    """Cameras of the two pictures, in the frame, z up."""
+    """Cameras of the two images, in the frame, z up."""
 
     before: Camera
     after: Camera
 
 
 def choose_views(cameras: Sequence[Camera], before: Points, after: Float64[np.ndarray, "m 3"]) -> PictureCameras:
-    """Where a splat is looked at from: both pictures from one place if that shows both.
+    """Choose the viewpoints: one for both images if it shows both splats.
 
     Args:
-        cameras: Of the run, in the frame; none where nobody knows.
-        before: Some centres, in the frame, z up.
-        after: The same of what it has become.
+        cameras: The run's cameras, in the frame; empty if unknown.
+        before: Sampled centres before the edit, in the frame, z up.
+        after: The same after the edit.
     """
     photo = _best_photo(cameras, after)
     if photo is not None:
@@ -67,7 +67,7 @@ def _best_photo(cameras: Sequence[Camera], points: Points) -> Camera | None:
     if most < SEEN:
         return None
     good = [camera for camera, share in zip(small, shares, strict=True) if share >= AS_MANY * most]
-    return max(good, key=lambda camera: _spread(camera, points))  # the first of equals
+    return max(good, key=lambda camera: _spread(camera, points))  # the first one wins ties
 
 
 def _reduced(camera: Camera) -> Camera:
@@ -76,7 +76,7 @@ def _reduced(camera: Camera) -> Camera:
 
 
 def _seen(camera: Camera, points: Points) -> Float64[np.ndarray, "m 2"]:
-    """Where those that lie in the picture do, pixels."""
+    """Pixel coordinates of those points that lie in the image."""
     inside = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     inside = inside[inside[:, 2] > 0.0]
     plan = inside[:, :2] / inside[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
@@ -92,10 +92,10 @@ def _spread(camera: Camera, points: Points) -> float:
 
 
 def oblique_view(box: Float64[np.ndarray, "2 3"]) -> Camera:
-    """All of a box, from above and the side.
+    """A camera that shows a whole box obliquely from above.
 
     Args:
-        box: Least and largest east, north, up.
+        box: Minimum and maximum east, north, up.
     """
     pitch, heading = math.radians(ELEVATION_DEG), math.radians(HEADING_DEG)
     forward = np.array([math.sin(heading) * math.cos(pitch), math.cos(heading) * math.cos(pitch), -math.sin(pitch)])
@@ -117,13 +117,13 @@ def _size(box: Float64[np.ndarray, "2 3"]) -> float:
 
 
 def picture(scene: Scene, camera: Camera, points: Points, label: str) -> Pixels:
-    """A picture of a splat.
+    """Render a labelled image of a splat.
 
     Args:
-        scene: In its own axes.
-        camera: In the frame, z up.
-        points: Some of its centres, there.
-        label: What is written on it.
+        scene: The splat, in its own axes.
+        camera: The viewpoint, in the frame, z up.
+        points: Sampled centres, in the frame.
+        label: Text to write above the image.
 
     Raises:
         SplatpipeError: if it covers more pixels than memory holds.
@@ -149,7 +149,7 @@ def picture(scene: Scene, camera: Camera, points: Points, label: str) -> Pixels:
 
 
 def write_side_by_side(path: Path, left: Pixels, right: Pixels) -> None:
-    """Write two pictures as one PNG.
+    """Write two images as one PNG.
 
     Raises:
         OSError: if it cannot be written.

@@ -1,4 +1,4 @@
-"""What was done to a splat: in its file, in few words, and beside it with all that tells how."""
+"""The record of edits: briefly in the splat's file, and in full in a file beside it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Edit = dict[str, Any]
 
 
 def with_edits(facts: SceneFacts, edits: Sequence[Edit]) -> SceneFacts:
-    """What a file says with what was done to it now; what was done first is counted only, where there is no room."""
+    """The facts with new edits appended; if there is not enough room, the oldest are only counted."""
     every: list[Mapping[str, Any]] = [*facts.edits, *edits]
     dropped = 0
     while True:
@@ -35,7 +35,7 @@ def _fits(facts: SceneFacts) -> bool:
     try:
         facts.record()
     except ValueError:
-        return not facts.edits  # then it is not the edits that are too long
+        return not facts.edits  # without any, it is not the edits that are too long
     return True
 
 
@@ -45,11 +45,11 @@ def write_record(
     """Write `<stem>.edits.json`.
 
     Args:
-        path: Where.
-        source: What was edited.
-        digest: sha256 of it.
-        edits: What was done.
-        output: What it became.
+        path: The file to write.
+        source: The splat that was edited.
+        digest: Its sha256.
+        edits: The steps.
+        output: Facts about the output.
 
     Raises:
         OSError: if it cannot be written.

@@ -1,4 +1,4 @@
-"""Reductions: to so many Gaussians, or to so many bytes of the file that is written."""
+"""Reduces a splat to a number of Gaussians or to a size of the output file in bytes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from splatpipe.pipeline.splat.scene import Scene
 
 MOST = 10**10  # Gaussians: more than any machine holds
 UNITS = {"KB": 10**3, "MB": 10**6, "GB": 10**9}
-SAMPLE = 50_000  # Gaussians whose file tells what one takes, about
-ROUNDS = 5  # of writing it and looking: what one takes depends on how many there are
-FULL = 0.93  # share of the bytes from which on it is full enough
-MARGIN = 0.985  # of what would just fit, for the next round
+SAMPLE = 50_000  # Gaussians written to estimate the bytes per Gaussian
+ROUNDS = 5  # of writing and measuring: the bytes per Gaussian depend on their number
+FULL = 0.93  # share of the allowed bytes that is close enough
+MARGIN = 0.985  # of the count that would just fit, for the next round
 FORM = "500000, 100MB or 1.5GB"
 
 _COUNT = re.compile(r"[0-9]{1,11}", re.ASCII)
@@ -33,11 +33,11 @@ _BYTES = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?) ?([KMG]B)", re.ASCII | re.IG
 
 @dataclass(frozen=True)
 class OutputFile:
-    """What is going to be written.
+    """The file to write.
 
     Attributes:
-        path: Where.
-        kind: In which format.
+        path: The output path.
+        kind: Its format.
     """
 
     path: Path
@@ -46,12 +46,12 @@ class OutputFile:
 
 @dataclass(frozen=True)
 class Reduce:
-    """Neighbours are merged until the splat is small enough; one that is stays as it is.
+    """Merge neighbouring Gaussians until the splat is small enough; one that already is stays unchanged.
 
     Attributes:
-        output: Whose bytes count.
-        count: Gaussians; 0 where bytes are asked for.
-        size_bytes: Of the output; 0 where Gaussians are asked for.
+        output: The file whose size counts.
+        count: Target number of Gaussians; 0 if a size is given.
+        size_bytes: Target size of the output; 0 if a count is given.
     """
 
     output: OutputFile
@@ -60,10 +60,10 @@ class Reduce:
 
     @staticmethod
     def parse(text: str, option: str, output: OutputFile) -> Reduce:
-        """A number of Gaussians, or bytes with their unit.
+        """Parse a number of Gaussians, or a size with its unit.
 
         Raises:
-            UsageError: if it is anything else, or nothing.
+            UsageError: if it is anything else, or zero.
         """
         text = text.strip()
         if _COUNT.fullmatch(text) and 0 < int(text) <= MOST:
@@ -75,11 +75,11 @@ class Reduce:
         return Reduce(output, size_bytes=size)
 
     def apply(self, piece: Workpiece) -> dict[str, Any]:
-        """Reduce; what is recorded of it.
+        """Reduce the splat; returns the record of the step.
 
         Raises:
-            SplatpipeError: if not even one Gaussian is so small a file.
-            MachineError: if the file cannot be tried.
+            SplatpipeError: if not even one Gaussian fits.
+            MachineError: if a trial file cannot be written.
         """
         if self.count:
             if len(piece) > self.count:
@@ -89,12 +89,12 @@ class Reduce:
         return {"step": "reduce", "bytes": self.size_bytes, "format": self.output.kind.name}
 
     def _fitting(self, scene: Scene) -> Gaussians:
-        """As many as fit, found by writing them."""
+        """The largest reduction that fits, found by writing trial files."""
         whole = scene.gaussians
         sample = whole.select(torch.arange(0, len(whole), max(1, -(-len(whole) // SAMPLE))))
         each = self._bytes(replace(scene, gaussians=sample)) / max(1, len(sample))
         count, too_many = min(len(whole), max(1, int(self.size_bytes / each))), len(whole) + 1
-        best = 0  # the most that are known to fit: they are merged anew rather than kept beside the next
+        best = 0  # the largest count known to fit; it is merged again at the end rather than kept in memory
         for _ in range(ROUNDS):
             tried = reduce_to(whole, count)
             size = self._bytes(replace(scene, gaussians=tried))
@@ -118,7 +118,7 @@ class Reduce:
         return reduce_to(whole, best)
 
     def _bytes(self, scene: Scene) -> int:
-        """What it takes when it is written, beside where it is going to be: that has the room."""
+        """Bytes of the scene when written, measured by writing it into the output's folder, which has the space."""
         self.output.path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".splatpipe-", dir=self.output.path.parent) as folder:
             path = Path(folder) / self.output.path.name

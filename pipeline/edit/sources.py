@@ -1,4 +1,4 @@
-"""What is edited: a splat's file or model folder, or the OUT of a run, whose `splat.ply` and cameras are taken."""
+"""The input of an edit: a splat file or model folder, or a run's OUT, whose `splat.ply` and cameras are used."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.scene import Scene
 
 SPLAT, CAMERAS, METRICS, STAGES = "splat.ply", "cameras.json", "metrics.json", "stages"
-LARGEST_CAMERAS = 64 << 20  # bytes: of some 100,000 photos
-LARGEST_PICTURE = 65_536  # pixels a side
+LARGEST_CAMERAS = 64 << 20  # bytes: enough for about 100,000 photos
+LARGEST_PICTURE = 65_536  # pixels per side
 
 
 @dataclass(frozen=True)
 class SplatSource:
-    """A splat that is there.
+    """An existing splat.
 
     Attributes:
         path: Its file, or the folder of a model.
-        run: The OUT that it lies in as a run's; None else.
+        run: The OUT of the run it belongs to, or None.
     """
 
     path: Path
@@ -35,11 +35,11 @@ class SplatSource:
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """The splat's display name."""
         return self.path.name if self.run is None else self.run.name
 
     def read(self) -> Scene:
-        """The splat.
+        """Read the splat.
 
         Raises:
             SplatpipeError: if it is broken.
@@ -47,16 +47,16 @@ class SplatSource:
         return read_scene(self.path)
 
     def digest(self) -> str:
-        """sha256 of its bytes, by which it is known again."""
+        """sha256 of its content, which identifies it."""
         entries = tree_entries(self.path, self.path)
         return entries[0].sha256 if self.path.is_file() else part_digest(entries, "")
 
     def cameras(self) -> list[Camera]:
-        """The run's cameras in the splat's frame, z up; none where there are none or their file is damaged."""
+        """The run's cameras in the splat's frame, z up; empty if there are none or their file is damaged."""
         return [] if self.run is None else read_cameras(self.run / CAMERAS)
 
     def trained_on(self) -> list[Camera]:
-        """Those of its cameras whose photos were trained on."""
+        """The cameras of the training photos, without held-out views."""
         held_out = set() if self.run is None else _held_out(self.run / METRICS)
         return [camera for camera in self.cameras() if camera.name not in held_out]
 
@@ -86,13 +86,13 @@ def is_run(path: Path) -> bool:
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Cameras as viewers of 3DGS have them: poses and focal lengths, the principal point in the middle.
+    """Read cameras in the format of 3DGS viewers: poses and focal lengths, with a centred principal point.
 
     Args:
         path: `cameras.json`.
 
     Returns:
-        Those that make sense; none of a file that is not there or damaged: pictures are made without them, then.
+        The valid ones; empty if the file is missing or damaged, in which case images are made without them.
     """
     try:
         if path.stat().st_size > LARGEST_CAMERAS:
@@ -104,7 +104,7 @@ def read_cameras(path: Path) -> list[Camera]:
 
 
 def _held_out(path: Path) -> set[str]:
-    """Names of the photos that a run judged itself by; none where its figures are not there or damaged."""
+    """Names of a run's held-out photos; empty if its metrics are missing or damaged."""
     try:
         if path.stat().st_size > LARGEST_CAMERAS:
             return set()

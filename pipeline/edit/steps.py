@@ -1,4 +1,4 @@
-"""Steps as they stand on a command line, read in their order and checked before anything is opened."""
+"""Parses edit steps from a command line, in order, and checks them before anything is opened."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ MOST_STEPS = 100
 def parse_steps(
     given: Sequence[tuple[str, Any]], output: OutputFile, local: bool, cameras: Sequence[Camera] = ()
 ) -> list[Step]:
-    """Steps from the options that ask for them.
+    """Convert command-line options to steps.
 
     Args:
-        given: Names of options (`crop_box`) with what the user wrote, in their order.
-        output: What is going to be written: `reduce` may ask for its bytes.
-        local: Coordinates are metres from the splat's zero, not of its CRS.
-        cameras: Of the photos that it was trained on, in its frame as it is read, z up; none where nobody knows them.
+        given: Option names (`crop_box`) with the user's values, in order.
+        output: The file to write: `reduce` may depend on its size.
+        local: Coordinates are metres from the splat's origin, not in its CRS.
+        cameras: Cameras of the training photos, in the splat's frame as read, z up; empty if unknown.
 
     Raises:
-        UsageError: if one makes no sense, or there are too many.
+        UsageError: if one is invalid, or there are too many.
     """
     if len(given) > MOST_STEPS:
         raise UsageError(

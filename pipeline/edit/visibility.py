@@ -1,9 +1,10 @@
-"""What photos see of each Gaussian: how much of it, in how many of them, over what angle, and whether it floats there.
+"""Visibility of each Gaussian in the photos: how much, in how many, over what angle, and whether it floats.
 
-A photo sees of a Gaussian what it blends in: its weights α T, summed over the pixels. What lies in a photo's frustum
-may be hidden, so that projecting centres would not do. The sum is the derivative of the picture's sum by the Gaussian's
-colour, since a pixel is Σ αᵢ Tᵢ cᵢ (Kerbl et al. 2023, eq. 3): one backward pass a photo. Red, green and blue may each
-have weights in that sum, so that the same pass tells means over what is seen of a Gaussian, such as the depth there.
+A Gaussian's visibility in a photo is the sum over the pixels of its blending weights α T. Projecting centres would not
+do, since what lies in a photo's frustum may be hidden. The sum is the derivative of the image's sum with respect to the
+Gaussian's colour, since a pixel is Σ αᵢ Tᵢ cᵢ (Kerbl et al. 2023, eq. 3): one backward pass per photo. Red, green and
+blue may be weighted separately in that sum, so the same pass yields means over the visible part of a Gaussian, such as
+the depth there.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from splatpipe.pipeline.splat.panorama import Panorama
 from splatpipe.pipeline.splat.sh import C0
 
 LEAST_SEEN = 1e-3  # of a pixel: less is rounding
-BORDER_SHARE = 0.08  # of a picture's shorter side, that is its border: what only borders show was hardly covered
-BEFORE_SHARE = 0.005  # of the depth, that a Gaussian is before what is behind islands: depths are as good as that
-BEFORE_SIGMAS = 2.0  # and of its own standard deviations along the view axis
+BORDER_SHARE = 0.08  # width of the border as a share of an image's shorter side: seen only there is hardly covered
+BEFORE_SHARE = 0.005  # of the depth: how far a Gaussian must be in front of the background, the depths' accuracy
+BEFORE_SIGMAS = 2.0  # the same in its own standard deviations along the view axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +37,10 @@ class TrainingPhotos:
     """The photos that a splat was trained on.
 
     Attributes:
-        cameras: Small (``options.SEEN_MEGAPIXELS``), whole pictures.
-        options: As the splat is rendered.
-        picture: A photo, (h, w, 3) RGB, and its mask, of its camera's size; None where only cameras are known.
-        sky: What is behind the splat.
+        cameras: Cameras of whole images at reduced size (``options.SEEN_MEGAPIXELS``).
+        options: How the splat is rendered.
+        picture: Returns a photo, (h, w, 3) RGB, and its mask at its camera's size; None if only cameras are known.
+        sky: The panorama behind the splat, or None.
     """
 
     cameras: Sequence[Camera]
@@ -50,15 +51,15 @@ class TrainingPhotos:
 
 @dataclass(frozen=True, eq=False)
 class GaussianVisibility:
-    """What all photos together see of each Gaussian.
+    """Visibility of each Gaussian in all photos together.
 
     Attributes:
-        weight: Σ w, of the pictures' pixels; w is a photo's sum of α T.
-        photos: (Σ w)² / Σ w², in how many photos it is seen, those that hardly show it hardly counted; 0 where unseen.
-        angle_deg: Of the rays from it to those photos about their mean, root mean square by weight; 0 where unseen.
-        border: Share of its weight that lies at the pictures' borders.
-        floating: Share of the area in which it is seen where it lies before all that is around it.
-        gap: How far before that it lies, share of the depth there: mean by weight, -1..1.
+        weight: Σ w in pixels; w is a photo's sum of α T.
+        photos: (Σ w)² / Σ w², the effective number of photos that see it; 0 if unseen.
+        angle_deg: Weighted RMS angle between the rays to those photos and their mean direction; 0 if unseen.
+        border: Share of its weight that lies at the images' borders.
+        floating: Share of its visible area in photos where it lies in front of everything around it.
+        gap: How far in front of its surroundings it lies as a share of their depth, weighted mean, -1..1.
     """
 
     weight: Float32[np.ndarray, " n"]
@@ -70,7 +71,7 @@ class GaussianVisibility:
 
 
 class _VisibilitySums:
-    """Sums over the photos, of which ``GaussianVisibility`` are made."""
+    """Sums over the photos from which ``GaussianVisibility`` is computed."""
 
     def __init__(self, n: int) -> None:
         self.weight, self.square, self.border = (np.zeros(n, np.float32) for _ in range(3))
@@ -81,7 +82,7 @@ class _VisibilitySums:
         def part(value: Float32[np.ndarray, " n"], of: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
             return np.asarray(np.divide(value, of, out=np.zeros_like(value), where=of > 0.0))
 
-        together = np.minimum(part(np.linalg.norm(self.towards, axis=1), self.weight), 1.0)  # 1 where all rays are one
+        together = np.minimum(part(np.linalg.norm(self.towards, axis=1), self.weight), 1.0)  # 1 if all rays coincide
         angle = np.rad2deg(np.sqrt(2.0 * (1.0 - together), dtype=np.float32))
         angle[self.weight == 0.0] = 0.0
         photos = part(self.weight * self.weight, self.square)
@@ -90,12 +91,12 @@ class _VisibilitySums:
 
 
 def look_through(gaussians: Gaussians, photos: TrainingPhotos, told: Callable[[int], None]) -> GaussianVisibility:
-    """Sum up what photos see.
+    """Compute the visibility of each Gaussian in the photos.
 
     Args:
-        gaussians: Where they are rendered, on the CPU or a device; finite.
-        photos: That see them.
-        told: Called with the number of photos that were looked through.
+        gaussians: Finite Gaussians on the CPU or device that renders them.
+        photos: The training photos; only their cameras are used.
+        told: Called with the number of photos done.
     """
     grey = grey_of(gaussians)
     plain = replace(photos.options, sh_degree=0, depth=True, magnitudes=False)
@@ -115,20 +116,20 @@ def look_through(gaussians: Gaussians, photos: TrainingPhotos, told: Callable[[i
 def weights_of(
     rendered: rasterizer.Render, grey: Gaussians, picture: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Sums over a render's pixels of each Gaussian's weights α T times a picture's values."""
+    """Sums over a render's pixels of each Gaussian's weights α T times an image's values."""
     values = torch.from_numpy(picture).to(rendered.colour)
     (found,) = torch.autograd.grad(rendered.colour, grey.sh, values)
     return np.asarray((found[:, 0] / C0).numpy(force=True))
 
 
 def grey_of(gaussians: Gaussians) -> Gaussians:
-    """The same of one colour, by which is derived."""
+    """Copies of the Gaussians with a single colour coefficient each, which requires a gradient."""
     colours: Float[Tensor, "n 1 3"] = torch.zeros_like(gaussians.sh[:, :1])
     return replace(gaussians.detach(), sh=colours.requires_grad_())
 
 
 def _border(camera: Camera) -> Float32[np.ndarray, "h w"]:
-    """1 at a picture's border, 0 elsewhere."""
+    """1 at an image's border, 0 elsewhere."""
     picture = np.ones((camera.height, camera.width), np.float32)
     width = max(1, round(BORDER_SHARE * min(camera.height, camera.width)))
     picture[width:-width, width:-width] = 0.0
@@ -142,7 +143,7 @@ def _add(
     camera: Camera,
     placed: tuple[Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3 3"]],
 ) -> None:
-    """Add what a photo sees."""
+    """Add one photo's contributions to the sums."""
     weight, border, behind = found.T
     centres, axes = placed
     rays = (camera.centre() - centres).astype(np.float32)

@@ -1,7 +1,7 @@
-"""A splat at work: its Gaussians are changed in place, piece by piece, so that five million fit where they lie.
+"""A splat being edited: its Gaussians are changed in place, in pieces, so that five million need no second copy.
 
-Motions are kept as one similarity in float64 until something needs the Gaussians where they are: what is turned about
-a far point and moved back is rounded once.
+Motions are accumulated as one similarity transform in float64 until something needs the moved Gaussians, so that a
+rotation about a far point followed by a move back is rounded only once.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from splatpipe.pipeline.survey.frames import Frame, Origin
 from splatpipe.pipeline.survey.handover import frame_of
 from splatpipe.pipeline.survey.world import open_world
 
-ROWS = 1 << 18  # Gaussians at a time: places in float64, in a CRS and on the way there take 50 MB
-FAR_M = 10_000.0  # from its zero a splat's float32 has steps of a millimetre: a nearer zero is taken
-MIDDLE = (0.01, 0.99)  # shares along each axis between which a splat's middle is: a floater does not move it
-COARSEST = 1e-5  # float32's step as a share of the splat: a millimetre of a site of 100 m
-SAMPLE = 200_000  # Gaussians that tell where a splat is
-FREED = 0.5  # share of the Gaussians that is given back to the machine when so many are gone
+ROWS = 1 << 18  # Gaussians at a time: their float64 coordinates, in a CRS and intermediate, take 50 MB
+FAR_M = 10_000.0  # at this distance float32 coordinates have steps of a millimetre: the origin is moved nearer
+MIDDLE = (0.01, 0.99)  # quantiles along each axis that bound a splat's main extent, robust against floaters
+COARSEST = 1e-5  # largest float32 step as a share of the splat's size: a millimetre for a site of 100 m
+SAMPLE = 200_000  # Gaussians from which a splat's extent is estimated
+FREED = 0.5  # memory is released once fewer than this share of the Gaussians remains
 
 
 class Workpiece:
-    """A splat that steps change.
+    """A splat that edit steps modify.
 
     Args:
-        scene: Taken over: its tensors are changed in place.
+        scene: The splat; its tensors are changed in place.
     """
 
     def __init__(self, scene: Scene) -> None:
         self._gaussians, self.facts = scene.gaussians, scene.facts
-        self._moved = Similarity.identity()  # in the frame: the splat's, turned to z up
+        self._moved = Similarity.identity()  # pending motion, in the splat's frame rotated to z up
         self.travelled = Similarity.identity()  # from the frame as it was read to the present one
         self.merged = False
         self.notes: list[str] = []
@@ -48,27 +48,27 @@ class Workpiece:
 
     @property
     def sh_degree(self) -> int:
-        """Of the spherical harmonics."""
+        """Degree of the spherical harmonics."""
         return self._gaussians.sh_degree
 
     @property
     def frame(self) -> Frame | None:
-        """The frame on the earth; None of a splat that lies nowhere."""
+        """The georeferenced frame; None if the splat is not georeferenced."""
         return None if self.facts.place is None else frame_of(self.facts.place)
 
     def places(self) -> Iterator[tuple[slice, Float64[np.ndarray, "n 3"]]]:
-        """Centres in the frame, z up, with the rows that they are of, a bounded number at a time."""
+        """Yield the rows and centres, in the frame, z up, of a bounded number of Gaussians at a time."""
         for start in range(0, len(self), ROWS):
             rows = slice(start, min(start + ROWS, len(self)))
             yield rows, self._placed(self._gaussians.means[rows])
 
     def sample(self) -> Float64[np.ndarray, "n 3"]:
-        """Centres of evenly chosen Gaussians in the frame."""
+        """Centres of an even sample of the Gaussians, in the frame."""
         step = max(1, -(-len(self) // SAMPLE))
         return self._placed(self._gaussians.means[::step])
 
     def middle(self) -> Float64[np.ndarray, " 3"]:
-        """Middle of the box that holds all but the outermost hundredths along each axis, in the frame."""
+        """Centre, in the frame, of the box that excludes the outermost 1 % at either end of each axis."""
         low, high = np.quantile(self.sample(), MIDDLE, axis=0)
         return np.asarray((low + high) / 2.0)
 
@@ -77,7 +77,7 @@ class Workpiece:
         return self._moved.apply(turned)
 
     def keep(self, chosen: Bool[np.ndarray, " n"]) -> None:
-        """Go on with the chosen Gaussians alone, in their order."""
+        """Keep only the chosen Gaussians, in their order."""
         count = 0
         for start in range(0, len(self), ROWS):
             rows = slice(start, start + ROWS)
@@ -92,20 +92,20 @@ class Workpiece:
             self._gaussians = self._gaussians.clone()
 
     def move(self, similarity: Similarity) -> None:
-        """Move all of it by a similarity of the frame."""
+        """Apply a similarity transform, given in the frame, to the whole splat."""
         self._moved = similarity.compose(self._moved)
         self.travelled = similarity.compose(self.travelled)
 
     def take(self, gaussians: Gaussians) -> None:
-        """Go on with other Gaussians, in the splat's own axes."""
+        """Replace the Gaussians by others, given in the splat's own axes."""
         self.settled()
         self._gaussians = gaussians
 
     def settled(self) -> Gaussians:
-        """The Gaussians where they are now, in the splat's own axes; not copied.
+        """Apply the pending motion and return the Gaussians in the splat's own axes; not copied.
 
         Raises:
-            SplatpipeError: if they are too far from zero for float32.
+            SplatpipeError: if they are too far from the origin for float32.
         """
         if _is_identity(self._moved):
             return self._gaussians
@@ -121,12 +121,16 @@ class Workpiece:
         return self._gaussians
 
     def scene(self) -> Scene:
-        """What it has become; not copied."""
+        """The edited scene; not copied."""
         gaussians = self.settled()
         return Scene(gaussians, self.facts)
 
     def _near_zero(self) -> None:
-        """See to it that float32 holds its places: by another zero on the earth where it has one, or not at all."""
+        """Make sure that float32 can hold the coordinates; a georeferenced splat gets a nearer origin if needed.
+
+        Raises:
+            SplatpipeError: if float32 would be too coarse.
+        """
         sample = self.sample()
         low, high = np.quantile(sample, MIDDLE, axis=0)
         middle = (low + high) / 2.0
@@ -134,7 +138,7 @@ class Workpiece:
             self._take_zero(middle)
             sample = self.sample()
         size = float(np.linalg.norm(high - low)) + self._moved.scale * _sigma(self._gaussians)
-        before = self._moved.scale * _step(_largest(self._gaussians.means))  # what a file had already is no loss
+        before = self._moved.scale * _step(_largest(self._gaussians.means))  # the file was no finer before
         if not _step(float(np.abs(sample).max())) <= max(COARSEST * size, before):
             raise SplatpipeError(
                 "The splat would be too far from the origin for a file, whose coordinates are 32-bit numbers.",
@@ -151,7 +155,7 @@ class Workpiece:
         placed = replace(place, latitude=latitude, longitude=longitude, height_m=height_m)
         try:
             open_world(frame_of(placed))
-        except SplatpipeError:  # its CRS does not reach there: the UTM zone does
+        except SplatpipeError:  # outside its CRS's area of use: fall back to the UTM zone
             placed = replace(placed, crs="")
         self.facts = replace(self.facts, place=placed)
         self.notes.append(
@@ -161,7 +165,7 @@ class Workpiece:
 
 
 def between(source: Origin, target: Origin) -> Similarity:
-    """From one local east-north-up frame to another's, exactly, through the earth-centred frame (EPSG:4978)."""
+    """The exact transform between two local east-north-up frames, through the earth-centred frame (EPSG:4978)."""
     if source == target:
         return Similarity.identity()
     from_source, from_target = source.ecef_from_enu(), target.ecef_from_enu()
@@ -174,7 +178,7 @@ def _is_identity(similarity: Similarity) -> bool:
 
 
 def _step(size: float) -> float:
-    """Between a float32 of this size and the next; infinite beyond the largest."""
+    """Spacing of float32 numbers at this magnitude; infinite beyond the largest."""
     return float(np.spacing(np.float32(size))) if size <= np.finfo(np.float32).max else np.inf
 
 
@@ -183,11 +187,11 @@ def _largest(values: torch.Tensor) -> float:
 
 
 def _sigma(gaussians: Gaussians) -> float:
-    """Median of the standard deviations along the longest axes, world units: the size of a splat of one Gaussian."""
+    """Median standard deviation along the longest axes, world units: a size even for a splat of one Gaussian."""
     step = max(1, -(-len(gaussians) // SAMPLE))
     return float(gaussians.log_scales[::step].amax(1).double().median().exp())
 
 
 def facts_without_place(facts: SceneFacts) -> SceneFacts:
-    """Of a splat whose lengths mean nothing any more."""
+    """The facts without place and metres, for a splat whose scale is no longer known."""
     return replace(facts, place=None, metres=False)

@@ -1,1 +1,1 @@
-"""Runs the line: stages, artifacts, configuration, events. No tensors, no photogrammetry."""
+"""Runs the pipeline: stages, artifacts, configuration, events. No tensors, no photogrammetry."""

@@ -1,6 +1,6 @@
-"""Processes that a stage's body starts for work that threads of one process must not share.
+"""Child processes that a stage's body starts for work that cannot be done by threads of one process.
 
-They end with the body, whatever ends that: an error, an interruption, or the death of its process.
+They end with the body, whether by an error, an interruption, or the death of its process.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from splatpipe.pipeline.engine.errors import StageError
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 LOOK_S = 0.2
-CHILDREN_MEMORY = "children_peak_memory_bytes"  # the metric by which a body tells what its children took
-# Each is one core's work: pools of the numeric libraries would only get into each other's way.
+CHILDREN_MEMORY = "children_peak_memory_bytes"  # the metric with which a body reports its children's memory
+# Each child uses one core: thread pools of the numeric libraries would only compete with each other.
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 MAXRSS_BYTES = 1 if sys.platform == "darwin" else 1024  # the unit of ru_maxrss
 
 
 def die_with_parent(parent: int) -> None:
-    """Have this process ended when the one that started it dies: by Linux, elsewhere by a look now and then.
+    """Have this process killed when its parent dies: by the kernel on Linux, elsewhere by polling.
 
     Args:
-        parent: Who that is; if it is dead already this process ends here.
+        parent: The parent's process ID; if it is already dead, this process ends here.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -45,19 +45,19 @@ def _outlive_nobody(parent: int) -> None:
 
 
 def run_children(commands: Sequence[Sequence[str]], look: Callable[[], None], what: str) -> int:
-    """Run commands side by side to their ends, a core each.
+    """Run commands in parallel to completion, one core each.
 
     Args:
-        commands: ``module, *arguments`` each; the module is given our process number before those, for
+        commands: ``module, *arguments`` each; the module gets our process ID as its first argument, for
             ``die_with_parent``.
         look: Called a few times a second.
-        what: What they do, for the message if one fails.
+        what: What they are doing, for the message if one fails.
 
     Returns:
-        The sum of their peaks of resident memory, bytes: they run side by side.
+        The sum of their peak resident memory, bytes, since they run in parallel.
 
     Raises:
-        StageError: if one fails; the others are ended.
+        StageError: if one fails; the others are killed.
     """
     running: dict[int, subprocess.Popen[bytes]] = {}
     peak = 0

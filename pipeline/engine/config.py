@@ -1,4 +1,4 @@
-"""Configuration: defaults < preset < file < ``--set``; what the answer depends on, checked before anything runs."""
+"""Configuration: defaults < preset < file < ``--set``; determines the result and is checked before anything runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_CONFIG_BYTES = 1 << 20  # a configuration is a page of text
 
 
 def preset_names() -> list[str]:
-    """Names of the presets that ship with the package."""
+    """Sorted names of the presets that ship with the package."""
     folder = resources.files("splatpipe.configs")
     return sorted(entry.name[: -len(".toml")] for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
@@ -43,7 +43,7 @@ def load_file(path: Path) -> Table:
     """Read a TOML file.
 
     Raises:
-        UsageError: if it cannot be read or is not TOML; the message has the line.
+        UsageError: if it cannot be read or is not TOML; the message includes the line.
     """
     try:
         if path.stat().st_size > MAX_CONFIG_BYTES:
@@ -53,7 +53,7 @@ def load_file(path: Path) -> Table:
         raise UsageError(
             f"Cannot read {path}: {error.strerror}.", hint="Check the path given with --config."
         ) from error
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, a number of thousands of digits
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a number with thousands of digits
         raise UsageError(
             f"{path} is not valid TOML: {error}.",
             hint='Write it like: [train] and below it "iterations = 7000".',
@@ -61,9 +61,9 @@ def load_file(path: Path) -> Table:
 
 
 def known(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
-    """An OUT's options as this version names them: what another version called otherwise by its new name and value.
+    """An OUT's options under this version's names: those that another version named differently are converted.
 
-    Names that it does not have are passed over, as those of a newer version are. Wrong values stay, to be refused.
+    Unknown options, e.g. those of a newer version, are dropped. Invalid values are kept, to be rejected later.
     """
     taken: Table = copy.deepcopy(dict(table))
     for old, new in getattr(model, "renamed", {}).items():
@@ -79,7 +79,7 @@ def known(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
 
 
 def _named(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
-    """What of a table the model has."""
+    """The entries of a table that the model has."""
     result: Table = {}
     for name, value in table.items():
         if name in model.model_fields:
@@ -90,7 +90,7 @@ def _named(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
 
 
 def _nested(keys: Sequence[str], value: JSON) -> Table:
-    """``{"train": {"seed": 3}}`` of ``train``, ``seed`` and 3."""
+    """Nest a value: ``train``, ``seed`` and 3 become ``{"train": {"seed": 3}}``."""
     table: JSON = value
     for key in reversed(keys):
         table = {key: table}
@@ -102,8 +102,8 @@ def parse_set(assignment: str, model: type[BaseModel]) -> Table:
     """Turn ``train.iterations=7000`` into ``{"train": {"iterations": 7000}}``.
 
     Args:
-        assignment: What stands after ``--set``; text options take it as it is, others as a TOML value.
-        model: The configuration that it is for.
+        assignment: The argument of ``--set``; text options take the value verbatim, others as TOML.
+        model: The configuration model.
 
     Raises:
         UsageError: if there is no ``=`` or no section.
@@ -129,12 +129,12 @@ def _takes_text(model: type[BaseModel], keys: Sequence[str]) -> bool:
 def _parse_value(raw: str) -> JSON:
     try:
         return tomllib.loads(f"value = {raw}")["value"]
-    except (ValueError, RecursionError, KeyError):  # no TOML, or a number of thousands of digits
+    except (ValueError, RecursionError, KeyError):  # not TOML, or a number with thousands of digits
         return raw
 
 
 def merge(layers: Iterable[Mapping[str, JSON]]) -> Table:
-    """Overlay tables, later ones winning, sections merged key by key."""
+    """Overlay tables: later ones take precedence, and sections are merged key by key."""
     result: Table = {}
     for layer in layers:
         for key, value in layer.items():
@@ -144,7 +144,7 @@ def merge(layers: Iterable[Mapping[str, JSON]]) -> Table:
 
 
 def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
-    """Check merged tables against the configuration model.
+    """Merge tables and validate them against the configuration model.
 
     Raises:
         UsageError: names every wrong key and value, with the nearest known name.
@@ -171,7 +171,7 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
 
 
 def _one_an_option(model: type[BaseModel], error: ValidationError) -> Iterable[dict[str, JSON]]:
-    """The problems, those of an option that takes values of several kinds as one."""
+    """The problems, with those of an option that accepts several types merged into one."""
     known, found = set(option_names(model)), dict[tuple[JSON, ...], dict[str, JSON]]()
     for problem in error.errors():
         place = problem["loc"]
@@ -187,7 +187,7 @@ def _one_an_option(model: type[BaseModel], error: ValidationError) -> Iterable[d
 
 
 def _gone(names: Sequence[str], hint: str) -> str:
-    """Of options that another version had: an old configuration may name many that went for one reason."""
+    """The message for removed options; an old configuration may name many that were removed for the same reason."""
     told = f"is no option {names[0]}" if len(names) == 1 else f"are no options {', '.join(names)}"
     return f"There {told} any more. {hint}"
 
@@ -200,7 +200,7 @@ def _describe(model: type[BaseModel], dotted: str, kind: str, message: str, valu
 
 
 def option_names(model: type[BaseModel], prefix: str = "") -> Iterable[str]:
-    """Dotted names of every option, and of the sections."""
+    """Dotted names of all options and sections."""
     for name, info in model.model_fields.items():
         yield prefix + name
         if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
@@ -217,7 +217,7 @@ def option_help(model: type[BaseModel]) -> Iterable[tuple[str, str]]:
 
 
 def with_seed(model: type[BaseModel], seed: int) -> Table:
-    """The table that gives every section with a ``seed`` this one."""
+    """A table that sets ``seed`` in every section that has it."""
     return {
         name: {"seed": seed}
         for name, info in model.model_fields.items()
@@ -232,14 +232,14 @@ def lookup(config: BaseModel, dotted: str) -> JSON:
 
 
 def settings_of(config: BaseModel, stage: Stage) -> tuple[Table, Table]:
-    """A stage's own options without those that name files, and the ones it borrows, by their dotted names."""
+    """A stage's own options except those that name files, and the options it borrows by dotted name."""
     section: BaseModel = getattr(config, stage.name)
     own = section.model_dump(mode="json", exclude=set(stage.files))
     return own, {name: lookup(config, name) for name in stage.borrows}
 
 
 def dump(table: Mapping[str, JSON]) -> str:
-    """A table as TOML; options that are None are left out, since None is what leaving out means."""
+    """A table as TOML; options that are None are omitted, since a missing option means None."""
 
     def without_none(value: JSON) -> JSON:
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Content digests: of a file, of a folder, of the user's photos (hashed once, then remembered)."""
+"""Content digests of a file, of a folder and of the user's photos (hashed once, then cached)."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import JSON
 
 BLOCK_BYTES = 1 << 20
-UNREADABLE = "unreadable"  # stands for the digest of a file that ingest will leave out with the reason
-KNOWN = 4  # facts of a file by which its digest is known again
-MAX_SOURCE_FILES = 1_000_000  # a folder with more is somebody's home, not a capture
+UNREADABLE = "unreadable"  # the digest of a file that cannot be read; ingest will exclude it and give the reason
+KNOWN = 4  # file attributes by which a cached digest is recognised as current
+MAX_SOURCE_FILES = 1_000_000  # a folder with more is somebody's home folder, not a capture
 
 
 def canonical(value: JSON) -> bytes:
-    """JSON with sorted keys and no blanks: the same bytes for the same value."""
+    """JSON with sorted keys and no spaces: the same bytes for the same value."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
@@ -39,7 +39,7 @@ def file_digest(path: Path) -> str:
 
 
 def walk_files(root: Path) -> Iterator[Path]:
-    """Every regular file below ``root`` in sorted order; hidden names and symlinked folders are passed over."""
+    """Yield every regular file below ``root`` in sorted order; hidden names and symlinked folders are skipped."""
     for folder, folders, files in os.walk(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(files):
@@ -50,7 +50,7 @@ def walk_files(root: Path) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class FileEntry:
-    """A file below an artifact: its POSIX path relative to it, size in bytes, sha256."""
+    """A file of an artifact: POSIX path relative to the artifact, size in bytes, sha256."""
 
     path: str
     size: int
@@ -58,7 +58,7 @@ class FileEntry:
 
 
 def tree_entries(path: Path, relative_to: Path) -> list[FileEntry]:
-    """Entries of a file, or of every file below a folder, sorted by path; dangling links are an error of ours."""
+    """Entries of a file, or of every file below a folder, sorted by path; dangling links are skipped."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     return [
         FileEntry(file.relative_to(relative_to).as_posix(), file.stat().st_size, file_digest(file)) for file in files
@@ -66,7 +66,7 @@ def tree_entries(path: Path, relative_to: Path) -> list[FileEntry]:
 
 
 def part_digest(entries: Iterable[FileEntry], root: str) -> str:
-    """Digest of a part: independent of where it lies, so that equal content has equal digests.
+    """Digest of a part, independent of its location: equal content has equal digests.
 
     Args:
         entries: Its files, paths relative to the artifact.
@@ -83,13 +83,13 @@ def _digest_or_unreadable(path: Path) -> str:
 
 
 class HashTable:
-    """Remembers the sha256 of files by path, size, times and inode, so that gigabytes are read once.
+    """A cache of files' sha256 by path, size, times and inode, so that gigabytes are read only once.
 
-    The time of the last change of the inode is among them: no program sets it, whatever it makes of the mtime.
+    The times include the inode's ctime, which no program can set, unlike the mtime.
 
     Args:
-        path: Where the table is kept (JSON); a broken one is started anew.
-        remember: Keep what is learnt; only the holder of the lock may.
+        path: The table's file (JSON); a corrupt one is replaced.
+        remember: Save new digests; only the holder of the lock may.
     """
 
     def __init__(self, path: Path, *, remember: bool) -> None:
@@ -100,7 +100,7 @@ class HashTable:
             table = json.loads(path.read_text(encoding="utf-8"))
             self._known = {str(key): list(value) for key, value in table.items() if len(value) == KNOWN + 1}
         except (OSError, ValueError, AttributeError, TypeError):
-            pass  # no table or a broken one costs one more reading of the photos, nothing else
+            pass  # a missing or corrupt table only costs reading the photos again
 
     def digest_of(
         self, files: Mapping[str, Path], threads: int, progress: Callable[[int, int], None] | None = None
@@ -109,7 +109,7 @@ class HashTable:
 
         Args:
             files: Name to path; the names are part of the digest, the paths are not.
-            threads: Files read at once.
+            threads: Number of files read at once.
             progress: Called with (done, total) files that had to be read.
         """
         wanted: dict[str, list[JSON]] = {}

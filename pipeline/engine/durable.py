@@ -1,4 +1,4 @@
-"""Files that are there whole or as before, even after a power cut: written aside, flushed to the disk, then renamed."""
+"""Atomic file replacement that survives a power cut: written beside the target, flushed to disk, then renamed."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import IO, Any
 
 
 def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None:
-    """Let a file take ``path``'s place at once, or not at all.
+    """Write a file atomically, replacing any existing one.
 
     Args:
-        path: Where; an older file there is replaced, and its permissions stay.
-        content: Its text, written as UTF-8; or what is called with the open file to fill it.
+        path: The file; the permissions of an existing one are kept.
+        content: Its text, written as UTF-8, or a function called with the open binary file to fill it.
 
     Raises:
         OSError: if the disk is full or not writable; what was at ``path`` is still there.
@@ -32,10 +32,10 @@ def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None
 
 
 def copy_durably(source: Path, path: Path) -> None:
-    """Let a copy of a file, with its times and permissions, take ``path``'s place at once, or not at all.
+    """Copy a file with its times and permissions to ``path`` atomically, replacing any existing file.
 
     Raises:
-        OSError: if it cannot be read, or the disk is full or not writable; what was at ``path`` is still there.
+        OSError: if ``source`` cannot be read, or the disk is full or not writable; what was at ``path`` is still there.
     """
     with _beside(path) as aside:
         shutil.copy2(source, aside)
@@ -43,7 +43,7 @@ def copy_durably(source: Path, path: Path) -> None:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
-    """A file's name to fill beside ``path``, whose place it then takes."""
+    """Yield a temporary name beside ``path`` to write to; on success it is flushed and renamed to ``path``."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         yield aside
@@ -57,19 +57,19 @@ def _beside(path: Path) -> Iterator[Path]:
 
 
 def remove_unfinished(folder: Path, name: str = "*", process: int | None = None) -> None:
-    """Remove what killed processes left of files that they were writing.
+    """Remove the temporary files of killed processes.
 
     Args:
-        folder: Where.
-        name: Of the file; of any by default.
-        process: Number of the one that was killed; None where nobody else writes these files there now.
+        folder: The folder to clean.
+        name: Name of the target file; any by default.
+        process: ID of the killed process; None if no other process is writing these files now.
     """
     for aside in folder.glob(f".{glob.escape(name) if name != '*' else name}.{process or '*'}.new"):
         aside.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush a folder's names to the disk."""
+    """Flush a folder's directory entries to disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -78,7 +78,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Flush a folder's files and names, and those of all folders in it, to the disk."""
+    """Flush a folder's files and directory entries to disk, recursively."""
     for path in folder.rglob("*"):
         if path.is_dir():
             sync_folder(path)

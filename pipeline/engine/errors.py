@@ -1,4 +1,4 @@
-"""What can go wrong, said once: every error carries what to do about it and the exit code it leads to."""
+"""Error classes: each error carries a message, a hint on what to do and its exit code."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class UsageError(SplatpipeError):
 
 
 class StageError(SplatpipeError):
-    """A stage failed for a reason that is not the input's: a crash, a fault of ours."""
+    """A stage failed for a reason other than its input: a crash or a bug in splatpipe."""
 
     exit_code = EXIT_STAGE
 
@@ -53,18 +53,18 @@ class StopSignal(BaseException):
     """Ctrl-C, SIGTERM or SIGHUP. Not an Exception, so that nothing mistakes it for a failure.
 
     Args:
-        exit_code: What the program ends with.
+        exit_code: The program's exit code.
     """
 
     def __init__(self, exit_code: int) -> None:
         super().__init__("Stopped.")
         self.exit_code = exit_code
-        self.at_s = time.monotonic()  # the end is promised within seconds of this
+        self.at_s = time.monotonic()  # the program promises to end within seconds of this
         self.hint = "Finished work is kept: repeat the command to resume."
 
 
 def exit_code(error: BaseException | None) -> int:
-    """What a command ends with that ended by this; None: as it should."""
+    """The exit code of a command that ended with this error; None means success."""
     if error is None:
         return 0
     if isinstance(error, SplatpipeError | StopSignal):

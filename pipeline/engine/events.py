@@ -1,4 +1,4 @@
-"""The one kind of event that a run tells of itself; the console, the report and a batch driver all read these."""
+"""The events that a run emits; the console, the report and the batch driver all read these."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ Kind = Literal[
 ]
 
 PROGRESS_INTERVAL_S = 0.1  # a console redraws ten times a second at most
-LOGGED_PROGRESS_INTERVAL_S = 2.0  # events.jsonl is for reading afterwards: it needs no more than a curve
+LOGGED_PROGRESS_INTERVAL_S = 2.0  # events.jsonl is read afterwards: this is enough for a curve
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened.
+    """An event of a run.
 
     Attributes:
         kind: What happened.
-        stage: The stage it happened in, or empty.
+        stage: The stage it concerns, or empty.
         data: The details, JSON values. ``progress``: done, total, what, unit. ``metric``: name, value, step.
             ``note``: message. ``warning``: message, hint. ``run_started``: stages, machine, versions.
             ``stage_started``: reason, key. ``stage_reused``: summary, seconds, key. ``stage_finished``: summary,
             seconds, cpu_seconds, peak_memory_bytes, key. ``stage_failed``: message, hint, exit_code, seconds,
-            peak_memory_bytes (None: nobody knows), key, lasting (the same input fails again). ``run_finished``:
+            peak_memory_bytes (None: unknown), key, lasting (the same input will fail again). ``run_finished``:
             exit_code, message, hint, seconds.
         time_s: Seconds since the epoch.
     """
@@ -57,7 +57,7 @@ Sink = Callable[[Event], None]
 
 
 def parse_event(line: bytes) -> Event | None:
-    """The event of a line of ``events.jsonl``; None where it is none: the log is for reading, not for believing."""
+    """Parse a line of ``events.jsonl``; None if it is not a valid event, since the log is not trusted."""
     try:
         told = json.loads(line)
         if told["kind"] in get_args(Kind) and isinstance(told["data"], dict):
@@ -68,9 +68,9 @@ def parse_event(line: bytes) -> Event | None:
 
 
 class EventReporter:
-    """The Reporter that stage bodies are given: makes events of its calls and thins out the progress of one thing.
+    """The Reporter passed to stage bodies: turns its calls into events and throttles the progress of each activity.
 
-    What begins is always told, however soon after the last: a person and a test wait for it by name.
+    The first progress of an activity is always reported: people and tests wait for it by name.
     """
 
     def __init__(self, stage: str, sink: Sink) -> None:
@@ -101,21 +101,21 @@ class EventReporter:
 
 
 class EventLog:
-    """Appends events to ``events.jsonl``, one JSON object a line, whole or not there; progress of a thing thinned."""
+    """Appends events to ``events.jsonl``, one JSON object per line, never partial lines; progress is throttled."""
 
     def __init__(self, path: Path) -> None:
         self._name = path.name
         self._descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        self._last_progress_s: dict[tuple[str, str], float] = {}  # of each thing that a stage does
+        self._last_progress_s: dict[tuple[str, str], float] = {}  # by stage and activity
         size = os.fstat(self._descriptor).st_size
-        if size and os.pread(self._descriptor, 1, size - 1) != b"\n":  # a machine that stopped in the middle of a line
+        if size and os.pread(self._descriptor, 1, size - 1) != b"\n":  # the machine stopped in the middle of a line
             os.write(self._descriptor, b"\n")
 
     def __call__(self, event: Event) -> None:
         """Append an event.
 
         Raises:
-            OSError: if the disk is full or gone; what is there ends with a whole line.
+            OSError: if the disk is full or gone; the file still ends with a complete line.
         """
         if event.kind == "progress":
             thing = event.stage, str(event.data.get("what"))
@@ -133,7 +133,7 @@ class EventLog:
 
 
 def _finite(value: JSON) -> JSON:
-    """The value with null for numbers that JSON does not have."""
+    """The value with None in place of numbers that are not finite, which JSON cannot represent."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Runs tasks in a worker process: starts it, passes its events on, ends it, and explains its death."""
+"""Runs tasks in a worker process: starts it, forwards its events, ends it, and explains crashes."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.worker import Task, peak_memory_of
 
-GRACE_S = 3.0  # a training writes its checkpoint in less; Ctrl-C promises an end within five seconds
+GRACE_S = 3.0  # training writes its checkpoint in less; Ctrl-C promises an end within five seconds
 
 
 class Executor:
-    """A worker process, started for the first task and kept for the next ones.
+    """A worker process, started for the first task and kept for later ones.
 
     Args:
-        log: File that takes what libraries print.
-        locks: The OUT's lock and a shard's, inherited so that they last as long as the worker writes.
-        environment: Variables for the worker besides our own (threads of the numeric libraries).
+        log: File for what libraries print.
+        locks: Descriptors of the locks of the OUT and of a shard, inherited so that they last as long as the worker.
+        environment: Additional environment variables for the worker (threads of the numeric libraries).
     """
 
     def __init__(self, log: Path, locks: tuple[int, ...], environment: Mapping[str, str]) -> None:
@@ -37,21 +37,21 @@ class Executor:
         self._process: subprocess.Popen[str] | None = None
 
     def run(self, task: Task, sink: Sink) -> dict[str, JSON]:
-        """Run one task to its end.
+        """Run one task to completion.
 
         Args:
             task: The stage to run.
-            sink: Takes its events.
+            sink: Receives its events.
 
         Returns:
             ``summary``, ``seconds``, ``cpu_seconds``, ``peak_memory_bytes``.
 
         Raises:
-            SplatpipeError: what the body raised, or how the worker died.
+            SplatpipeError: what the body raised, or a StageError if the worker died.
         """
         process = self._started()
         assert process.stdin is not None and process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):  # a worker dead at birth is explained below
+        with contextlib.suppress(BrokenPipeError):  # a worker that died on startup is explained below
             process.stdin.write(json.dumps({"task": asdict(task)}) + "\n")
             process.stdin.flush()
         for line in process.stdout:
@@ -74,11 +74,11 @@ class Executor:
         )
 
     def peak_memory_bytes(self) -> int | None:
-        """Peak resident memory of the worker in the stage that it runs; None if it is dead or nobody knows."""
+        """Peak resident memory of the worker in its current stage, bytes; None if it is dead or this is unknown."""
         return None if self._process is None else peak_memory_of(self._process.pid)
 
     def stop(self) -> None:
-        """End the worker: politely, then within ``GRACE_S`` for certain."""
+        """End the worker: ask it to terminate, and kill it after ``GRACE_S``."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -94,7 +94,7 @@ class Executor:
             _close(process)
 
     def close(self) -> None:
-        """Let an idle worker go."""
+        """Shut down an idle worker."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -135,7 +135,7 @@ class Executor:
 
     def _raise(self, failure: Mapping[str, str]) -> None:
         if failure["type"] == "KeyboardInterrupt":
-            raise StopSignal(EXIT_TERMINATED)  # somebody ended the worker alone
+            raise StopSignal(EXIT_TERMINATED)  # somebody terminated only the worker
         raise ERRORS[failure["type"]](failure["message"], failure["hint"])
 
 

@@ -1,4 +1,4 @@
-"""Memory that a process has freed and the allocator keeps: glibc returns it on request only."""
+"""Returns freed memory that the allocator keeps: glibc gives it back only on request."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ import ctypes
 
 
 def return_free_heap() -> None:
-    """Give it back to the system; nothing where the C library is another."""
+    """Return freed heap memory to the system; does nothing with C libraries other than glibc."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,4 +1,4 @@
-"""A line with all that its answer depends on, and where its stages and their shards stand, without running anything."""
+"""A pipeline with everything its result depends on, and the status of its stages and shards, without running any."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ State = Literal["valid", "stale", "missing", "waiting"]
 
 @dataclass(frozen=True)
 class Job:
-    """What one process makes: a stage's artifact, or a shard's.
+    """A unit of work for one process: a stage's artifact, or a shard's.
 
     Attributes:
-        stage: What makes it: of a shard as ``Stage.shard`` says.
-        inputs: What its answer depends on.
-        shard: Which one; None for a stage's own.
+        stage: The stage to run; for a shard, the result of ``Stage.shard``.
+        inputs: Everything its result depends on.
+        shard: The shard; None for a stage's own body.
     """
 
     stage: Stage
@@ -36,11 +36,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Line:
-    """A line with everything that its answer depends on.
+    """A pipeline with everything its result depends on.
 
     Attributes:
         stages: In order; each reads parts of those before it.
-        config: The resolved configuration, a section a stage.
+        config: The resolved configuration, with a section for each stage.
         source: External parts by name, e.g. ``source.photos``.
         photos_dir: The user's folder.
     """
@@ -51,7 +51,10 @@ class Line:
     photos_dir: Path
 
     def needed(self, until: str | None = None) -> list[Stage]:
-        """The stages to walk from what the source does not give: those that lead to ``until``, else to deliverables."""
+        """The stages to run, in order: those that ``until`` depends on, or else the deliverables and the last stage.
+
+        Stages whose parts the source provides are not needed.
+        """
         names = [stage.name for stage in self.stages]
         last = names.index(until) if until else len(names) - 1
         wanted = {names[last]} if until else {names[last], *(stage.name for stage in self.stages if stage.deliverables)}
@@ -61,20 +64,20 @@ class Line:
         return [stage for stage in self.stages[: last + 1] if stage.name in wanted]
 
     def reads_of(self, stage: Stage) -> tuple[str, ...]:
-        """The parts that a stage, or a shard of it, reads as it is configured."""
+        """The parts that a stage or one of its shards reads; none if the stage is turned off."""
         section: StageConfig = getattr(self.config, stage_name(stage.name))
         return () if section.is_off else stage.reads
 
     def inputs_of(self, stage: Stage, parts: Mapping[str, Part]) -> StageInputs:
-        """What a stage's key is made of."""
+        """The inputs that make up a stage's key."""
         reads = {name: parts[name].digest for name in self.reads_of(stage)}
         return StageInputs(stage.name, stage.version, *settings_of(self.config, stage), reads)
 
     def shards_of(self, stage: Stage, parts: Mapping[str, Part]) -> list[Job]:
-        """A stage's shards in order, each with a key of its own, which nothing of the others is in.
+        """A stage's shards in order, each with its own key, independent of the other shards.
 
         Raises:
-            StageError: if the part that counts them does not.
+            StageError: if the part that should give their number does not.
         """
         pieces = self.pieces_of(stage, parts)
         inputs = self.inputs_of(stage, parts)
@@ -84,10 +87,10 @@ class Line:
         ]
 
     def pieces_of(self, stage: Stage, parts: Mapping[str, Part]) -> list[Stage]:
-        """What makes each of a stage's shards; empty as long as the part that counts them is not there.
+        """The stages that run each shard; empty as long as the part that gives their number is missing.
 
         Raises:
-            StageError: if that part does not count them.
+            StageError: if that part does not give their number.
         """
         if stage.shards is None or stage.shards.counted_by not in parts:
             return []
@@ -109,15 +112,15 @@ def _counted(path: Path, stage: str) -> int:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """Where a stage stands without running anything: its artifact where it is valid, else why it is not.
+    """The status of a stage without running anything: its artifact if valid, else why it is not.
 
     Attributes:
-        stage: The stage, or what makes a shard.
-        state: Whether it is there.
-        key: Of its artifact; empty where it waits for others.
-        reason: Why it is not there.
-        artifact: What is there.
-        shards: Where its shards stand.
+        stage: The stage, or the stage that runs a shard.
+        state: Whether its artifact is valid, stale, missing, or waits for other stages.
+        key: The artifact's key; empty while it waits for others.
+        reason: Why there is no valid artifact.
+        artifact: The valid artifact.
+        shards: The status of its shards.
     """
 
     stage: Stage
@@ -129,12 +132,12 @@ class StageStatus:
 
     @property
     def wanted(self) -> list[tuple[str, str]]:
-        """Names and keys of what is asked for: its own and its shards'."""
+        """Names and keys of the artifacts to keep: the stage's own and its shards'."""
         return [(self.stage.name, self.key), *((shard.stage.name, shard.key) for shard in self.shards)]
 
 
 def line_status(line: Line, store: Store) -> Iterator[StageStatus]:
-    """Say of every needed stage whether it is valid, and if not why, without running anything."""
+    """Yield the status of every needed stage without running anything."""
     parts = dict(line.source)
     for stage in line.needed():
         missing = [name for name in line.reads_of(stage) if name not in parts]
@@ -163,7 +166,7 @@ def _status(job: Job, store: Store) -> StageStatus:
 
 
 def explain(inputs: StageInputs, earlier: Iterable[Artifact]) -> str:
-    """Why a stage has to run, against its newest artifact."""
+    """Why a stage has to run, compared with its newest artifact."""
     newest = next(iter(earlier), None)
     if newest is None:
         return "not run yet"

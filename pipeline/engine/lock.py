@@ -1,12 +1,14 @@
-"""Who works in an OUT: one splatpipe at a time, whatever file system it is on.
+"""Locks an OUT: one splatpipe at a time works in it, whatever file system it is on.
 
 On one machine the kernel's lock decides (``flock``): it ends with the last process that holds it, however that dies.
-Other machines see it only where the file system carries it (NFS does, by a lock on the file's bytes; not with
-``nolock``, nor 9p, nor most of FUSE). So who holds it also signs the file with the machine's boot and touches it every
-few seconds: what another boot has signed is believed as long as it is touched. No two clocks are compared.
+Other machines see it only where the file system propagates it (NFS does, as a lock on the file's bytes; not with
+``nolock``, nor 9p, nor most FUSE file systems). So the holder also signs the file with its machine's boot ID and
+touches it every few seconds: a signature from another boot counts as long as it is touched. No two machines' clocks
+are compared.
 
-Shards of a stage are made side by side: who makes one shares the OUT's lock and holds a file of the shard's own, signed
-and touched like the other. Each side signs its file first and looks at the other's then, so that one of two sees it.
+Shards of a stage may be run side by side: a process that runs one shares the OUT's lock and holds a lock file of the
+shard's own, signed and touched in the same way. Each side first signs its own file and then checks the other's, so that
+at least one of the two notices.
 """
 
 from __future__ import annotations
@@ -27,15 +29,15 @@ from pathlib import Path
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.machine import LOCAL_KINDS, mount_of
 
-LOCK_FILE = ".lock"  # below stages/; it stays there, and only who holds it works
+LOCK_FILE = ".lock"  # below stages/; it is never removed, and only its holder works
 PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
-BEAT_S = 4.0  # between touches; a server is not troubled by one in that time
-SILENCE_S = 20.0  # without a touch: five missed ones are no busy disk any more
-SETTLE_S = 1.0  # in which two machines that sign at once see who was last
+BEAT_S = 4.0  # between touches; rare enough not to burden a server
+SILENCE_S = 20.0  # without a touch: five missed ones cannot be explained by a busy disk
+SETTLE_S = 1.0  # time for two machines that sign at once to see which was last
 LOOK_S = 0.25
 FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-LONGEST = 4096  # bytes of a signature
-WIDTH = 1024  # of all, so that of two written over each other the last one stands whole
+LONGEST = 4096  # bytes read of a signature
+WIDTH = 1024  # bytes to which signatures are padded: of two written over each other, the last is intact
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in all containers of a machine
 
@@ -44,13 +46,13 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Holder:
-    """Who signed the file.
+    """The signer of a lock file.
 
     Attributes:
-        process: Its number, on its machine.
+        process: The process ID on its machine.
         host: The machine's name.
-        boot: What its machine's kernel calls this boot: with the same one, ``flock`` tells the truth.
-        turn: Of this hold alone.
+        boot: The boot ID of its machine's kernel: within the same boot, ``flock`` is reliable.
+        turn: A random token that identifies this hold.
     """
 
     process: int
@@ -60,7 +62,7 @@ class Holder:
 
     @staticmethod
     def here() -> Holder:
-        """This process, about to hold."""
+        """A new holder for this process."""
         return Holder(os.getpid(), socket.gethostname(), _boot(), secrets.token_hex(8))
 
     @property
@@ -72,15 +74,16 @@ class Holder:
 
 
 class Hold:
-    """The lock, held; touched from a thread of its own until it is closed.
+    """A held lock; a thread touches its file until it is closed.
 
     Args:
-        path: The file.
-        descriptor: Of it.
-        holder: As it is signed.
+        path: The lock file.
+        descriptor: Its file descriptor.
+        holder: Its signature.
 
     Attributes:
-        descriptors: Of it, and of what it shares, for a worker to inherit: the lock lasts as long as either lives.
+        descriptors: Of this lock and of the one it shares, for a worker to inherit: the lock lasts as long as either
+            process lives.
     """
 
     def __init__(self, path: Path, descriptor: int, holder: Holder) -> None:
@@ -92,10 +95,10 @@ class Hold:
         self._thread.start()
 
     def confirm(self) -> None:
-        """Make sure that it is still ours.
+        """Check that the lock is still ours.
 
         Raises:
-            MachineError: if another machine took it, as it may where this one slept or lost its disk for a while.
+            MachineError: if another machine took it, which may happen if this one slept or lost its disk for a while.
         """
         if self._taker:
             raise MachineError(
@@ -105,10 +108,10 @@ class Hold:
             )
 
     def close(self) -> None:
-        """Take the signature back and let the lock go."""
+        """Remove the signature and release the lock."""
         self._over.set()
-        self._thread.join(LOOK_S)  # it may hang with a server
-        with suppress(OSError):  # a disk that is gone holds nobody up
+        self._thread.join(LOOK_S)  # it may hang if a server does
+        with suppress(OSError):  # a missing disk must not block the exit
             if not self._taker and _signed(self._path) == self._holder:
                 os.ftruncate(self.descriptors[0], 0)
         for descriptor in self.descriptors:
@@ -119,20 +122,23 @@ class Hold:
             with suppress(OSError):
                 found = _signed(self._path)
                 if found != self._holder and (found is not None or self._path.stat().st_size == 0):
-                    self._taker = str(found or "unknown")  # who takes a silent shard's place takes its signature off
+                    self._taker = str(found or "unknown")  # replacing a silent shard removes its signature
                     return
                 os.utime(self.descriptors[0])
 
 
 @contextmanager
 def locked(out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell = lambda _text: None) -> Iterator[Hold]:
-    """Hold an OUT for writing.
+    """Lock an OUT for writing.
 
     Args:
         out: Its folder.
-        folder: Of ours in it, which keeps the file.
-        wait: Wait for another that works in it.
-        tell: Is told whom for.
+        folder: Our folder in it that contains the lock file.
+        wait: Wait for another splatpipe that works in it.
+        tell: Called with a message that names the process waited for.
+
+    Yields:
+        The hold.
 
     Raises:
         UsageError: if another process works in it.
@@ -142,7 +148,7 @@ def locked(out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell 
     hold = _acquired(path, tell, wait=wait)
     try:
         for shard in sorted(path.parent.glob(f"{LOCK_FILE}.*")):
-            if _signed(shard) is not None:  # of a process that was killed, or of a machine that this one's lock misses
+            if _signed(shard) is not None:  # of a killed process, or of a machine that does not see our lock
                 _acquired(shard, tell, wait=wait).close()
         yield hold
     finally:
@@ -151,16 +157,19 @@ def locked(out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell 
 
 @contextmanager
 def locked_shard(out: Path, shard: str, *, wait: bool = False, tell: Tell = lambda _text: None) -> Iterator[Hold]:
-    """Hold one shard of an OUT for writing, and the OUT against all but other shards.
+    """Lock one shard of an OUT for writing, and share the OUT with other shards only.
 
     Args:
         out: Its folder.
         shard: By name, e.g. ``train.2``.
-        wait: Wait for another that makes the shard, or that has the OUT to itself.
-        tell: Is told whom for.
+        wait: Wait for another process that runs the shard or has the OUT to itself.
+        tell: Called with a message that names the process waited for.
 
-    Raises:
-        UsageError: if another process makes it, or has the OUT to itself.
+        Yields:
+            The hold.
+
+        Raises:
+            UsageError: if another process runs it, or has the OUT to itself.
         MachineError: if its file system has no locks, or cannot be written.
     """
     path = out / "stages" / LOCK_FILE
@@ -176,7 +185,7 @@ def locked_shard(out: Path, shard: str, *, wait: bool = False, tell: Tell = lamb
             other = _signed(path)
             if other is None or other == silent or not other.is_elsewhere:
                 break
-            hold.close()  # a machine that this one's lock misses signed meanwhile: it may not have seen us
+            hold.close()  # a machine that does not see our lock signed meanwhile and may not have noticed us
             waiting.begin(other)
     except BaseException:
         os.close(shared)
@@ -189,7 +198,7 @@ def locked_shard(out: Path, shard: str, *, wait: bool = False, tell: Tell = lamb
 
 
 def _acquired(path: Path, tell: Tell, *, wait: bool) -> Hold:
-    """A lock's file, held alone and signed; the errors are those of ``locked``."""
+    """Lock a file exclusively and sign it; raises what ``locked`` raises."""
     with _explained(path.parents[1]):
         descriptor = os.open(path, FLAGS, 0o666)
         try:
@@ -211,7 +220,7 @@ def _explained(out: Path) -> Iterator[None]:
 
 
 def is_locked(out: Path, shard: str = "") -> bool:
-    """Whether a splatpipe has an OUT to itself now, or makes one of its shards, as far as a look tells.
+    """Whether a splatpipe currently has an OUT to itself, or runs one of its shards; checked without waiting.
 
     Args:
         out: Its folder.
@@ -223,7 +232,7 @@ def is_locked(out: Path, shard: str = "") -> bool:
     except OSError:
         return False
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a run that begins now waits for longer
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # brief: a run that starts now waits longer
         holder = _signed(path)
         touched_s = time.time() - os.fstat(descriptor).st_mtime
     except BlockingIOError:
@@ -236,13 +245,13 @@ def is_locked(out: Path, shard: str = "") -> bool:
 
 
 def shards_being_made(out: Path) -> list[str]:
-    """Names of an OUT's shards that somebody makes now on their own, as far as a look tells."""
+    """Names of an OUT's shards that separate processes are currently running; checked without waiting."""
     names = sorted(path.name.removeprefix(f"{LOCK_FILE}.") for path in (out / "stages").glob(f"{LOCK_FILE}.*"))
     return [name for name in names if is_locked(out, name)]
 
 
 def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
-    """Lock the file against this machine and others, and sign it."""
+    """Lock the file against processes on this machine and others, sign it, and return the signature."""
     waiting = _Queue(path, tell, wait)
     _wait_for(descriptor, waiting, fcntl.LOCK_EX)
     _outlast(path, waiting)
@@ -260,7 +269,7 @@ def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
 
 @dataclass
 class _Queue:
-    """What is said to the user of another who works there, once."""
+    """Tells the user, once, about the process being waited for."""
 
     path: Path
     tell: Tell
@@ -268,10 +277,10 @@ class _Queue:
     announced: bool = False
 
     def begin(self, other: Holder | None) -> None:
-        """Say whom for.
+        """Announce the process being waited for.
 
         Raises:
-            UsageError: if nobody wants to wait.
+            UsageError: if waiting is not allowed.
         """
         if not self.allowed:
             raise _refusal(self.path, other)
@@ -281,7 +290,7 @@ class _Queue:
 
 
 def _wait_for(descriptor: int, waiting: _Queue, kind: int) -> None:
-    """Get the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``; who is waited for where shards are made is one of theirs."""
+    """Acquire the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``; the holder reported may be that of a shard."""
     path = waiting.path
     deadline_s = time.monotonic() + PATIENCE_S
     while not _flocked(descriptor, path.parents[1], kind):
@@ -292,24 +301,24 @@ def _wait_for(descriptor: int, waiting: _Queue, kind: int) -> None:
 
 
 def _outlast(path: Path, waiting: _Queue) -> Holder | None:
-    """Wait until what another boot has signed is taken back, or has not been touched for too long.
+    """Wait until a signature from another boot is removed, or has not been touched for ``SILENCE_S``.
 
     Returns:
-        Who signed and has fallen silent; None where nobody is signed in.
+        The signer that has fallen silent; None if there is no signature.
 
     Raises:
-        UsageError: if it is touched, and nobody wants to wait for it.
+        UsageError: if it is still being touched and waiting is not allowed.
     """
     other = _signed(path)
     if other is None or not other.is_elsewhere:
-        return None  # this machine's own was killed: it would still hold the lock
+        return None  # a signer on this machine must have been killed: it would still hold the lock
     touched, silence_s = _touched(path), 0.0
     waiting.tell(f"Looking for up to {SILENCE_S:.0f} s whether {other} is still {_doing(path)}.")
     while silence_s < SILENCE_S:
         began_s = time.monotonic()
         time.sleep(LOOK_S)
         now = _touched(path)
-        # While a server does not answer, nobody's touch arrives: a look that hangs counts as BEAT_S at most.
+        # While a server does not answer, no touch arrives: a check that hangs counts as BEAT_S at most.
         silence_s += min(time.monotonic() - began_s, BEAT_S)
         if now != touched:
             if (signed := _signed(path)) is None:
@@ -321,7 +330,7 @@ def _outlast(path: Path, waiting: _Queue) -> Holder | None:
 
 def _refusal(path: Path, other: Holder | None) -> UsageError:
     hint = "Wait for it to finish (or use --wait), or choose another OUT."
-    if other is not None and other.is_elsewhere:  # a server may keep a dead machine's lock: NFS 3 until that is back
+    if other is not None and other.is_elsewhere:  # a server may keep a dead machine's lock: NFS 3 does until it is back
         hint += f" If {other.host} has crashed for good, remove {path}."
     return UsageError(f"Another splatpipe ({other or 'unknown'}) is {_doing(path)}.", hint=hint)
 
@@ -331,7 +340,7 @@ def _shard_file(out: Path, shard: str) -> Path:
 
 
 def _place(path: Path) -> str:
-    """What a lock's file stands for: an OUT, or one of its shards."""
+    """What a lock file protects, for messages: an OUT, or one of its shards."""
     shard = path.name.removeprefix(LOCK_FILE).removeprefix(".")
     return f"{shard} in {path.parents[1]}" if shard else str(path.parents[1])
 
@@ -341,10 +350,10 @@ def _doing(path: Path) -> str:
 
 
 def _flocked(descriptor: int, out: Path, kind: int) -> bool:
-    """Try the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``.
+    """Try to acquire the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``; False if another process holds it.
 
     Raises:
-        MachineError: if the file system has none.
+        MachineError: if the file system does not support locks.
     """
     try:
         fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
@@ -364,7 +373,7 @@ def _flocked(descriptor: int, out: Path, kind: int) -> bool:
 
 
 def _signed(path: Path) -> Holder | None:
-    """Who signed the file; None if nobody did. Opened anew, so that NFS asks the server."""
+    """The signer of the file, or None. The file is reopened so that NFS queries the server."""
     with suppress(OSError, ValueError, TypeError, KeyError, RecursionError):
         with path.open("rb") as file:
             told = json.loads(file.read(LONGEST))
@@ -373,7 +382,7 @@ def _signed(path: Path) -> Holder | None:
 
 
 def _touched(path: Path) -> int:
-    """When the file was touched by its own file system's clock; opened anew, so that NFS asks the server."""
+    """The file's mtime, ns, by its file system's clock; 0 if unreadable. Reopened so that NFS queries the server."""
     with suppress(OSError), path.open("rb") as file:
         return os.fstat(file.fileno()).st_mtime_ns
     return 0

@@ -1,8 +1,8 @@
-"""What this process may use of its machine: memory and processors, within the control groups that it runs in.
+"""The memory and processors this process may use, within the limits of its control groups.
 
-A container, a Slurm job or a systemd unit sees the whole machine in ``/proc/meminfo`` and ``os.cpu_count``, and is
-killed or slowed down at its own limits. They stand in the files of its control groups, version 1 or 2, and of all
-groups above (https://docs.kernel.org/admin-guide/cgroup-v2.html, cgroup-v1/memory.html, scheduler/sched-bwc.html).
+A container, a Slurm job or a systemd unit sees the whole machine in ``/proc/meminfo`` and ``os.cpu_count``, but is
+killed or slowed down at its own limits. These are set in the files of its control groups, version 1 or 2, and of all
+their ancestors (https://docs.kernel.org/admin-guide/cgroup-v2.html, cgroup-v1/memory.html, scheduler/sched-bwc.html).
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-MOST_CHARACTERS = 1 << 20  # of a file of the kernel's: a machine with thousands of mounts has less
-UNLIMITED_BYTES = 1 << 60  # more than any machine has: version 1 says "no limit" with a number of that size
-# File systems that one machine has to itself, and on which its locks hold.
+MOST_CHARACTERS = 1 << 20  # read of a kernel file: a machine with thousands of mounts needs less
+UNLIMITED_BYTES = 1 << 60  # more than any machine has: cgroup version 1 expresses "no limit" by a number this large
+# File systems that belong to one machine, so that its own locks suffice.
 LOCAL_DISKS = ("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "ntfs3", "vfat", "exfat")
 LOCAL_KINDS = frozenset((*LOCAL_DISKS, "overlay", "tmpfs", "ramfs"))
-_OCTAL = re.compile(r"\\([0-7]{3})")  # as the kernel writes blanks in names of mounts
+_OCTAL = re.compile(r"\\([0-7]{3})")  # how the kernel escapes spaces in mount points
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Mount:
     """A line of ``/proc/self/mountinfo``.
 
     Attributes:
-        root: Of the file system that is mounted, what is seen at ``point``.
-        point: Where.
-        kind: Of file system, e.g. ``ext4``.
-        options: Of the mount, then of the file system.
+        root: The folder within the mounted file system that appears at ``point``.
+        point: The mount point.
+        kind: The file system type, e.g. ``ext4``.
+        options: Options of the mount, then of the file system.
     """
 
     root: str
@@ -41,12 +41,12 @@ class Mount:
 
 
 def mounts(root: Path = Path("/")) -> list[Mount]:
-    """What is mounted, in the order in which it was; empty where the system does not say."""
+    """The mounts in the order they were mounted; empty if the system does not list them."""
     return parse_mounts(_text(root / "proc/self/mountinfo"))
 
 
 def parse_mounts(text: str) -> list[Mount]:
-    """The mounts in a text like ``/proc/self/mountinfo``; lines that are none are passed over."""
+    """Parse text in the format of ``/proc/self/mountinfo``; malformed lines are skipped."""
     found = []
     for line in text.splitlines():
         before, _, after = line.partition(" - ")
@@ -58,25 +58,25 @@ def parse_mounts(text: str) -> list[Mount]:
 
 
 def mount_of(path: Path, among: Sequence[Mount] | None = None) -> Mount | None:
-    """The mount that a path lies in, which need not be there yet; None where the system does not say.
+    """The mount that contains a path, which need not exist yet; None if unknown.
 
     Args:
-        path: Any.
-        among: What is mounted, in order; now and here by default.
+        path: Any path.
+        among: The mounts in order; by default those of this system now.
     """
     place = PurePosixPath(path.resolve())
     found = None
     for mount in mounts() if among is None else among:
         if place.is_relative_to(mount.point) and (found is None or len(mount.point) >= len(found.point)):
-            found = mount  # the later of two at one place hides the other
+            found = mount  # the later of two mounts at one point hides the other
     return found
 
 
 def available_cores(root: Path = Path("/")) -> int:
-    """Processors that this process may use: those that it is bound to, and no more than its groups give it time of.
+    """Number of processors this process may use, limited by its CPU affinity and the CPU quotas of its groups.
 
     Args:
-        root: Where ``proc`` and ``sys`` lie.
+        root: The folder that contains ``proc`` and ``sys``.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     shares = [share for folder in _groups(root, "cpu") if (share := _processors(folder)) is not None]
@@ -84,20 +84,20 @@ def available_cores(root: Path = Path("/")) -> int:
 
 
 def available_memory_bytes(root: Path = Path("/")) -> int:
-    """Most memory that this process and those beside it in its groups may take together; 0 if nobody says.
+    """Most memory, bytes, that this process and the others in its groups may use together; 0 if unknown.
 
     Args:
-        root: Where ``proc`` and ``sys`` lie.
+        root: The folder that contains ``proc`` and ``sys``.
     """
     limits = [limit for folder in _groups(root, "memory") if (limit := _memory_limit(folder)) is not None]
     return min([amount for amount in (_machine_memory(root, "MemTotal"), *limits) if amount], default=0)
 
 
 def free_memory_bytes(root: Path = Path("/")) -> int:
-    """How much more memory this process may take now without swapping or being killed; 0 if nobody says.
+    """How much more memory, bytes, this process may use now without swapping or being killed; 0 if unknown.
 
     Args:
-        root: Where ``proc`` and ``sys`` lie.
+        root: The folder that contains ``proc`` and ``sys``.
     """
     machine = _machine_memory(root, "MemAvailable")
     free = [machine] if machine else []
@@ -109,7 +109,7 @@ def free_memory_bytes(root: Path = Path("/")) -> int:
 
 
 def _groups(root: Path, controller: str) -> Iterator[Path]:
-    """Folders of this process's control groups that may limit something, and of all above them, innermost first."""
+    """Yield the folders of this process's control groups for a controller and their ancestors, innermost first."""
     own = _own_groups(_text(root / "proc/self/cgroup"))
     for mount in mounts(root):
         if mount.kind == "cgroup2":
@@ -127,7 +127,7 @@ def _groups(root: Path, controller: str) -> Iterator[Path]:
 
 
 def _own_groups(text: str) -> dict[str, str]:
-    """Paths of the process's groups by controller, from ``/proc/self/cgroup``; version 2's has no name."""
+    """Paths of the process's groups by controller, from ``/proc/self/cgroup``; version 2 has the empty name."""
     found: dict[str, str] = {}
     for line in text.splitlines():
         _, _, rest = line.partition(":")
@@ -137,7 +137,7 @@ def _own_groups(text: str) -> dict[str, str]:
 
 
 def _below(path: str, root: str) -> str:
-    """A group's path below what is mounted; the top where that is something else, as in a container of its own."""
+    """A group's path relative to the mounted root; empty (the top) if it lies outside, as in a container."""
     inner = PurePosixPath(path)
     if ".." in inner.parts or not inner.is_relative_to(root):
         return ""
@@ -145,7 +145,7 @@ def _below(path: str, root: str) -> str:
 
 
 def _processors(folder: Path) -> float | None:
-    """Processors' worth of time that a group gets; None without a limit."""
+    """The CPU quota of a group in processors; None without a limit."""
     quota, _, period = _text(folder / "cpu.max").strip().partition(" ")
     if not quota:
         quota, period = _text(folder / "cpu.cfs_quota_us"), _text(folder / "cpu.cfs_period_us")
@@ -161,7 +161,7 @@ def _memory_limit(folder: Path) -> int | None:
 
 
 def _memory_used(folder: Path) -> int | None:
-    """What a group has taken, without the file cache that goes first when memory gets short."""
+    """Bytes a group uses, excluding the inactive file cache, which is reclaimed first; None if unknown."""
     for usage, cache in (("memory.current", "inactive_file"), ("memory.usage_in_bytes", "total_inactive_file")):
         used = _number(_text(folder / usage))
         if used is not None:
@@ -170,7 +170,7 @@ def _memory_used(folder: Path) -> int | None:
 
 
 def _machine_memory(root: Path, name: str) -> int:
-    """A line of ``/proc/meminfo`` in bytes; 0 if nobody says."""
+    """A value of ``/proc/meminfo`` in bytes; 0 if unknown."""
     told = _field(_text(root / "proc/meminfo"), f"{name}:")
     if told is not None:
         return told << 10
@@ -180,13 +180,13 @@ def _machine_memory(root: Path, name: str) -> int:
 
 
 def _field(text: str, name: str) -> int | None:
-    """The number after a name at a line's beginning."""
+    """The number after the name that begins a line; None if there is none."""
     words = next((words for line in text.splitlines() if (words := line.split())[:1] == [name]), [])
     return _number(words[1]) if len(words) > 1 else None
 
 
 def _number(text: str) -> int | None:
-    """A count as the kernel writes it; None for ``max``, ``-1`` and what is none."""
+    """A count as the kernel writes it; None for ``max``, ``-1`` and anything else that is not a count."""
     digits = text.strip()
     return int(digits) if digits.isascii() and digits.isdigit() and len(digits) <= 20 else None
 

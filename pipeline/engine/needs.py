@@ -1,4 +1,4 @@
-"""What a stage takes of a machine: as it is forecast, and as it was."""
+"""The resources a stage uses: forecast and measured."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from splatpipe.pipeline.engine.stage import JSON, Shard, Summary
 
 @dataclass(frozen=True)
 class Need:
-    """A stage's forecast.
+    """The forecast resource use of a stage.
 
     Attributes:
-        memory_bytes: Peak resident memory of the process that it runs in.
-        cpu_seconds: Of all its threads together.
-        disk_bytes: What it leaves in OUT.
-        scratch_bytes: What it takes there besides while it runs.
-        parallel: Share of the CPU seconds that is divided among the threads.
+        memory_bytes: Peak resident memory of its process.
+        cpu_seconds: CPU seconds of all threads together.
+        disk_bytes: Size of what it writes into OUT.
+        scratch_bytes: Additional disk space it uses there while it runs.
+        parallel: Fraction of the CPU seconds that is divided among the threads.
     """
 
     memory_bytes: int
@@ -27,28 +27,31 @@ class Need:
     parallel: float = 1.0
 
     def seconds(self, threads: int) -> float:
-        """How long it takes with so many cores to itself."""
+        """Wall-clock seconds with ``threads`` cores to itself."""
         return self.cpu_seconds * (1.0 - self.parallel + self.parallel / max(1, threads))
 
     def as_json(self) -> dict[str, JSON]:
-        """For a manifest."""
+        """The need as JSON, for a manifest."""
         return {**asdict(self), "cpu_seconds": round(self.cpu_seconds, 2)}
 
 
 Foresight = Callable[[Mapping[str, Summary]], Mapping[str, Need]]
-"""Forecasts by stage from the summaries of those that are done; a stage that nothing is known of is not in it.
+"""Forecasts by stage from the summaries of finished stages; stages without a forecast are left out.
 
-A stage's is with all of its shards, one after the other; a shard's own may be there by its name, e.g. ``train.2``.
+A stage's forecast includes all of its shards, run one after the other; a shard may have its own, e.g. ``train.2``.
 """
 
 
 def unforeseen(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
-    """The foresight of a line that has none."""
+    """The foresight of a pipeline without forecasts."""
     return {}
 
 
 def of_shard(needs: Mapping[str, Need], stage: str, shard: Shard) -> Need | None:
-    """What a shard takes: as it is forecast, else its share of the stage's time and disk, with the stage's memory."""
+    """A shard's need: its own forecast, else its share of the stage's time and disk with the stage's memory.
+
+    None if neither has a forecast.
+    """
     own, of_stage = needs.get(f"{stage}.{shard.number}"), needs.get(stage)
     if own is not None or of_stage is None:
         return own
@@ -57,11 +60,11 @@ def of_shard(needs: Mapping[str, Need], stage: str, shard: Shard) -> Need | None
 
 
 def used_with_shards(used: Mapping[str, JSON], shards: Sequence[Mapping[str, JSON]]) -> dict[str, JSON]:
-    """What a stage took together with its shards, one after the other, for its manifest.
+    """The resources a stage used including its shards, run one after the other, for its manifest.
 
     Args:
-        used: ``seconds``, ``cpu_seconds`` and ``peak_memory_bytes`` of its own body.
-        shards: Manifests of its shards; where there are none, nothing is added.
+        used: ``seconds``, ``cpu_seconds`` and ``peak_memory_bytes`` of the stage's own body.
+        shards: Manifests of its shards; without any, ``used`` is returned as it is.
     """
     if not shards:
         return dict(used)
@@ -75,13 +78,13 @@ def used_with_shards(used: Mapping[str, JSON], shards: Sequence[Mapping[str, JSO
 
 
 def _disk_bytes(manifest: Mapping[str, JSON]) -> int:
-    """What an artifact takes on the disk, with the shards that it was made of."""
+    """Bytes an artifact occupies on disk, including the shards it was made from."""
     own = sum(file["size"] for part in manifest["parts"].values() for file in part["files"])
     return int(own + sum(shard["disk_bytes"] for shard in manifest.get("shards", ())))
 
 
 def used_and_forecast(manifest: Mapping[str, JSON]) -> dict[str, JSON]:
-    """What a finished stage took and what had been forecast for it, from its manifest; null where nothing had been."""
+    """The resources a finished stage used and its forecast, from its manifest; ``forecast`` is None without one."""
     used = {"memory_bytes": manifest["peak_memory_bytes"], "cpu_seconds": manifest["cpu_seconds"]}
     used["disk_bytes"] = _disk_bytes(manifest)
     forecast = manifest.get("forecast")
@@ -89,10 +92,12 @@ def used_and_forecast(manifest: Mapping[str, JSON]) -> dict[str, JSON]:
 
 
 def whole(needs: Mapping[str, Need]) -> Need:
-    """Of a run of these stages, one after the other: the largest memory, all the time, all that is left on the disk.
+    """The need of a run of these stages, one after the other.
+
+    Memory and scratch space are the largest of any stage; CPU time and disk space are totals.
 
     Args:
-        needs: By stage; at least one.
+        needs: Needs by stage; at least one.
     """
     each = list(needs.values())
     cpu = sum(need.cpu_seconds for need in each)

@@ -1,4 +1,4 @@
-"""Work on many photos by threads: results in order, and only a few photos in memory at a time."""
+"""Processes many photos with threads: results in order, and only a few photos in memory at a time."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ LOOK_S = 0.3
 
 
 def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Apply a function to each item by threads, and yield the results in the items' order.
+    """Apply a function to each item in threads, and yield the results in the items' order.
 
-    Only ``threads + AHEAD`` results exist at a time. Where the caller stops or fails, what has not begun is dropped and
-    what runs is not waited for, so that an interrupted stage ends at once.
+    Only ``threads + AHEAD`` results exist at a time. If the caller stops or fails, pending items are dropped and
+    running ones are not waited for, so that an interrupted stage ends at once.
 
     Args:
         function: Called from several threads at once; should spend its time outside the GIL.
@@ -41,10 +41,10 @@ def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threa
 
 
 def watched(function: Callable[[], Result], look: Callable[[], None], cancel: Callable[[], None]) -> Result:
-    """Run one long call in a thread of its own, so that this one can tell of its progress and be interrupted.
+    """Run one long call in its own thread and return its result; this thread can report progress and be interrupted.
 
     Args:
-        function: Spends its time outside the GIL.
+        function: Should spend its time outside the GIL.
         look: Called a few times a second while it runs.
         cancel: Called when this thread is interrupted or ``look`` fails; the call is then not waited for.
     """

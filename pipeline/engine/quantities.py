@@ -1,4 +1,4 @@
-"""Quantities as people write them on a command line: `1h30m`, `8G`, `2cm`."""
+"""Parses quantities as written on a command line: `1h30m`, `8G`, `2cm`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _UNITS = {"M": 10**6, "G": 10**9, "T": 10**12}
 
 
 def parse_duration(text: str, option: str) -> float:
-    """Seconds of `90s`, `10m`, `1h30m` or `1.5h`.
+    """Parse a duration such as `90s`, `10m`, `1h30m` or `1.5h`; returns seconds.
 
     Args:
         text: What the user wrote.
-        option: Where, for the message.
+        option: The option's name, for the message.
 
     Raises:
-        UsageError: if it is anything else, or no time at all.
+        UsageError: if it is anything else, or zero.
     """
     match = _DURATION.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
     parts = match.groups(default="0") if match else ()
@@ -40,14 +40,14 @@ def parse_duration(text: str, option: str) -> float:
 
 
 def parse_bytes(text: str, option: str) -> int:
-    """Bytes of `512M`, `8G` or `1.5T`: decimal units, the smaller of the two readings.
+    """Parse a size such as `512M`, `8G` or `1.5T`; returns bytes. Units are decimal, the smaller interpretation.
 
     Args:
         text: What the user wrote.
-        option: Where, for the message.
+        option: The option's name, for the message.
 
     Raises:
-        UsageError: if it is anything else, or nothing at all.
+        UsageError: if it is anything else, or zero.
     """
     match = _BYTES.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
     number = int(float(match[1]) * _UNITS[match[2]]) if match else 0
@@ -60,14 +60,14 @@ def parse_bytes(text: str, option: str) -> int:
 
 
 def parse_length(text: str, option: str) -> float:
-    """Metres of `2cm`, `25mm` or `0.1m`.
+    """Parse a length such as `2cm`, `25mm` or `0.1m`; returns metres.
 
     Args:
         text: What the user wrote.
-        option: Where, for the message.
+        option: The option's name, for the message.
 
     Raises:
-        UsageError: if it is anything else, or no length at all.
+        UsageError: if it is anything else, or zero.
     """
     match = _LENGTH.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
     metres = float(match[1]) * _METRES[match[2]] if match else 0.0

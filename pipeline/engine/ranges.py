@@ -1,4 +1,4 @@
-"""Ranges of numbers that options of several rooms share."""
+"""Number ranges shared by the options of several rooms."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""An OUT that is there: its settings, what it holds that belongs together, and whether a splatpipe works in it.
+"""An existing OUT: its settings, its consistent set of artifacts, and whether a splatpipe is working in it.
 
-Unlike ``runner.survey`` this asks nothing of the photos, so it finds what they left when they are gone, too.
+The photos are not needed, so results are found even if the photos are gone.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ Model = TypeVar("Model", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Contents:
-    """Artifacts that belong together.
+    """A consistent set of artifacts.
 
     Attributes:
-        artifacts: By stage.
-        working: Where a stage that is not done leaves what it has so far, by stage; also a shard, by its name.
+        artifacts: Artifacts by stage.
+        working: Working folders of unfinished stages by stage name, and of shards by shard name.
     """
 
     artifacts: Mapping[str, Artifact] = field(default_factory=dict)
@@ -38,17 +38,17 @@ class Contents:
 
     @property
     def parts(self) -> dict[str, Part]:
-        """What they left, by full name, e.g. ``georef.frame``."""
+        """The artifacts' parts by full name, e.g. ``georef.frame``."""
         return {name: part for artifact in self.artifacts.values() for name, part in artifact.parts.items()}
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """An OUT.
+    """An existing OUT.
 
     Attributes:
-        out: Its folder, absolute, without links.
-        stages: The line that it was made with.
+        out: Its folder, absolute, with links resolved.
+        stages: The pipeline that it was made with.
     """
 
     out: Path
@@ -60,16 +60,16 @@ class RunFolder:
 
     @property
     def name(self) -> str:
-        """What people call it: its folder's name."""
+        """The run's display name: its folder's name."""
         return self.out.name
 
     @property
     def at_work(self) -> bool:
-        """Whether a splatpipe works in it now."""
+        """Whether a splatpipe is working in it now."""
         return is_locked(self.out)
 
     def settings(self) -> tuple[Path, Table]:
-        """The photos' folder and the options as they were written.
+        """The photo folder and the options as saved in ``config.toml``.
 
         Raises:
             UsageError: if there are none.
@@ -86,30 +86,30 @@ class RunFolder:
         return Path(photos), table
 
     def config(self, model: type[Model], *above: Table) -> tuple[Path, Model]:
-        """The photos' folder and the options that it ran with.
+        """The photo folder and the options of the run.
 
         Args:
-            model: Of this version's configuration; options that it no longer has are passed over.
-            above: What is to be otherwise.
+            model: This version's configuration model; options that no longer exist are ignored.
+            above: Tables that override the run's options.
 
         Raises:
-            UsageError: if there are none, or they make no sense.
+            UsageError: if there are none, or they are invalid.
         """
         photos, table = self.settings()
         return photos, resolve(model, [known(model, table), *above])
 
     def contents(self, config: BaseModel | None, keys: Mapping[str, str], unfinished: Container[str] = ()) -> Contents:
-        """Of each stage the artifact that the last run made or would reuse; none that an earlier stage's contradicts.
+        """For each stage, the artifact the last run made or would reuse, if consistent with those of earlier stages.
 
         Args:
-            config: The options; None where they cannot be read.
-            keys: The last known key of each stage, by its events; of one without the newest artifact is taken.
-            unfinished: Stages that the last run began and did not end.
+            config: The options; None if they cannot be read.
+            keys: The last known key of each stage from its events; without a key, the newest artifact is used.
+            unfinished: Stages that the last run started and did not finish.
         """
         chosen: dict[str, Artifact] = {}
         working: dict[str, Path] = {}
         digests: dict[str, str] = {}
-        given = {"source"}  # what left no artifact came from the user's folder, as a reconstruction in it does
+        given = {"source"}  # stages whose parts come from the user's folder, e.g. a reconstruction in it
         for stage in self.stages:
             key, artifacts = keys.get(stage.name, ""), self.store.artifacts(stage.name)
             if not artifacts and not key:
@@ -131,7 +131,7 @@ class RunFolder:
         return Contents(chosen, working)
 
     def _shards_at_work(self, stage: Stage, keys: Mapping[str, str]) -> dict[str, Path]:
-        """Where shards of a stage work, as far as events tell of them."""
+        """Working folders of a stage's shards that are known from events, by shard name."""
         if stage.shards is None:
             return {}
         names = [name for name in keys if name != stage.name and stage_name(name) == stage.name]
@@ -139,13 +139,13 @@ class RunFolder:
         return {name: folder for name, folder in folders.items() if folder.is_dir()}
 
     def lineage(self, *stages: Stage) -> dict[str, Part]:
-        """The parts behind what lies in OUT, found by digests alone, so in what another version left, too.
+        """The parts from which the deliverables in OUT were made, traced by digest alone, across versions.
 
         Args:
-            stages: Of the first that left anything, the artifact whose deliverables lie in OUT, or else the newest.
+            stages: The first with any artifact counts: the one whose deliverables are in OUT, else its newest.
 
         Returns:
-            Its parts, and those of all that it was made from, by full name; what is gone is left out.
+            Its parts and those of everything it was made from, by full name; missing ones are left out.
         """
         made = next(filter(None, (_delivered(self.store, stage) for stage in stages)), None)
         if made is None:
@@ -163,31 +163,31 @@ class RunFolder:
         return found
 
     def deliverables(self) -> list[str]:
-        """Files for people that are there and that any artifact delivers, relative to OUT, in POSIX form."""
+        """Existing deliverables of any artifact, as POSIX paths relative to OUT."""
         made = ((stage, artifact) for stage in self.stages for artifact in self.store.artifacts(stage.name))
         names = dict.fromkeys(name for stage, artifact in made for name in artifact.deliverables(stage))
         return [name.as_posix() for name in names if (self.out / name).is_file()]
 
 
 def shard_events(out: Path, shard: str) -> Path:
-    """Where a process that makes a shard alone tells of it.
+    """The events file of a process that runs a single shard.
 
     Args:
         out: The OUT.
-        shard: By name, e.g. ``train.2``.
+        shard: The shard's name, e.g. ``train.2``.
     """
     return Store(out).shards / f"{shard}.jsonl"
 
 
 def open_run_folder(out: Path, stages: Sequence[Stage]) -> RunFolder:
-    """The run in a folder.
+    """Open the run in a folder.
 
     Args:
         out: The folder.
-        stages: The line.
+        stages: The pipeline.
 
     Raises:
-        UsageError: if there is none.
+        UsageError: if there is no run in it.
     """
     out = out.expanduser().resolve()
     open_store(out, create=False)
@@ -195,13 +195,13 @@ def open_run_folder(out: Path, stages: Sequence[Stage]) -> RunFolder:
 
 
 def _fits(artifact: Artifact, digests: Mapping[str, str], given: Container[str]) -> bool:
-    """Whether it was made from parts of these digests, as far as the line made them."""
+    """Whether it was made from parts with these digests; parts of ``given`` stages are not compared."""
     reads = artifact.manifest["inputs"]["reads"]
     return all(name.split(".")[0] in given or digests.get(name) == digest for name, digest in reads.items())
 
 
 def _agrees(artifact: Artifact, config: BaseModel | None, stage: Stage) -> bool:
-    """Whether it was made with these options, as far as they can be told."""
+    """Whether it was made with these options; True if they cannot be compared."""
     inputs = artifact.manifest["inputs"]
     if config is None or inputs["version"] != stage.version:  # an older version's options are not compared
         return True
@@ -209,7 +209,7 @@ def _agrees(artifact: Artifact, config: BaseModel | None, stage: Stage) -> bool:
 
 
 def _delivered(store: Store, stage: Stage) -> Artifact | None:
-    """The artifact of a stage whose deliverables lie in OUT; the newest where none does, None without any."""
+    """The artifact of a stage whose deliverables are in OUT, else its newest; None without any."""
     artifacts = store.artifacts(stage.name)
     for artifact in artifacts:
         files = artifact.deliverables(stage)

@@ -1,4 +1,4 @@
-"""Walks the line: finds what is valid, runs what is not, and says which and why."""
+"""Walks the pipeline: reuses what is valid, runs what is not, and reports which and why."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ VERSIONED = (
 
 @dataclass
 class Outcome:
-    """What a walk did: artifacts by stage, the stages that ran, and the one that failed."""
+    """The result of a walk: artifacts by stage, the stages that ran, and the one that failed."""
 
     artifacts: dict[str, Artifact] = field(default_factory=dict)
     ran: list[str] = field(default_factory=list)
@@ -55,18 +55,18 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Runner:
-    """Runs a line into a store.
+    """Runs a pipeline into a store.
 
     Attributes:
         line: What to run.
-        store: Where artifacts lie.
+        store: Where artifacts are kept.
         executor: Runs the bodies.
         machine: Device and threads.
-        sink: Takes the events.
-        source_now: Digests of the external parts as they are at this moment.
-        save_config: Keeps the configuration in OUT; called once it is known that something can run with it.
-        foresee: What each stage will take; written beside what it took.
-        outcome: What was done so far, also when it ends in an error.
+        sink: Receives the events.
+        source_now: Returns the current digests of the external parts.
+        save_config: Saves the configuration in OUT; called once it is known that something can run with it.
+        foresee: Forecasts what each stage will use; recorded beside what it did use.
+        outcome: What was done so far, also if the walk ends in an error.
     """
 
     line: Line
@@ -80,14 +80,14 @@ class Runner:
     outcome: Outcome = field(default_factory=Outcome)
 
     def walk(self, *, until: str | None = None, rerun: frozenset[str] = frozenset()) -> Outcome:
-        """Run the line: reuse what is valid, run the rest.
+        """Run the pipeline: reuse what is valid, run the rest.
 
         Args:
             until: The last stage to run; all if None.
-            rerun: Stages to run again though they are valid.
+            rerun: Stages to run again even if they are valid.
 
         Raises:
-            SplatpipeError: the first stage that failed; what came before it stays.
+            SplatpipeError: from the first stage that failed; earlier results are kept.
         """
         with self._explained():
             self.store.recover()
@@ -107,9 +107,9 @@ class Runner:
         return outcome
 
     def run_alone(self, name: str) -> Outcome:
-        """Run one stage again, whether or not it is valid, and nothing else but what of its shards is missing.
+        """Run one stage again, valid or not, and besides it only those of its shards that are missing.
 
-        To its shards belongs the stage that counts them.
+        The stage that counts the shards is run if it is missing.
 
         Raises:
             UsageError: if a stage that it reads from is not valid.
@@ -129,14 +129,14 @@ class Runner:
         return self.outcome
 
     def run_shard(self, name: str, number: int) -> Outcome:
-        """Make one shard of a stage and nothing else; one that is there is reused.
+        """Run one shard of a stage and nothing else; an existing valid one is reused.
 
         Args:
-            name: The stage's.
-            number: The shard's, from 1 on.
+            name: The stage's name.
+            number: The shard's number, counted from 1.
 
         Raises:
-            UsageError: if there is no such shard, or a stage that it reads from is not valid.
+            UsageError: if there is no such shard, or a stage it reads from is not valid.
         """
         with self._explained():
             self.store.recover(f"{name}.{number}")
@@ -156,10 +156,10 @@ class Runner:
         return self.outcome
 
     def _ready(self, name: str) -> tuple[Stage, dict[str, Part], list[Stage]]:
-        """A stage, the parts that valid stages before it left, and what has to be made first: what counts its shards.
+        """Return a stage, the parts of the valid stages before it, and the stage to run first, which counts its shards.
 
         Raises:
-            UsageError: if one of them is not valid.
+            UsageError: if any other stage it reads from is not valid.
         """
         parts = dict(self.line.source)
         for status in line_status(self.line, self.store):
@@ -187,7 +187,7 @@ class Runner:
 
     @contextmanager
     def _reported(self, stages: Sequence[str]) -> Iterator[None]:
-        """The events of a run's beginning and end, the bad one, too."""
+        """Emit the events of a run's start and end, also if it fails."""
         began_s = time.monotonic()
         machine = {**asdict(self.machine), **describe_machine()}
         self.sink(Event("run_started", data={"stages": list(stages), "machine": machine, "versions": versions()}))
@@ -200,11 +200,11 @@ class Runner:
         finally:
             told = {"message": "" if ended is None else str(ended), "hint": getattr(ended, "hint", "")}
             seconds = round(time.monotonic() - began_s, 3)
-            with suppress(OSError, MachineError):  # a full disk, or a taken one, is what ended it, and is told
+            with suppress(OSError, MachineError):  # a full or taken-over OUT ended the run and is reported anyway
                 self.sink(Event("run_finished", data={"exit_code": exit_code(ended), **told, "seconds": seconds}))
 
     def _found(self, job: Job, *, anew: bool = False) -> Artifact | None:
-        """The valid artifact of a job, told of as reused; None where it is to be made."""
+        """The valid artifact of a job, reported as reused; None if it has to be made."""
         artifact = None if anew else self.store.find(job.stage, job.inputs.key)
         if artifact is not None:
             data = {"summary": artifact.summary, "seconds": artifact.manifest["seconds"], "key": artifact.key}
@@ -213,14 +213,14 @@ class Runner:
         return artifact
 
     def _make(self, job: Job, parts: Mapping[str, Part], *, anew: bool = False) -> Artifact:
-        """Make a stage: those of its shards that are missing, one after the other, then what it joins them to.
+        """Run a stage: first its missing shards, one after the other, then the body that joins them.
 
-        One whose process dies costs itself alone: the others are made before that is told.
+        A shard that fails with a StageError does not stop the others: the error is raised after they have run.
 
         Args:
-            job: The stage's.
-            parts: That are there.
-            anew: Make all shards, also those that are there.
+            job: The stage's job.
+            parts: The parts available.
+            anew: Run all shards again, also valid ones.
         """
         shards: list[Artifact] = []
         failures: list[tuple[str, StageError]] = []
@@ -286,14 +286,14 @@ class Runner:
         )
 
     def _forecast(self, job: Job) -> dict[str, JSON]:
-        """What was thought to be taken, for the manifest; empty where nobody could know."""
+        """The forecast of resource use, for the manifest; empty if there is none."""
         needs = self.foresee({name: done.summary for name, done in self.outcome.artifacts.items()})
         name = stage_name(job.stage.name)
         need = of_shard(needs, name, job.shard) if job.shard else needs.get(name)
         return {} if need is None else {"forecast": need.as_json()}
 
     def _failed(self, inputs: StageInputs, seconds: float, error: BaseException) -> Event:
-        """The event of a stage's bad end; the worker still lives, so that its memory can be told."""
+        """The event of a stage's failure; built while the worker is alive, so that its peak memory can be read."""
         told = (error.message, error.hint) if isinstance(error, SplatpipeError) else ("Stopped.", "")
         data: dict[str, JSON] = {"message": told[0], "hint": told[1], "exit_code": exit_code(error), "key": inputs.key}
         data |= {"seconds": round(seconds, 3), "peak_memory_bytes": self.executor.peak_memory_bytes()}
@@ -301,7 +301,11 @@ class Runner:
         return Event("stage_failed", inputs.stage, data)
 
     def _check_source(self, stage: Stage) -> None:
-        """An artifact's key says what it was made from, so that has to be what the stage read."""
+        """Check that the source has not changed, since an artifact's key states what the stage read.
+
+        Raises:
+            SplatpipeError: if it has changed.
+        """
         read = [name for name in self.line.reads_of(stage) if name in self.line.source]
         if not read:
             return
@@ -325,7 +329,7 @@ class Runner:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Turn a full, failing or absent disk, here or behind what the worker says, into its plain message."""
+        """Turn errors caused by a full, failing or missing disk, here or in the worker, into a plain message."""
         try:
             yield
         except OSError as error:
@@ -341,7 +345,7 @@ class Runner:
             raise
 
     def _source_stands(self) -> bool:
-        """Whether the user's files are what they were when the run began: then what is wrong with them stays wrong."""
+        """Whether the user's files are unchanged since the run began, so that the same error would recur."""
         try:
             now = self.source_now()
         except (SplatpipeError, OSError):
@@ -349,7 +353,12 @@ class Runner:
         return all(now.get(name, "") in ("", part.digest) for name, part in self.line.source.items())
 
     def _check_places(self) -> None:
-        """What lies behind many an error: a disk that is no longer there."""
+        """Check for the cause of many errors: a disk that is no longer there.
+
+        Raises:
+            MachineError: if OUT has disappeared.
+            SplatpipeError: if the photo folder has disappeared.
+        """
         if not self.store.stages.is_dir():
             raise MachineError(
                 f"{self.store.out} has disappeared.",
@@ -363,7 +372,7 @@ class Runner:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computes, for the manifest."""
+    """Versions of Python and of the libraries that affect results, for the manifest."""
     found = {"python": platform.python_version()}
     for name in VERSIONED:
         with suppress(importlib.metadata.PackageNotFoundError):
@@ -372,7 +381,7 @@ def versions() -> dict[str, str]:
 
 
 def describe_machine() -> dict[str, JSON]:
-    """The machine, for the manifest: system, processor family, the cores and the memory that may be used of it."""
+    """The machine, for the manifest: system, processor family, and the cores and memory available to this process."""
     return {
         "system": platform.system(),
         "processor": platform.machine(),

@@ -1,4 +1,4 @@
-"""A run on an OUT: opens the source, the store, the lock, the log and the worker, and closes them whatever happens."""
+"""A run on an OUT: opens the source, store, lock, log and worker, and closes them whatever happens."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Request:
     """What to run.
 
     Attributes:
-        stages: The line.
+        stages: The pipeline.
         config: Its resolved configuration.
         photos: The user's folder.
         out: Where the results go.
         machine: Device and threads.
-        foresee: What each stage will take, for the manifests.
+        foresee: Forecasts each stage's resource use, for the manifests.
     """
 
     stages: Sequence[Stage]
@@ -50,14 +50,14 @@ class Request:
 
 @contextmanager
 def open_session(request: Request, show: Sink, *, wait: bool = False, shard: str = "") -> Iterator[Runner]:
-    """Everything that a run needs, held for its length.
+    """Open everything that a run needs, and close it at the end.
 
     Args:
         request: What to run.
         show: Shows events to the user.
-        wait: Wait for another splatpipe that works there.
-        shard: The only one that is to be made, e.g. ``train.2``: others may be by other processes at the same time.
-            It has its own log and events; nothing else of OUT's is written.
+        wait: Wait for another splatpipe that is working in OUT.
+        shard: The only shard to run, e.g. ``train.2``; other processes may run other shards at the same time. It has
+            its own log and events; nothing else in OUT is written.
 
     Yields:
         The runner.
@@ -81,7 +81,7 @@ def open_session(request: Request, show: Sink, *, wait: bool = False, shard: str
         try:
 
             def sink(event: Event) -> None:
-                show(event)  # first: a full disk takes the log, and not what is told
+                show(event)  # first: a full disk stops the log but not the display
                 log(event)
                 hold.confirm()
 
@@ -106,13 +106,13 @@ def _open_log(store: Store, path: Path) -> EventLog:
 
 
 def status_of(request: Request) -> tuple[Line, Store]:
-    """The line and the store of an existing OUT, for looking and not for running."""
+    """The pipeline and the store of an existing OUT, for reading its status only."""
     store = open_store(request.out, create=False)
     return _open_line(request, _digests(request, store, EventReporter("source", _unheard), remember=False)), store
 
 
 def _unheard(_event: Event) -> None:
-    """The sink of a look that nobody waits for."""
+    """Discard an event: reading the status reports no progress."""
 
 
 def _open_line(request: Request, digests: Mapping[str, str]) -> Line:
@@ -122,7 +122,7 @@ def _open_line(request: Request, digests: Mapping[str, str]) -> Line:
 
 
 def _digests(request: Request, store: Store, report: EventReporter, *, remember: bool) -> dict[str, str]:
-    """Those of the external parts, of which only what changed since the last time is read."""
+    """Digests of the external parts; only files that changed since the last time are read."""
     source = open_source(request.photos, request.out, request.stages, request.config)
     return source.digests(
         HashTable(store.stages / "photos-index.json", remember=remember), request.machine.threads, report
@@ -130,9 +130,9 @@ def _digests(request: Request, store: Store, report: EventReporter, *, remember:
 
 
 def _worker_environment(threads: int) -> dict[str, str]:
-    """What libraries read at import: the size of their pools, which shall sleep and not spin; the order of sets.
+    """Environment variables for the worker: thread pool sizes, idle threads that sleep instead of spin, hash seed.
 
-    And that nobody reads their log on a terminal, whatever the user's own environment says of colours.
+    Colours are off, since the log is not a terminal, whatever the user's own environment says.
     """
     return {
         "NO_COLOR": "1",

@@ -1,4 +1,4 @@
-"""The user's folder: photos (with masks), or a reconstruction of another program with its images; surveyor's files."""
+"""The user's folder: photos (with masks) or another program's reconstruction with its images, and survey files."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from splatpipe.pipeline.engine.stage import NamedFile, Reporter, Stage
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
 MASK_FOLDERS = ("masks", "sky_masks")
-AUTO, NONE = "auto", "none"  # what an option that names a file may say instead of a path
-MAX_NAMED_BYTES = 64 << 20  # a table of a million photos; a larger file was named by mistake
-ABSENT = Path(os.devnull)  # where a part without a file lies: no file, and empty for who reads it all the same
+AUTO, NONE = "auto", "none"  # values of an option that names a file, other than a path
+MAX_NAMED_BYTES = 64 << 20  # the size of a table of a million photos; a larger file was named by mistake
+ABSENT = Path(os.devnull)  # path of a part without a file: not a regular file, and empty if read
 
 
 @dataclass(frozen=True)
 class RunSource:
-    """Where a run starts from.
+    """The input of a run.
 
     Attributes:
         folder: The folder the user named.
-        model: The COLMAP model in it, where it is a reconstruction and not just photos.
-        named: The file of each part that is one file, e.g. ``source.control``; None where there is none.
-        passed: Files that are no photos, whatever they hold: those of such parts, and what could be one.
+        model: The COLMAP model in it, if it is a reconstruction and not just photos.
+        named: The file of each single-file part, e.g. ``source.control``; None if there is none.
+        passed: Files to skip when collecting photos: those of single-file parts, used or not.
     """
 
     folder: Path
@@ -38,7 +38,11 @@ class RunSource:
 
     @property
     def part_files(self) -> dict[str, dict[str, Path]]:
-        """The external parts and their files by name: ``source.photos``, and ``sparse.model`` where there is one."""
+        """The files of each external part: ``source.photos``, ``sparse.model`` if present, and single-file parts.
+
+        Raises:
+            SplatpipeError: if the folder has too many files.
+        """
         roots = [self.folder]
         if self.model is not None:
             roots = [self.folder / name for name in ("images", *MASK_FOLDERS)]
@@ -58,12 +62,12 @@ class RunSource:
         parts = {"source.photos": photos}
         if self.model is not None:
             parts["sparse.model"] = {path.name: path for path in walk_files(self.model)}
-        # The name is no part of the digest: the same points in another file are the same points.
+        # The name is not part of the digest: the same points in another file are the same points.
         parts |= {part: {} if path is None else {"": path} for part, path in self.named.items()}
         return parts
 
     def part_path(self, part: str) -> Path:
-        """Where a part lies; for one without a file a path that is none."""
+        """The path of a part; ``ABSENT`` for a part without a file."""
         if part in self.named:
             return self.named[part] or ABSENT
         return self.model if part == "sparse.model" and self.model is not None else self.folder
@@ -79,16 +83,16 @@ class RunSource:
 
 
 def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: BaseModel | None = None) -> RunSource:
-    """Look at what the user named as PHOTOS.
+    """Examine the folder that the user named as PHOTOS.
 
     Args:
-        photos: The folder of photos, or with ``images/`` and ``sparse/0``.
+        photos: A folder of photos, or one with ``images/`` and ``sparse/0``.
         out: Where the run writes; must not lie inside the photos.
-        stages: The line, whose stages may read files that lie with the photos.
-        config: The line's configuration, which may name these files.
+        stages: The pipeline, whose stages may read files that lie with the photos.
+        config: The pipeline's configuration, which may name these files.
 
     Raises:
-        SplatpipeError: if there is no such folder or file.
+        SplatpipeError: if there is no such folder or file, or it cannot be read.
         UsageError: if ``out`` lies inside the folder, or the folder has two files for one part.
     """
     folder = photos.expanduser().resolve()
@@ -117,7 +121,7 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
 
 
 def with_absolute_files(config: BaseModel, stages: Sequence[Stage]) -> BaseModel:
-    """The configuration with every path of a named file made absolute, so that it holds wherever OUT is looked at."""
+    """The configuration with the paths of named files made absolute, independent of the current folder."""
     for section, option, _ in _named_files(stages):
         part = getattr(config, section)
         setting = getattr(part, option)
@@ -132,7 +136,7 @@ def _named_files(stages: Iterable[Stage]) -> Iterable[tuple[str, str, NamedFile]
 
 
 def _files_called(root: Path, names: set[str]) -> dict[str, Path]:
-    """The files of these names right in a folder, by their names in small letters."""
+    """The files with these names directly in a folder, by lower-case name."""
     try:
         found = sorted(path for path in root.iterdir() if path.name.casefold() in names)
     except OSError:
@@ -141,7 +145,7 @@ def _files_called(root: Path, names: set[str]) -> dict[str, Path]:
 
 
 def _choose(file: NamedFile, option: str, setting: str, beside: Mapping[Path, Mapping[str, Path]]) -> Path | None:
-    """The file of a part: the named one, or the one that lies with the photos, or None."""
+    """The file of a part: the one the option names, else the one found with the photos, else None."""
     if setting == NONE:
         return None
     if setting != AUTO:

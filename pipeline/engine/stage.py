@@ -1,4 +1,4 @@
-"""What a stage is: a name, a configuration, the parts it reads and leaves, and a body loaded by string."""
+"""Stage definitions: a name, a configuration, the parts read and written, and a body imported by name."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict
 
-JSON = Any  # a value that json.dumps takes: pydantic's JsonValue costs import time
+JSON = Any  # a value that json.dumps accepts; pydantic's JsonValue costs import time
 Summary = Mapping[str, JSON]
 
 
 class StageConfig(BaseModel):
-    """Base of every stage's configuration: what changes the answer. Unknown keys are refused.
+    """Base class of stage configurations: everything that changes the result. Unknown keys are rejected.
 
-    The docstring under each field is its help text. A field ``enabled`` turns a stage off: it reads nothing then, waits
-    for no other stage, and its body leaves its parts empty.
+    The docstring under each field is its help text. ``enabled = False`` turns a stage off: it then reads nothing, waits
+    for no other stage, and its body writes empty parts.
 
     Attributes:
-        gone: Options that there were, by their dotted names, with a sentence on what takes their place.
+        gone: Removed options by dotted name, each with a sentence on what replaces it.
     """
 
     gone: ClassVar[Mapping[str, str]] = {}
@@ -38,12 +38,13 @@ class StageConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Machine:
-    """What changes only speed; never part of a key.
+    """Settings that affect only speed; never part of a key.
 
     Attributes:
         device: ``auto``, ``cpu`` or ``cuda``.
         threads: Worker threads, at least 1.
-        began_s: ``time.monotonic()`` when the command began, which all processes of a machine share; 0 where not known.
+        began_s: ``time.monotonic()`` at the start of the command, a clock that all processes on a machine share; 0 if
+            unknown.
     """
 
     device: str = "auto"
@@ -53,11 +54,11 @@ class Machine:
 
 @dataclass(frozen=True)
 class NamedFile:
-    """A file of the user's that lies with the photos or is named by an option: an external part of its own.
+    """A user's file, found beside the photos or named by an option; it is an external part of its own.
 
     Attributes:
-        part: The part, e.g. ``source.control``: the file, or a path that is none (``is_file()`` is false).
-        names: What it is called where it lies in the photo folder or beside it, in small letters.
+        part: The part, e.g. ``source.control``: the file's path, or one for which ``is_file()`` is false.
+        names: The lower-case file names under which it is found in the photo folder or its parent folder.
     """
 
     part: str
@@ -66,11 +67,11 @@ class NamedFile:
 
 @dataclass(frozen=True)
 class Shard:
-    """Which piece of a stage's work.
+    """One piece of a stage's work.
 
     Attributes:
-        number: From 1 on.
-        count: How many there are.
+        number: Counted from 1.
+        count: The number of shards.
     """
 
     number: int
@@ -78,7 +79,7 @@ class Shard:
 
     @property
     def index(self) -> int:
-        """Its place in a list of them."""
+        """The shard's index, counted from 0."""
         return self.number - 1
 
     def __str__(self) -> str:
@@ -87,14 +88,14 @@ class Shard:
 
 @dataclass(frozen=True)
 class Shards:
-    """How a stage's work is divided: into pieces that any process may make, each an artifact of its own.
+    """How a stage's work is divided into pieces that any process may run, each an artifact of its own.
 
     Attributes:
-        counted_by: The part, one that the stage reads, that says how many: a JSON object with ``shards``. With 0 the
-            stage's own body does all of it.
-        parts: What each leaves: part name to the file or folder below the shard's own folder.
-        entry: ``module:function`` of the body that makes one; ``Inputs.shard`` says which.
-        resumable: A shard's partial folder is kept after a kill, for the body to go on from.
+        counted_by: The part, one that the stage reads, that gives their number: a JSON object with ``shards``. With 0,
+            the stage's own body does all of the work.
+        parts: What each shard writes: part name to the file or folder below the shard's own folder.
+        entry: ``module:function`` of the body that runs one shard; ``Inputs.shard`` identifies it.
+        resumable: A killed shard's partial folder is kept so that the body can resume from it.
     """
 
     counted_by: str
@@ -105,22 +106,22 @@ class Shards:
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of the line.
+    """One step of the pipeline.
 
     Attributes:
         name: The stage's name; its parts are called ``<name>.<part>``.
-        version: Raised whenever the body's answer changes for the same config and inputs.
+        version: Raised whenever the body's result changes for the same config and inputs.
         config: Its configuration model.
-        reads: Names of the parts it reads unless it is turned off, e.g. ``ingest.photos``; ``source.photos`` is the
+        reads: Names of the parts it reads unless turned off, e.g. ``ingest.photos``; ``source.photos`` is the
             user's folder.
-        parts: What it leaves: part name to the file or folder below the stage's own folder.
+        parts: What it writes: part name to the file or folder below the stage's own folder.
         entry: ``module:function`` of the body, a ``Body``.
-        borrows: Settings of other stages that its answer depends on, e.g. ``train.time_budget_s``.
-        resumable: Its partial folder is kept after a kill, for the body to go on from.
-        files: Files of the user's by the option that names them (``auto``, ``none`` or a path). Their content is in the
-            key and the option is not: the body knows the part alone.
-        deliverables: Parts that are copied into OUT for people (a folder part: what is in it).
-        shards: How its work is divided; its own body joins them. None: it is one piece.
+        borrows: Settings of other stages that its result depends on, e.g. ``train.time_budget_s``.
+        resumable: Its partial folder is kept after a kill so that the body can resume from it.
+        files: The user's files by the option that names them (``auto``, ``none`` or a path). Their content is in the
+            key and the option is not: the body sees only the part.
+        deliverables: Parts that are copied into OUT for people (of a folder part, its contents).
+        shards: How its work is divided; its own body joins the shards. None: it is not divided.
     """
 
     name: str
@@ -136,10 +137,10 @@ class Stage:
     shards: Shards | None = None
 
     def shard(self, number: int) -> Stage:
-        """What makes one of its shards: a stage as any other, of the same options and inputs.
+        """The stage that produces one of this stage's shards, with the same options and inputs.
 
         Args:
-            number: From 1 on.
+            number: Counted from 1.
         """
         assert self.shards is not None
         return replace(
@@ -154,12 +155,12 @@ class Stage:
 
 
 def stage_name(name: str) -> str:
-    """The stage that a name belongs to: of ``train.2``, its second shard, as of ``train`` that is ``train``."""
+    """The stage that a name belongs to: ``train`` for ``train`` and for ``train.2``, its second shard."""
     return name.partition(".")[0]
 
 
 def shards_first(names: Iterable[str]) -> list[str]:
-    """Names of stages in their order, each shard's before its stage's: it is heard of when it begins."""
+    """Order stage names as given, with each stage's shards, which are first known when they start, before it."""
     listed = list(names)
     place = {name: at for at, name in enumerate(listed)}
     return sorted(listed, key=lambda name: (place.get(stage_name(name), len(listed)), name == stage_name(name)))
@@ -167,16 +168,16 @@ def shards_first(names: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that a body may look at besides its config.
+    """Everything a body may use besides its config.
 
     Attributes:
         parts: Absolute path of each part that the stage reads.
         photos_dir: The user's photo folder. Its content is pinned by the digests in ``ingest.photos``.
-        settings: The borrowed settings, by their dotted names.
+        settings: The borrowed settings by dotted name.
         machine: Device and threads.
-        summaries: What the stages before it returned; outside the key, so only for what people read (timings).
-        shard: Which one to make; None for a stage's own body.
-        shards: Folders of the stage's shards in order, for its own body to join; empty where it has none.
+        summaries: What earlier stages returned; outside the key, so only for what people read (timings).
+        shard: The shard to run; None for a stage's own body.
+        shards: Folders of the stage's shards in order, for its own body to join; empty if it has none.
     """
 
     parts: Mapping[str, Path]
@@ -193,27 +194,27 @@ class Inputs:
 
 @runtime_checkable
 class Reporter(Protocol):
-    """How a body tells what it does. Calls are cheap; the receiver thins them out."""
+    """How a body reports what it is doing. Calls are cheap; the receiver thins them out."""
 
     def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
-        """``done`` of ``total`` ``unit`` (photos, pairs, iterations); ``what`` is being done, in a few words."""
+        """Report ``done`` of ``total`` ``unit`` (photos, pairs, iterations); ``what`` names the work in a few words."""
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None:
-        """A figure worth a curve, e.g. ``loss`` at an iteration."""
+        """Report a value worth plotting, e.g. ``loss`` at an iteration."""
 
     def note(self, message: str) -> None:
-        """One line that everybody who watches wants to read, e.g. the plan of a training."""
+        """Report one line for everybody who watches the run, e.g. the training plan."""
 
     def warning(self, message: str, hint: str = "") -> None:
-        """Something the user should know about a result that is right all the same."""
+        """Report something the user should know about a result that is valid nevertheless."""
 
 
-# The function behind ``Stage.entry``, as (config, inputs, out, report): writes all of the stage's parts below out.
+# The function behind ``Stage.entry``, called with (config, inputs, out, report); writes the stage's parts below out.
 Body = Callable[[Any, Inputs, Path, Reporter], Summary]
 
 
 def load_body(entry: str) -> Body:
-    """Import a stage's body.
+    """Import and return a stage's body.
 
     Args:
         entry: ``module:function``.

@@ -1,4 +1,4 @@
-"""The artifacts of a run: keys, manifests, and the commit that makes them appear whole or not at all."""
+"""The artifacts of a run: keys, manifests, and an atomic commit, so that they appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, s
 from splatpipe.pipeline.engine.errors import MachineError, StageError, UsageError
 from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
-FORMAT = 1  # of what lies under OUT; raised when older versions could no longer read it
-KEY_CHARACTERS = 16  # of a folder's name: 64 bits tell the few artifacts of one OUT apart
+FORMAT = 1  # of the layout of OUT; raised when older versions could no longer read it
+KEY_CHARACTERS = 16  # in a folder's name: 64 bits are enough for the few artifacts of one OUT
 MIN_FREE_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
 class Part:
-    """A named part of an artifact: where it lies, and the digest of its content."""
+    """A named part of an artifact: its path and the digest of its content."""
 
     path: Path
     digest: str
@@ -30,7 +30,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Artifact:
-    """A finished stage: its folder and what its manifest says."""
+    """The output of a finished stage: its folder and its manifest."""
 
     folder: Path
     manifest: Mapping[str, JSON]
@@ -46,14 +46,14 @@ class Artifact:
 
     @property
     def parts(self) -> dict[str, Part]:
-        """Its parts under their full names."""
+        """The artifact's parts by full name, e.g. ``georef.frame``."""
         return {
             f"{self.manifest['stage']}.{name}": Part(self.folder / part["path"], part["digest"])
             for name, part in self.manifest["parts"].items()
         }
 
     def deliverables(self, stage: Stage) -> dict[Path, Path]:
-        """The files of its stage's deliverables by their paths relative to OUT; of a folder part, what is in it."""
+        """The files of the stage's deliverables by path relative to OUT; a folder part stands for its contents."""
         files: dict[Path, Path] = {}
         for name in stage.deliverables:
             root = self.folder / stage.parts[name]
@@ -64,7 +64,7 @@ class Artifact:
 
 @dataclass(frozen=True)
 class StageInputs:
-    """What a stage's answer depends on; its digest is the key."""
+    """Everything a stage's result depends on; its digest is the key."""
 
     stage: str
     version: int
@@ -88,27 +88,27 @@ class Store:
         self.out = out
         self.stages = out / "stages"
         self.partials = self.stages / ".partial"
-        self.shards = self.stages / ".shards"  # what processes that made one alone have told
+        self.shards = self.stages / ".shards"  # logs and events of processes that ran a single shard
 
     def find(self, stage: Stage, key: str) -> Artifact | None:
-        """The finished artifact of that key, if all of its files are there with their sizes."""
+        """The finished artifact with that key if all of its files exist with the recorded sizes, else None."""
         artifact = _read_artifact(self.stages / _folder_name(stage.name, key))
         if artifact is None or artifact.key != key or set(artifact.manifest["parts"]) != set(stage.parts):
             return None
         return artifact
 
     def artifacts(self, stage: str) -> list[Artifact]:
-        """All finished artifacts of a stage, the newest first."""
+        """All finished artifacts of a stage, newest first."""
         found = [_read_artifact(folder) for folder in self.stages.glob(f"{stage}-*")]
         whole = [artifact for artifact in found if artifact is not None]
         return sorted(whole, key=lambda artifact: float(artifact.manifest["finished_s"]), reverse=True)
 
     def working_folder(self, stage: Stage, key: str) -> Path:
-        """Where a stage of that key works until it is done; it need not be there."""
+        """The folder in which a stage with that key works until it is done; it may not exist."""
         return self.partials / _folder_name(stage.name, key)
 
     def begin(self, stage: Stage, key: str) -> Path:
-        """An empty folder for a stage to work in; a resumable stage gets back what a killed run left."""
+        """Make a stage's empty working folder; a resumable stage gets back the one that a killed run left."""
         folder = self.working_folder(stage, key)
         if folder.exists() and not stage.resumable:
             shutil.rmtree(folder)
@@ -119,17 +119,17 @@ class Store:
     def commit(
         self, stage: Stage, inputs: StageInputs, partial: Path, summary: Summary, run: Mapping[str, JSON]
     ) -> Artifact:
-        """Make what lies in ``partial`` the stage's artifact: manifest last, all synced, then one rename.
+        """Turn ``partial`` into the stage's artifact: manifest last, everything synced, then one rename.
 
         Args:
             stage: The stage that ran.
-            inputs: What it depended on.
-            partial: Its working folder; what belongs to no part is dropped.
+            inputs: What its result depended on.
+            partial: Its working folder; files that belong to no part are deleted.
             summary: What the body returned.
-            run: Versions, machine, timings: what does not belong to the key.
+            run: Versions, machine, timings: what is not part of the key.
 
         Raises:
-            StageError: if the body did not leave one of its parts.
+            StageError: if the body did not write one of its parts.
         """
         parts: dict[str, dict[str, JSON]] = {}
         for name, relative in stage.parts.items():
@@ -179,10 +179,10 @@ class Store:
         return artifact
 
     def recover(self, shard: str = "") -> None:
-        """Finish the rename that a killed run had begun, and drop what it had replaced.
+        """Finish the rename that a killed run had begun, and delete what it had replaced.
 
         Args:
-            shard: The only one that is held; empty where the whole OUT is.
+            shard: The shard whose lock is held; empty if the whole OUT is locked.
         """
         for partial in sorted(self.partials.glob("*")):
             if shard and not partial.name.removeprefix("replaced-").startswith(f"{shard}-"):
@@ -196,7 +196,7 @@ class Store:
                     shutil.rmtree(partial, ignore_errors=True)
 
     def remove_stale(self, keep: Iterable[tuple[str, str]]) -> tuple[int, int]:
-        """Remove artifacts and unfinished work that nothing asks for any more.
+        """Remove artifacts and unfinished work that are no longer needed.
 
         Args:
             keep: Stage name and key of what is wanted.
@@ -213,9 +213,9 @@ class Store:
         return len(stale), freed
 
     def deliver(self, artifact: Artifact, stage: Stage) -> None:
-        """Copy an artifact's deliverables into OUT, each replaced in one step; unchanged ones are left alone.
+        """Copy an artifact's deliverables into OUT, each replaced atomically; unchanged ones are left alone.
 
-        Copies of an earlier artifact's that this one does not have are taken back.
+        Unmodified copies of an earlier artifact's deliverables that this one does not have are removed.
         """
         wanted = artifact.deliverables(stage)
         for name, file in wanted.items():
@@ -227,9 +227,9 @@ class Store:
 
 
 def is_copy(source: Path, target: Path) -> bool:
-    """Whether ``_copy_if_changed`` made it, and nobody has changed it since.
+    """Whether ``target`` is a copy made by ``_copy_if_changed`` that nobody has changed since.
 
-    It may have more in it than its source: who puts something into a delivered file leaves it the time that it had.
+    It may be larger than its source: code that adds something to a delivered file keeps the file's mtime.
     """
     if not target.is_file():
         return False
@@ -241,7 +241,7 @@ def _copy_if_changed(source: Path, target: Path) -> None:
     if is_copy(source, target):
         return
     target.parent.mkdir(parents=True, exist_ok=True)
-    remove_unfinished(target.parent, target.name)  # of a killed run: only who holds the lock delivers
+    remove_unfinished(target.parent, target.name)  # of a killed run: only the lock's holder delivers
     copy_durably(source, target)
 
 
@@ -271,14 +271,14 @@ def _drop_strays(folder: Path, keep: set[str]) -> None:
 
 
 def open_store(out: Path, *, create: bool) -> Store:
-    """Check an OUT and make its folders.
+    """Check an OUT, create its folders if asked, and return its store.
 
     Args:
         out: The run's folder.
-        create: Make it if it is not there; otherwise a missing one is an error.
+        create: Create it if it is missing; otherwise a missing one is an error.
 
     Raises:
-        UsageError: if it is a file, is not a run's folder, or was made by a version with another layout.
+        UsageError: if it is a file, is not a run's folder, or was made by a version with a different layout.
         MachineError: if it cannot be written.
     """
     if out.exists() and not out.is_dir():
@@ -315,7 +315,7 @@ def open_store(out: Path, *, create: bool) -> Store:
 
 
 def unwritable(out: Path, error: OSError) -> MachineError:
-    """An OUT that cannot be written, from the first look on: full, read-only, another user's, gone."""
+    """The error for an OUT that cannot be written: full, read-only, another user's, or gone."""
     return MachineError(
         f"Cannot write to {out}: {error.strerror or error}.",
         hint="Check its permissions and the free space, or choose another OUT.",

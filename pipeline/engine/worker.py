@@ -1,8 +1,8 @@
-"""The child process in which stage bodies run, so that a crash in somebody's C++ is a failed stage and no more.
+"""The child process in which stage bodies run, so that a crash in a C++ library fails only the stage.
 
-One worker runs the stages of a line one after the other (torch is imported once). Requests come in on stdin and events
-go out on what was stdout, a JSON object a line; whatever libraries print goes to the log. The worker dies with its
-parent, whatever kills that.
+One worker runs the stages of a pipeline one after the other (torch is imported once). Requests arrive on stdin and
+events leave on the original stdout, one JSON object per line; whatever libraries print goes to the log. The worker
+dies with its parent, whatever kills the parent.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Shard, StageConfig, load_body
 
-NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # of libraries' errors, in small letters
+NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # in libraries' error messages, lower case
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
-BAD_DISK = {errno.EIO, errno.ESTALE, errno.ENXIO, errno.ENODEV}  # a failing one, or a server's that went away
+BAD_DISK = {errno.EIO, errno.ESTALE, errno.ENXIO, errno.ENODEV}  # a failing disk, or a network share that went away
 
 
 @dataclass(frozen=True)
 class Task:
-    """One stage to run, as plain JSON, so that any process that sees the same files can run it.
+    """One stage to run, as plain JSON, so that any process with access to the same files can run it.
 
     Attributes:
         stage: Its name.
@@ -49,7 +49,7 @@ class Task:
         summaries: Summaries of the stages before it.
         machine: Device and threads.
         out: Where it writes.
-        shard: Number and count of the shard that it is to make; None for a stage's own body.
+        shard: Number and count of the shard to run; None for a stage's own body.
         shards: Folders of the stage's shards.
     """
 
@@ -67,7 +67,7 @@ class Task:
     shards: list[str] = field(default_factory=list)
 
     def inputs(self) -> Inputs:
-        """What the body is given."""
+        """The inputs passed to the body."""
         return Inputs(
             {name: Path(path) for name, path in self.parts.items()},
             Path(self.photos_dir),
@@ -80,14 +80,14 @@ class Task:
 
 
 def execute(task: Task, send: IO[str]) -> None:
-    """Run a task's body here and send its events and its end.
+    """Run a task's body in this process and send its events and its result.
 
     Args:
         task: What to run.
-        send: Takes JSON lines: ``{"event": …}``, then ``{"done": …}`` or ``{"failed": …}``.
+        send: Receives JSON lines: ``{"event": …}``, then ``{"done": …}`` or ``{"failed": …}``.
 
     Raises:
-        KeyboardInterrupt: where it was asked to end, which is told before.
+        KeyboardInterrupt: if it was asked to stop; ``failed`` is sent first.
     """
 
     lock = threading.Lock()
@@ -97,7 +97,7 @@ def execute(task: Task, send: IO[str]) -> None:
             send.write(json.dumps(message) + "\n")
             send.flush()
 
-    children = 0  # the most that the body's own processes took side by side
+    children = 0  # peak memory of the body's own child processes, running side by side
 
     def sink(event: Event) -> None:
         nonlocal children
@@ -111,7 +111,7 @@ def execute(task: Task, send: IO[str]) -> None:
         config_type: type[StageConfig] = getattr(__import__(module, fromlist=[name]), name)
         config = config_type.model_validate(task.config)
         body = load_body(task.entry)
-        _listen()  # again: pycolmap's import puts its own handlers in place of ours
+        _listen()  # again: importing pycolmap replaces our handlers
         summary = body(config, task.inputs(), Path(task.out), EventReporter(task.stage, sink))
     except KeyboardInterrupt:
         tell({"failed": {"type": "KeyboardInterrupt"}})
@@ -128,9 +128,9 @@ def execute(task: Task, send: IO[str]) -> None:
 
 
 def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
-    """The message for the user behind any exception of a stage's body."""
+    """Convert any exception of a stage's body into an error with a message for the user."""
     if isinstance(error, SplatpipeError):
-        # A stage may raise a subclass of its own; only the known ones cross the process boundary by name.
+        # A stage may raise its own subclass; only the known ones cross the process boundary by name.
         known = next(ERRORS[kind.__name__] for kind in type(error).__mro__ if kind.__name__ in ERRORS)
         return known(error.message, error.hint)
     text = str(error).lower()
@@ -163,8 +163,8 @@ class _Usage:
 
     @staticmethod
     def now() -> _Usage:
-        return_free_heap()  # of the stages before, so that none is charged with what another has freed
-        with contextlib.suppress(OSError):  # restarts the kernel's record of this process's peak memory
+        return_free_heap()  # freed by earlier stages: this one must not be charged for it
+        with contextlib.suppress(OSError):  # resets the kernel's record of this process's peak memory
             Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
         return _Usage(time.monotonic(), _cpu_seconds())
 
@@ -177,13 +177,13 @@ class _Usage:
 
 
 def _cpu_seconds() -> float:
-    """Of this process and of those that it started and that have ended."""
+    """CPU seconds of this process and of its ended children."""
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
 
 
 def peak_memory_bytes() -> int:
-    """Peak resident memory of this process since the stage began (where the kernel says so, else since its start)."""
+    """Peak resident memory of this process, bytes, since the stage began (where unsupported: since process start)."""
     told = peak_memory_of("self")
     if told is not None:
         return told
@@ -192,7 +192,7 @@ def peak_memory_bytes() -> int:
 
 
 def peak_memory_of(process: int | str) -> int | None:
-    """Peak resident memory of a process of this machine, bytes; None where the kernel does not say."""
+    """Peak resident memory of a process on this machine, bytes; None if the kernel does not report it."""
     with contextlib.suppress(OSError, StopIteration, ValueError, UnicodeDecodeError):
         lines = Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
@@ -200,7 +200,7 @@ def peak_memory_of(process: int | str) -> int | None:
 
 
 def _requests(stream: IO[str]) -> Iterator[Task]:
-    """Tasks from the parent; its end of the pipe closing, unasked, is the parent's death."""
+    """Yield the parent's tasks; if the pipe closes without an exit request, the parent has died: kill this process."""
     ready: list[Task | None] = []
     arrived = threading.Condition()
 
@@ -229,12 +229,12 @@ def _interrupt(_number: int, _frame: FrameType | None) -> None:
 
 
 def _listen() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C reaches the parent, which decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the parent, which decides
     signal.signal(signal.SIGTERM, _interrupt)
 
 
 def main() -> None:
-    """Serve the parent named on the command line until it says goodbye."""
+    """Serve the parent, whose process ID is on the command line, until it sends an exit request."""
     die_with_parent(int(sys.argv[1]))
     _listen()
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -242,7 +242,7 @@ def main() -> None:
     try:
         for task in _requests(sys.stdin):
             execute(task, events)
-    except KeyboardInterrupt:  # at once: who asked waits for it, and the reader of stdin would hold up an orderly exit
+    except KeyboardInterrupt:  # at once: the parent waits, and the thread reading stdin would delay an orderly exit
         os._exit(EXIT_TERMINATED)
 
 
