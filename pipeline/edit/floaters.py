@@ -27,7 +27,7 @@ Figures = Float32[np.ndarray, " n"]
 LOOSE = TouchRule(sigmas=2.0, size_ratio=4.0)
 """Gaussians not connected to the scene even by this rule are loose."""
 LIGHTLY_HELD = TouchRule(sigmas=2.0, size_ratio=1.0, needed=3)
-"""Gaussians not connected by this stricter rule are held only lightly, as leaves, edges and near-surface floaters are."""
+"""Gaussians not connected by this stricter rule are held only lightly, like leaves, edges or near-surface floaters."""
 LIMITS = ((0.02, 0.05), (0.008, 0.015), (0.003, 0.005))
 """Limits per pass on the change of a pixel's squared error (0..3) per unit of a Gaussian's weight. A Gaussian that
 worsens the photos by more than the first is left out of later passes, since it makes what is behind it look bad; one

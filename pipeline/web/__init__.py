@@ -13,7 +13,7 @@ def asset(name: str) -> str:
     """The text of a bundled script or style, e.g. ``viewer.js``.
 
     Raises:
-        MachineError: This installation was built without it.
+        MachineError: if this installation was built without it.
     """
     try:
         return (DIST / name).read_text(encoding="utf-8")
@@ -24,5 +24,5 @@ def asset(name: str) -> str:
 
 
 def script_safe(text: str) -> str:
-    """JSON that cannot end the script element that it stands in."""
+    """Escape JSON so that it cannot end the script element that contains it."""
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

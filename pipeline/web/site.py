@@ -1,8 +1,8 @@
-"""`web/`: the viewer as a folder of plain files for any web host, the splat in levels of detail.
+"""`web/`: the viewer as a folder of static files for any web host, with the splat in levels of detail (LOD).
 
-What the first picture needs is asked for at once: page, script, tree and root. A file's name, or the address by which
-the page asks for it, has its content's digest in it: a host's and a browser's copies of an earlier site are not taken
-for this one's.
+What the first image needs is requested at once: page, script, tree and root. Each file's name, or the URL by which the
+page requests it, contains a digest of its content, so that copies of an earlier site cached by hosts or browsers are
+never used.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src blob:; style-src 'self';"
     " img-src 'self' data: blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
 )
-DIGITS = 16  # of a digest, in names: enough for no two files of a site ever to share one
+DIGITS = 16  # of a digest, in names: enough to be unique within a site
 CORE = (0.02, 0.98)  # quantiles of the centres along each axis
 SPZ_AXES: Axes = "y up"
 
@@ -42,10 +42,10 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
     """Write the site: `index.html`, its script and style, `levels.json`, `nodes/`, `photos/`, and the sparse points.
 
     Args:
-        folder: Where to; made here, and empty if it is there.
-        scene: What it shows besides the splat.
-        splat: In the world frame (z up); what its facts say holds for the levels as well.
-        root: Of its levels, finite.
+        folder: The site's folder; created if missing, else it must be empty.
+        scene: What the viewer shows besides the splat.
+        splat: The splat in the world frame (z up); its facts apply to the levels too.
+        root: The root of its levels of detail, finite.
 
     Raises:
         ValueError: if the splat is not z up, a parameter is not finite, or there is no camera.
@@ -78,7 +78,7 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
 
 
 def _page_parts(folder: Path, levels: str, first: str) -> PageParts:
-    """The page's head asks for what the first picture takes: `start.js` goes on from there."""
+    """Write the scripts and styles; the page's head preloads what the first image needs, and `start.js` continues."""
     viewer = asset("viewer.js").encode()
     script, packed = _write(folder, "viewer.js", viewer), _write(folder, PACKED, gzip.compress(viewer, 9, mtime=0))
     style, start = (_write(folder, name, asset(name).encode()) for name in ("viewer.css", "start.js"))
@@ -91,7 +91,7 @@ def _page_parts(folder: Path, levels: str, first: str) -> PageParts:
 
 
 def _write_node(folder: Path, node: LevelNode, antialias: bool) -> dict[str, Any]:
-    """Write a node's splat; what `levels.json` says of it, but for its children."""
+    """Write a node's splat; returns its entry for `levels.json`, without the children."""
     origin = _middle(node.gaussians)
     data = spz_bytes(_about(node.gaussians, origin), antialias, turn=turn_of(SPZ_AXES, "z up"))
     name = f"nodes/{_digest(data)}.spz"
@@ -108,16 +108,16 @@ def _write_node(folder: Path, node: LevelNode, antialias: bool) -> dict[str, Any
 
 
 def _middle(gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
-    """Between the outermost centres: from there none is far, and 24 bits hold all in steps of a millimetre and less."""
+    """The centre of the centres' bounding box: relative to it, 24-bit coordinates have steps of at most a millimetre."""
     means = gaussians.means.detach().numpy().astype(np.float64)
     middle: Float64[np.ndarray, " 3"] = (means.min(axis=0) + means.max(axis=0)) / 2.0
     return middle
 
 
 def _core(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
-    """Where nearly all centres are: by that the viewer finds what is near, and in the window.
+    """The box of nearly all centres, with which the viewer decides what is near and within the view.
 
-    A node's box is around whole Gaussians. A few large and far ones are in most nodes: their boxes are about the eye.
+    A node's bounding box would enclose whole Gaussians: a few large, far ones in most nodes make it contain the viewpoint.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
     core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE, axis=0)
@@ -134,7 +134,7 @@ def _thumb_address(shown: ViewerCamera) -> str | None:
 
 
 def _write(folder: Path, name: str, data: bytes) -> str:
-    """Write a file of a name that people know; the address to ask for it."""
+    """Write a file with a fixed name; returns the URL to request it by."""
     (folder / name).write_bytes(data)
     return f"{name}?v={_digest(data)}"
 

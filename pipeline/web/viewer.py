@@ -1,4 +1,4 @@
-"""`viewer.html`: a splat in one page that opens anywhere, also from a disk and offline."""
+"""`viewer.html`: a splat in a single page that opens anywhere, also from disk and offline."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ POLICY = (
     " style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:;"
     " base-uri 'none'; form-action 'none'"
 )
-MOST_POINTS = 150_000  # that the page carries, 15 bytes each; more are thinned out evenly
-SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis: what is within is the scene
-NEARLY_ALL = 0.9  # of the points in focus: a few on the other side are no reason to begin from afar
-NEAR_PER_SIZE = 1e-3  # where the caller states no near plane
+MOST_POINTS = 150_000  # that the page includes, 15 bytes each; more are thinned evenly
+SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis; they bound the scene
+NEARLY_ALL = 0.9  # of the points in focus: a few on the far side are no reason to start from far away
+NEAR_PER_SIZE = 1e-3  # near plane as a share of the scene's size, if the caller gives none
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ class ViewerCamera:
     """A photo and where it was taken.
 
     Attributes:
-        camera: In the world frame; ``camera.name`` is shown. Upright: the picture's top is where people are to see it.
-        thumb: A small JPEG of the photo, turned like the camera; None for none.
-        held_out: Whether training left it out.
+        camera: The camera in the world frame, rotated upright; ``camera.name`` is shown.
+        thumb: A small JPEG of the photo, rotated like the camera; None for none.
+        held_out: Whether it is a held-out view.
     """
 
     camera: Camera
@@ -49,11 +49,11 @@ class ViewerCamera:
 
 @dataclass(frozen=True, eq=False)
 class ViewerSky:
-    """What is behind the scene, by direction.
+    """The background of the scene by direction.
 
     Attributes:
-        colours: Red, green, blue by elevation (rows, from straight down) and azimuth (columns, from west by south), of
-            the cells' centres; twice as many columns as rows. Below the horizon the background is shown instead.
+        colours: RGB at the cells' centres by elevation (rows, from straight down) and azimuth (columns, from west via
+            south); twice as many columns as rows. Below the horizon the background colour is shown instead.
     """
 
     colours: UInt8[np.ndarray, "rows columns 3"]
@@ -61,23 +61,23 @@ class ViewerSky:
 
 @dataclass(frozen=True, eq=False)
 class ViewerScene:
-    """All that a page shows besides the splat, in the world frame (z up).
+    """Everything a page shows besides the splat, in the world frame (z up).
 
     Attributes:
-        title: The page's.
+        title: The page's title.
         cameras: The photos; at least one.
         points: The sparse points.
-        point_colours: Theirs.
-        gaussians: How many the splat has.
-        metres: Whether a world unit is a metre; else lengths mean nothing.
-        crs: The CRS that coordinates are shown in; None for the world frame's own.
-        antialias: Whether the splat was trained with opacities that allow for the blur on screen.
-        background: Red, green, blue behind everything, 0..1.
-        near: Gaussians nearer than this are not drawn, world units; 0 for a share of the scene's size.
+        point_colours: The points' RGB colours.
+        gaussians: The splat's number of Gaussians.
+        metres: Whether a world unit is a metre; else the scale is arbitrary.
+        crs: The CRS in which coordinates are shown; None for the world frame.
+        antialias: Whether the splat was trained with opacities that compensate for the screen-space blur.
+        background: RGB behind everything, 0..1.
+        near: Distance of the near plane, world units; 0 for a share of the scene's size.
         sky: In front of the background; None for none.
         note: A sentence about the frame and its accuracy, for the help.
-        focus: Which sparse points the page begins at, and turns about; None for all.
-        placed: Whether east, north and the place mean something, where lengths do.
+        focus: The sparse points that the initial view shows and rotates about; None for all.
+        placed: If metric, whether heading and position are known too.
     """
 
     title: str
@@ -97,12 +97,12 @@ class ViewerScene:
 
 
 def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
-    """The page as HTML text, with no reference to anything but the splat's address, if that is given.
+    """The page as HTML, with no external reference other than the splat's URL, if that is given.
 
     Args:
         scene: What to show.
-        splat: An SPZ file in its own frame (y up, see ``scene.spz``) to carry along; or its address, relative to the
-            page's, from where the page loads it: that needs a server, or the user drops the file on the page.
+        splat: An SPZ file in its own frame (y up, see ``scene.spz``) to embed; or its URL relative to the page, from
+            which the page loads it: this needs a server, or the user drops the file on the page.
 
     Raises:
         ValueError: if there is no camera.
@@ -121,12 +121,12 @@ def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
 
 @dataclass(frozen=True)
 class PageParts:
-    """How a page brings what draws it.
+    """The page-specific parts of the HTML.
 
     Attributes:
-        policy: What the page may do (Content-Security-Policy).
-        style: HTML of the head.
-        script: HTML of the body's end.
+        policy: The Content-Security-Policy.
+        style: HTML for the head.
+        script: HTML for the end of the body.
     """
 
     policy: str
@@ -135,12 +135,12 @@ class PageParts:
 
 
 def page_of(scene: ViewerScene, facts: Mapping[str, Any], parts: PageParts) -> str:
-    """The page's HTML.
+    """Render the page's HTML.
 
     Args:
         scene: What it shows.
-        facts: The same for its script.
-        parts: How it brings what draws it.
+        facts: The facts for its script.
+        parts: Policy, styles and scripts.
     """
     environment = Environment(autoescape=True, keep_trailing_newline=True)
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
@@ -158,9 +158,9 @@ def page_of(scene: ViewerScene, facts: Mapping[str, Any], parts: PageParts) -> s
 
 
 def start_camera(scene: ViewerScene) -> int:
-    """The camera to begin from: the one that shows the most sparse points, the first of equals.
+    """Index of the camera of the initial view: the first one that shows the most sparse points.
 
-    Where the page has a focus, many show all of it: the nearest of those that show nearly as much as any.
+    With a focus, which many cameras may show completely: the nearest of those that show nearly the most of it.
     """
     if not len(scene.points):
         return 0
@@ -172,11 +172,11 @@ def start_camera(scene: ViewerScene) -> int:
 
 
 def scene_facts(scene: ViewerScene, thumbs: Sequence[str | None]) -> dict[str, Any]:
-    """What a page's script has to know of a scene, but for the splat and the sparse points.
+    """The facts about a scene for the page's script, without the splat and the sparse points.
 
     Args:
         scene: The scene.
-        thumbs: Where each camera's picture is.
+        thumbs: URL of each camera's thumbnail, or None.
 
     Raises:
         ValueError: if there is no camera.

@@ -1,4 +1,4 @@
-"""What `viewer.html` shows of a run: cameras, photos, points, sky and CRS in the world frame; and the page itself."""
+"""Collects what `viewer.html` shows of a run (cameras, photos, points, sky, CRS; world frame) and writes the page."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from splatpipe.pipeline.web.measured_page import PAGE
 from splatpipe.pipeline.web.viewer import ViewerCamera, ViewerScene, ViewerSky, viewer_page
 
 SPLAT = "splat.spz"
-SH_STEP = 8.0  # finer than files: the page is looked at, and 41.6 dB for 40.2 cost 6 % of its splat
-THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows; of more photos than the next, less
+SH_STEP = 8.0  # finer than in files: the page is for viewing; 41.6 instead of 40.2 dB cost 6 % of its splat's size
+THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows; less if there are many photos
 MOST_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
-SKY_ROWS = 64  # twice the panorama's: what interpolating twice blurs is not seen
-CLEARLY_TILTED = 0.6  # of the upward direction, in the picture: seen from rather above, no edge is clearly the top
+SKY_ROWS = 64  # twice the panorama's, so that the blur of interpolating twice is invisible
+CLEARLY_TILTED = 0.6  # image component of the up direction: in steep views from above, no edge is clearly the top
 
 
 @dataclass(frozen=True)
 class ViewerRendering:
-    """How a model was trained to be rendered.
+    """The rendering settings a model was trained with.
 
     Attributes:
-        antialias: With opacities that allow for the blur on screen.
+        antialias: Whether opacities compensate for the screen-space blur.
         background: Red, green, blue, 0..1.
-        near: Of the near plane, model units.
-        sky: Behind it all; None for none.
+        near: Distance of the near plane, model units.
+        sky: The panorama behind everything; None for none.
     """
 
     antialias: bool
@@ -55,7 +55,7 @@ class ViewerRendering:
 
 
 def viewer_rendering(options: RenderOptions, sky: Panorama | None) -> ViewerRendering:
-    """What of the rasterizer's options (see `as_trained`) counts in the page as well."""
+    """The rasterizer options (see `as_trained`) that also apply in the page."""
     return ViewerRendering(options.antialias, options.background, options.near, sky)
 
 
@@ -70,12 +70,12 @@ def viewer_scene(
     """Collect what the page shows besides the splat.
 
     Args:
-        dataset: The folder that `undistort` left.
-        frame: georef's.
+        dataset: The folder that `undistort` wrote.
+        frame: The frame of `georef`.
         look: How the model is rendered.
-        held_out: Names of the photos that were not trained on.
-        gaussians: How many there are.
-        title: The page's.
+        held_out: Names of the held-out photos.
+        gaussians: The number of Gaussians.
+        title: The page's title.
 
     Raises:
         StageError: if the dataset cannot be read.
@@ -106,16 +106,16 @@ def viewer_scene(
 
 
 def write_viewer(folder: Path, scene: ViewerScene, gaussians: Gaussians, largest_bytes: float) -> None:
-    """Write the page, and the splat beside it where the page would be too large with it.
+    """Write the page, with the splat in it or, if that would be too large, beside it.
 
     Args:
-        folder: Where to.
-        scene: What it shows.
-        gaussians: In the world frame, finite.
-        largest_bytes: Of a page that carries its splat.
+        folder: The output folder.
+        scene: What the page shows.
+        gaussians: The splat in the world frame, finite.
+        largest_bytes: Largest size of a page that includes its splat.
     """
     splat = viewer_splat(gaussians, scene.antialias)
-    fits = 4 * len(splat) <= 3 * largest_bytes  # base64; a page of gigabytes is not even tried
+    fits = 4 * len(splat) <= 3 * largest_bytes  # base64; a page of gigabytes is not even assembled
     page = viewer_page(scene, splat) if fits else ""
     if not fits or len(page.encode()) > largest_bytes:
         (folder / SPLAT).write_bytes(splat)
@@ -124,20 +124,20 @@ def write_viewer(folder: Path, scene: ViewerScene, gaussians: Gaussians, largest
 
 
 def viewer_splat(gaussians: Gaussians, antialias: bool) -> bytes:
-    """The SPZ file that the page draws.
+    """The SPZ file that the page renders.
 
     Args:
-        gaussians: In the world frame (z up), finite.
-        antialias: Whether their opacities allow for the blur on screen.
+        gaussians: The splat in the world frame (z up), finite.
+        antialias: Whether its opacities compensate for the screen-space blur.
     """
     return spz_bytes(gaussians, antialias, SH_STEP, torch.tensor(SPZ_FROM_Z_UP, dtype=torch.float64))
 
 
 def upright(camera: Camera) -> tuple[Camera, int]:
-    """The camera turned by quarters so that its picture's top is where the world's up (+z) is.
+    """The camera rotated by quarter turns so that the world's up (+z) is at the top of its image.
 
     Returns:
-        The camera of the turned picture, and the quarter turns anticlockwise, as ``np.rot90`` takes them.
+        The camera of the rotated image, and the number of anticlockwise quarter turns, as for ``np.rot90``.
     """
     up_right, up_down = float(camera.cam_from_world[0, 2]), float(camera.cam_from_world[1, 2])
     if math.hypot(up_right, up_down) < CLEARLY_TILTED:
@@ -149,7 +149,7 @@ def upright(camera: Camera) -> tuple[Camera, int]:
 
 
 def _quarter(camera: Camera) -> Camera:
-    """Its picture turned anticlockwise: what was right is up."""
+    """The camera of the image rotated anticlockwise by a quarter turn: its right edge becomes the top."""
     turn = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     return replace(
         camera,
@@ -189,7 +189,7 @@ def _thumb(picture: Pixels, height: int) -> bytes:
 
 
 def _sky(sky: Panorama, frame: Frame) -> ViewerSky:
-    """The panorama by directions of the world."""
+    """The sky panorama resampled to world directions."""
     elevation = (np.arange(SKY_ROWS) + 0.5) / SKY_ROWS * math.pi - math.pi / 2.0
     azimuth = (np.arange(2 * SKY_ROWS) + 0.5) / SKY_ROWS * math.pi - math.pi
     rays = _directions(elevation, azimuth) @ np.asarray(frame.world_from_model.rotation)  # rows: Rᵀ ray
