@@ -1,8 +1,8 @@
-"""What each technique gains: ``ablation.py --data CAPTURE [CAPTURE …] --threads N --work DIR --json FILE``.
+"""Measure what each technique gains: ``ablation.py --data CAPTURE [CAPTURE …] --threads N --work DIR --json FILE``.
 
-Every variant (`ablation.toml`: a name, options on top of the base) is trained on every capture with every seed by
-`splatpipe run`, at the base's size, iterations and cap. Photos are placed once a capture. What is finished is kept in
-the work folder and not run again: the same command goes on where it was stopped.
+`splatpipe run` trains every variant (`ablation.toml`: a name, and options on top of the base) on every capture with
+every seed, at the base's size, iterations and cap. Photos are registered once per capture. Finished runs are kept in
+the work folder and not repeated: running the same command again resumes after an interruption.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.stages.line import LINE
 
 VARIANTS = Path(__file__).with_suffix(".toml")
-FRONT_SIZE = 4.0  # photos are placed once at this multiple of the training's megapixels, and each run reduces them
+FRONT_SIZE = 4.0  # photos are registered once at this multiple of the training size; each run downsamples them
 LARGEST_FRONT = 200.0  # megapixels
 FOLLOW = VARIANTS.with_name("time_to_quality.py")
 CURVE = "curve.json"
-TOLD = ("psnr", "psnr_cc", "best_psnr")  # of a run that ended, on the way
-AS_TRAINED = ("clean.enabled=false",)  # what is compared is training; a variant that cleans says so
+TOLD = ("psnr", "psnr_cc", "best_psnr")  # figures of a finished run, recorded along the way
+AS_TRAINED = ("clean.enabled=false",)  # training is what is compared; a variant that cleans says so
 FRONT = ("ingest", "features", "matches", "sparse", "georef", "undistort")
 
 
 @dataclass(frozen=True)
 class AblationCase:
-    """A training to be measured.
+    """A training run to be measured.
 
     Attributes:
-        variant: Its name.
-        capture: Its name.
-        seed: Of every random choice.
-        key: Digest of all that the figures depend on.
-        command: That makes them.
-        out: Where it leaves them.
-        followed: It is `time_to_quality`, which has nothing to say but the best and the end.
+        variant: The variant's name.
+        capture: The capture's name.
+        seed: Seed of every random choice.
+        key: Digest of everything that the figures depend on.
+        command: The command that produces them.
+        out: Folder that the command writes them to.
+        followed: Whether the command is `time_to_quality`, which reports only the best and the final figures.
     """
 
     variant: str
@@ -63,16 +63,16 @@ class AblationCase:
     followed: bool = False
 
     def named(self, figures: Row) -> Row:
-        """A row of the result."""
+        """Return a row of the result table."""
         return {"variant": self.variant, "capture": self.capture, "seed": self.seed} | figures
 
     def figures(self, end: CommandEnd, threads: int) -> Row:
-        """What the command left."""
+        """Read the figures that the command wrote."""
         return best_and_end(self.out / CURVE) if self.followed else figures(self.out / "out", end, threads)
 
 
 def base_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """What all variants have in common."""
+    """Return the options that all variants share."""
     return (
         f"train.iterations={arguments.iterations}",
         f"train.max_gaussians={arguments.max_gaussians}",
@@ -84,10 +84,10 @@ def base_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 
 def captures_of(texts: Sequence[str]) -> dict[str, Path]:
-    """Captures by name: PATH, whose last folder is the name, or NAME=PATH.
+    """Map names to captures: PATH, named after its last folder, or NAME=PATH.
 
     Raises:
-        UsageError: if two have one name, or it is none.
+        UsageError: if two captures have the same name, or a name is invalid.
     """
     found: dict[str, Path] = {}
     for text in texts:
@@ -102,7 +102,7 @@ def captures_of(texts: Sequence[str]) -> dict[str, Path]:
 
 
 def front_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """The base's, for photos: larger than the training's, since each run reduces them."""
+    """Return the base options for the photos: larger than the training size, since each run downsamples them."""
     size = min(LARGEST_FRONT, FRONT_SIZE * config_of(base_sets(arguments), 0).undistort.max_megapixels)
     return (*base_sets(arguments), f"undistort.max_megapixels={size!r}")
 
@@ -110,14 +110,14 @@ def front_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
 def placed(
     captures: Mapping[str, Path], work: Path, arguments: argparse.Namespace, sets: Sequence[str], *, photos_only: bool
 ) -> tuple[dict[str, Path], list[Row]]:
-    """The captures' datasets, and the failures: taken through the line up to `undistort`.
+    """Run the captures through the pipeline up to `undistort`; return their datasets and the failures.
 
     Args:
-        captures: By name.
+        captures: Captures by name.
         work: The work folder.
-        arguments: The command line.
-        sets: Options.
-        photos_only: Leave captures that are datasets as they are.
+        arguments: The parsed command line.
+        sets: Options, as assignments.
+        photos_only: Leave captures that already are datasets as they are.
     """
     sections = {stage: getattr(config_of(sets, 0), stage).model_dump(mode="json") for stage in FRONT}
     datasets, commands = dict(captures), []
@@ -142,13 +142,13 @@ def placed(
 
 
 def contents(path: Path, work: Path, threads: int) -> dict[str, str]:
-    """Digests of a capture's files, remembered in the work folder."""
+    """Return digests of a capture's files, cached in the work folder."""
     table = HashTable(work / "photos-index.json", remember=True)
     return open_source(path, work, LINE, config_of((), 0)).digests(table, threads, SilentReporter())
 
 
 def options(sets: Sequence[str]) -> tuple[str, ...]:
-    """Assignments for the command line."""
+    """Return the assignments as command-line arguments."""
     return tuple(word for each in sets for word in ("--set", each))
 
 
@@ -159,14 +159,14 @@ def cases_of(
     work: Path,
     arguments: argparse.Namespace,
 ) -> list[AblationCase]:
-    """Every variant on every capture with every seed; whole rounds of a seed first.
+    """Return every variant on every capture with every seed; all runs of one seed come before the next seed.
 
     Args:
         variants: The base and the others.
-        datasets: What the line is run on, by capture.
-        reduced: The same at the size of training, as each run makes them, of the captures that are followed.
+        datasets: Input of the pipeline, by capture.
+        reduced: The same at the training size, as each run produces them, for the captures that are followed.
         work: The work folder.
-        arguments: The command line.
+        arguments: The parsed command line.
     """
     stages = {stage.name: stage.version for stage in LINE}
     build = {"stages": stages, "versions": versions(), "isa": rasterizer.isa_name()}
@@ -190,7 +190,7 @@ def cases_of(
 
 
 def followed(case: AblationCase, sets: Sequence[str], dataset: Path, arguments: argparse.Namespace) -> AblationCase:
-    """The same training once more, to the bit, its held-out photos measured on the way."""
+    """Return the same training again, bit-identical, with its held-out views measured along the way."""
     name = f"{case.command.name}-curve"
     out = case.out.with_name(name)
     config = config_of(sets, case.seed)
@@ -204,10 +204,10 @@ def followed(case: AblationCase, sets: Sequence[str], dataset: Path, arguments: 
 
 
 def run_cases(cases: Sequence[AblationCase], finished: ResultLog, arguments: argparse.Namespace) -> dict[str, str]:
-    """Run what is not finished, and keep its figures.
+    """Run whatever is not finished, and store its figures.
 
     Returns:
-        Messages of the runs that failed, by key.
+        Error messages of the failed runs, by key.
     """
     wanted = {case.key: case for case in cases if case.key not in finished.rows}
     by_name = {case.command.name: case for case in wanted.values()}
@@ -238,7 +238,7 @@ def run_cases(cases: Sequence[AblationCase], finished: ResultLog, arguments: arg
 
 
 def show(rows: Sequence[Row], failed: Sequence[Row], variants: Sequence[str]) -> list[Row]:
-    """Print a table a capture and the differences, which are returned."""
+    """Print a table per capture and the differences; return the differences."""
     followed = any("below_best" in row for row in rows)
     headings = {heading: f"{heading}:" for heading, (key, _) in MEASURES.items() if followed or key != "below_best"}
     for capture in dict.fromkeys(row["capture"] for row in (*rows, *failed)):
@@ -259,7 +259,7 @@ def show(rows: Sequence[Row], failed: Sequence[Row], variants: Sequence[str]) ->
 
 
 def ablate(arguments: argparse.Namespace) -> int:
-    """Do it all; returns the exit code: 1 where a run failed."""
+    """Run the whole ablation; return the exit code: 1 if a run failed."""
     variants = choose(arguments.variants, arguments.variant, arguments.only, base_sets(arguments))
     captures = captures_of(arguments.data)
     with work_folder(arguments.work) as work:
@@ -287,7 +287,7 @@ def ablate(arguments: argparse.Namespace) -> int:
 
 
 def rows_of(cases: Sequence[AblationCase], finished: Mapping[str, Row]) -> list[Row]:
-    """A row a training, with what following it showed."""
+    """Return a row per training, with the results of following it."""
     curves = {(case.variant, case.capture, case.seed): finished.get(case.key, {}) for case in cases if case.followed}
     return [
         case.named(finished[case.key] | curves.get((case.variant, case.capture, case.seed), {}))
@@ -297,12 +297,12 @@ def rows_of(cases: Sequence[AblationCase], finished: Mapping[str, Row]) -> list[
 
 
 def tell(text: str) -> None:
-    """Progress, for people."""
+    """Print progress."""
     print(text, file=sys.stderr, flush=True)
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Build the command-line parser."""
     options = argparse.ArgumentParser(description=__doc__)
     say = options.add_argument
     say("--data", nargs="+", required=True, metavar="[NAME=]PATH", help="photos, or images/ and sparse/0, undistorted")
@@ -324,7 +324,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def positive(text: str) -> int:
-    """An integer from 1."""
+    """Parse an integer of at least 1."""
     if (value := int(text)) < 1:
         raise ValueError(text)
     return value
@@ -346,6 +346,6 @@ def main(words: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:  # nohup means it
+        if signal.getsignal(number) != signal.SIG_IGN:  # respect nohup
             signal.signal(number, signal.default_int_handler)
     sys.exit(main())

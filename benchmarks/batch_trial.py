@@ -1,13 +1,13 @@
-"""A night of seven small captures, four of them bad, and what `splatpipe batch` makes of it; about ten minutes of CPU.
+"""Run `splatpipe batch` on seven small captures, four of them bad, and check the result; about ten minutes of CPU time.
 
     python benchmarks/batch_trial.py ../shared/data /tmp/night
 
-The captures are links to photos of the demo and of the folder of real ones, made below the second folder. One is
-broken, one cannot be reconstructed, one has a wrong control file, and of one the training is killed with -9. Then the
-command is repeated at once, and once more with a capture added and one changed. Then Snakemake says what it would send
-to Slurm and Kubernetes; its plugins have to be there: `pip install snakemake-executor-plugin-slurm
-snakemake-executor-plugin-kubernetes snakemake-storage-plugin-fs`. It ends with 1 at the first thing that is not as it
-should be.
+The captures are links to photos of the demo and of the folder of real captures, created in the second folder. One is
+broken, one cannot be reconstructed, one has a wrong control file, and the training of one is killed with -9. The
+command is then repeated at once, and once more with one capture added and one changed. Finally Snakemake reports what
+it would submit to Slurm and Kubernetes, which requires its plugins: `pip install snakemake-executor-plugin-slurm
+snakemake-executor-plugin-kubernetes snakemake-storage-plugin-fs`. The script exits with 1 at the first unexpected
+result.
 """
 
 import importlib.util
@@ -30,7 +30,7 @@ SETS = (
     *("train.iterations=100", "split.every=4", "flythrough.seconds=0.2"),
     *("depths.max_megapixels=0.01", "dsm.cell_m=0.3", "ortho.gsd_m=0.3"),
 )
-KILLED_ITERATIONS = 600  # long enough to be met in its training
+KILLED_ITERATIONS = 600  # long enough to be caught during training
 EXPECTED = {
     "orbit": "done",
     "surveyed": "done",
@@ -44,7 +44,7 @@ PLUGINS = {"slurm": "snakemake_executor_plugin_slurm", "kubernetes": "snakemake_
 
 
 def main() -> None:
-    """Make the captures, run the night, repeat it, change it."""
+    """Create the captures, run the batch, repeat it, change it."""
     data, folder = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
     if folder.exists():
         sys.exit(f"{folder} is there already; name a folder that is not.")
@@ -66,7 +66,7 @@ class BatchTrial:
         self.listed, self.out = listed, out
 
     def write_list(self, captures: Mapping[str, Path], sets: Mapping[str, Iterable[str]] | None = None) -> None:
-        """Write the list, with options of single captures."""
+        """Write the list, with options for individual captures."""
         own = {"killed": [f"train.iterations={KILLED_ITERATIONS}"], **(sets or {})}
         text = f"preset = 'preview'\nset = {json.dumps(SETS)}\n"
         for name, photos in captures.items():
@@ -78,11 +78,11 @@ class BatchTrial:
         return [sys.executable, "-m", "splatpipe.pipeline.app.cli", "batch", str(self.listed), str(self.out), *more]
 
     def start(self) -> subprocess.Popen[str]:
-        """Begin the batch."""
+        """Start the batch."""
         return subprocess.Popen(self.command("--json"), stdout=subprocess.PIPE, text=True)
 
     def told(self, process: subprocess.Popen[str]) -> dict[str, Any]:
-        """What it says at its end; it has to be what lies in its folder, too."""
+        """Return the batch's final report, which must match the one in its folder."""
         printed, _ = process.communicate()
         told: dict[str, Any] = json.loads(printed)
         filed = json.loads((self.out / "batch.json").read_text(encoding="utf-8"))
@@ -100,12 +100,12 @@ class BatchTrial:
         return told
 
     def events(self) -> dict[str, bytes]:
-        """The events of every capture: what ran there is in them."""
+        """Return the event log of every capture: it shows which stages ran."""
         return {path.parent.name: path.read_bytes() for path in self.out.glob("*/events.jsonl")}
 
 
 def first(night: BatchTrial) -> None:
-    """The night itself."""
+    """Run the batch for the first time."""
     print("The night:")
     process = night.start()
     killed = kill_in_training(night.out / "killed", process)
@@ -129,7 +129,7 @@ def first(night: BatchTrial) -> None:
 
 
 def repeated(night: BatchTrial) -> None:
-    """At once again: nothing may start but the command itself."""
+    """Repeat the batch at once: nothing may start but the command itself."""
     print("The same at once:")
     before, seen = night.events(), set()
     process = night.start()
@@ -144,7 +144,7 @@ def repeated(night: BatchTrial) -> None:
 
 
 def changed(night: BatchTrial, captures: Mapping[str, Path]) -> None:
-    """One more capture, and an option of another: those two run, and of the changed one what the option reaches."""
+    """Add a capture and change an option of another: only these two run, the latter from the first affected stage."""
     print("One added, one changed:")
     night.write_list(captures, {"orbit": ["train.iterations=120"]})
     before = night.events()
@@ -162,7 +162,7 @@ def changed(night: BatchTrial, captures: Mapping[str, Path]) -> None:
 
 
 def dry_run(night: BatchTrial, name: str, plugin: str) -> None:
-    """What Snakemake would send to a cluster."""
+    """Check what Snakemake would submit to a cluster."""
     if importlib.util.find_spec(plugin) is None:
         sys.exit(f"{plugin} is not installed: pip install {plugin.replace('_', '-')}")
     with_profile = BatchTrial(night.listed, night.out.with_name(name))
@@ -176,7 +176,7 @@ def dry_run(night: BatchTrial, name: str, plugin: str) -> None:
 
 
 def make_captures(data: Path, folder: Path) -> dict[str, Path]:
-    """Seven captures, of links."""
+    """Create seven captures made of links."""
     house = demo()
     brighton = sorted((data / "brighton" / "photos").glob("*.JPG"))
     real = [sorted((data / name / "photos").iterdir())[0] for name in ("brighton", "ochota", "sceaux", "seneca")]
@@ -199,12 +199,12 @@ def make_captures(data: Path, folder: Path) -> dict[str, Path]:
 
 
 def demo() -> list[Path]:
-    """The demo's photos."""
+    """Return the demo's photos."""
     return sorted(capture_path().glob("*.JPG"))
 
 
 def link(folder: Path, photos: Iterable[Path]) -> Path:
-    """A folder of links to photos."""
+    """Create a folder of links to photos."""
     folder.mkdir(parents=True)
     for photo in photos:
         (folder / photo.name).symlink_to(photo)
@@ -212,7 +212,7 @@ def link(folder: Path, photos: Iterable[Path]) -> Path:
 
 
 def kill_in_training(out: Path, batch: subprocess.Popen[str]) -> bool:
-    """Wait until the capture trains, and kill the process that does."""
+    """Wait until the capture is in training, then kill the training process."""
     events = out / "events.jsonl"
     while batch.poll() is None:
         if events.is_file() and b'"stage_started", "stage": "train"' in events.read_bytes():
@@ -226,7 +226,7 @@ def kill_in_training(out: Path, batch: subprocess.Popen[str]) -> bool:
 
 
 def descendants(process: int) -> dict[int, str]:
-    """The command lines of all processes that came from one, by their numbers."""
+    """Return the command lines of all descendants of a process, by process ID."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -256,7 +256,7 @@ def parent_words(process: int) -> str:
 
 
 def check(right: bool, what: str) -> None:
-    """Say that something is as it should be, or end."""
+    """Report a passed check, or exit."""
     print(f"  {'yes' if right else 'NO '} {what}", flush=True)
     if not right:
         sys.exit(1)

@@ -1,17 +1,18 @@
-"""Captures made to bend, and sound ones: ``bent_captures.py DEMO_OUT [--sound OUT …] [--only NAME …]``.
+"""Test mapping on captures that provoke bent models, and on sound ones.
 
-DEMO_OUT is a run of the demo up to `matches` (``splatpipe demo OUT --until matches``). From its database ten variants
-are made: the focal length is no longer known (COLMAP's guess of 1.2 times the longer side, without a prior), and
-verified pairs are thinned by a rule and a seed until incremental mapping goes wrong: random trees of pairs, so that
-nothing closes a loop; trees with a few triangles; the photos' sequence with a few bridges; matches near the picture's
-middle alone.
+    bent_captures.py DEMO_OUT [--sound OUT …] [--only NAME …]
 
-Each is mapped as splatpipe 0.x before this benchmark did (COLMAP's incremental mapper as it comes, on one thread, once
-more with lower demands if it placed less than half), and by the line. The error is the root mean square distance of
-the camera centres from the demo's truth after a least-squares similarity. A variant is bent where nine tenths of the
-photos are placed more than three times as far off as in the sound run, and incomplete where fewer are placed. The
-line's answer is right where nine tenths are placed within three times, or where it is called bad. Of the sound
-captures none may be called bad.
+DEMO_OUT is a run of the demo up to `matches` (``splatpipe demo OUT --until matches``). Ten variants are derived from
+its database: the focal length is no longer known (COLMAP's guess of 1.2 times the longer side, without a prior), and
+verified pairs are thinned by a rule and a seed until incremental mapping goes wrong: random trees of pairs, so that no
+loop closes; trees with a few triangles; the photo sequence with a few bridges; matches only near the image centre.
+
+Each variant is mapped twice: as splatpipe did before this benchmark (COLMAP's incremental mapper with its defaults, on
+one thread, and again with lower thresholds if it registered less than half of the photos), and by the pipeline. The
+error is the RMS distance of the camera centres from the demo's truth after a least-squares similarity. A model is bent
+if nine tenths of the photos are registered but the error is more than three times that of the sound run, and incomplete
+if fewer are registered. The pipeline's answer is right if nine tenths are registered within three times the error, or
+if it reports the model as bad. No sound capture may be reported as bad.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 from splatpipe.stages.line import LINE, MATCHES
 
-GUESS = 1.2  # of the longer side: COLMAP's where nothing is known
-PLACED = 0.9  # of the photos
-TIMES = 3.0  # the sound run's error
-LEAST_MATCHES = 15  # of a pair that stays
+GUESS = 1.2  # of the longer side: COLMAP's guess if nothing is known
+PLACED = 0.9  # share of the photos
+TIMES = 3.0  # times the sound run's error
+LEAST_MATCHES = 15  # of a pair that is kept
 
 Pair = tuple[int, int]
 Truth = Mapping[str, np.ndarray]
@@ -51,12 +52,12 @@ Truth = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class ThinnedGraph:
-    """How a view graph is thinned.
+    """Rule by which a view graph is thinned.
 
     Attributes:
-        name: For the table.
-        pairs: Which stay.
-        middle: Share of the picture's sides around its middle in which matches stay.
+        name: Name in the table.
+        pairs: Selects the pairs to keep.
+        middle: Share of the image's sides, around its centre, in which matches are kept.
     """
 
     name: str
@@ -65,7 +66,7 @@ class ThinnedGraph:
 
 
 def tree(seed: int, least: int, triangles: int) -> Callable[[ViewGraph], Collection[Pair]]:
-    """A random spanning tree of the pairs with so many matches, and some pairs that close a triangle with it."""
+    """Select a random spanning tree of the pairs with at least ``least`` matches, and pairs that close triangles."""
 
     def choose(verified: ViewGraph) -> Collection[Pair]:
         rng = np.random.default_rng(seed)
@@ -87,7 +88,7 @@ def tree(seed: int, least: int, triangles: int) -> Callable[[ViewGraph], Collect
 
 
 def sequence(reach: int, bridges: Collection[Pair]) -> Callable[[ViewGraph], Collection[Pair]]:
-    """Photos that follow each other, and a few pairs between the flights."""
+    """Select pairs of consecutive photos, and a few pairs between the flights."""
     return lambda verified: {pair for pair in verified.matches if pair[1] - pair[0] <= reach or pair in bridges}
 
 
@@ -101,7 +102,7 @@ VARIANTS = [
 
 
 def thin(source: Path, target: Path, variant: ThinnedGraph) -> None:
-    """Write a variant of a database of matches."""
+    """Write a thinned variant of a match database."""
     verified = read_verified(source)
     kept = set(variant.pairs(verified))
     with pycolmap.Database.open(source) as old, pycolmap.Database.open(target) as new:
@@ -135,7 +136,7 @@ def _in_middle(verified: ViewGraph, number: int, rows: np.ndarray, variant: Thin
 
 
 def map_as_before(database: Path, scratch: Path) -> pycolmap.Reconstruction | None:
-    """COLMAP's incremental mapper as it comes; with lower demands where it places less than half of the photos."""
+    """Run COLMAP's incremental mapper with its defaults; again with lower thresholds if it registers under half."""
     total = len(read_verified(database).names)
     best = None
     for relaxed in (False, True):
@@ -157,7 +158,7 @@ def map_as_before(database: Path, scratch: Path) -> pycolmap.Reconstruction | No
 
 
 def error_m(model: pycolmap.Reconstruction, truth: Truth) -> float:
-    """Root mean square distance of the camera centres from the truth after a least-squares similarity."""
+    """Return the RMS distance of the camera centres from the truth after a least-squares similarity, in metres."""
     images = [model.images[number] for number in sorted(model.reg_image_ids())]
     here = np.array([image.projection_center() for image in images])
     there = np.array([truth[image.name] for image in images])
@@ -171,7 +172,7 @@ def error_m(model: pycolmap.Reconstruction, truth: Truth) -> float:
 
 
 def open_capture(out: Path, scratch: Path) -> MappingInput:
-    """What the stage `sparse` would see of a run."""
+    """Open a run's capture as the stage `sparse` would see it."""
     folder = open_run_folder(out, LINE)
     photos_dir, _ = folder.settings()
     at = {name: part.path for name, part in folder.lineage(MATCHES).items()}
@@ -189,7 +190,7 @@ def open_capture(out: Path, scratch: Path) -> MappingInput:
 
 
 def answer(capture: MappingInput) -> tuple[pycolmap.Reconstruction, Row]:
-    """The line's cameras and what it says of them."""
+    """Return the pipeline's reconstruction and its verdict."""
     began = time.process_time()
     config, report = SparseConfig(), SilentReporter()
     found = climb(capture, reconstruct(capture, config, report), config, report)
@@ -208,7 +209,7 @@ def answer(capture: MappingInput) -> tuple[pycolmap.Reconstruction, Row]:
 
 
 def try_variants(out: Path, only: Sequence[str], sound_mm: float) -> list[Row]:
-    """A row for the sound capture, unless its error is given, and for each variant."""
+    """Return a row for the sound capture, unless its error is given, and one for each variant."""
     truth_file = json.loads((capture_path().parent / "truth.json").read_text(encoding="utf-8"))
     truth = {photo["name"]: np.array(photo["centre_m"]) for photo in truth_file["photos"]}
     rows: list[Row] = []

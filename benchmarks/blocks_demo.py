@@ -1,8 +1,8 @@
-"""The demo capture in blocks against in one, at equal Gaussians: ``blocks_demo.py WORK``.
+"""Compare the demo capture trained in blocks and in one piece, at equal Gaussians: ``blocks_demo.py WORK``.
 
-Likeness and time of both; seams on the borders between blocks, by ``render/seams.py`` against the training in one; and
-whether the blocks come out with the same bits made one by one in another order, on another number of threads, each
-killed with -9 in its training and made again. WORK keeps the runs, so the same call again goes on.
+Reports quality and time of both; seams on the borders between blocks, by ``render/seams.py`` against the training in
+one piece; and whether the blocks come out bit-identical if they are made one by one in another order, on another number
+of threads, each killed with -9 during training and restarted. WORK keeps the runs, so the same call again resumes.
 """
 
 from __future__ import annotations
@@ -39,36 +39,36 @@ KILLED_AT = 0.3  # of a block's iterations
 
 
 def splatpipe(*words: object) -> list[str]:
-    """A command's words."""
+    """Return the words of a splatpipe command."""
     return [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, words)]
 
 
 def run(photos: Path, out: Path, sets: Sequence[str], *more: object) -> None:
-    """Run the line; its words go to this terminal."""
+    """Run the pipeline; its output goes to this terminal."""
     given = [word for each in sets for word in ("--set", each)]
     subprocess.run(splatpipe("run", photos, out, *given, *more), check=True)
 
 
 def begun(one: Path, out: Path) -> Path:
-    """An OUT that has all that ``one`` has before its training."""
+    """Create an OUT with everything that ``one`` has before training."""
     if not out.is_dir():
         shutil.copytree(one, out, ignore=shutil.ignore_patterns("train-*", "blocks-*", "*.jsonl"))
     return out
 
 
 def manifest(out: Path, stage: str) -> dict[str, Any]:
-    """Of a stage's newest artifact."""
+    """Return the manifest of a stage's newest artifact."""
     found = sorted(out.glob(f"stages/{stage}-*/manifest.json"), key=lambda path: path.stat().st_mtime)
     return dict(json.loads(found[-1].read_text(encoding="utf-8")))
 
 
 def file_of(out: Path, stage: str, name: str) -> Path:
-    """A file of a stage's newest artifact."""
+    """Return the path of a file of a stage's newest artifact."""
     return max(out.glob(f"stages/{stage}-*/{name}"), key=lambda path: path.stat().st_mtime)
 
 
 def figures(name: str, out: Path) -> Row:
-    """A row of the table."""
+    """Return a row of the table."""
     metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     train, before = manifest(out, "train"), manifest(out, "blocks")
     row: Row = {key: metrics[key] for key in ("psnr", "psnr_cc", "ssim", "gaussians", "iterations")}
@@ -83,7 +83,7 @@ def figures(name: str, out: Path) -> Row:
 
 
 def made_one_by_one(photos: Path, out: Path, sets: Sequence[str], how: Sequence[object], threads: int) -> None:
-    """The blocks in the order of falling numbers, each killed once, on so many threads; then what joins them."""
+    """Train the blocks from the highest number down, each killed once, on ``threads`` threads; then merge them."""
     run(photos, out, sets, *how, "--until", "blocks", "--threads", threads)
     blocks = json.loads(file_of(out, "blocks", "blocks.json").read_text(encoding="utf-8"))["shards"]
     for number in range(blocks, 0, -1):
@@ -107,7 +107,7 @@ def _kill_midway(command: Sequence[str], events: Path) -> None:
 
 
 def _share(events: Path, before: int) -> float:
-    """How far a training is by what was told since a place in its file."""
+    """Return a training's progress according to the events after a position in its file."""
     if not events.is_file():
         return 0.0
     with events.open("rb") as file:
@@ -118,12 +118,12 @@ def _share(events: Path, before: int) -> float:
 
 
 def digest(path: Path) -> str:
-    """Of a file's content."""
+    """Return the digest of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def seams_found(out: Path, one: Path, work: Path, plant: bool, threads: int) -> None:
-    """What `seams.py` finds on the blocks' borders."""
+    """Run `seams.py` on the borders between blocks and print what it finds."""
     plan = json.loads(file_of(out, "blocks", "blocks.json").read_text(encoding="utf-8"))
     (work / "partition.json").write_text(json.dumps(plan["partition"]), encoding="utf-8")
     words = [out, file_of(one, "train", "model.ply"), "--partition", work / "partition.json", "--threads", threads]

@@ -1,9 +1,9 @@
-"""What a boundary around the demo's house costs and spares: ``boundary.py WHOLE BOUNDED --save FOLDER``.
+"""Measure what a boundary around the demo's house costs and saves: ``boundary.py WHOLE BOUNDED --save FOLDER``.
 
-WHOLE and BOUNDED are OUTs of runs on the demo capture that differ by the boundary alone; ``boundary.py --draw FILE``
-writes it: the house's outline in plan, grown by a metre. The pixels that count are those of held-out photos whose true
-surface (the first triangle of the true mesh on their ray) lies inside the true outline; both runs are measured on the
-same ones, so that what a splat makes of them has no say in which.
+WHOLE and BOUNDED are OUTs of runs on the demo capture that differ only in the boundary; ``boundary.py --draw FILE``
+writes it: the house's outline in plan, grown by a metre. The pixels that count are those of held-out views whose true
+surface (the first triangle of the true mesh on their ray) lies inside the true outline. Both runs are measured on the
+same pixels, so the splats do not influence the selection.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring, read_model_are
 from splatpipe.pipeline.photos.images import reduced_view
 from splatpipe.pipeline.raster.threads import same_bits
 
-MARGIN_M = 1.0  # around the house, as one draws it by hand on a map
-CORNER_STEPS = 16  # of the circle that the outline is grown by
+MARGIN_M = 1.0  # around the house, as if drawn by hand on a map
+CORNER_STEPS = 16  # of the circle that the outline is grown with
 COLUMNS = {
     "view": "view:",
     "inside": "inside:.3f",
@@ -43,7 +43,7 @@ COLUMNS = {
 
 
 def outline() -> Ring:
-    """The boundary in the true frame: the house seen from above, its convex hull grown by the margin; metres."""
+    """Return the boundary in the true frame: the house's convex hull in plan, grown by the margin; metres."""
     turns = 2.0 * math.pi * np.arange(CORNER_STEPS) / CORNER_STEPS
     circle = MARGIN_M * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     grown = (building_corners().reshape(-1, 3)[:, None, :2] + circle).reshape(-1, 2)
@@ -51,7 +51,7 @@ def outline() -> Ring:
 
 
 def geojson() -> str:
-    """The boundary as people would save it: WGS 84, longitude first."""
+    """Return the boundary as a user would save it: WGS 84, longitude first."""
     ring = outline()
     places = Origin().geodetic(np.column_stack([ring, np.zeros(len(ring))]))
     closed = [[round(x, 9), round(y, 9)] for y, x in [*places[:, :2].tolist(), places[0, :2].tolist()]]
@@ -60,11 +60,11 @@ def geojson() -> str:
 
 
 def true_inside(camera: Camera, surface: np.ndarray) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose true surface lies inside the boundary.
+    """Mask the pixels whose true surface lies inside the boundary.
 
     Args:
-        camera: In the true frame.
-        surface: The true triangles.
+        camera: Camera in the true frame.
+        surface: Triangles of the true mesh.
     """
     depth = depth_map(camera, surface)
     hit = np.isfinite(depth)
@@ -78,7 +78,7 @@ def true_inside(camera: Camera, surface: np.ndarray) -> Bool[np.ndarray, "h w"]:
 def measured(
     run: OpenedRun, save: Path | None
 ) -> dict[str, tuple[Float64[np.ndarray, " 2"], Float64[np.ndarray, " 2"]]]:
-    """Sums of squared errors and pixels of each held-out view, inside and outside."""
+    """Return the sum of squared errors and the pixel count of each held-out view, inside and outside."""
     truth = truth_from_model({view.camera.name: view.camera.cam_from_world for view in run.views})
     surface = true_surface()
     found = {}
@@ -102,12 +102,12 @@ def measured(
 
 
 def decibels(squares: float, pixels: float) -> float:
-    """PSNR of a sum of squared errors."""
+    """Return the PSNR for a sum of squared errors."""
     return -10.0 * math.log10(squares / pixels) if pixels and squares else math.nan
 
 
 def compared(whole: OpenedRun, bounded: OpenedRun, save: Path) -> list[Row]:
-    """A row a held-out view, and one of the mean over views."""
+    """Return a row per held-out view, and one with the mean over views."""
     (save / "whole").mkdir(parents=True, exist_ok=True), (save / "bounded").mkdir(exist_ok=True)
     both = [measured(run, save / name) for name, run in (("whole", whole), ("bounded", bounded))]
     rows: list[Row] = []
@@ -121,7 +121,7 @@ def compared(whole: OpenedRun, bounded: OpenedRun, save: Path) -> list[Row]:
 
 
 def counts(run: OpenedRun, area: PlanArea) -> tuple[int, int]:
-    """Gaussians inside, and all."""
+    """Count the Gaussians inside the boundary, and all of them."""
     means = run.model[0].means.double().numpy()
     return int(area.contains(means).sum()), len(means)
 

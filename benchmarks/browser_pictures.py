@@ -1,4 +1,4 @@
-"""Splat files drawn by spark, in a browser without a window."""
+"""Render splat files with spark in a headless browser."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.scene import Axes, turn_of
 
-PATIENCE_MS = 600_000.0  # of a busy machine
+PATIENCE_MS = 600_000.0  # for a busy machine
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PAGE = '<!doctype html><meta charset="utf-8"><script src="draw.js"></script>'
 SPARK_TYPES = {"ply": "ply", "compressed-ply": "ply", "spz": "spz", "spz2": "spz", "sog": "pcsogszip", "glb": "glb"}
@@ -35,7 +35,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @contextmanager
 def drawing_page(others: OtherPrograms, folder: Path) -> Iterator[Page]:
-    """A page that draws the files of a folder, into which its script is put.
+    """Serve a page that renders the files of a folder, with its script injected.
 
     Raises:
         MachineError: if there is no browser, or the script cannot be bundled.
@@ -60,15 +60,15 @@ def drawing_page(others: OtherPrograms, folder: Path) -> Iterator[Page]:
 
 
 def draw(page: Page, address: str, kind: str, axes: Axes, camera: Camera, antialias: bool) -> tuple[int, Picture]:
-    """How many splats spark read of a file, and its picture on black, 0..1.
+    """Return the number of splats that spark read from a file, and its render on black, 0..1.
 
     Args:
-        page: Of ``drawing_page``.
-        address: Of the file, below the page's folder.
+        page: Page from ``drawing_page``.
+        address: The file, relative to the page's folder.
         kind: The format's name.
-        axes: The file's.
-        camera: In a world with z up, whose principal point is the picture's middle.
-        antialias: Whether opacities allow for the blur on screen.
+        axes: The file's axes.
+        camera: Camera in a z-up world, with its principal point at the image centre.
+        antialias: Whether opacities compensate for the screen-space blur.
     """
     cam_from_file = camera.cam_from_world.copy()
     cam_from_file[:3, :3] = cam_from_file[:3, :3] @ turn_of("z up", axes).numpy()

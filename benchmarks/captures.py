@@ -1,4 +1,4 @@
-"""A run's deliverable to measure: its splat in the survey frame, and the cameras of the held-out photos there."""
+"""A run's deliverable to be measured: its splat and the cameras of the held-out photos, both in the survey frame."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from splatpipe.pipeline.splat.scene import Axes, Scene
 
 Picture = Float[np.ndarray, "h w 3"]
 NEAR_M = 0.1
-MOST_PIXELS = 500_000  # of a picture that is compared
+MOST_PIXELS = 500_000  # of an image that is compared
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
 AXES: tuple[Axes, ...] = ("z up", "y up", "y down")
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureRun:
-    """A run.
+    """A finished run.
 
     Attributes:
-        name: Its folder's.
+        name: Name of its folder.
         scene: `splat.ply`, z up.
-        cameras: Of photos that it was not trained on, in the frame of the splat.
+        cameras: Cameras of the held-out photos, in the frame of the splat.
     """
 
     name: str
@@ -40,7 +40,7 @@ class CaptureRun:
     cameras: list[Camera]
 
     def pictures(self, scene: Scene) -> list[Picture]:
-        """Renders of a splat in any axes from all cameras, on black, 0..1, before rounding."""
+        """Render a splat in any axes from all cameras, on black, 0..1, before rounding."""
         turned = scene.turned("z up").gaussians
         options = rasterizer.RenderOptions(
             sh_degree=turned.sh_degree, antialias=self.scene.facts.antialias, near=NEAR_M, depth=False
@@ -54,7 +54,7 @@ def open_capture(out: Path, most_views: int = 5) -> CaptureRun:
     """Open a finished run.
 
     Raises:
-        UsageError: if it is not finished.
+        UsageError: if the run is not finished.
         SplatpipeError: if its splat is broken.
     """
     try:
@@ -68,7 +68,7 @@ def open_capture(out: Path, most_views: int = 5) -> CaptureRun:
 
 
 def _camera(row: dict[str, object]) -> Camera:
-    """Of the layout of a 3DGS model's `cameras.json`: world-from-camera rotation, centre, the middle of the picture."""
+    """Read a camera as in a 3DGS `cameras.json`: world-from-camera rotation, centre; centred principal point."""
     width, height = int(row["width"]), int(row["height"])  # type: ignore[call-overload]
     pose = np.eye(4)
     pose[:3, :3] = np.array(row["rotation"], float).T
@@ -80,16 +80,17 @@ def _camera(row: dict[str, object]) -> Camera:
 
 
 def decibels(pictures: Sequence[Picture], originals: Sequence[Picture]) -> float:
-    """PSNR of all pictures together; infinite where they are the same."""
+    """Return the PSNR over all images together; infinite if they are identical."""
     errors = [float(np.mean((a - b) ** 2)) for a, b in zip(pictures, originals, strict=True)]
     mean = sum(errors) / len(errors)
     return -10.0 * math.log10(mean) if mean > 0.0 else math.inf
 
 
 def likely_frame(capture: CaptureRun, scene: Scene, originals: Sequence[Picture]) -> tuple[str, Scene]:
-    """The frame in which a splat looks most like the original to the first camera: its name, and the splat in it.
+    """Return the frame in which a splat looks most like the original from the first camera: its name, and the splat.
 
-    Of the axes, and of those turned by 180° about the vertical: heading is a matter of taste to files without a place.
+    Candidates are all axis conventions, each also turned by 180° about the vertical: for files without a georeference
+    the heading is arbitrary.
     """
     first = replace(capture, cameras=capture.cameras[:1])
     frames = {}

@@ -1,4 +1,4 @@
-"""The machine's own ceilings, measured beside every benchmark: ``python benchmarks/ceilings.py --threads N``."""
+"""Measure the machine's performance ceilings beside every benchmark: ``python benchmarks/ceilings.py --threads N``."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ PLAIN = ["-DLANES=4"]  # SSE2 and NEON: four floats
 
 @functools.cache
 def measure_ceilings(threads: int) -> dict[str, float | str]:
-    """Compile the small program for the best instruction set of this CPU, and run it.
+    """Compile the small C++ program for this CPU's best instruction set, and run it.
 
     Args:
-        threads: That run at once, each with its own registers and memory.
+        threads: Concurrent threads, each with its own registers and memory.
 
     Returns:
-        ``fma_gflops_per_core`` (an FMA is two; by CPU time, all threads at work), ``copy_gb_s`` of all threads
-        together (bytes read and written both count), and the ``ceiling_isa`` they were measured with.
+        ``fma_gflops_per_core`` (an FMA counts as two; by CPU time, with all threads busy), ``copy_gb_s`` of all threads
+            together (bytes read and written both count), and the ``ceiling_isa`` that they were measured with.
     """
     isa = _native.isas()[0]
     with tempfile.TemporaryDirectory() as folder:

@@ -1,7 +1,8 @@
-"""CesiumJS draws our 3D Tiles where they belong: known points of a made site, and a real splat beside our own renderer.
+"""Check that CesiumJS draws our 3D Tiles in the right place, on a synthetic site and on a real splat.
 
-The site is three kilometres across, of small bright Gaussians at known places. Where their pixels should be is asked of
-CesiumJS, in its own frame of the place. Nothing but the page, CesiumJS and the tiles is asked for, of this machine.
+The site is three kilometres across and consists of small bright Gaussians at known points. CesiumJS itself, in its own
+local frame, says at which pixels they should appear. The real splat is compared with our own renderer. The page
+requests nothing but itself, CesiumJS and the tiles, all from this machine.
 
     npm install cesium@1.145
     python benchmarks/cesium_tiles.py --modules node_modules [--splat OUT/splat.ply] [--pictures FOLDER]
@@ -42,25 +43,25 @@ from splatpipe.pipeline.survey.globe import write_tiles_on_globe
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PLACE = SplatOrigin(52.2, 21.0, 150.0, "ellipsoidal", "EPSG:32634")
 WIDTH, HEIGHT = 640, 420
-NEAR_PX = 12  # around where a point should be: what is bright there is the point
+NEAR_PX = 12  # a bright spot within this distance of a point's expected pixel is the point
 MOST_OFF_PX = 2.0
 SIGMA_M = 0.15
 CORNERS_M = 1500.0
 SPACING_M = 12.0
-PER_NODE = 40  # of the site: so few that its corners are tiles of their own
+PER_NODE = 40  # for the site: low enough for its corners to become separate tiles
 PATIENCE_MS = 300_000.0
 
 
 @dataclass
 class PageProblems:
-    """What a page said and asked for that it should not have."""
+    """Console messages and requests that a page should not have made."""
 
     errors: list[str] = field(default_factory=list)
     strangers: list[str] = field(default_factory=list)
 
 
 class Files(SimpleHTTPRequestHandler):
-    """The page, the tiles and CesiumJS, from their three folders."""
+    """Serve the page, the tiles and CesiumJS from their three folders."""
 
     def __init__(self, *arguments: Any, roots: dict[str, Path], **options: Any) -> None:
         self.roots = roots
@@ -75,7 +76,7 @@ class Files(SimpleHTTPRequestHandler):
 
 
 def main() -> None:
-    """Print how far points are from where they should be, and how like our own renderer's the pictures are."""
+    """Print how far points are from their expected pixels, and how similar the images are to our own renderer's."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--modules", type=Path, required=True, help="node_modules with cesium")
     parser.add_argument("--splat", type=Path, help="a splat that lies on the earth, of any format")
@@ -92,7 +93,7 @@ def main() -> None:
 
 
 def known_places() -> np.ndarray:
-    """Squares of nine points about the middle and the corners of the site, at different heights."""
+    """Return squares of nine points around the centre and the corners of the site, at different heights."""
     offsets = SPACING_M * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)], float)
     centres = CORNERS_M * np.array([[0, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]], float)
     flat = (centres[:, None] + offsets[None]).reshape(-1, 2)
@@ -100,7 +101,7 @@ def known_places() -> np.ndarray:
 
 
 def bright_points(places: np.ndarray) -> Gaussians:
-    """Small, round, opaque and of the colours that tell the first points of each square from the others."""
+    """Create small, round, opaque Gaussians; colours distinguish the first points of each square from the others."""
     made = Gaussians.empty(len(places), 1)
     made.means = torch.from_numpy(places).float()
     made.log_scales[:] = math.log(SIGMA_M)
@@ -111,7 +112,7 @@ def bright_points(places: np.ndarray) -> Gaussians:
 
 
 def check_site(folder: Path, modules: Path, pictures: Path | None) -> float:
-    """The largest distance of a known point from its pixel."""
+    """Return the largest distance of a known point from its expected pixel."""
     places = known_places()
     scene = Scene(bright_points(places), SceneFacts("z up", False, True, PLACE))
     write_tiles_on_globe(folder, scene, build_levels(scene.gaussians, PER_NODE // 4))
@@ -134,7 +135,7 @@ def check_site(folder: Path, modules: Path, pictures: Path | None) -> float:
 
 
 def check_splat(folder: Path, path: Path, modules: Path, pictures: Path | None) -> None:
-    """Print how alike CesiumJS's pictures of a splat and ours are."""
+    """Print how similar CesiumJS's images of a splat are to ours."""
     scene = read_scene(path).turned("z up")
     root = build_levels(scene.gaussians)
     placement = write_tiles_on_globe(folder, scene, root)
@@ -159,14 +160,14 @@ def check_splat(folder: Path, path: Path, modules: Path, pictures: Path | None) 
 
 
 def raise_of(ecef_from_local: np.ndarray, lies: SplatOrigin) -> float:
-    """By how much a placement is above its place's height: the geoid, where it is known."""
+    """Return how far a placement lies above its origin's height: the geoid undulation, if known."""
     height = float(geodetic_from_ecef(ecef_from_local[:3, 3][None])[0, 2])
     return height - lies.height_m
 
 
 @contextmanager
 def opened(folder: Path, modules: Path) -> Iterator[tuple[Page, PageProblems]]:
-    """The page in a browser that draws in software, over a server of this machine."""
+    """Open the page in a browser that renders in software, from a server on this machine."""
     roots = {"cesium": modules / "cesium/Build/Cesium", "tiles": folder, "page": Path(__file__).parent}
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, roots=roots))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -188,28 +189,28 @@ def opened(folder: Path, modules: Path) -> Iterator[tuple[Page, PageProblems]]:
 
 
 def foreign(url: str, home: str) -> bool:
-    """Whether an address is another host's."""
+    """Whether a URL belongs to another host."""
     return not url.startswith((home, "data:", f"blob:{home}"))
 
 
 def report(heard: PageProblems) -> None:
-    """End where something was said or asked for.
+    """Exit if the page logged or requested anything that it should not.
 
     Raises:
-        SystemExit: if it was anything.
+        SystemExit: if there was anything.
     """
     if heard.errors or heard.strangers:
         raise SystemExit("\n".join([*heard.errors, *heard.strangers]))
 
 
 def place(page: Page, lies: SplatOrigin) -> None:
-    """Open the tiles."""
+    """Load the tiles at their placement."""
     where = [lies.longitude, lies.latitude, lies.height_m]
     page.evaluate("([x, y, h]) => openTiles('/tiles/tileset.json', x, y, h)", where)
 
 
 def seen(page: Page, eye: np.ndarray, target: np.ndarray) -> tuple[str, np.ndarray]:
-    """What is drawn from a place, once nothing changes any more: a line, and the picture."""
+    """Return what is drawn from a viewpoint once it no longer changes: a line of text, and the image."""
     page.evaluate("([eye, target]) => lookFrom(eye, target)", [eye.tolist(), target.tolist()])
     drawn = page.evaluate("() => complete()")
     picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
@@ -217,14 +218,14 @@ def seen(page: Page, eye: np.ndarray, target: np.ndarray) -> tuple[str, np.ndarr
 
 
 def distances(page: Page, places: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Of the middles of the bright spots from where CesiumJS projects the places, pixels."""
+    """Return the distances, in pixels, of the bright spots' centres from where CesiumJS projects the points."""
     light = picture.astype(float).max(axis=2)
     found = []
     for x, y in page.evaluate("places => pixels(places)", places.tolist()):
         left, top = round(x) - NEAR_PX, round(y) - NEAR_PX
         part = light[max(top, 0) : top + 2 * NEAR_PX, max(left, 0) : left + 2 * NEAR_PX]
         if part.size == 0 or part.max() < 64.0:
-            found.append(math.inf)  # there is nothing
+            found.append(math.inf)  # no spot there
             continue
         rows, columns = np.mgrid[: part.shape[0], : part.shape[1]]
         spot = np.array([(part * columns).sum(), (part * rows).sum()]) / part.sum() + 0.5
@@ -233,7 +234,7 @@ def distances(page: Page, places: np.ndarray, picture: np.ndarray) -> np.ndarray
 
 
 def rendered(scene: Scene, page: Page) -> np.ndarray:
-    """Our renderer's picture from where CesiumJS's camera is."""
+    """Render the scene from CesiumJS's camera with our own renderer."""
     view = page.evaluate("() => view()")
     forward, up = np.array(view["forward"]), np.array(view["up"])
     cam_from_world = np.eye(4)
@@ -248,7 +249,7 @@ def rendered(scene: Scene, page: Page) -> np.ndarray:
 
 
 def save(pictures: Path | None, name: str, picture: np.ndarray) -> None:
-    """Keep what was seen."""
+    """Save an image, if a folder is given."""
     if pictures is not None:
         Image.fromarray(picture).save(pictures / name)
 

@@ -1,10 +1,12 @@
-"""Faults put into the demo's photos, and how many of them `splatpipe check` finds. Its author did not write `check`.
+"""Inject faults into the demo's photos, and count how many `splatpipe check` finds.
+
+The author of this script neither wrote `check` nor had read it.
 
     python benchmarks/check_faults.py [--trials 16]
 
-A trial is a copy of the demo capture with five faults on different photos: even trials have a defocused photo, an
-underexposed one, two with each other's GPS, a truncated file and a strip of three missing; odd ones a photo blurred by
-motion, an overexposed one, a duplicate, one of a second camera and one of half the size.
+A trial is a copy of the demo capture with five faults on different photos. Even trials have a defocused photo, an
+underexposed one, two with swapped GPS positions, a truncated file and a strip of three missing photos; odd trials have
+a motion-blurred photo, an overexposed one, a duplicate, one from a second camera and one of half the size.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ QUALITY = 95
 
 @dataclass(frozen=True)
 class CaptureFault:
-    """One fault: what it is, the photos concerned, and the codes of findings that tell it."""
+    """One fault: what it is, the photos concerned, and the codes of findings that report it."""
 
     kind: str
     photos: tuple[str, ...]
@@ -42,7 +44,7 @@ class CaptureFault:
 
 
 def rewrite(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Other pixels under the same metadata."""
+    """Replace a photo's pixels and keep its metadata."""
     with Image.open(path) as photo:
         pixels, info = np.asarray(photo.convert("RGB")), dict(photo.info)
     Image.fromarray(change(pixels)).save(path, "JPEG", quality=QUALITY, exif=info["exif"], xmp=info["xmp"])
@@ -59,7 +61,7 @@ def defocus(path: Path, generator: np.random.Generator) -> str:
 
 def shake(path: Path, generator: np.random.Generator) -> str:
     length, angle = float(generator.uniform(3.0, 9.0)), float(generator.uniform(0.0, np.pi))
-    side, fine = 13, 8  # the line is drawn finely and averaged down
+    side, fine = 13, 8  # the line is drawn at high resolution and averaged down
     drawn = np.zeros((side * fine, side * fine), np.float32)
     middle, half = side * fine / 2, length * fine / 2
     ends = [(round(middle + s * half * np.cos(angle)), round(middle + s * half * np.sin(angle))) for s in (-1, 1)]
@@ -79,7 +81,7 @@ def expose(path: Path, stops: float) -> str:
 
 
 def swap_positions(one: Path, two: Path) -> str:
-    """Each other's position in EXIF and XMP; all else stays."""
+    """Swap the positions of two photos in EXIF and XMP; everything else stays."""
     place = re.compile(rb'drone-dji:(GpsLatitude|GpsLongitude|AbsoluteAltitude)="[^"]*"')
     photos = [Image.open(path) for path in (one, two)]
     exifs, xmps = [photo.getexif() for photo in photos], [photo.info["xmp"] for photo in photos]
@@ -96,7 +98,7 @@ def swap_positions(one: Path, two: Path) -> str:
 
 
 def second_camera(path: Path, generator: np.random.Generator) -> str:
-    """The middle of the photo at the size of the whole, as a longer lens of another body sees it."""
+    """Replace a photo by its upscaled centre, as a longer lens on another camera body would see it."""
     zoom = float(generator.uniform(1.3, 1.8))
     with Image.open(path) as photo:
         exif, xmp, size = photo.getexif(), photo.info["xmp"], photo.size
@@ -120,7 +122,7 @@ def halve(path: Path) -> str:
 
 
 def put_faults(photos: Path, trial: int) -> list[CaptureFault]:
-    """Faults of one trial, put into a copy of the demo's photos."""
+    """Inject the faults of one trial into a copy of the demo's photos."""
     generator = np.random.default_rng(trial)
     names = sorted(path.name for path in photos.iterdir())
     faults: list[CaptureFault] = []
@@ -155,7 +157,7 @@ def put_faults(photos: Path, trial: int) -> list[CaptureFault]:
 
 
 def is_told(fault: CaptureFault, findings: list[dict[str, object]]) -> bool:
-    """A finding of the right kind names one of its photos."""
+    """Whether a finding of the right kind names one of the fault's photos."""
     for finding in findings:
         if re.search(fault.codes, str(finding["code"])):
             text = json.dumps([finding["photos"], finding["message"]])

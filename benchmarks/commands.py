@@ -1,4 +1,4 @@
-"""Commands of the line as subprocesses, a few at a time: what each used, how it ended, and no orphans."""
+"""Run pipeline commands as subprocesses, a few at a time: what each used, how it ended, and no orphans."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-POLL_S = 0.1  # far below what any run takes
-GRACE_S = 10.0  # the line ends within five seconds of a signal
-LONGEST_MESSAGE = 400  # characters of a failure that are told; the log has the rest
+POLL_S = 0.1  # far shorter than any run
+GRACE_S = 10.0  # the pipeline ends within five seconds of a signal
+LONGEST_MESSAGE = 400  # characters of an error message that are reported; the log has the rest
 
 
 @dataclass(frozen=True)
 class Command:
-    """A call of this interpreter.
+    """A call of this Python interpreter.
 
     Attributes:
-        name: For people.
-        words: After the interpreter: a script or module, and its arguments.
-        log: File that takes what it tells.
+        name: Name to display.
+        words: Arguments of the interpreter: a script or module, and its arguments.
+        log: File that receives its standard error.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Command:
 
 
 def splatpipe(name: str, arguments: Sequence[str], log: Path) -> Command:
-    """A call of the line, whose message of failure is told."""
+    """Return a call of the pipeline whose error message is reported."""
     return Command(name, ("-m", "splatpipe.pipeline.app.cli", *arguments, "--json"), log)
 
 
@@ -41,10 +41,10 @@ class CommandEnd:
     """How a command ended.
 
     Attributes:
-        command: Which.
-        failure: Its message; empty where it did what it should.
-        wall_s: From its start.
-        cpu_s: Of it and all its descendants.
+        command: The command.
+        failure: Its error message; empty on success.
+        wall_s: Wall-clock seconds since its start.
+        cpu_s: CPU seconds of the process and all its descendants.
     """
 
     command: Command
@@ -54,14 +54,14 @@ class CommandEnd:
 
 
 def run_all(commands: Sequence[Command], jobs: int) -> Iterator[CommandEnd]:
-    """Run commands; those that run when this ends early are ended.
+    """Run commands; if the generator is closed early, running ones are terminated.
 
     Args:
-        commands: In the order in which they start.
-        jobs: How many run at once.
+        commands: Commands, in the order in which they start.
+        jobs: Maximum number of concurrent commands.
 
     Yields:
-        Their ends, as they come.
+        How each command ended, in order of completion.
     """
     waiting = list(reversed(commands))
     running: dict[int, _Running] = {}
@@ -91,12 +91,12 @@ class _Running:
         command.log.parent.mkdir(parents=True, exist_ok=True)
         words = [sys.executable, *command.words]
         with command.log.open("wb") as log, _told(command).open("wb") as told:
-            # A session of its own: the terminal's Ctrl-C reaches only us, and we end it.
+            # In a session of its own: the terminal's Ctrl-C reaches only this process, which terminates the children.
             process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=told, stderr=log, start_new_session=True)
         return _Running(command, process, time.perf_counter())
 
     def poll(self) -> CommandEnd | None:
-        """Its end, once; None while it runs."""
+        """Return how the command ended, once; None while it is running."""
         pid, status, usage = os.wait4(self.process.pid, os.WNOHANG)
         if pid == 0:
             return None
@@ -107,7 +107,7 @@ class _Running:
 
 
 def _told(command: Command) -> Path:
-    """Where what it prints goes: the line's JSON object."""
+    """Return the file for its standard output: the pipeline's JSON object."""
     return command.log.with_name(f"{command.log.name}.json")
 
 
@@ -124,7 +124,7 @@ def _failure(command: Command, code: int) -> str:
 
 
 def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
-    """Politely, then for certain: a run's worker dies with it."""
+    """Terminate the processes, first politely, then by force: a run's worker dies with it."""
     try:
         for process in processes:
             process.terminate()

@@ -1,4 +1,4 @@
-"""Variants against a base over captures and seeds: means, and paired differences with their standard error."""
+"""Compare variants with a base over captures and seeds: means, and paired differences with their standard error."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tables import Row
 
 BASE = "base"
 
-# Heading, the figure's key, and how it is written. One that no run has is shown as "-".
+# Heading, key of the figure, and its format. A figure that no run has is shown as "-".
 MEASURES = {
     "PSNR dB": ("psnr", ".2f"),
     "PSNR cc": ("psnr_cc", ".2f"),
@@ -27,11 +27,11 @@ MEASURES = {
 
 
 def means(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
-    """A capture's table: each variant's mean over the seeds, ± half of the range, written out.
+    """Return a capture's table: each variant's mean over the seeds, ± half the range, formatted.
 
     Args:
-        rows: Of one capture.
-        variants: In the order wanted; those without a row are in it, too.
+        rows: Rows of one capture.
+        variants: Variants in the order of the table; those without rows are included.
     """
     table = []
     for variant in variants:
@@ -48,15 +48,15 @@ def means(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
 
 
 def differences(rows: Sequence[Row], variants: Sequence[str]) -> list[Row]:
-    """Each variant's differences to the base with the same capture and seed, a figure at a time.
+    """Return each variant's differences from the base with the same capture and seed, for each figure.
 
     Args:
-        rows: Of all runs.
-        variants: Besides the base.
+        rows: Rows of all runs.
+        variants: Variants other than the base.
 
     Returns:
-        A row a variant with, under each figure's key, ``mean`` (over captures, of their means over seeds), ``error``
-        (standard error over the pairs; None where there are fewer than two) and ``pairs``.
+        A row per variant with, under each figure's key, ``mean`` (over captures, of their means over seeds), ``error``
+            (standard error over the pairs; None if there are fewer than two) and ``pairs``.
     """
     base = {(row["capture"], row["seed"]): row for row in rows if row["variant"] == BASE}
     found = []
@@ -82,7 +82,7 @@ def _paired(by_capture: Mapping[str, Sequence[float]]) -> Row:
 
 
 def written(found: Sequence[Row]) -> list[Row]:
-    """Differences as text, a heading at a time: `+0.31 ± 0.05`."""
+    """Format differences, one column per heading: `+0.31 ± 0.05`."""
     table = []
     for line in found:
         text: Row = {"variant": line["variant"]}

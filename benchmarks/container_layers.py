@@ -1,4 +1,4 @@
-"""What is inside a file, to be changed and packed again with right lengths and checksums: damage that gets in deep."""
+"""Unpack one layer of a container file, and repack it with valid lengths and checksums, so that damage reaches deep."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from collections.abc import Callable
 import numpy as np
 from PIL import Image
 
-BOMB_BYTES = 600_000_000  # unpacked: more than a reader may take
-LARGEST_WEBP_PX = 16_384  # a side: 14 bits of a VP8L header, less one
-FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # the earliest that a ZIP holds
+BOMB_BYTES = 600_000_000  # unpacked: more than a reader may take in memory
+LARGEST_WEBP_PX = 16_384  # per side: 14 bits of a VP8L header, minus one
+FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # the earliest that a ZIP can store
 SPZ_4_HEADER, SPZ_4_ENTRY = struct.Struct("<IIIBBBBI12x"), struct.Struct("<QQ")
 
 Layer = tuple[bytes, Callable[[bytes], bytes]]
 
 
 def layer_of(data: bytes, generator: np.random.Generator) -> Layer | None:
-    """What a container holds, one of its parts at random, and how to pack a changed one; None if it is none.
+    """Return the content of a random part of a container and a function that repacks it; None for other files.
 
     Args:
-        data: A gzip stream, a ZIP, a binary glTF, a WebP picture or an SPZ of version 4; whole.
+        data: A complete gzip stream, ZIP, binary glTF, WebP image or SPZ of version 4.
         generator: Chooses the part.
     """
     if data[:2] == b"\x1f\x8b":
@@ -93,7 +93,7 @@ def _webp_layer(data: bytes) -> Layer:
 
 
 def _spz_4_layer(data: bytes, generator: np.random.Generator) -> Layer | None:
-    """One of the streams of the nianticlabs/spz file of version 4: 32 bytes, a table of lengths, zstd streams."""
+    """Pick one of the streams of a nianticlabs/spz version 4 file: 32 bytes, a table of lengths, zstd streams."""
     import zstandard
 
     streams, table_at = data[15], struct.unpack_from("<I", data, 16)[0]
@@ -116,10 +116,10 @@ def _spz_4_layer(data: bytes, generator: np.random.Generator) -> Layer | None:
 
 
 def bomb_like(data: bytes, generator: np.random.Generator) -> bytes | None:
-    """A small file of the same kind that unpacks to ``BOMB_BYTES`` or more, or nests too deep; None for other kinds."""
+    """Return a small file of the same kind that unpacks to at least ``BOMB_BYTES`` or nests too deep; else None."""
     if data[:2] == b"\x1f\x8b":
         head = bytearray(gzip.decompress(data)[:16])
-        head[8:12] = struct.pack("<I", BOMB_BYTES // 64)  # where SPZ counts
+        head[8:12] = struct.pack("<I", BOMB_BYTES // 64)  # SPZ's count of points
         return _gzip_bomb(bytes(head))
     if data[:4] == b"PK\x03\x04":
         return _zip_bomb(data, generator)
@@ -134,7 +134,7 @@ def bomb_like(data: bytes, generator: np.random.Generator) -> bytes | None:
 
 @functools.cache
 def deflated_zeros() -> tuple[bytes, int]:
-    """``BOMB_BYTES`` zeros, and their CRC-32."""
+    """Return ``BOMB_BYTES`` zeros, deflated, and their CRC-32."""
     packer, found, zeros, crc = zlib.compressobj(1, zlib.DEFLATED, -15), [], bytes(1 << 20), 0
     for start in range(0, BOMB_BYTES, len(zeros)):
         piece = zeros[: BOMB_BYTES - start]
@@ -144,14 +144,14 @@ def deflated_zeros() -> tuple[bytes, int]:
 
 
 def _gzip_bomb(head: bytes) -> bytes:
-    """A first member with a header, a second one of zeros: both are one stream to gzip's readers."""
+    """Return two gzip members, a header and zeros: to gzip readers they are one stream."""
     packed, crc = deflated_zeros()
     zeros = b"\x1f\x8b\x08\0\0\0\0\0\0\x03" + packed + struct.pack("<II", crc, BOMB_BYTES)
     return gzip.compress(head, mtime=0) + zeros
 
 
 def _zip_bomb(data: bytes, generator: np.random.Generator) -> bytes:
-    """One member is all zeros, or a picture of a quarter of a billion pixels, or JSON that nests."""
+    """Replace one member by zeros, by an image of a quarter of a billion pixels, or by deeply nested JSON."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     chosen = sorted(members)[generator.integers(len(members))]
@@ -184,10 +184,10 @@ def _stored(members: dict[str, bytes]) -> bytes:
 
 
 def blank_webp(side_px: int = LARGEST_WEBP_PX) -> bytes:
-    """A square lossless picture of one colour in 40 bytes: a prefix code of one symbol takes no bit a pixel.
+    """Return a square lossless image of one colour in 40 bytes: a prefix code of one symbol needs zero bits per pixel.
 
-    RFC 9649: 14 bits a side less one, alpha, 3 bits of version; no transform, no colour cache, no meta prefix codes;
-    then five simple codes (1), of one symbol (0), that is one bit (0): 0.
+    RFC 9649: 14 bits per side (minus one), alpha, 3 bits of version; no transform, no colour cache, no meta prefix
+        codes; then five simple codes (1) of one symbol (0) stored in one bit (0): 0.
     """
     bits, count = 0, 0
     for value, width in (
@@ -208,7 +208,7 @@ def blank_webp(side_px: int = LARGEST_WEBP_PX) -> bytes:
 
 
 def _json_bomb(data: bytes, generator: np.random.Generator) -> bytes:
-    """Nested too deep, a number of a million digits, or a list of ten million."""
+    """Return JSON that is nested too deep, a number of a million digits, or a list of ten million entries."""
     value = (b"[" * 200_000 + b"]" * 200_000, b"9" * 1_000_000, b"[" + b"0," * 10_000_000 + b"0]")[
         generator.integers(3)
     ]
@@ -216,7 +216,7 @@ def _json_bomb(data: bytes, generator: np.random.Generator) -> bytes:
 
 
 def _ply_bomb(data: bytes, generator: np.random.Generator) -> bytes:
-    """A header of thousands of properties, or of elements that promise more than there is in the world."""
+    """Return a header with thousands of properties, or with absurdly large element counts."""
     many = b"".join(b"property float p%d\n" % i for i in range(3000))
     empty = b"element nothing 999999999999999\n"
     lists = b"element face 999999999999\nproperty list uchar int vertex_indices\n"

@@ -1,13 +1,15 @@
-"""The demo's splat against the demo's truth: ``demo_truth.py OUT --half OUT_HALF --double OUT_DOUBLE --save FOLDER``.
+"""Compare the demo's splat with the demo's truth.
 
-Depth: the splat's median depth at every pixel that truly shows the house, in the held-out views at the size of
-training, against the true mesh along the same ray. The model's frame is laid over the true one by the least-squares
-similarity of the camera centres. Errors are along the view axis, in ground sample distances: GSD = true depth / focal
-length in pixels. A pixel without a median depth is wrong. Pictures of the errors go to the folder.
+    demo_truth.py OUT --half OUT_HALF --double OUT_DOUBLE --save FOLDER
 
-Scales: the held-out views at half and double the size of training, each against the original photo brought to that size
-by one resampling, beside a model that was trained for it: the same command with a quarter and four times of
-`undistort.max_megapixels`, and the same seed. Photos that are too small for double bring what they have.
+Depth: the splat's median depth at every pixel that truly shows the house, in the held-out views at training size,
+against the true mesh along the same ray. The model's frame is aligned to the true one by the least-squares similarity
+of the camera centres. Errors are along the viewing axis, in ground sampling distances: GSD = true depth / focal length
+in pixels. A pixel without a median depth counts as wrong. Error images are written to the folder.
+
+Scales: the held-out views at half and double the training size, each against the original photo resampled once to that
+size, beside a model trained for it: the same command with a quarter and four times `undistort.max_megapixels`, and the
+same seed. Photos too small for double are used at full size.
 """
 
 from __future__ import annotations
@@ -40,9 +42,9 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.view_measures import flat_stems, mean_measures, measure
 
 WITHIN_GSD = 2.0
-ATTACHED_M = 0.05  # in front of the house: the survey targets on its walls, also where they are seen at a slant
-FULL_SCALE_GSD = 4.0  # the brightest colour of an error, the same in every picture
-NOT_THE_HOUSE = 0.35  # how bright the rest of a picture is left
+ATTACHED_M = 0.05  # in front of the house: the survey targets on its walls, including oblique views of them
+FULL_SCALE_GSD = 4.0  # error with the brightest colour, the same in every image
+NOT_THE_HOUSE = 0.35  # how much brightness the rest of the image keeps
 LARGEST_MEGAPIXELS = 1e6  # no limit
 SIZES = {"half": 0.5, "training": 1.0, "double": 2.0}
 
@@ -75,17 +77,17 @@ SCALE_COLUMNS = {
 def depth_errors(
     run: OpenedRun, camera: Camera, truth: Similarity, surfaces: tuple[np.ndarray, np.ndarray]
 ) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-    """How far the splat's median depth is from the true one.
+    """Return the splat's depth errors against the truth.
 
     Args:
-        run: The demo's.
-        camera: In the model's frame, at the size to measure at.
-        truth: From the model's frame to the true one.
-        surfaces: Triangles of the whole scene and of the house.
+        run: The demo's run.
+        camera: Camera in the model's frame, at the size to measure at.
+        truth: Similarity from the model's frame to the true one.
+        surfaces: Triangles of the whole scene, and of the house.
 
     Returns:
-        Errors in GSD, positive where the splat is farther, infinite where it has no depth; the pixels that truly show
-        the house, the only ones that count; the GSD, metres.
+        Errors in GSD, positive where the splat is farther, infinite where it has no depth; a mask of the pixels that
+        truly show the house, the only ones that count; the GSD in metres.
     """
     there = replace(camera, cam_from_world=truth.camera_pose(camera.cam_from_world))
     true, house = (depth_map(there, triangles) for triangles in surfaces)
@@ -97,7 +99,7 @@ def depth_errors(
 
 
 def depth_row(name: str, errors: Float64[np.ndarray, " n"], gsd: Float64[np.ndarray, " n"]) -> Row:
-    """The figures of the pixels that count; those without a depth are as far off as can be."""
+    """Return the figures over the pixels that count; a pixel without a depth is an infinite error."""
     row: Row = {"view": name, "pixels": int(errors.size)}
     if errors.size == 0:
         return row
@@ -112,7 +114,7 @@ def depth_row(name: str, errors: Float64[np.ndarray, " n"], gsd: Float64[np.ndar
 
 
 def measure_depth(run: OpenedRun, names: Sequence[str], folder: Path) -> list[Row]:
-    """A row a view, and one of all pixels; leaves a picture of the errors of each view."""
+    """Return a row per view, and one over all pixels; write an error image of each view."""
     poses = {view.camera.name: view.camera.cam_from_world for view in run.views}
     truth = truth_from_model(poses)
     true = true_poses()
@@ -134,7 +136,7 @@ def measure_depth(run: OpenedRun, names: Sequence[str], folder: Path) -> list[Ro
 
 
 def error_picture(render: Pixels, errors: Float64[np.ndarray, "h w"], seen: Bool[np.ndarray, "h w"]) -> Pixels:
-    """The render, and beside it the errors' size on the house; (h, 2 w, 3) RGB."""
+    """Return the render beside the error magnitudes on the house; (h, 2 w, 3) RGB."""
     scaled = np.clip(np.abs(errors) / FULL_SCALE_GSD, 0.0, 1.0) * 255.0
     heat = cv2.applyColorMap(scaled.astype(np.uint8), cv2.COLORMAP_INFERNO)[:, :, ::-1]
     dim = (NOT_THE_HOUSE * render).astype(np.uint8)
@@ -142,12 +144,12 @@ def error_picture(render: Pixels, errors: Float64[np.ndarray, "h w"], seen: Bool
 
 
 def photos_at(run: OpenedRun, names: Sequence[str], factor: float) -> dict[str, tuple[Camera, Pixels]]:
-    """Original photos as pinhole cameras see them, as `undistort` makes them, and these cameras.
+    """Return original photos undistorted to pinhole cameras, as `undistort` does it, and these cameras.
 
     Args:
-        run: Whose photos.
-        names: Of which.
-        factor: On the size of training; less where the photos are too small.
+        run: Run with the photos.
+        names: Names of the photos.
+        factor: Times the training size; less if the photos are too small.
     """
     part = run.parts["ingest.photos"].path
     model, photos = pycolmap.Reconstruction(run.parts["georef.model"].path), load_photo_list(part).photos
