@@ -1,8 +1,8 @@
-"""How differently a capture's photos are exposed, told from how bright and how coloured they show the same points.
+"""How much the exposures of a capture's photos differ, estimated from their colours at common points.
 
 The surface's colour and the photo's gain are separated as in Goldman, "Vignette and Exposure Calibration and
-Compensation" (PAMI 2010), without its vignetting: each observation is their product, and both are fitted in turns, the
-gains as medians, so that highlights and what moved have no say.
+Compensation" (PAMI 2010), without its vignetting: each observation is their product, and both are fitted alternately,
+the gains as medians, so that highlights and moving objects have no influence.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks
 from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.train.options import TrainConfig
 
-MEGAPIXELS = 0.3  # of a photo in which colours are looked up: a pixel is a mean of many, and noise is gone
-WINDOW_PX = 5  # of the mean around a point: the photos' points are off by a fraction of it
-DARKEST, BRIGHTEST = 8.0, 247.0  # of 255, of a channel that has not been clipped
-ROUNDS = 10  # of fitting; a gain moves by less than a thousandth in the last
-LEAST_SEEN = 20  # points of a photo that tell its gain
-DIFFERING = 0.06  # spread from which on exposures differ. Measured: 0.027 to 0.034 in three captures whose light or
+MEGAPIXELS = 0.3  # of the photos whose colours are sampled: each pixel averages many, which removes noise
+WINDOW_PX = 5  # side of the mean around a point: points are off by a fraction of it
+DARKEST, BRIGHTEST = 8.0, 247.0  # of 255, of a channel that is not clipped
+ROUNDS = 10  # of fitting; a gain changes by less than a thousandth in the last
+LEAST_SEEN = 20  # minimum number of points to estimate a photo's gain
+DIFFERING = 0.06  # spread above which exposures differ. Measured: 0.027 to 0.034 in three captures whose light or
 # exposure hardly changes (0.1 stops, known, are 0.034), 0.097 to 0.18 in five with automatic exposure
 
 
 def exposure_spread(views: Sequence[View], dataset: Path, threads: int) -> float:
-    """Root mean square of the photos' gains about their mean, over the channels: 0.1 is a tenth of the colours' values.
+    """RMS of the photos' log gains about their mean, over the channels: 0.1 is a tenth of the colour values.
 
     Args:
-        views: Photos.
+        views: The photos.
         dataset: The photos' dataset, for its sparse points.
         threads: Number of threads that read photos.
 
@@ -54,7 +54,7 @@ def exposure_spread(views: Sequence[View], dataset: Path, threads: int) -> float
 def decided_exposure(
     config: TrainConfig, views: Sequence[View], dataset: Path, threads: int, report: Reporter
 ) -> TrainConfig:
-    """The options with ``exposure`` decided, where that is `auto`: modelled where the photos' exposures differ.
+    """The options with ``exposure`` decided if it is `auto`: modelled if the photos' exposures differ.
 
     Args:
         config: The training options.
@@ -75,13 +75,13 @@ def decided_exposure(
 def log_gains(
     photo: Int64[np.ndarray, " n"], point: Int64[np.ndarray, " n"], logs: Float64[np.ndarray, "n 3"], photos: int
 ) -> Float64[np.ndarray, "k 3"]:
-    """Logarithms of the photos' gains, their mean 0; only of photos that show enough points that others show, too.
+    """Log gains of the photos, with mean 0; only of photos that share enough points with others.
 
     Args:
-        photo: Which photo each observation is of.
-        point: Which point.
-        logs: Logarithms of the colours.
-        photos: How many there are.
+        photo: Photo index of each observation.
+        point: Point index of each observation.
+        logs: Logarithms of the observed colours.
+        photos: Number of photos.
     """
     _, number, count = np.unique(point, return_inverse=True, return_counts=True)
     shared = count[number] > 1
@@ -102,7 +102,7 @@ def log_gains(
 def _colours(
     view: View, xyz: Float64[np.ndarray, "m 3"], tracks: Mapping[str, Int64[np.ndarray, " _"]]
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
-    """The points that a photo saw, where it is not clipped, and the logarithms of its colours there."""
+    """The points that a photo observes unclipped, and the logarithms of its colours there."""
     camera, pixels, mask = small_view(view, MEGAPIXELS)
     tracked = tracks[view.camera.name]
     inside, places, _ = camera.in_view(xyz[tracked])

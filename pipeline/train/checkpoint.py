@@ -1,4 +1,4 @@
-"""Where a killed training goes on from: tensors and counts after a whole iteration, tied to one plan."""
+"""Checkpoints from which a killed training resumes: tensors and counts after an iteration, tied to one plan."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _FACTS = "facts"
 
 
 class BrokenCheckpointError(Exception):
-    """A checkpoint that cannot be gone on from; the message says why."""
+    """A checkpoint from which training cannot resume; the message says why."""
 
 
 class HostArrays(Mapping[str, npt.NDArray[Any]]):
-    """Tensors as arrays, not copied; one of a device is fetched when it is asked for: the host may not hold them all.
+    """Tensors as NumPy arrays, not copied; device tensors are fetched on access, since the host may not hold them all.
 
     Args:
-        tensors: By name.
+        tensors: Tensors by name.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
@@ -50,10 +50,10 @@ class HostArrays(Mapping[str, npt.NDArray[Any]]):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What one holds.
+    """The content of a checkpoint.
 
     Attributes:
-        arrays: Every tensor of the state, by name; asked for one after the other.
+        arrays: Every tensor of the state, by name; accessed one after the other.
         facts: Counts and curves as JSON values.
     """
 
@@ -62,19 +62,19 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, plan_digest: str, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint at ``path`` at once.
+    """Atomically replace the checkpoint at ``path``.
 
-    The file is an uncompressed NumPy archive, whose checksums tell a damaged one.
+    The file is an uncompressed NumPy archive, whose checksums reveal damage.
 
     Raises:
-        OSError: if it cannot be written; the one before is still there.
+        OSError: if it cannot be written; the previous checkpoint is kept.
     """
     header = {"format": CHECKPOINT_FORMAT, "plan": plan_digest, "facts": dict(checkpoint.facts)}
     facts = np.frombuffer(json.dumps(header).encode(), np.uint8)
     if _FACTS in checkpoint.arrays:
         raise ValueError(f"an array may not be called {_FACTS}")
 
-    def write(file: IO[bytes]) -> None:  # as np.savez, which wants all arrays at once
+    def write(file: IO[bytes]) -> None:  # like np.savez, which needs all arrays at once
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
             _add_array(archive, _FACTS, facts)
             for name in checkpoint.arrays:
@@ -92,12 +92,12 @@ def load_checkpoint(path: Path, plan_digest: str) -> Checkpoint:
     """Read a checkpoint back.
 
     Args:
-        path: Where it is.
-        plan_digest: The plan it must be of.
+        path: Path of the checkpoint.
+        plan_digest: Digest of the plan that it must belong to.
 
     Raises:
         FileNotFoundError: if there is none.
-        BrokenCheckpointError: if it is damaged, of another version, or of another plan.
+        BrokenCheckpointError: if it is damaged, from another version, or for another plan.
     """
     try:
         arrays = read_archive(path)

@@ -1,11 +1,11 @@
-"""Early end: where the loss on the training photos is flat, larger photos come at once, or the schedule is run down.
+"""Early stopping: once the training loss is flat, switch to larger photos, or end with a short tail of the schedule.
 
-A size is flat where training on with it, for all iterations that are left, would take too little off its loss.
-Epochs are compared, in which every photo counts once with all of its windows, by a straight line through the logarithms
-of their mean losses over the logarithm of the iteration. Such a power law has no unit, and it foretells too much gain
-rather than too little, for a real curve bends towards its floor: on four captures it was 1.5 to 2 times what came.
-Learning rates that have not fallen yet hide a part of the gain, so the end is not abrupt: the schedule's remainder is
-compressed into a short tail. Only losses and iterations have a say, no clock and no held-out photo.
+A size is flat if training with it for all remaining iterations would reduce its loss too little. The forecast is a
+straight line through the logarithm of the epochs' mean losses over the logarithm of the iteration; an epoch has every
+photo once with all of its windows. Such a power law has no unit, and it overestimates rather than underestimates the
+gain, because a real curve bends towards its floor: on four captures it was 1.5 to 2 times the actual gain. Learning
+rates that have not fallen yet hide part of the gain, so the end is not abrupt: the rest of the schedule is compressed
+into a short tail. Only losses and iterations decide, not the clock or held-out views.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import Schedule, tail_of
 
-WINDOW_SHARE = 0.25  # of the iterations done: what the line is drawn through
-FEWEST_EPOCHS = 8  # in it, so that their scatter is known
-STANDARD_ERRORS = 2.0  # the line is taken so much steeper: noise does not end a training that still gains
+WINDOW_SHARE = 0.25  # of the iterations done: the line is fitted to these
+FEWEST_EPOCHS = 8  # in the window, so that their scatter can be estimated
+STANDARD_ERRORS = 2.0  # by which the line is made steeper: noise must not end a training that still improves
 
 
 def settled_from(schedule: Schedule) -> int:
-    """Iteration after which only the rates change: all Gaussians, all degrees and the photos' finest size are there.
+    """Iteration after which only the rates change: Gaussians, SH degree and photo size have reached their final state.
 
     Args:
         schedule: The training schedule.
@@ -35,9 +35,9 @@ def settled_from(schedule: Schedule) -> int:
 
 
 def judged_from(schedule: Schedule, iteration: int, resets: Sequence[int]) -> int:
-    """Iteration since which losses tell whether the size that is trained on at one has more to give.
+    """Iteration from which losses show whether the current photo size can still improve.
 
-    Before the finest size growth has to have begun only: what it adds later, it adds to larger photos as well.
+    Before the finest size, growth only has to have begun: Gaussians added later also serve larger photos.
 
     Args:
         schedule: The training schedule.
@@ -53,14 +53,14 @@ def judged_from(schedule: Schedule, iteration: int, resets: Sequence[int]) -> in
 
 
 def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
-    """Share of the loss that training on would take off it, rather too large than too small.
+    """Share of the loss that further training would remove; an overestimate rather than an underestimate.
 
     Args:
-        epochs: Middle iteration and mean loss of each, in order; at least three.
-        last: Iteration until which it would go on.
+        epochs: Middle iteration and mean loss of each epoch, in order; at least three.
+        last: Iteration to forecast to.
 
     Returns:
-        At most 1; below 0 where the loss rises. 1 where a loss is not above 0, so nothing can be said.
+        At most 1; below 0 if the loss rises. 1 if a loss is not positive, so that no forecast is possible.
     """
     losses = np.array([loss for _, loss in epochs])
     if not (losses > 0.0).all():
@@ -74,12 +74,12 @@ def expected_gain(epochs: Sequence[tuple[int, float]], last: int) -> float:
 
 
 def is_flat(epochs: Sequence[tuple[int, float]], plan: TrainingPlan, iteration: int) -> bool:
-    """Whether `stop_when_flat` ends the size that is trained on here, or the training after a tail that begins here.
+    """Whether `stop_when_flat` ends the current photo size here, or starts the training's final tail.
 
     Args:
-        epochs: Middle iteration and mean loss of all since ``judged_from``.
+        epochs: Middle iteration and mean loss of all epochs since ``judged_from``.
         plan: The training plan.
-        iteration: Now, the last one of an epoch.
+        iteration: The current iteration, the last one of an epoch.
     """
     scheduled = plan.schedule.iterations
     recent = [epoch for epoch in epochs if epoch[0] > (1.0 - WINDOW_SHARE) * iteration]
@@ -93,13 +93,13 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: TrainingPlan, iteration: 
 
 
 def end_epoch(history: History, plan: TrainingPlan, iteration: int, length: int) -> None:
-    """Close an epoch, and note where its loss ends a size or begins the training's tail.
+    """Close an epoch, and record if its loss ends a photo size or begins the training's tail.
 
     Args:
         history: Changed in place.
         plan: The current training plan.
         iteration: The last one of an epoch.
-        length: Iterations that the epoch has.
+        length: Number of iterations in the epoch.
     """
     since = judged_from(plan.schedule, iteration, history.resets)
     history.end_epoch(iteration - length // 2, iteration - length >= since)
@@ -112,10 +112,10 @@ def end_epoch(history: History, plan: TrainingPlan, iteration: int, length: int)
 
 
 def ends_at(plan: TrainingPlan, flat_at: int) -> int:
-    """The last iteration.
+    """The last iteration of the training.
 
     Args:
         plan: The training plan.
-        flat_at: Iteration after which the tail began; 0 where it did not.
+        flat_at: Iteration after which the tail began; 0 if it has not.
     """
     return min(plan.last_iteration, flat_at + tail_of(flat_at)) if flat_at else plan.last_iteration

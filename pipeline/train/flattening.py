@@ -3,9 +3,9 @@
 A splat is trained for images. Its surfaces are translucent clouds of Gaussians, and on textureless walls they hang in
 front of and behind the surface, because no photo constrains them. The copy is trained further for some hundred
 iterations, at the size at which a whole photo fits in one window, with a distortion loss about the median, which
-pulls everything along a ray to one depth, and a smoothness loss between neighbouring depths.
-Density control is off, sky and exposures stay as they were
-trained. This costs some decibels of image quality, so the delivered splat is not changed.
+pulls everything along a ray to one depth, and a smoothness loss between neighbouring depths. Density control is off;
+sky and exposures keep their trained values. This costs some decibels of image quality, so the delivered splat is not
+changed.
 """
 
 from __future__ import annotations
@@ -39,10 +39,7 @@ VISITS = 8  # of every photo
 LEAST_ITERATIONS = 300  # if there are few photos
 SPREAD_WEIGHT = 0.5  # ten times that of a splat trained for images
 EVENNESS_WEIGHT = 0.1
-FIRST_MEANS_RATE, LAST_MEANS_RATE = (
-    1.6e-5,
-    1.6e-6,
-)  # of positions, times the extent: the later half of the published ones
+FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6  # of positions, times the extent: later half of the published
 OPACITY_RATE = 0.05  # as published
 
 FLATTENED = "flattened.ply"

@@ -1,4 +1,4 @@
-"""How many Gaussians fit into a memory limit (`limits.py` says why), and whether the process keeps to it."""
+"""How many Gaussians fit in a memory limit (see `limits.py`), and whether the process keeps within it."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from splatpipe.pipeline.train.limits import (
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import TrainingPlan
 
-RESIDENT_STEP = 16_000_000  # what the process has is rounded up to it: a few pages more or less change no plan
-GROWTH_STOPS_AT = 0.97  # of the limit: more at rest after a step of density control was no surprise in the next one
+RESIDENT_STEP = 16_000_000  # resident memory is rounded up to it: a few pages more or less change no plan
+GROWTH_STOPS_AT = 0.97  # of the limit, at rest after a density-control step: above it the next step may exceed it
 
 
 def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bool = False) -> TrainingPlan:
-    """The plan with windows and a cap on Gaussians that keep the process, or a device's tensors, within its limit.
+    """The plan with windows and a cap on Gaussians that keep the process, or a device's tensors, within the limit.
 
     Args:
-        plan: Without it; ``max_memory_bytes`` of its options is the limit.
-        sparse: Gaussians of sparse points at the start; dense ones go before they do, and nobody misses those.
-        report: Is told where those of sparse points have to be thinned.
-        on_cuda: The training's tensors are a CUDA device's.
+        plan: The plan without the limit, which is ``max_memory_bytes`` of its options.
+        sparse: Number of initial Gaussians from sparse points; dense ones are dropped first, without a warning.
+        report: Receives a warning if those from sparse points have to be thinned.
+        on_cuda: Whether the training's tensors are on a CUDA device.
 
     Raises:
-        MachineError: if not even the fewest fit beside what the process has already.
+        MachineError: if not even the minimum fits beside what the process already uses.
     """
     return_free_heap()
     limit, taken = plan.options.max_memory_bytes, -(-resident_bytes() // RESIDENT_STEP) * RESIDENT_STEP
@@ -64,23 +64,23 @@ def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bo
 
 
 def within_room(wanted: int, gaussians: Gaussians) -> int:
-    """The most Gaussians, up to those wanted, that the free memory of their device holds; all of them on the CPU.
+    """Number of Gaussians, at most ``wanted``, that fit in the free memory of their device; ``wanted`` on the CPU.
 
-    Where it is fewer, growth ends for the rest of the training and its checkpoints, and that is told.
+    If it is fewer, growth ends for the rest of the training and its checkpoints, and that is reported.
     """
     free, count = free_bytes(gaussians.means.device), len(gaussians)
     if free is None:
         return wanted
-    passing = DEVICE_PASSING_BYTES * count  # those that are there have their state already
+    passing = DEVICE_PASSING_BYTES * count  # existing Gaussians already have their state
     more = (free - passing) // device_bytes_per_gaussian(gaussians.sh_degree)
     return min(wanted, count + max(0, int(more)))
 
 
 def over_memory(options: TrainConfig) -> bool:
-    """Whether the process is about to pass its limit: asked after every step of density control.
+    """Whether the process is about to exceed its limit; checked after every step of density control.
 
-    The plan's cap should never let it come to that. Where it does, growth ends for the rest of the training and its
-    checkpoints: besides the deadline the one thing that a machine may change in a planned training, and it is told.
+    The plan's cap should prevent that. If it happens, growth ends for the rest of the training and its checkpoints, and
+    that is reported: besides the deadline this is the only thing that a machine may change in a planned training.
     """
     limit = options.max_memory_bytes
     if limit == 0 or resident_bytes() <= GROWTH_STOPS_AT * limit:
@@ -90,7 +90,7 @@ def over_memory(options: TrainConfig) -> bool:
 
 
 def resident_bytes() -> int:
-    """Memory of this process now, bytes; 0 where the system does not say."""
+    """Resident memory of this process, bytes; 0 if the system does not report it."""
     try:
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
         return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) * 1024

@@ -33,9 +33,7 @@ def by_distance(
         camera: Camera of the photo that causes the step.
         unit: Distance up to which a step has the length given by its rate, world units.
     """
-    on_device = (
-        kernels_of(means.device) is not None
-    )  # there, counting rows would synchronize, and using all of them costs little
+    on_device = kernels_of(means.device) is not None  # counting rows would synchronize, and using all is cheap there
     chosen = slice(None) if rows is None or on_device else torch.nonzero(rows).flatten()
     ray = means[chosen].clone()
     for axis, value in enumerate(camera.centre().tolist()):

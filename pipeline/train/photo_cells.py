@@ -1,4 +1,4 @@
-"""Cells that divide a whole photo, and what a window shows of them; on the device of the pictures, nothing waits."""
+"""A grid of cells over a whole photo, and the part of it in a window; computed without synchronizing the device."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from splatpipe.pipeline.geometry.camera import Camera
 
-LEAST_SHOWN = 0.25  # of a cell that is judged in a window: where four windows meet, one of them shows as much
+LEAST_SHOWN = 0.25  # of a cell to be judged in a window: where four windows meet, at least one shows as much
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,9 @@ class PhotoCells:
     """A grid over the whole photo.
 
     Attributes:
-        camera: Of the photo, or of a window of it.
-        rows: Of cells.
-        columns: Of cells.
+        camera: Camera of the photo, or of a window of it.
+        rows: Rows of cells.
+        columns: Columns of cells.
     """
 
     camera: Camera
@@ -29,7 +29,7 @@ class PhotoCells:
     columns: int
 
     def means(self, planes: Float[Tensor, "c h w"]) -> Float[Tensor, "c rows columns"]:
-        """Each cell's means over what is shown of it; zero where nothing is."""
+        """Each cell's means over its visible part; zero for cells not shown."""
         if self.camera.window is None:
             return functional.adaptive_avg_pool2d(planes[None], (self.rows, self.columns))[0]
         (rows, down), (columns, across) = self._sides(planes)
@@ -39,7 +39,7 @@ class PhotoCells:
         return found
 
     def judged(self, like: Tensor) -> Bool[Tensor, "rows columns"] | None:
-        """The cells of which enough is shown; None where that is all of them."""
+        """The cells of which enough is shown; None if that is all of them."""
         if self.camera.window is None:
             return None
         whole, found = self.camera.whole(), like.new_zeros(self.rows, self.columns)
@@ -50,7 +50,7 @@ class PhotoCells:
         return found >= LEAST_SHOWN
 
     def spread(self, cells: Bool[Tensor, "rows columns"]) -> Bool[Tensor, "h w"]:
-        """For each pixel what its cell has."""
+        """Each pixel's cell value."""
         camera, part = self.camera, self.camera.window
         if part is None:
             size = (camera.height, camera.width)
@@ -60,7 +60,7 @@ class PhotoCells:
         return cells[rows][:, columns]
 
     def _sides(self, like: Tensor) -> tuple[tuple[slice, Tensor], tuple[slice, Tensor]]:
-        """The rows of cells that the window touches, and which of its rows belong to each; the same of columns."""
+        """The rows of cells that the window touches, and which of its rows belong to each; the same for columns."""
         camera, part = self.camera, self.camera.window
         assert part is not None
         return (
@@ -70,14 +70,14 @@ class PhotoCells:
 
 
 def _touched(pixels: range, size: int, cells: int, like: Tensor) -> tuple[slice, Float[Tensor, "touched count"]]:
-    """The cells that some pixels along a side belong to, and which belong to each; one more, empty, does no harm."""
+    """The cells that pixels along a side belong to, and which pixels belong to each; extra empty cells do no harm."""
     first, last = pixels.start * cells // size, (pixels.stop - 1) * cells // size
     numbers = slice(max(0, first - 1), min(cells, last + 2))
     return numbers, _belongs(pixels, size, cells, like)[numbers]
 
 
 def _belongs(pixels: range, size: int, cells: int, like: Tensor) -> Float[Tensor, "cells count"]:
-    """1 where a pixel along a side belongs to a cell: as torch's adaptive pooling divides it, overlaps and all."""
+    """1 where a pixel along a side belongs to a cell: as in torch's adaptive pooling, including overlaps."""
     number = torch.arange(cells, device=like.device)[:, None]
     begin = number * size // cells
     end = -(-(number + 1) * size // cells)
@@ -86,6 +86,6 @@ def _belongs(pixels: range, size: int, cells: int, like: Tensor) -> Float[Tensor
 
 
 def _nearest(first: int, count: int, size: int, cells: int, device: torch.device) -> Int64[Tensor, " count"]:
-    """The cells of some pixels along a side: as torch's nearest interpolation finds them, in float32."""
+    """The cells of pixels along a side, as torch's nearest interpolation computes them in float32."""
     pixel = torch.arange(first, first + count, dtype=torch.float32, device=device)
     return (pixel * (cells / size)).floor().long().clamp(max=cells - 1)

@@ -1,11 +1,11 @@
-"""Even surfaces: the depths that neighbouring rays meet shall go on straight, wherever they do not break off.
+"""Smoothness loss: depths of neighbouring rays should lie on a plane, except at depth discontinuities.
 
-The inverse depth of a plane is linear over a picture, so its second difference tells, pixel by pixel, how far a place
-lies off the straight line between two on either side: wherever surfaces are plain, and whatever their slant. As in
-depth–normal consistency (Huang et al., "2D Gaussian Splatting for Geometrically Accurate Radiance Fields", SIGGRAPH
-2024) a Gaussian's orientation is drawn to that of the surface which its neighbours make together; here through the
-depths that rays meet in it, which turn with it, so that no second picture, of normals, has to be rendered: on the demo
-both were as good, and this took half the time. Edges and steps are much more than a pixel, and cost no more than that.
+The inverse depth of a plane is linear over an image, so its second difference tells how far a point lies off the
+straight line between its neighbours on either side, whatever the slant of the surface. As in depth–normal consistency
+(Huang et al., "2D Gaussian Splatting for Geometrically Accurate Radiance Fields", SIGGRAPH 2024), a Gaussian's
+orientation is pulled towards that of the surface formed by its neighbours; here through the depths at which rays meet
+it, which depend on its orientation, so that no normal map has to be rendered: on the demo both were equally good, and
+this took half the time. The penalty saturates, so edges and steps of many pixels cost no more.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from splatpipe.pipeline.train.distortion_loss import LEAST_ALPHA
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
-REACHES_PX = (1, 4, 12)  # between a place and those on either side: from what is rough to what is wavy
-HALF_PX = 1.0  # off the line, pixels on the ground, at which half of the most is reached
+REACHES_PX = (1, 4, 12)  # distances to the neighbours on either side: from roughness to waviness
+HALF_PX = 1.0  # deviation, in GSD, at which half of the maximum penalty is reached
 
 
 class SmoothnessLoss(Technique):
-    """Adds how uneven the depths are to the loss; used with ``Distortion``, which asks for them.
+    """Adds the unevenness of depths to the loss; requires ``DistortionLoss``, which turns depths on.
 
     Args:
         weight: Weight in the loss.
@@ -37,26 +37,26 @@ class SmoothnessLoss(Technique):
         self._weight = weight
 
     def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
-        """How uneven the photo's depths are, weighted."""
+        """The unevenness of the photo's depths, weighted."""
         return self._weight * unevenness(shot.rendered, shot.photo.camera, shot.photo.inside)
 
 
 def unevenness(
     rendered: Render, camera: Camera, inside: tuple[slice, slice] = EVERYWHERE, reaches: tuple[int, ...] = REACHES_PX
 ) -> Float[Tensor, ""]:
-    """How far depths are off the line between those on either side, 0 to 1 for each reach and direction, summed.
+    """Deviation of depths from the line between their neighbours, 0 to 1 per reach and direction, summed.
 
-    Each is the mean over the places that have neighbours; where one of the three shows no surface, it is 0.
+    Each is the mean over the pixels that have neighbours; where one of the three shows no surface, it is 0.
 
     Args:
         rendered: With depths.
         camera: The photo's camera.
         inside: Rows and columns that count.
-        reaches: Pixels between a place and its neighbours; one that the picture is too small for is left out.
+        reaches: Pixels between a pixel and its neighbours; reaches too large for the image are left out.
     """
     seen = (rendered.alpha.detach() >= LEAST_ALPHA)[inside]
     inverse = torch.where(seen, rendered.alpha[inside], 1.0) / torch.where(seen, rendered.depth_sum[inside], 1.0)
-    ground = camera.fx / inverse.detach()  # pixels of depth that a difference of inverse depths is
+    ground = camera.fx / inverse.detach()  # converts a difference of inverse depths to GSD
     total = inverse.new_zeros(())
     for reach in reaches:
         for axis in (0, 1):

@@ -84,9 +84,7 @@ class Uploader:
         current.wait_event(upload.sent)
         for tensor in (upload.colour, upload.mask):
             if tensor is not None:
-                tensor.record_stream(
-                    current
-                )  # its memory belongs to the other stream and must not be reused before then
+                tensor.record_stream(current)  # its memory is the other stream's and must not be reused before then
         return colours_of(upload.colour), upload.mask
 
     def _sent(self, colour: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:

@@ -1,4 +1,4 @@
-"""Trained blocks joined to what a training of the whole leaves: model, history, plan and side models."""
+"""Joining trained blocks into the output of a whole training: model, history, plan and side models."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat_pa
 from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan, load_site_plan
 
-OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # are the coarse pass's, which looked at the whole
+OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # copied from the coarse pass, which covers the whole scene
 FROM_COARSE = ("sky_photos", "device", "instruction_set", "mode")
 
 
 def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write what stage `train` leaves, from its shards and the coarse pass.
+    """Write the output of the stage `train` from its shards and the coarse pass.
 
     Args:
-        inputs: The stage's.
-        out: Where to.
+        inputs: The stage's inputs.
+        out: Output folder.
         report: Receives progress.
 
     Raises:
-        StageError: if a block is missing, or a part of one is broken.
+        StageError: if a block is missing or one of its files is broken.
     """
     site, coarse = load_site_plan(inputs["blocks.plan"]), inputs["blocks.coarse"]
     read = _BlockReader(inputs.shards, report)
@@ -51,10 +51,10 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
 
 
 def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:
-    """Refuse to merge unless each block left its model.
+    """Check that each block has written its model.
 
     Raises:
-        StageError: if one did not.
+        StageError: if one has not.
     """
     there = {number for number, folder in enumerate(shards, 1) if (folder / "model.ply").is_file()}
     missing = [str(number) for number in range(1, len(site.blocks) + 1) if number not in there]
@@ -67,7 +67,7 @@ def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:
 
 
 class _BlockReader:
-    """Reads what a block trained, and tells how far that is: each is read to count and to write."""
+    """Reads trained blocks and reports progress: each is read twice, to count and to write."""
 
     def __init__(self, folders: Sequence[Path], report: Reporter) -> None:
         self._folders, self._report, self._done = folders, report, 0
@@ -79,10 +79,10 @@ class _BlockReader:
 
 
 def joint_history(coarse: Mapping[str, Any], blocks: Sequence[Mapping[str, Any]]) -> dict[str, JSON]:
-    """The history of the coarse pass, and after it that of all blocks as if they had been trained side by side.
+    """The history of the coarse pass, followed by that of all blocks as if they had been trained in parallel.
 
-    A point of the curve has the iterations of all, their mean loss and the Gaussians of all together; each block's own
-    history is there, too.
+    A point of the curve has the total iterations, the mean loss and the total Gaussians of all blocks; each block's own
+    history is included too.
 
     Args:
         coarse: The coarse pass's `history.json`.
@@ -122,7 +122,7 @@ def _side_by_side(curves: Sequence[Sequence[Mapping[str, Any]]], before: int) ->
 
 
 def _told(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JSON]:
-    """What people are told of the training: sums over its blocks, with the coarse pass; the loss is the blocks'."""
+    """The training's summary: sums over its blocks and the coarse pass; the loss is that of the blocks."""
     first = inputs.summaries.get("blocks", {}).get("coarse", {})
     each = [inputs.summaries.get(f"train.{number}", {}) for number in range(1, len(inputs.shards) + 1)]
     losses = [point["loss"] for point in history["curve"] if point["loss"] is not None]
@@ -150,7 +150,7 @@ def _named(coarse: Summary, blocks: Sequence[Summary]) -> dict[str, Summary]:
 
 
 def _ended_flat(part: Summary) -> dict[str, JSON]:
-    """What a part's training says of having ended, or gone on to larger photos, because its loss was flat."""
+    """The entries of a part's summary about early ends of the training or of a photo size after a flat loss."""
     return {name: part[name] for name in ("flat_at", "sizes_ended") if part.get(name)}
 
 

@@ -1,7 +1,7 @@
-"""The coarse pass: the whole scene at its first size, with its cap or what the limit of memory holds.
+"""The coarse pass: the whole scene at its first size, up to its cap or the memory limit.
 
-It is what is drawn around blocks and outside of all of them, what they start from, and what they see their photos
-through: its sky and exposures are theirs, so that no two blocks differ in them.
+Its model is rendered around blocks and outside all of them, and blocks start from it; they also use its sky and
+exposures, so that no two blocks differ in them.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ SKIES = "skies.npz"
 
 @dataclass(frozen=True)
 class TrainingLimits:
-    """What keeps a training to its memory.
+    """Limits that keep a training within its memory.
 
     Attributes:
-        gaussians: At most.
+        gaussians: Maximum number of Gaussians.
         window_pixels: Most pixels of a photo that an iteration uses.
     """
 
@@ -42,13 +42,13 @@ class TrainingLimits:
 
 
 def train_coarse(config: TrainConfig, inputs: Inputs, limits: TrainingLimits, out: Path, report: Reporter) -> Summary:
-    """Write what the stage `train` does, of the whole scene at its first size, and the photos' skies.
+    """Write the same files as the stage `train`, for the whole scene at its first size, and the photos' sky masks.
 
     Args:
-        config: The options of the whole training; a time budget is nothing to it.
-        inputs: Those of the stage `train`.
-        limits: Of this pass.
-        out: Takes the files, and has its checkpoint meanwhile.
+        config: The options of the whole training; a time budget is ignored.
+        inputs: The inputs of the stage `train`.
+        limits: The limits of this pass.
+        out: Output folder, also of the checkpoint.
         report: Receives progress and messages.
 
     Raises:
@@ -66,11 +66,11 @@ def train_coarse(config: TrainConfig, inputs: Inputs, limits: TrainingLimits, ou
 
 
 def coarse_iterations(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> int:
-    """Those of the pass.
+    """Number of iterations of the coarse pass.
 
     Args:
         config: The options of the whole training.
-        cameras: Of the photos trained on.
+        cameras: Cameras of the training photos.
         window_pixels: Most pixels of a photo that an iteration uses.
     """
     footage, _most = footage_on(config, cameras, window_pixels)
@@ -78,12 +78,12 @@ def coarse_iterations(config: TrainConfig, cameras: Sequence[Camera], window_pix
 
 
 def coarse_plan(plan: TrainingPlan, scene: PlanningInput, limits: TrainingLimits) -> TrainingPlan:
-    """That of the coarse pass.
+    """The plan of the coarse pass.
 
     Args:
-        plan: Of the whole training.
-        scene: What is trained.
-        limits: Of the pass.
+        plan: Plan of the whole training.
+        scene: The scene to train.
+        limits: The limits of the pass.
     """
     options = plan.options.model_copy(update={"max_gaussians": limits.gaussians})
     plan = plan.within_windows(limits.window_pixels).of(options)

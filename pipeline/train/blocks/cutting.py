@@ -1,8 +1,8 @@
-"""Cutting the plan into cells of alike work: the sparse points in them, and the pixels of all photos that see them.
+"""Cutting the plan into cells of equal work, measured by sparse points and by the pixels of all photos that see a cell.
 
-Both count, as both cost: points grow Gaussians, and pixels are iterations. The plan is cut in two, and each part again,
-across its longer side, where the worse of the two measures is shared best; of an odd number of cells the second part
-gets one more. All is counted in whole numbers on one grid first, so that memory follows the grid, and not the photos.
+Both measures cost time: points grow Gaussians, and pixels need iterations. The plan is bisected recursively across its
+longer side, where the worse of the two measures is balanced best; of an odd number of cells the second part gets one
+more. Everything is first counted in integers on one grid, so memory depends on the grid, not on the photos.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.train.blocks.partition import Cell, Partition
 from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 
-BINS = 1024  # along the longer side of what is cut: 256 blocks are still cut to some percents of a cell
-NEAR = 4.0  # times the median size of a pixel: what is seen more coarsely is background
-SITE_PERCENTILES = (0.5, 99.5)  # of what is seen, along each axis: the few wrong depths lie outside
-MOST_SAMPLES = 1_000_000  # that say where the site is: 24 MB
-MARGIN_SHARE = 0.1  # of a cell's side (that of a square of its size)
+BINS = 1024  # along the longer side of the site: 256 blocks are still cut to a few percent of a cell
+NEAR = 4.0  # times the median GSD: anything seen more coarsely is background
+SITE_PERCENTILES = (0.5, 99.5)  # of the visible places, along each axis: the few wrong depths lie outside
+MOST_SAMPLES = 1_000_000  # used to locate the site: 24 MB
+MARGIN_SHARE = 0.1  # of a cell's side (of a square of equal area)
 
 
 @dataclass(frozen=True, eq=False)
 class WorkMap:
-    """What there is to do, counted on square bins of the plan.
+    """The work, counted on square bins of the plan.
 
     Attributes:
-        plan: The ground's.
-        low: Where the first bin begins, plan units.
-        bin_size: Plan units.
-        measures: Sparse points, and pixels that see a bin, of each bin.
+        plan: The ground plan.
+        low: Lower corner of the first bin, plan units.
+        bin_size: Side of a bin, plan units.
+        measures: Number of sparse points in each bin, and of pixels that see it.
     """
 
     plan: GroundPlan
@@ -43,7 +43,7 @@ class WorkMap:
     measures: Int64[np.ndarray, "2 nx ny"]
 
     def bins(self, places: PlanPoints) -> tuple[Int64[np.ndarray, "k 2"], Bool[np.ndarray, " n"]]:
-        """The bins of those places that have one, and which do."""
+        """The bins of the places inside the map, and which places those are."""
         scaled = (places - np.array(self.low)) / self.bin_size
         inside = np.asarray((scaled >= 0.0).all(axis=1) & (scaled < self.measures.shape[1:]).all(axis=1))
         return scaled[inside].astype(np.int64), inside
@@ -52,13 +52,13 @@ class WorkMap:
 def site(
     plan: GroundPlan, seen: Sequence[PhotoCoverage], xyz: Float64[np.ndarray, "p 3"], area: PlanArea | None = None
 ) -> Cell:
-    """The rectangle that is cut: what photos see, and not from too far; beyond it the outer cells go on.
+    """The rectangle to cut: what photos see from not too far away; the outer cells extend beyond it.
 
     Args:
-        plan: The ground's.
-        seen: What the photos see.
+        plan: The ground plan.
+        seen: The photos' coverages.
         xyz: All sparse points.
-        area: That counts, where somebody drew one, in the model's frame.
+        area: Area of interest, if the user drew one, in the model's frame.
 
     Raises:
         ValueError: if no photo sees anything.
@@ -72,14 +72,14 @@ def site(
         raise ValueError("no photo sees anything")
     middle = float(np.median(sizes))
     low, high = np.percentile(plan.places(places[sizes <= NEAR * middle]), SITE_PERCENTILES, axis=0)
-    high = np.maximum(high, low + max(float((high - low).max()), middle) / BINS)  # a strip is one bin wide at least
+    high = np.maximum(high, low + max(float((high - low).max()), middle) / BINS)  # a strip is at least one bin wide
     return Cell((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
 
 
 def _evenly(
     sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], most: int
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """About so many of the places that a photo sees, and how large a pixel is there."""
+    """About ``most`` of the places that a photo sees, and the size of a pixel (GSD) there."""
     samples = sight.samples(xyz)
     rows = np.flatnonzero(np.isfinite(samples.places).all(axis=1))
     rows = rows[:: max(1, -(-len(rows) // most))]
@@ -90,9 +90,9 @@ def work_map(plan: GroundPlan, extent: Cell, seen: Sequence[PhotoCoverage], xyz:
     """Count points and pixels.
 
     Args:
-        plan: The ground's.
-        extent: What is to be cut.
-        seen: What the photos see.
+        plan: The ground plan.
+        extent: The rectangle to cut.
+        seen: The photos' coverages.
         xyz: All sparse points.
     """
     sides = np.array(extent.high) - np.array(extent.low)
@@ -109,14 +109,14 @@ def work_map(plan: GroundPlan, extent: Cell, seen: Sequence[PhotoCoverage], xyz:
 
 
 def cut(work: WorkMap, cells: int) -> Partition:
-    """Cut what was counted into so many cells.
+    """Cut the plan into the given number of cells.
 
     Args:
-        work: Of ``work_map``.
-        cells: At least 1.
+        work: From ``work_map``.
+        cells: Number of cells, at least 1.
 
     Raises:
-        ValueError: if the plan has not as many bins.
+        ValueError: if the plan has fewer bins.
     """
     boxes = _boxes((0, 0, *work.measures.shape[1:]), cells, work.measures)
     found = []
@@ -128,7 +128,7 @@ def cut(work: WorkMap, cells: int) -> Partition:
 
 
 def shares(work: WorkMap, partition: Partition) -> Float64[np.ndarray, "2 cells"]:
-    """The part of all points, and of all pixels, that each cell has; of those that lie in any."""
+    """Each cell's share of the points and of the pixels that lie in any cell."""
     nx, ny = work.measures.shape[1:]
     x, y = np.meshgrid(np.arange(nx) + 0.5, np.arange(ny) + 0.5, indexing="ij")
     centres = np.stack([x.ravel(), y.ravel()], axis=1) * work.bin_size + np.array(work.low)
@@ -139,7 +139,7 @@ def shares(work: WorkMap, partition: Partition) -> Float64[np.ndarray, "2 cells"
 def _boxes(
     box: tuple[int, int, int, int], cells: int, measures: Int64[np.ndarray, "2 nx ny"]
 ) -> list[tuple[int, int, int, int]]:
-    """The bins of each cell: left, low, right and high, the last two exclusive."""
+    """The bins of each cell: left, bottom, right and top, the last two exclusive."""
     x0, y0, x1, y1 = box
     if cells == 1:
         return [box]
@@ -154,12 +154,12 @@ def _boxes(
 
 
 def _best_cut(across: Int64[np.ndarray, "2 n"], left: int, cells: int) -> int:
-    """After how many bins to cut, so that the worse measure of the worse side is as good as can be; the first of them.
+    """The number of bins before the cut that minimizes the larger measure of the larger side; ties take the first.
 
     Args:
         across: Both measures of each slice of bins.
-        left: Cells that the first part gets.
-        cells: Of both parts.
+        left: Number of cells in the first part.
+        cells: Number of cells in both parts.
     """
     if across.shape[1] < 2:
         raise ValueError(f"{across.shape[1]} bins cannot be cut into {cells} cells")

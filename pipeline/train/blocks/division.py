@@ -1,7 +1,7 @@
-"""Into how many blocks a scene is cut: as few as keep to a limit of memory. Plain arithmetic, light to import.
+"""The number of blocks of a scene: as few as the memory limit allows. Plain arithmetic, cheap to import.
 
-A scene whose cap on Gaussians fits, or that is not thought to come near to what fits, is one whole. Else the cap stays
-and the scene is cut, into blocks of some photos each at least; only where that is not enough is the cap lowered.
+A scene whose cap on Gaussians fits, or that is not expected to come near the limit, is trained whole. Otherwise the cap
+stays and the scene is cut into blocks of at least a few photos each; only if that is not enough is the cap lowered.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from splatpipe.pipeline.train.limits import (
     window_within,
 )
 
-PHOTOS_A_BLOCK = 8  # at least: of smaller blocks each photo shows many, and each looks at it again
-FEWEST_GAUSSIANS = 1000  # of a block: fewer are no model
-LIKELY_MOST = 2.0  # times what a scene is thought to grow to, it hardly ever does: forecasts are off by so much
+PHOTOS_A_BLOCK = 8  # at least: each photo shows many smaller blocks and would be trained on in each
+FEWEST_GAUSSIANS = 1000  # of a block: fewer are not a useful model
+LIKELY_MOST = 2.0  # times the expected size is hardly ever exceeded: forecasts are off by up to this factor
 
 
 @dataclass(frozen=True)
 class SceneSize:
-    """What says how much memory a training takes.
+    """The quantities that determine the memory of a training.
 
     Attributes:
-        cap: On Gaussians.
-        expected: Gaussians that its photos are thought to ask for.
-        window_pixels: That an iteration looks at, at most, where memory is no matter.
+        cap: Maximum number of Gaussians.
+        expected: Number of Gaussians that the photos are expected to need.
+        window_pixels: Most pixels that an iteration uses if memory does not matter.
         sh_degree: SH degree of the model.
-        photos: That are trained on.
+        photos: Number of training photos.
     """
 
     cap: int
@@ -52,17 +52,18 @@ class SceneSize:
 
 @dataclass(frozen=True)
 class Division:
-    """How a scene is trained.
+    """How a scene is divided for training.
 
     Attributes:
-        blocks: How many; 1 is the whole in one.
-        cap: On Gaussians of the whole; lower than asked for only where no more blocks make sense.
-        limit_bytes: Of memory; 0 for none.
-        window_pixels: That an iteration looks at, at most.
-        need: What one of the blocks takes, without the libraries.
-        coarse_cap: On Gaussians of the pass over the whole that comes before blocks: of those of the whole as many as
-            the limit holds, for what it lacks no block makes up for.
-        is_near: Whether a whole one may come near the limit: of too few photos for blocks, its training keeps to it.
+        blocks: Number of blocks; 1 means the whole scene at once.
+        cap: Maximum number of Gaussians in the scene; lower than requested only if more blocks make no sense.
+        limit_bytes: Memory limit; 0 for none.
+        window_pixels: Most pixels that an iteration uses.
+        need: What each block takes, without the libraries.
+        coarse_cap: Maximum number of Gaussians in the coarse pass: as many of the scene's as the limit allows, because
+            blocks cannot make up for what it lacks.
+        is_near: Whether a whole scene may come near the limit: with too few photos for blocks, its training has to
+            enforce the limit.
     """
 
     blocks: int
@@ -75,12 +76,12 @@ class Division:
 
     @property
     def is_whole(self) -> bool:
-        """Whether there are no blocks."""
+        """Whether the scene is trained whole, without blocks."""
         return self.blocks == 1
 
     @property
     def memory_bytes(self) -> int:
-        """Of the process that trains one of the blocks."""
+        """Memory of the process that trains one of the blocks."""
         return LIBRARIES_BYTES + self.need.memory_bytes
 
     @staticmethod
@@ -88,28 +89,28 @@ class Division:
         """The inverse of ``dataclasses.asdict``, from JSON.
 
         Raises:
-            KeyError, TypeError: if it is something else.
+            KeyError, TypeError: if it is not a division.
         """
         return Division(**{**facts, "need": BlockNeed(**facts["need"])})
 
 
 def memory_limit(asked_bytes: int, machine_bytes: int) -> int:
-    """The limit that a training keeps to: the one that was asked for, or most of the machine's; 0 for none.
+    """The memory limit of a training: the requested one, or most of the machine's memory; 0 for none.
 
     Args:
         asked_bytes: ``train.max_memory_bytes``; 0 for none.
-        machine_bytes: That the machine has; 0 where nobody says.
+        machine_bytes: The machine's memory; 0 if unknown.
     """
     return asked_bytes or int(MACHINE_SHARE * machine_bytes)
 
 
 def divided(scene: SceneSize, limit_bytes: int, least: int = 0) -> Division:
-    """How many blocks there are, and what each takes.
+    """The number of blocks, and what each takes.
 
     Args:
-        scene: What is trained.
-        limit_bytes: Of the process that trains; 0 for none.
-        least: Blocks that somebody wants at least; 0 for as few as there can be.
+        scene: The scene to train.
+        limit_bytes: Memory limit of the training process; 0 for none.
+        least: Requested minimum number of blocks; 0 for as few as possible.
     """
     if not limit_bytes:
         return _of(scene, max(1, least), scene.cap, limit_bytes, scene.window_pixels)
@@ -123,7 +124,7 @@ def divided(scene: SceneSize, limit_bytes: int, least: int = 0) -> Division:
     blocks, cap = max(wanted, least), scene.cap
     if blocks > most:
         blocks, cap = most, _most_gaussians(most, room, window, scene.sh_degree)
-        if cap < FEWEST_GAUSSIANS * blocks:  # the training of the whole says what is too little
+        if cap < FEWEST_GAUSSIANS * blocks:  # the whole training reports that memory is too small
             blocks, cap = 1, _most_gaussians(1, room, window, scene.sh_degree)
     return replace(_of(scene, blocks, min(cap, scene.cap), limit_bytes, window), is_near=blocks == 1)
 
@@ -138,7 +139,7 @@ def _of(scene: SceneSize, blocks: int, cap: int, limit_bytes: int, window: int) 
 
 
 def _most_gaussians(blocks: int, room: int, window: int, sh_degree: int) -> int:
-    """Most Gaussians of a scene in so many blocks, each of which keeps to a limit."""
+    """Maximum number of Gaussians of a scene in a number of blocks, each within the limit."""
     of_one = bytes_per_gaussian(sh_degree) + (FROZEN_SHARE * frozen_bytes(sh_degree) if blocks > 1 else 0.0)
     fitting = max(0, int((room - FIXED_BYTES - PIXEL_BYTES * window) / of_one))
     return fitting if blocks == 1 else int(fitting / MARGIN_GROWTH) * blocks

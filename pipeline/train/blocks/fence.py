@@ -1,4 +1,4 @@
-"""A block's Gaussians stay in its cell and margin, and each of the two gets no more of them than its share."""
+"""Keep a block's Gaussians in its cell and margin, each with no more of them than its share."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from splatpipe.pipeline.train.hooks import Technique
 
 
 class Fence(Technique):
-    """Keeps a block's Gaussians where they belong: what they could stand for elsewhere is another block's, or frozen.
+    """Keeps a block's Gaussians where they belong: everything elsewhere belongs to another block or is frozen.
 
     Args:
         partition: The cells.
-        block: Whose.
-        share: Gaussians that its cell gets at most; the cap's rest is the margin's.
-        density: The training's schedule of density control; its steps are when it looks, and goes on to.
+        block: The block's number.
+        share: Maximum number of Gaussians in its cell; the rest of the cap goes to the margin.
+        density: The density-control schedule; checks follow its interval, and continue after its end.
     """
 
     name = "fence"
@@ -31,7 +31,7 @@ class Fence(Technique):
     def ranked(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
     ) -> Float[Tensor, " n"]:
-        """The same, but 0 for those that would be more than cell or margin have room for."""
+        """The same score, but 0 for Gaussians for which the cell or the margin has no room."""
         score = score.clone()
         for inside, most in self._shares(gaussians):
             room = max(0, most - int(inside.sum()))
@@ -41,12 +41,12 @@ class Fence(Technique):
         return score
 
     def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
-        """Those that left cell and margin, and the least opaque of what is too many; None between two looks."""
+        """Gaussians outside cell and margin, and the least opaque in excess of the shares; None between checks."""
         due = iteration >= self._density.first and iteration % self._density.every == 0
         return ~self.kept(gaussians) if due and self._density.on else None
 
     def kept(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
-        """Which Gaussians of a model are the block's to leave."""
+        """Which Gaussians of a model lie within the block's shares."""
         kept = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         for inside, most in self._shares(gaussians):
             rows = torch.nonzero(inside).flatten()
@@ -55,7 +55,7 @@ class Fence(Technique):
         return kept
 
     def _shares(self, gaussians: Gaussians) -> list[tuple[Bool[Tensor, " n"], int]]:
-        """Which Gaussians are in the cell and which in the margin, and how many each may have."""
+        """The Gaussians in the cell and in the margin, with the maximum number of each."""
         means = gaussians.means.detach()
         points = means.double().cpu().numpy()
         cell = self._partition.owners(points) == self._block

@@ -1,4 +1,4 @@
-"""Which windows of which photos each block trains on at each size, and what that takes, told without training any."""
+"""Forecast of each block, without training: its windows of photos at each size, and the effort that they take."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class WindowScheme:
     """How photos are cut into windows at the sizes that blocks train.
 
     Attributes:
-        levels: How often photos are halved, the first size first.
-        window_pixels: Of a window at most; 0 for whole photos.
+        levels: Number of times photos are halved, first size first.
+        window_pixels: Most pixels of a window; 0 for whole photos.
         max_megapixels: Photos are first reduced to this size; None: they are as the dataset has them.
     """
 
@@ -47,18 +47,18 @@ class WindowScheme:
 
     @staticmethod
     def of(config: TrainConfig, footage: PhotoSizes, max_megapixels: float | None) -> WindowScheme:
-        """That of a training's blocks.
+        """The window scheme of a training's blocks.
 
         Args:
             config: The training options.
             footage: All photos.
-            max_megapixels: That they are reduced to.
+            max_megapixels: Size that they are reduced to.
         """
         levels = tuple(level for level, _count in finer_lengths(config, footage))
         return WindowScheme(levels, footage.window_pixels, max_megapixels)
 
     def camera(self, camera: Camera, level: int) -> Camera:
-        """A photo's at a level."""
+        """A photo's camera at a level."""
         return reduced_camera(camera, self.max_megapixels, level)
 
     def frames(self, camera: Camera, level: int) -> list[PixelRectangle]:
@@ -75,21 +75,21 @@ class WindowScheme:
 
 
 Parts = dict[int, Int64[np.ndarray, "k 2"]]
-"""By the level, each a photo's row and the number of one of its windows."""
+"""By level: pairs of a photo's row and the index of one of its windows."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlockForecast:
-    """What a block will do.
+    """The forecast of a block's training.
 
     Attributes:
-        windows: That it trains on; their rows are those of the photos.
-        photos: That it sees.
-        parts: Windows that it trains on at each of its sizes, the first size first.
-        pixels: Of all of them, at that size.
-        iterations: Of its plan.
-        steps: Of density control in them.
-        disk_bytes: Of decoded photos while it trains, at most.
+        windows: The windows that it trains on; rows are those of the photos.
+        photos: Number of its photos.
+        parts: Number of windows at each of its sizes, first size first.
+        pixels: Total pixels of these windows, at that size.
+        iterations: Number of iterations in its plan.
+        steps: Number of density-control steps among them.
+        disk_bytes: Maximum disk space of decoded photos during training.
     """
 
     windows: Parts
@@ -104,13 +104,13 @@ class BlockForecast:
 def visible_windows(
     partition: Partition, sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], cut: WindowScheme
 ) -> dict[int, Bool[np.ndarray, "cells w"]]:
-    """By the level, which windows of a photo show each cell.
+    """Which windows of a photo show each cell, by level.
 
     Args:
         partition: The cells.
-        sight: What the photo sees.
+        sight: The photo's coverage.
         xyz: All sparse points.
-        cut: How it is cut.
+        cut: How it is cut into windows.
     """
     found = {}
     for level in cut.levels:
@@ -127,8 +127,8 @@ def parts_of(shown: Iterable[Mapping[int, Bool[np.ndarray, "cells w"]]], block: 
     """The windows that a block trains on.
 
     Args:
-        shown: Of each photo, as of ``visible_windows``.
-        block: Its number.
+        shown: For each photo, the result of ``visible_windows``.
+        block: The block's number.
     """
     found: dict[int, list[tuple[int, int]]] = {}
     for row, by_level in enumerate(shown):
@@ -145,12 +145,12 @@ def block_outlooks(
     partition: Partition,
     window_pixels: int,
 ) -> list[BlockForecast]:
-    """What each block will do.
+    """The forecast of each block.
 
     Args:
-        config: The options of the training.
-        views: Photos trained on.
-        seen: What they see, in their order.
+        config: The training options.
+        views: The training photos.
+        seen: Their coverages, in the same order.
         xyz: All sparse points.
         partition: The cells.
         window_pixels: Most pixels of a photo that an iteration uses.
@@ -162,7 +162,7 @@ def block_outlooks(
 
 
 def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> tuple[PhotoSizes, float | None]:
-    """Photos as they are trained on, and the megapixels that they are reduced to; None where they are as they are."""
+    """Photos at their training sizes, and the megapixels that they are reduced to; None if they are not reduced."""
     sizes = sizes_of(cameras)
     most = config.max_megapixels or None
     if most is not None and max(width * height for width, height, _count in sizes) <= 1e6 * most:
@@ -190,7 +190,7 @@ def _outlook(
 
 
 def _steps(config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: Sequence[View], parts: Parts) -> int:
-    """Steps of density control of a block."""
+    """Number of density-control steps of a block."""
     pieces = {level: len(pairs) for level, pairs in parts.items()}
     rows = {row for pairs in parts.values() for row in pairs[:, 0].tolist()}
     if not rows:
@@ -203,13 +203,13 @@ def _steps(config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: S
 def coarse_sights(
     coarse: Path, views: Sequence[View], observed: Sequence[Int64[np.ndarray, " _"]], machine: Machine
 ) -> list[PhotoCoverage]:
-    """What photos see by the depth of a coarse model; 40 kB a photo.
+    """The photos' coverages by the depth of a coarse model; 40 kB per photo.
 
     Args:
-        coarse: The folder that the coarse pass left.
+        coarse: Output folder of the coarse pass.
         views: The photos.
         observed: Rows of the sparse points that each observes.
-        machine: Renders it.
+        machine: The machine that renders the depths.
 
     Raises:
         SplatpipeError: if a file is missing or broken.
@@ -227,7 +227,7 @@ def each_sight(
     observed: Sequence[Int64[np.ndarray, " _"]],
     device: Device,
 ) -> Iterator[PhotoCoverage]:
-    """The same one after the other, where the bits are seen to; ``gaussians`` are the coarse model's."""
+    """The same, one by one, for callers that already ensure determinism; ``gaussians`` are the coarse model."""
     options = load_rendering(coarse / "rendering.json").options(gaussians)
     drawn = gaussians.to(device.tensors)
     for view, rows in zip(views, observed, strict=True):
@@ -236,6 +236,6 @@ def each_sight(
 
 
 def _counted(view: View, grid: Camera) -> Mask | None:
-    """Which pixels of a photo's grid its mask counts."""
+    """Which pixels of a photo's grid count by its mask; None if all do."""
     mask = load_mask(view)
     return None if mask is None else reduced_mask(mask, (grid.width, grid.height))

@@ -1,4 +1,4 @@
-"""The cells of a site and what each block may take, from a coarse model of the whole."""
+"""The layout of a site: its cells and the limits of each block, from a coarse model of the whole."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from splatpipe.pipeline.train.blocks.scope import BlockScope, write_free_space
 from splatpipe.pipeline.train.blocks.site_plan import SitePlan, block_limits
 from splatpipe.pipeline.train.options import TrainConfig
 
-COARSE, PROSPECTS = "coarse", "prospects"  # folders of the stage's
+COARSE, PROSPECTS = "coarse", "prospects"  # folders in the stage's output
 
 
 def lay_out(
     train: TrainConfig, inputs: Inputs, division: Division, out: Path, report: Reporter
 ) -> tuple[SitePlan, dict[str, JSON]]:
-    """Cut a site into cells, share the cap among them, and keep what each looks at.
+    """Cut a site into cells, share the cap among them, and write each block's scope.
 
     Args:
-        train: Options of training.
-        inputs: The stage's.
-        division: Into how many blocks, and what one may take.
-        out: The stage's folder: has that of the coarse pass, and takes what blocks look at.
-        report: Told of what is being done.
+        train: The training options.
+        inputs: The stage's inputs.
+        division: The number of blocks and the resources of each.
+        out: The stage's output folder: contains the coarse pass's and receives the scopes.
+        report: Receives progress.
 
     Returns:
-        The plan, and what people are told of its blocks.
+        The plan, and the facts about its blocks for the summary.
     """
     dataset, threads, coarse = inputs["undistort.dataset"], inputs.machine.threads, out / COARSE
     kept = set(load_split(inputs["split.views"]).train)
@@ -98,14 +98,14 @@ def _look_around(
     folder: Path,
     report: Reporter,
 ) -> list[int]:
-    """Keep what each block looks at; the coarse Gaussians that each sees around itself.
+    """Write each block's scope and return the number of coarse Gaussians that each sees around itself.
 
     Args:
         partition: The cells.
-        parts: How photos are cut.
-        outlooks: What blocks do.
-        scene: The coarse model, what all photos see, all sparse points.
-        folder: Takes the files.
+        parts: How photos are cut into windows.
+        outlooks: The blocks' forecasts.
+        scene: The coarse model, all photos' coverages and all sparse points.
+        folder: Output folder.
         report: Receives progress.
     """
     found = []
@@ -118,12 +118,12 @@ def _look_around(
 
 
 def upward(views: Sequence[View], xyz: Float64[np.ndarray, "p 3"], threads: int) -> Float64[np.ndarray, " 3"]:
-    """The unit vector against gravity, by the cameras alone: new control moves the frame, and no training.
+    """The unit vector against gravity, from the cameras alone: new control moves the frame but affects no training.
 
     Args:
-        views: Photos.
+        views: The photos.
         xyz: The sparse points.
-        threads: That read photos, where these seem to be turned.
+        threads: Number of threads that read photos, needed if these seem to be rotated.
     """
 
     def photo(index: int) -> SkyPhoto:
@@ -134,5 +134,5 @@ def upward(views: Sequence[View], xyz: Float64[np.ndarray, "p 3"], threads: int)
 
 
 def _counted(partition: Partition, block: int, means: Float64[np.ndarray, "n 3"]) -> tuple[int, int]:
-    """Gaussians in a block's cell, and in its cell and margin."""
+    """Number of Gaussians in a block's cell, and in its cell and margin."""
     return int((partition.owners(means) == block).sum()), int(partition.trained_by(block, means).sum())

@@ -1,8 +1,7 @@
-"""How a training's iterations are divided between the coarse pass over the whole and its blocks. Light to import.
+"""How a training's iterations are divided between the coarse pass over the whole and its blocks. Cheap to import.
 
-The coarse pass takes those at the first size, whole photos; blocks go on from there with the finer sizes, window by
-window. Where photos have one size only, the coarse pass takes a part of its iterations, and the blocks go on with the
-rest.
+The coarse pass takes those at the first size, with whole photos; blocks continue with the finer sizes, window by
+window. If there is only one size, the coarse pass takes part of its iterations and the blocks take the rest.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import math
 from splatpipe.pipeline.train.lengths import Length, PhotoSizes, lengths_of
 from splatpipe.pipeline.train.options import TrainConfig
 
-COARSE_PART = 0.5  # of the iterations where there is one size only
+COARSE_PART = 0.5  # of the iterations if there is only one size
 
 
 def coarse_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
@@ -27,7 +26,7 @@ def coarse_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
 
 
 def finer_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
-    """Iterations of all that comes after the coarse pass, if no window were in two blocks, the first size first.
+    """Iterations after the coarse pass, first size first, counting each window once even if several blocks share it.
 
     Args:
         config: The training options.

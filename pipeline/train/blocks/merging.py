@@ -1,8 +1,8 @@
-"""Trained blocks put together: each Gaussian belongs to one block, by where its centre lies.
+"""Merging trained blocks: each Gaussian belongs to the block whose cell contains its centre.
 
-A block trains its cell and a margin, so that what is at its border has seen what is on the other side; of its result
-only the cell is taken. The blocks come in the order of their numbers, whatever the order in which they were trained.
-Models are read one at a time, to be counted and to be written.
+A block trains its cell and a margin, so that Gaussians at its border are trained with those on the other side; only
+the cell of its result is used. Blocks are merged in order of their numbers, whatever the order of training. Models are
+read one at a time, once to count and once to write.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from splatpipe.pipeline.train.blocks.partition import Partition
 
 
 def owned(partition: Partition, block: int, gaussians: Gaussians) -> Gaussians:
-    """Those of a block's Gaussians that are its own, in their order.
+    """The Gaussians of a block's model that lie in its own cell, in their order.
 
     Args:
         partition: The cells.
-        block: Its number.
-        gaussians: What it trained: cell and margin, and what wandered off.
+        block: The block's number.
+        gaussians: The trained model: cell, margin, and Gaussians that moved out of both.
     """
     owners = partition.owners(gaussians.means.detach().double().numpy(force=True))
     return gaussians.select(torch.from_numpy(np.flatnonzero(owners == block)))
 
 
 def counted(partition: Partition, read: Callable[[int], Gaussians]) -> tuple[int, int]:
-    """The Gaussians of the whole scene, and their SH degree.
+    """The number of Gaussians of the whole scene, and their SH degree.
 
     Args:
         partition: The cells.
-        read: As of ``own_pieces``.
+        read: As for ``own_pieces``.
 
     Raises:
         ValueError: if the SH degrees differ.
@@ -45,17 +45,17 @@ def counted(partition: Partition, read: Callable[[int], Gaussians]) -> tuple[int
 
 
 def own_pieces(partition: Partition, read: Callable[[int], Gaussians]) -> Iterator[Gaussians]:
-    """The whole scene, piece by piece; each model is let go before the next is read.
+    """The whole scene, piece by piece; each model is freed before the next is read.
 
     Args:
         partition: The cells.
-        read: Gives what the block of a number trained, without what it drew frozen.
+        read: Reads a block's trained model by number, without frozen Gaussians.
     """
     for block in range(len(partition.cells)):
         yield from (owned(partition, block, piece) for piece in read(block).pieces())
 
 
 def _count(partition: Partition, block: int, model: Gaussians) -> tuple[int, int]:
-    """A model's own Gaussians, and its degree."""
+    """Number of a model's Gaussians in its own cell, and its SH degree."""
     means = (piece.means.detach().double().numpy(force=True) for piece in model.pieces())
     return sum(int((partition.owners(each) == block).sum()) for each in means), model.sh_degree

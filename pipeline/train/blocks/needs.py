@@ -1,8 +1,7 @@
-"""How many blocks a memory limit asks for, and what one of them takes: plain arithmetic, light to import.
+"""How many blocks a memory limit requires, and the memory of one block: plain arithmetic, cheap to import.
 
-A block holds, besides what every training holds, the Gaussians of its cell and margin with all that their training
-needs, and the frozen ones around it, which need their parameters and room for what a frame says of them. The number of
-photos is in none of it.
+Besides the base of every training, a block holds the Gaussians of its cell and margin with their training state, and
+the frozen ones around it with their parameters and per-frame data. The number of photos does not matter.
 """
 
 from __future__ import annotations
@@ -20,24 +19,24 @@ from splatpipe.pipeline.train.limits import (
 )
 
 MARGIN_GROWTH = 1.44  # (1 + 2 × 0.1)²: a square cell with its margin, over the cell
-FROZEN_SHARE = 1.0  # of those that a block trains: what it sees of a coarse model that is larger is thinned
+FROZEN_SHARE = 1.0  # frozen per trained Gaussian: more of the coarse model than that is thinned
 FROZEN_COPIES = 2  # of a frozen Gaussian's parameters: density control copies them with the others
-FRAME_BYTES = 201  # of any Gaussian in a frame (`limits.py`)
-SPLAT_BYTES = 249  # of a Gaussian in a file
-CHECKPOINT_BYTES = 2 * 720  # of a Gaussian that is trained: parameters and moments, and the new one beside the old
-GROWTH_A_STEP = 1.25  # of what a block trains, in a step of density control: 1.2 in the tiled demo, 1.8 at first where
-# a coarse pass ended at smaller photos
-MOST_BLOCKS = 4096  # beyond it a block is no larger than its margin
+FRAME_BYTES = 201  # per Gaussian in a frame (`limits.py`)
+SPLAT_BYTES = 249  # per Gaussian in a file
+CHECKPOINT_BYTES = 2 * 720  # per trained Gaussian: parameters and moments, the new checkpoint beside the old
+GROWTH_A_STEP = 1.25  # of a block's Gaussians per density-control step: 1.2 in the tiled demo, 1.8 initially if the
+# coarse pass ended at smaller photos
+MOST_BLOCKS = 4096  # beyond it a block is not larger than its margin
 
 
 @dataclass(frozen=True)
 class BlockNeed:
-    """What a block takes.
+    """The resources of a block.
 
     Attributes:
-        trained: Gaussians of its cell and margin, at most.
-        frozen: Gaussians around it, at most.
-        memory_bytes: While it trains.
+        trained: Maximum number of Gaussians in its cell and margin.
+        frozen: Maximum number of frozen Gaussians around it.
+        memory_bytes: Memory during its training.
     """
 
     trained: int
@@ -46,28 +45,28 @@ class BlockNeed:
 
 
 def frozen_bytes(sh_degree: int) -> int:
-    """Most that a frozen Gaussian takes."""
+    """Peak memory per frozen Gaussian, bytes."""
     return FROZEN_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + FRAME_BYTES
 
 
 def grown_from(start: int, steps: int, most: int) -> int:
-    """Gaussians that a block is expected to train at its end.
+    """Expected number of trained Gaussians at a block's end.
 
     Args:
-        start: The coarse model's in its cell and margin.
-        steps: Of density control.
-        most: That it may train.
+        start: Number of the coarse model's Gaussians in its cell and margin.
+        steps: Number of density-control steps.
+        most: Maximum number of trained Gaussians.
     """
     return int(min(most, start * GROWTH_A_STEP**steps))
 
 
 def block_need(trained: int, frozen: int, window_pixels: int, sh_degree: int) -> BlockNeed:
-    """What a block of that size takes on the CPU.
+    """The memory of a block of a given size on the CPU.
 
     Args:
-        trained: Gaussians that it trains, at most.
-        frozen: Gaussians that it draws besides, at most.
-        window_pixels: Of the largest window.
+        trained: Maximum number of trained Gaussians.
+        frozen: Maximum number of frozen Gaussians.
+        window_pixels: Pixels of the largest window.
         sh_degree: SH degree of the model.
     """
     of_gaussians = trained * bytes_per_gaussian(sh_degree) + frozen * frozen_bytes(sh_degree)
@@ -75,12 +74,12 @@ def block_need(trained: int, frozen: int, window_pixels: int, sh_degree: int) ->
 
 
 def need_of_blocks(blocks: int, cap: int, window_pixels: int, sh_degree: int) -> BlockNeed:
-    """What each of so many equal blocks takes; one block is the whole, without margin and surroundings.
+    """The memory of each of a number of equal blocks; a single block is the whole, without margin and surroundings.
 
     Args:
-        blocks: At least 1.
-        cap: Gaussians of the whole scene.
-        window_pixels: Of the largest window.
+        blocks: Number of blocks, at least 1.
+        cap: Maximum number of Gaussians in the whole scene.
+        window_pixels: Pixels of the largest window.
         sh_degree: SH degree of the model.
     """
     if blocks == 1:
@@ -90,12 +89,12 @@ def need_of_blocks(blocks: int, cap: int, window_pixels: int, sh_degree: int) ->
 
 
 def fewest_blocks(cap: int, room_bytes: int, window_pixels: int, sh_degree: int) -> int | None:
-    """The fewest equal blocks of a scene, each of which keeps to a limit; None where no number of them does.
+    """The fewest equal blocks that each fit the limit; None if no number of blocks does.
 
     Args:
-        cap: Gaussians of the whole scene.
-        room_bytes: Of the limit, what the process has not taken already.
-        window_pixels: Of the largest window.
+        cap: Maximum number of Gaussians in the whole scene.
+        room_bytes: Memory limit less what the process already uses.
+        window_pixels: Pixels of the largest window.
         sh_degree: SH degree of the model.
     """
     for blocks in range(1, MOST_BLOCKS + 1):
@@ -105,43 +104,43 @@ def fewest_blocks(cap: int, room_bytes: int, window_pixels: int, sh_degree: int)
 
 
 def work_bytes(trained: int, frozen: int) -> int:
-    """What a block has on the disk while it trains, besides its photos: its checkpoints, and what is around it.
+    """Disk space of a block during training, besides its photos: checkpoints and frozen Gaussians.
 
     Args:
-        trained: Gaussians that it trains.
-        frozen: Gaussians that it draws besides.
+        trained: Number of trained Gaussians.
+        frozen: Number of frozen Gaussians.
     """
     return CHECKPOINT_BYTES * trained + SPLAT_BYTES * frozen
 
 
 def round_pixels(pixels: float, blocks: int, window_side: float, site_area: float) -> float:
-    """Pixels of one visit of each window that one of so many equal blocks trains on.
+    """Pixels in one visit of each window that one of a number of equal blocks trains on.
 
-    A window that shows a square of the ground meets, along each axis, one cell and as many more as borders cross it, on
-    average over where on the site it lies: so often is it trained on. Oblique windows show more than a square.
+    A window that shows a square of the ground meets, along each axis, one cell plus one for each border that crosses
+    it, on average over its position on the site; it is trained on in each of these. Oblique windows show more.
 
     Args:
-        pixels: Of all photos, at the size that is trained.
-        blocks: At least 1.
-        window_side: Of what a window shows of the ground, world units: its pixels' root times the size of one.
-        site_area: Of all cells, square world units.
+        pixels: Pixels of all photos, at the training size.
+        blocks: Number of blocks, at least 1.
+        window_side: Side of a window on the ground, world units: the square root of its pixels times the GSD.
+        site_area: Area of all cells, square world units.
     """
     meets = 1.0 + (math.sqrt(blocks) - 1.0) * window_side / math.sqrt(site_area)
     return pixels * min(1.0, meets**2 / blocks)
 
 
 def shared_cap(cap: int, weights: Sequence[float], least: int = 0) -> list[int]:
-    """A cap on Gaussians shared among blocks; the shares add up to it.
+    """Share a cap on Gaussians among blocks; the shares add up to the cap.
 
-    By the largest remainders (Hamilton's method), the first of equal ones before the others.
+    Uses the largest-remainder method (Hamilton); ties go to the first.
 
     Args:
-        cap: Of all together.
-        weights: Of each block, not negative; equal shares where all are 0.
-        least: What each gets before the rest is shared by weight.
+        cap: Total number of Gaussians.
+        weights: Non-negative weight of each block; equal shares if all are 0.
+        least: What each block gets before the rest is shared by weight.
 
     Raises:
-        ValueError: if there is no block, a weight is negative, or the cap does not hold the least of each.
+        ValueError: if there is no block, a weight is negative, or the cap is below the sum of the minimums.
     """
     if not weights or min(weights) < 0.0 or cap < least * len(weights):
         raise ValueError(f"{cap} Gaussians cannot be shared among {len(weights)} blocks")
@@ -156,11 +155,11 @@ def shared_cap(cap: int, weights: Sequence[float], least: int = 0) -> list[int]:
 
 
 def with_margin(own: int, in_cell: int, in_block: int) -> int:
-    """How many Gaussians a block may train, so that those of its cell can be as many as its share.
+    """Number of Gaussians that a block may train so that its cell can reach its share.
 
     Args:
-        own: Its share of the cap.
-        in_cell: The coarse model's Gaussians in its cell.
-        in_block: Those in cell and margin.
+        own: The block's share of the cap.
+        in_cell: Number of the coarse model's Gaussians in its cell.
+        in_block: Number of those in cell and margin.
     """
     return own if in_cell == 0 else max(own, -(-own * in_block // in_cell))

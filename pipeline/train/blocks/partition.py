@@ -1,9 +1,9 @@
-"""The ground plan cut into cells, one a block: who owns a place, and who trains it.
+"""The ground plan cut into cells, one per block: which block owns a place, and which blocks train it.
 
-Cells are rectangles of the plan, each with its lower and without its upper edges, so that a place has one owner and two
-neighbours share no Gaussian. Those at the site's edge reach outward without end: what lies outside belongs to the cell
-that is nearest to it, so that the horizon is trained as all else is. Heights do not count: a wall and the ground before
-it belong together, and photos of a flight see all heights of a place from alike distances.
+Cells are rectangles of the plan that include their lower and exclude their upper edges, so that each place has one
+owner and neighbours share no Gaussian. Cells at the site's edge extend outward without limit: a place outside belongs
+to the nearest cell, so that the horizon is trained like everything else. Heights do not count: a wall and the ground in
+front of it belong together, and the photos of a flight see all heights of a place from similar distances.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine, PlanPoints
 
-NOBODY = -1  # the owner of what has no place: a point that is not finite
+NOBODY = -1  # owner of a non-finite point
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Cell:
     """A rectangle of the plan, plan units.
 
     Attributes:
-        low: Its lower edges, which belong to it.
-        high: Its upper edges, which do not.
+        low: Lower edges, inclusive.
+        high: Upper edges, exclusive.
     """
 
     low: tuple[float, float]
@@ -35,7 +35,7 @@ class Cell:
 
     @property
     def area(self) -> float:
-        """Square units."""
+        """Area, square plan units."""
         return (self.high[0] - self.low[0]) * (self.high[1] - self.low[1])
 
     def grown(self, margin: float) -> Cell:
@@ -46,11 +46,11 @@ class Cell:
         )
 
     def contains(self, places: PlanPoints) -> Bool[np.ndarray, " n"]:
-        """Which places lie inside; one that is not finite does not."""
+        """Which places lie inside; a non-finite one does not."""
         return np.asarray(((places >= self.low) & (places < self.high)).all(axis=1))
 
     def distance(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
-        """How far outside each place lies; 0 inside."""
+        """Distance of each place from the cell, plan units; 0 inside."""
         outside = np.maximum(np.maximum(np.array(self.low) - places, places - np.array(self.high)), 0.0)
         return np.asarray(np.hypot(outside[:, 0], outside[:, 1]))
 
@@ -61,7 +61,7 @@ class Border:
 
     Attributes:
         blocks: Their numbers, the smaller first.
-        line: Between them.
+        line: The line between them.
     """
 
     blocks: tuple[int, int]
@@ -70,12 +70,12 @@ class Border:
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """The cells, numbered from 0 in an order that follows from the cuts alone.
+    """The cells, numbered from 0 in an order that depends only on the cuts.
 
     Attributes:
-        plan: The ground's, in the model's frame.
-        cells: They touch, and do not overlap.
-        margin: Around each, what its block trains besides, plan units.
+        plan: The ground plan, in the model's frame.
+        cells: The cells; they touch but do not overlap.
+        margin: Width of the margin that a block trains around its cell, plan units.
     """
 
     plan: GroundPlan
@@ -83,22 +83,22 @@ class Partition:
     margin: float
 
     def places(self, points: Float64[np.ndarray, "n 3"]) -> PlanPoints:
-        """Plan coordinates of the nearest places of the site, the rectangle around all cells: what cells own.
+        """Plan coordinates of the points, clamped to the site (the rectangle around all cells).
 
         Args:
-            points: In the model's frame; one that is not finite has none, NaN.
+            points: In the model's frame; a non-finite point gives NaN.
         """
         there = np.isfinite(points).all(axis=1)
         places = self.plan.places(np.where(there[:, None], points, math.nan))
         low = np.min([cell.low for cell in self.cells], axis=0)
-        high = np.nextafter(np.max([cell.high for cell in self.cells], axis=0), low)  # upper edges are nobody's
+        high = np.nextafter(np.max([cell.high for cell in self.cells], axis=0), low)  # upper edges are exclusive
         return np.asarray(np.clip(places, low, high))
 
     def owners(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-        """The cell that each point belongs to, `NOBODY` for none.
+        """Index of the cell that owns each point, `NOBODY` for a non-finite one.
 
         Args:
-            points: In the model's frame; one that is not finite is nobody's.
+            points: In the model's frame.
         """
         places = self.places(points)
         owners = np.full(len(points), NOBODY, np.int64)
@@ -107,15 +107,15 @@ class Partition:
         return owners
 
     def trained_by(self, block: int, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points belong to a block's cell or its margin."""
+        """Which points lie in a block's cell or its margin."""
         return self.near(block, self.margin, points)
 
     def near(self, block: int, distance: float, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points belong to a block's cell, or to others up to a distance from it, plan units."""
+        """Which points lie in a block's cell or within a distance of it, plan units."""
         return self.cells[block].grown(distance).contains(self.places(points))
 
     def borders(self) -> list[Border]:
-        """All lines where two blocks meet, within the site; outside of it those that come to its edge go on."""
+        """All lines where two blocks meet, within the site; lines that reach its edge continue outside."""
         found = []
         for number, cell in enumerate(self.cells):
             for axis in (0, 1):
@@ -124,7 +124,7 @@ class Partition:
         return found
 
     def _edge(self, number: int, axis: int, at: float, side: str) -> Iterator[Border]:
-        """One edge of a cell: a border with each neighbour whose number is greater."""
+        """The borders along one edge of a cell, with each neighbour of a greater number."""
         cell = self.cells[number]
         for other, neighbour in enumerate(self.cells):
             if other == number or getattr(neighbour, side)[axis] != at:
@@ -135,7 +135,7 @@ class Partition:
                 yield Border((number, other), _line(axis, at, low, high))
 
     def facts(self) -> dict[str, Any]:
-        """As JSON, whose numbers read back as the same float64."""
+        """The partition as JSON values; the numbers round-trip as float64."""
         return {
             "axes": self.plan.axes.tolist(),
             "up": self.plan.up.tolist(),
@@ -148,7 +148,7 @@ class Partition:
         """The inverse of ``facts``.
 
         Raises:
-            KeyError, TypeError, ValueError: if it is something else.
+            KeyError, TypeError, ValueError: if it is not a partition.
         """
         plan = GroundPlan(np.array(facts["axes"], np.float64).reshape(2, 3), np.array(facts["up"], np.float64))
         rows = np.array(facts["cells"], np.float64).reshape(-1, 4).tolist()

@@ -1,9 +1,9 @@
-"""What each photo of a capture sees, and where: from a coarse model's depth, or from the sparse points it observes.
+"""Photo coverage: what each photo sees, and where, from a coarse model's depth or from the sparse points it observes.
 
-A photo sees the first surface on each of its rays, however near the ground below its camera may be: an oblique one sees
-little of what it flies over. The depth is sampled coarsely; each sample stands for as many pixels that count. Where
-there is no depth (the sky, a model that ends) nothing is seen. Without a coarse model the photo's pixels are spread
-evenly over the points that it observes.
+A photo sees the first surface on each of its rays, however near the ground below its camera is: an oblique photo sees
+little of what it flies over. The depth is sampled coarsely; each sample stands for an equal number of pixels. Without
+depth (sky, beyond the model) nothing is seen. Without a coarse model the photo's pixels are spread evenly over the
+points that it observes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import reduced_camera
 
-MEGAPIXELS = 0.01  # of a photo's samples: 40 kB of depth a photo, and a window of half a megapixel still has 250 of 20
+MEGAPIXELS = 0.01  # samples per photo: 40 kB of depth, and half a megapixel of a 20-megapixel photo still has 250
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,10 +25,10 @@ class Samples:
     """Places that a photo sees.
 
     Attributes:
-        pixels: Where in the dataset's photo.
-        places: In the model's frame.
-        weights: Pixels of the dataset's photo that each stands for.
-        distances: From the camera along its axis, world units.
+        pixels: Positions in the dataset's photo, pixels.
+        places: Positions in the model's frame.
+        weights: Number of pixels of the dataset's photo that each sample stands for.
+        distances: Depths along the camera's axis, world units.
     """
 
     pixels: Float64[np.ndarray, "n 2"]
@@ -39,13 +39,13 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class PhotoCoverage:
-    """What one photo sees.
+    """The coverage of one photo.
 
     Attributes:
-        camera: The dataset's.
-        grid: The same view at the size of the samples.
-        depth: The coarse model's, along the view axis; 0 where it has none; None without such a model.
-        counted: Which samples count; None where all do.
+        camera: The dataset's camera.
+        grid: The same camera at the size of the samples.
+        depth: The coarse model's depth along the view axis, 0 where it has none; None without such a model.
+        counted: Which samples count; None if all do.
         observed: Rows of the sparse points that the photo observes, ascending.
     """
 
@@ -57,12 +57,12 @@ class PhotoCoverage:
 
     @property
     def pixels(self) -> float:
-        """Of the dataset's photo, those that count."""
+        """Number of the dataset photo's pixels that count."""
         share = 1.0 if self.counted is None else float(self.counted.mean())
         return share * self.camera.width * self.camera.height
 
     def samples(self, xyz: Float64[np.ndarray, "p 3"]) -> Samples:
-        """What it sees.
+        """The places that the photo sees.
 
         Args:
             xyz: All sparse points.
@@ -70,7 +70,7 @@ class PhotoCoverage:
         return self.of_points(xyz) if self.depth is None else self._of_depth(self.depth)
 
     def of_points(self, xyz: Float64[np.ndarray, "p 3"]) -> Samples:
-        """The sparse points that it observes, each with the same part of its pixels."""
+        """The sparse points that it observes, each with an equal share of its pixels."""
         rows, pixels, depths = self.camera.in_view(xyz[self.observed])
         weights = np.full(len(rows), self.pixels / max(len(rows), 1))
         return Samples(pixels, xyz[self.observed[rows]], weights, depths)
@@ -93,13 +93,13 @@ def sights(
     depth_of: Callable[[Camera], Float32[np.ndarray, "h w"]] | None,
     counted_of: Callable[[Camera], Bool[np.ndarray, "h w"] | None] | None = None,
 ) -> list[PhotoCoverage]:
-    """What photos see.
+    """The coverage of each photo.
 
     Args:
-        cameras: The dataset's.
+        cameras: The dataset's cameras.
         observed: Rows of the sparse points that each photo observes.
         depth_of: Renders a camera's median depth of the coarse model; None before there is one.
-        counted_of: Which pixels of a camera count, in its grid; None where all do.
+        counted_of: Which pixels of a camera count, in its grid; None if all do.
     """
     found = []
     for camera, rows in zip(cameras, observed, strict=True):

@@ -1,7 +1,7 @@
-"""Which pixels of a photo count when a block is trained: those that show its cell and what is near it.
+"""Which pixels of a photo count when a block is trained: those that show its cell and its surroundings.
 
-The rest is drawn as the coarse pass left it. What the photo shows sharper there would draw the block's own Gaussians
-over it, and those in the margin most of all.
+The rest is rendered from the coarse pass. Where the photo is sharper than that, it would pull the block's own Gaussians
+over the rest, above all those in the margin.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 
-MARGINS = 2.0  # around the cell: what is trained reaches one, and casts its light a little farther
+MARGINS = 2.0  # around the cell: trained Gaussians lie within one margin, and their footprints reach slightly farther
 
 SampleMask = Bool[np.ndarray, "rows columns"]
-"""What of a whole photo counts, by the cells of a grid that covers it."""
+"""The part of a whole photo that counts, as cells of a grid over it."""
 
 
 def counted_samples(
     partition: Partition, block: int, sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"]
 ) -> SampleMask:
-    """What of a photo counts for a block, by the samples of its depth.
+    """The part of a photo that counts for a block, by the samples of its depth.
 
-    Counted are samples whose place lies in the cell grown by ``MARGINS``, those without a depth (what is there, nobody
-    knows), those at sparse points there that the photo observes (thin things before a far ground), and all beside one
-    that counts: so in each window of the block something counts.
+    Samples count if their place lies in the cell grown by ``MARGINS``, if they have no depth (unknown), or if the photo
+    observes a sparse point there (thin objects in front of distant ground); so do the neighbours of all these. Every
+    window of the block therefore has pixels that count.
 
     Args:
         partition: The cells.
-        block: The number of one.
-        sight: What the photo sees.
+        block: The block's number.
+        sight: The photo's coverage.
         xyz: All sparse points.
     """
     shape = (sight.grid.height, sight.grid.width)

@@ -1,12 +1,12 @@
 """How the iterations of a training are divided among the coarse pass and the blocks.
 
-The coarse pass takes those at the first size, whole photos. A block goes on from there with the finer sizes, window by
-window: as many visits of each of its windows as without blocks. Where photos have one size only, the coarse pass takes
-a part of its iterations, and the blocks go on at the same size with the rest.
+The coarse pass takes those at the first size, with whole photos. A block continues with the finer sizes, window by
+window, with as many visits to each of its windows as without blocks. If there is only one size, the coarse pass takes
+part of its iterations and the blocks continue at the same size with the rest.
 
-The rate of positions, which the coarse pass has run down, for it is a model that is drawn, rises to where it is in a
-training of the whole that has as large a part of its Gaussians: what a block grows has to find its place, too, and one
-of many blocks begins with few.
+The coarse pass ends with a low rate of positions, because its model is rendered. A block raises it to that of a whole
+training that has the same share of its Gaussians: new Gaussians have to find their position too, and one of many
+blocks begins with few.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.schedule import Schedule, schedule_of
 
 
 def block_lengths(config: TrainConfig, footage: PhotoSizes, parts: Mapping[int, int]) -> list[Length]:
-    """Iterations of a block, the first size first; a size at which it sees nothing is left out.
+    """Iterations of a block, first size first; sizes without windows are left out.
 
     Args:
         config: The training options.
@@ -38,7 +38,7 @@ def block_lengths(config: TrainConfig, footage: PhotoSizes, parts: Mapping[int, 
 
 
 def coarse_schedule(config: TrainConfig, footage: PhotoSizes) -> Schedule:
-    """That of the coarse pass.
+    """The schedule of the coarse pass.
 
     Args:
         config: The training options.
@@ -50,32 +50,32 @@ def coarse_schedule(config: TrainConfig, footage: PhotoSizes) -> Schedule:
 def block_schedule(
     config: TrainConfig, footage: PhotoSizes, seen: PhotoSizes, parts: Mapping[int, int], begun: float
 ) -> Schedule:
-    """That of a block.
+    """The schedule of a block.
 
     Args:
         config: The training options.
         footage: All photos.
-        seen: Those that the block sees.
+        seen: The photos of the block.
         parts: The block's windows at each level.
-        begun: The part of its Gaussians that it begins with, 0..1.
+        begun: Share of its Gaussians that it begins with, 0..1.
     """
     made = schedule_of(config.model_copy(update={"coarse_levels": 0}), seen, block_lengths(config, footage, parts))
     density = replace(made.density, first=made.density.every, reset_every=0)
-    dropout = coarse_schedule(config, footage).dropout  # a block sees few photos where the site has many
+    dropout = coarse_schedule(config, footage).dropout  # a block has few photos even if the site has many
     rates = _begun(made.rates, share_at(config, footage, begun))
     return replace(made, sh_every=1, dropout=dropout, density=density, rates=rates)
 
 
 def share_at(config: TrainConfig, footage: PhotoSizes, begun: float) -> float:
-    """How much of its schedule a training of the whole has done when it has that part of its Gaussians.
+    """Share of the schedule that a whole training has done when it has a given share of its Gaussians.
 
-    That is ``densify.room_at`` turned around, for a training that begins with hardly any; no more than is done when
+    This is the inverse of ``densify.room_at`` for a training that begins with hardly any; at most what is done when
     blocks begin.
 
     Args:
         config: The training options.
         footage: All photos.
-        begun: The part, 0..1.
+        begun: The share of its Gaussians, 0..1.
     """
     done, left = (sum(n for _, n in each(config, footage)) for each in (coarse_lengths, finer_lengths))
     growth = schedule_of(config, footage, lengths_of(config, footage)).density
@@ -85,5 +85,5 @@ def share_at(config: TrainConfig, footage: PhotoSizes, begun: float) -> float:
 
 
 def _begun(rates: Rates, share: float) -> Rates:
-    """Rates that begin as they are at a share of the schedule."""
+    """Rates that begin at their values at a share of the schedule."""
     return replace(rates, means=rates.means_at(share) / rates.boost)

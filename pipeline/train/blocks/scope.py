@@ -1,7 +1,7 @@
-"""What each block looks at and sees around itself: worked out once for all blocks, from what all photos see.
+"""The scope of each block (its windows and surroundings), computed once for all blocks from all photos' coverages.
 
-It lies in the artifact of the stage `blocks`, a file a block, and one for all of what photos say is free: no block
-renders depths of photos again, or reads all sparse points with their tracks, which takes memory by the photo.
+It is stored in the artifact of the stage `blocks`, one file per block and one for the free space of all photos: no
+block has to render depths again or read all sparse points with their tracks, whose memory grows with the photos.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ _COUNTED = "counted_"
 
 @dataclass(frozen=True, eq=False)
 class BlockScope:
-    """What one block looks at; photos by their rows among those trained on.
+    """The scope of one block; photos are identified by their rows among the training photos.
 
     Attributes:
-        windows: That it trains on.
-        counted: What of each of their photos counts.
-        around: What they see of the coarse model besides.
+        windows: The windows that it trains on.
+        counted: The part of each photo that counts.
+        around: What the windows see of the coarse model besides the block.
     """
 
     windows: Parts
@@ -59,14 +59,14 @@ class BlockScope:
         cut: WindowScheme,
         scene: tuple[Gaussians, Sequence[PhotoCoverage], Float64[np.ndarray, "p 3"]],
     ) -> BlockScope:
-        """Work it out.
+        """Compute a block's scope.
 
         Args:
             partition: The cells.
-            block: The number of one.
-            windows: That it trains on.
-            cut: How photos are cut.
-            scene: The coarse model, what all photos see, all sparse points.
+            block: The block's number.
+            windows: The windows that it trains on.
+            cut: How photos are cut into windows.
+            scene: The coarse model, all photos' coverages and all sparse points.
         """
         coarse, seen, xyz = scene
         rows, photos, frames = rows_of(windows), [], []
@@ -84,7 +84,7 @@ class BlockScope:
         return BlockScope(windows, counted, visible_around(partition, block, coarse, view))
 
     def write(self, folder: Path, block: int) -> None:
-        """Keep it in a folder of all blocks."""
+        """Write the scope to a folder shared by all blocks."""
         arrays: dict[str, npt.NDArray[Any]] = {f"{_LEVEL}{level}": pairs for level, pairs in self.windows.items()}
         arrays |= {f"{_COUNTED}{row}": grid for row, grid in self.counted.items()}
         arrays |= {"rows": self.around.rows.astype(np.int32), "units": self.around.units}
@@ -115,16 +115,16 @@ class BlockScope:
 
 @dataclass(frozen=True, eq=False)
 class ScopeReader:
-    """Who knows it of a block that is trained.
+    """Reads the scope of a block that is being trained.
 
     Attributes:
-        prospects: The folder that has them.
-        coarse: The folder that the coarse pass left.
+        prospects: Folder of the scopes.
+        coarse: Output folder of the coarse pass.
         partition: The cells.
-        number: Of the block.
-        views: All photos trained on.
+        number: Number of the block.
+        views: All training photos.
         cut: How they are cut into windows.
-        most_frozen: Gaussians that are drawn around the block.
+        most_frozen: Maximum number of frozen Gaussians rendered around the block.
     """
 
     prospects: Path
@@ -136,7 +136,7 @@ class ScopeReader:
     most_frozen: int
 
     def prospect(self) -> BlockScope:
-        """What the block looks at.
+        """The block's scope.
 
         Raises:
             StageError: if it is missing or broken.
@@ -144,7 +144,7 @@ class ScopeReader:
         return BlockScope.read(self.prospects, self.number)
 
     def frozen(self, out: Path) -> Gaussians:
-        """What is drawn around the block, kept in its folder for those who look at its checkpoints.
+        """The frozen Gaussians around the block, also kept in its folder for inspecting its checkpoints.
 
         Args:
             out: The block's folder.
@@ -157,7 +157,7 @@ class ScopeReader:
             return read_splat(out / FROZEN)
 
     def start(self, most: int) -> Gaussians:
-        """What the coarse model has in the cell and its margin; the most opaque where it is more than ``most``."""
+        """The coarse model's Gaussians in the cell and its margin; the most opaque if there are more than ``most``."""
         coarse = read_splat(self.coarse / "model.ply")
         inside = self.partition.trained_by(self.number, coarse.means.double().numpy())
         rows = torch.from_numpy(np.flatnonzero(inside))
@@ -168,7 +168,7 @@ class ScopeReader:
 
 
 def write_free_space(folder: Path, space: FreeSpace) -> None:
-    """Keep what all photos say is free."""
+    """Write the free space of all photos to a folder."""
     photos = space.photos
     arrays = {
         "support": space.support,
@@ -188,8 +188,8 @@ def read_free_space(folder: Path, cameras: Sequence[Camera]) -> FreeSpace:
     """The inverse of ``write_free_space``.
 
     Args:
-        folder: As there.
-        cameras: Of all photos trained on, in their order.
+        folder: The folder written to.
+        cameras: Cameras of all training photos, in order.
 
     Raises:
         StageError: if it is missing or broken.
@@ -210,7 +210,7 @@ def read_free_space(folder: Path, cameras: Sequence[Camera]) -> FreeSpace:
 
 
 def rows_of(windows: Parts) -> list[int]:
-    """The photos of some windows, ascending."""
+    """Rows of the windows' photos, ascending."""
     return sorted({row for pairs in windows.values() for row in pairs[:, 0].tolist()})
 
 
@@ -219,5 +219,5 @@ def _path(folder: Path, block: int) -> Path:
 
 
 def _named(arrays: dict[str, npt.NDArray[Any]], prefix: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """The arrays whose names begin so, with the rest of the name."""
+    """The arrays whose names begin with a prefix, with the rest of the name."""
     return ((name.removeprefix(prefix), array) for name, array in arrays.items() if name.startswith(prefix))

@@ -1,4 +1,4 @@
-"""What the stage `blocks` leaves for those who train and merge: how many blocks there are, and what each may take."""
+"""The output of the stage `blocks` for training and merging: the number of blocks and the limits of each."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from splatpipe.pipeline.train.blocks.needs import FROZEN_SHARE, MARGIN_GROWTH, f
 from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.limits import FIXED_BYTES, LIBRARIES_BYTES, PIXEL_BYTES, bytes_per_gaussian
 
-MOST_GROWTH = 2.0 * MARGIN_GROWTH  # of a cell with its margin over the cell: beyond it, its neighbours are what is full
+MOST_GROWTH = 2.0 * MARGIN_GROWTH  # of a cell with its margin over the cell: beyond it, the neighbours are what is full
 
 
 @dataclass(frozen=True)
 class BlockLimits:
-    """What a block may take.
+    """The limits of a block.
 
     Attributes:
-        share: Gaussians of the merged scene in its cell, at most.
-        trained: Gaussians that it trains, in cell and margin, at most.
-        frozen: Gaussians that it draws besides, at most.
+        share: Maximum number of Gaussians of the merged scene in its cell.
+        trained: Maximum number of trained Gaussians, in cell and margin.
+        frozen: Maximum number of frozen Gaussians rendered around it.
     """
 
     share: int
@@ -39,9 +39,9 @@ class SitePlan:
 
     Attributes:
         partition: The cells.
-        blocks: What each may take, in the cells' order.
+        blocks: The limits of each block, in order of the cells.
         window_pixels: Most pixels of a photo that an iteration uses.
-        limit_bytes: Of memory; 0 for none.
+        limit_bytes: Memory limit; 0 for none.
     """
 
     partition: Partition
@@ -62,10 +62,10 @@ class SitePlan:
 
 
 def whole_json(limit_bytes: int = 0) -> str:
-    """The text of `blocks.json` where the scene is trained in one.
+    """The text of `blocks.json` for a scene that is trained whole.
 
     Args:
-        limit_bytes: Of memory, that nobody asked for and the training has to keep to; 0 for none.
+        limit_bytes: Memory limit that was not requested but that the training has to enforce; 0 for none.
     """
     return json_text({"shards": 0} | ({"limit_bytes": limit_bytes} if limit_bytes else {}))
 
@@ -83,10 +83,10 @@ def is_in_blocks(path: Path) -> bool:
 
 
 def limit_of_whole(path: Path) -> int:
-    """Of memory, that the training of a scene in one has to keep to though nobody asked for it; 0 for none.
+    """The memory limit that the training of a whole scene has to enforce although it was not requested; 0 for none.
 
     Raises:
-        StageError: if it cannot be read, or is of a scene in blocks.
+        StageError: if it cannot be read, or belongs to a scene in blocks.
     """
     try:
         fields: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -101,7 +101,7 @@ def limit_of_whole(path: Path) -> int:
 
 
 def load_site_plan(path: Path) -> SitePlan:
-    """Read what `blocks` left of a scene that is trained in blocks.
+    """Read the output of `blocks` for a scene that is trained in blocks.
 
     Raises:
         StageError: if it is not such a file.
@@ -118,12 +118,13 @@ def load_site_plan(path: Path) -> SitePlan:
 
 
 def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[float, int, int]]) -> list[BlockLimits]:
-    """Share the cap among blocks, so that each keeps to the limit of memory.
+    """Share the cap among blocks, so that each keeps within the memory limit.
 
     Args:
         division: How the scene is divided.
         sh_degree: SH degree of the model.
-        counted: Of each block its weight, and the coarse model's Gaussians in its cell, and in cell and margin.
+        counted: For each block its weight, and the number of the coarse model's Gaussians in its cell and in cell and
+            margin.
     """
     cap, most = division.cap, _most(division, sh_degree)
     top = max(1, int(most / MARGIN_GROWTH)) if division.limit_bytes else cap
@@ -137,14 +138,14 @@ def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[flo
 
 
 def _most(division: Division, sh_degree: int) -> int:
-    """Gaussians that a block may train within the limit of memory, with as many frozen ones around."""
+    """Number of Gaussians that a block may train within the memory limit, with as many frozen ones around."""
     room = division.limit_bytes - LIBRARIES_BYTES - FIXED_BYTES - PIXEL_BYTES * division.window_pixels
     fitting = int(room / (bytes_per_gaussian(sh_degree) + FROZEN_SHARE * frozen_bytes(sh_degree)))
     return max(division.need.trained, fitting)
 
 
 def _frozen(division: Division, trained: int, sh_degree: int) -> int:
-    """Gaussians around a block that memory has room for; where there is no limit, all that a coarse model has."""
+    """Number of frozen Gaussians around a block that fit in memory; without a limit, the whole coarse model."""
     if not division.limit_bytes:
         return max(1, division.coarse_cap)
     room = division.limit_bytes - LIBRARIES_BYTES - FIXED_BYTES - PIXEL_BYTES * division.window_pixels
@@ -153,15 +154,15 @@ def _frozen(division: Division, trained: int, sh_degree: int) -> int:
 
 
 def capped_shares(cap: int, weights: Sequence[float], tops: Sequence[int]) -> list[int]:
-    """A cap shared by weight among blocks of which each takes no more than its own; what one cannot take, others do.
+    """Share a cap by weight among blocks with individual maximums; what one cannot take goes to the others.
 
     Args:
-        cap: Of all together.
-        weights: Of each, not negative; equal where all are 0.
-        tops: The most of each.
+        cap: Total number of Gaussians.
+        weights: Non-negative weight of each block; equal shares if all are 0.
+        tops: Maximum of each block.
 
     Returns:
-        The shares; less than the cap together only where all have their most.
+        The shares; they add up to less than the cap only if all are at their maximum.
     """
     shares = [0] * len(weights)
     open_ones, rest = list(range(len(weights))), cap

@@ -1,8 +1,8 @@
-"""What of a coarse model a block trains, and what it draws around it and leaves as it is.
+"""The parts of a coarse model that a block trains, and those that it renders frozen around them.
 
-A block trains the Gaussians in its cell and margin. Before and behind them its photos see others: these are drawn
-frozen, so that nothing in the block has to stand for them. Those that no window of the block sees are left out, and the
-others are thinned the farther they are from the cell, until they are as many as memory is to hold.
+A block trains the Gaussians in its cell and margin. Its photos see others in front of and behind them: these are
+rendered frozen, so that nothing in the block has to stand in for them. Those that no window of the block sees are left
+out; the others are thinned, more with distance from the cell, until they fit in memory.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.blocks.visibility import BlockViews, Windows
 
-SIGMAS = 3.0  # of a Gaussian count as its reach, as in the rasterizer's radii
-BEHIND = 1.1  # times the depth of the coarse surface: farther back is hidden, allowing for what that has wrong
-COARSER = math.sqrt(2.0)  # voxels from one try to the next; each Gaussian's is a power of two, so not all change
+SIGMAS = 3.0  # reach of a Gaussian in standard deviations, as in the rasterizer's radii
+BEHIND = 1.1  # times the depth of the coarse surface: farther back is hidden, allowing for errors of that depth
+COARSER = math.sqrt(2.0)  # growth of voxels per attempt; each one's size is a power of two, so not all change
 COARSEST = 64.0  # pixels of a voxel at the cell's edge: beyond it the least opaque are dropped instead
 
 
 @dataclass(frozen=True, eq=False)
 class BlockSurroundings:
-    """What a block's windows see of a coarse model besides the Gaussians that the block trains.
+    """The Gaussians of a coarse model that a block's windows see besides those that the block trains.
 
     Attributes:
-        rows: Of the model, ascending.
-        units: Of each a voxel's least side, world units: the size of a pixel there, more away from the cell.
+        rows: Rows of the model, ascending.
+        units: Smallest voxel side for each, world units: the GSD there, increasing away from the cell.
     """
 
     rows: Int64[np.ndarray, " k"]
     units: Float64[np.ndarray, " k"]
 
     def within(self, coarse: Gaussians, most: int) -> Gaussians:
-        """At most so many: those of a voxel of some times their unit become one; if need be, the least opaque go."""
+        """At most ``most`` Gaussians: merged by voxels of growing size, then by dropping the least opaque."""
         return _within(coarse.select(torch.from_numpy(self.rows)), self.units, most)
 
 
@@ -51,13 +51,13 @@ def visible_around(
     coarse: Gaussians,
     view: tuple[BlockViews, Sequence[PhotoCoverage], Sequence[Windows]],
 ) -> BlockSurroundings:
-    """What a block's windows see around it.
+    """The Gaussians that a block's windows see around it.
 
     Args:
         partition: The cells.
-        block: Which.
-        coarse: The model of the whole, on the CPU.
-        view: What the block trains on; what all photos see, with depths; how each of those photos is cut.
+        block: The block's number.
+        coarse: The model of the whole scene, on the CPU.
+        view: The block's views; all photos' coverages, with depths; the windows of each of those photos.
     """
     views, seen, windows = view
     means = coarse.means.detach().double().numpy()
@@ -72,7 +72,7 @@ def visible_around(
 
 
 def _within(gaussians: Gaussians, unit: Float64[np.ndarray, " n"], most: int) -> Gaussians:
-    """At most so many: those of a voxel of some times their unit become one; if need be, the least opaque go."""
+    """At most ``most`` Gaussians: merged by voxels of growing size, then by dropping the least opaque."""
     found, side = gaussians, 1.0
     while len(found) > most and side <= COARSEST:
         found = thinned(gaussians, side * unit)
@@ -86,7 +86,7 @@ def _within(gaussians: Gaussians, unit: Float64[np.ndarray, " n"], most: int) ->
 def _seen_in(
     gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], sight: PhotoCoverage, windows: Windows
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
-    """The Gaussians that reach into windows of a photo and are not behind its surface; a pixel's size at each."""
+    """The Gaussians that reach into windows of a photo and are not behind its surface, and the GSD at each."""
     camera = sight.camera
     depths = camera.depths(means)
     rows = np.flatnonzero((depths > 0.0) & np.isfinite(depths))
@@ -109,13 +109,13 @@ def _hidden(
     pixels: Float64[np.ndarray, "n 2"],
     size: tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]],
 ) -> Bool[np.ndarray, " n"]:
-    """Which lie behind all of the surface around their centre; those larger than that neighbourhood never do.
+    """Which Gaussians lie behind all of the surface around their centre; those larger than that neighbourhood never do.
 
     Args:
-        sight: What the photo sees.
+        sight: The photo's coverage.
         depth: Its depth.
-        pixels: Where the Gaussians are in the dataset's photo.
-        size: Their depths, their reach in world units, and in pixels.
+        pixels: Positions of the Gaussians in the dataset's photo.
+        size: Their depths, and their reach in world units and in pixels.
     """
     depths, reach, radius = size
     surface = np.where((depth > 0.0) & np.isfinite(depth), depth, np.inf).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Fewer Gaussians that look alike from afar: those of a voxel become one with their first two moments.
+"""Thinning for distant viewing: the Gaussians in a voxel become one with their first two moments.
 
-Weights are opacity times size on the screen (a standard deviation squared), as light is what has to stay: the one has
-as much of it as they had together, by its opacity, and beyond the rasterizer's cap on that by its size.
+Weights are opacity times projected area (a standard deviation squared), because the total light has to be preserved:
+the merged Gaussian gets it through its opacity and, beyond the rasterizer's cap on opacity, through its size.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from scipy.spatial.transform import Rotation
 from splatpipe.pipeline.raster.definitions import ALPHA_MAX
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-LEAST_VARIANCE = 1e-30  # world units squared: what lies in one plane has none across it, or less by rounding
+LEAST_VARIANCE = 1e-30  # world units squared: coplanar Gaussians have none across the plane, or less by rounding
 LEAST_OPACITY = 1e-6  # whose logit is still finite
 
 
 def thinned(gaussians: Gaussians, voxel: Float64[np.ndarray, " n"]) -> Gaussians:
-    """One Gaussian for those that share a voxel; one that is alone stays as it is, bit for bit.
+    """Merge the Gaussians that share a voxel; a Gaussian alone in its voxel stays bit-identical.
 
     Args:
         gaussians: Finite, on the CPU.
-        voxel: Side of the voxel that each falls into, rounded down to a power of two, world units.
+        voxel: Voxel side for each Gaussian, world units; rounded down to a power of two.
     """
     means = gaussians.means.detach().double().numpy()
     levels = np.floor(np.log2(voxel)).astype(np.int64)
@@ -41,7 +41,7 @@ def thinned(gaussians: Gaussians, voxel: Float64[np.ndarray, " n"]) -> Gaussians
 
 
 def _merged(gaussians: Gaussians, starts: Int64[np.ndarray, " g"]) -> Gaussians:
-    """One for each run of Gaussians that begins at a row of ``starts``."""
+    """One Gaussian for each run that begins at a row of ``starts``."""
     means, quats = (tensor.detach().double().numpy() for tensor in (gaussians.means, gaussians.quats))
     scales = np.exp(gaussians.log_scales.detach().double().numpy())
     opacities = torch.sigmoid(gaussians.opacity_logits.detach().double()).numpy()

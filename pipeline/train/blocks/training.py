@@ -1,7 +1,7 @@
-"""One block of a scene, trained: its own Gaussians on the windows that show its cell, before all else as it was.
+"""Training one block of a scene: its own Gaussians, on the windows that show its cell, with all else frozen.
 
-It goes on where the coarse pass ended (``schedules.py``), with that pass's sky and exposures. What it leaves is of its
-cell and margin alone; ``merging.py`` puts the cells together.
+It continues where the coarse pass ended (``schedules.py``), with that pass's sky and exposures. Its output covers only
+its cell and margin; ``merging.py`` joins the cells.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from splatpipe.pipeline.train.windows import TrainingSize
 
 @dataclass(frozen=True, eq=False)
 class SiteParts:
-    """What all blocks of a scene share.
+    """The files that all blocks of a scene share.
 
     Attributes:
         dataset: The photos and the sparse points.
         split: Which photos are trained on.
-        coarse: The folder that the coarse pass left.
-        prospects: The folder of what each block looks at.
+        coarse: Output folder of the coarse pass.
+        prospects: Folder of the blocks' scopes.
         partition: The cells.
         area: Area of interest, in the model's frame; None for everything.
     """
@@ -61,13 +61,13 @@ class SiteParts:
 
 @dataclass(frozen=True)
 class BlockTask:
-    """What is one block's.
+    """One block and its limits.
 
     Attributes:
-        number: Of its cell.
-        share: Gaussians that its cell gets at most.
-        trained: Gaussians that it trains at most, with those of the margin.
-        frozen: Gaussians that it draws besides at most.
+        number: Number of its cell.
+        share: Maximum number of Gaussians in its cell.
+        trained: Maximum number of trained Gaussians, including the margin.
+        frozen: Maximum number of frozen Gaussians rendered around it.
         window_pixels: Most pixels of a photo that an iteration uses.
     """
 
@@ -81,19 +81,19 @@ class BlockTask:
 def train_block(
     config: TrainConfig, parts: SiteParts, task: BlockTask, machine: Machine, out: Path, report: Reporter
 ) -> Summary:
-    """Write what the block trained, its history and its plan; go on from a checkpoint where a killed run left one.
+    """Write the block's model, history and plan; resumes from the checkpoint of a killed run.
 
     Args:
-        config: The options, as for ``train_coarse``.
+        config: The training options, as for ``train_coarse``.
         parts: The scene.
         task: The block.
-        machine: Changes only speed.
-        out: Takes the files, and has checkpoint and decoded photos meanwhile.
+        machine: Affects only speed.
+        out: Output folder, also of the checkpoint and decoded photos.
         report: Receives progress and messages.
 
     Raises:
         SplatpipeError: if a file is missing or broken.
-        MachineError: if the device asked for is not there, or memory is short.
+        MachineError: if the requested device is not available, or memory is short.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     device = choose_device(machine.device, config.unfit_for_cuda(), report.note)
@@ -120,8 +120,8 @@ class Block:
         task: Which block.
         device: The compute device.
         whole: The plan of the whole scene, with the block's options.
-        surveyor: Knows its windows and surroundings.
-        exposures: The photos' maps, as `exposures.json` has them.
+        surveyor: Reads its windows and surroundings.
+        exposures: The photos' colour maps, as in `exposures.json`.
     """
 
     parts: SiteParts
@@ -133,7 +133,7 @@ class Block:
 
     @staticmethod
     def of(config: TrainConfig, parts: SiteParts, task: BlockTask, device: Device) -> Block:
-        """One with its scene's files read.
+        """Read the scene's files and return the block.
 
         Raises:
             SplatpipeError: if a file is missing or broken.
@@ -143,7 +143,7 @@ class Block:
         trained_on = [view for view in views if view.camera.name in kept]
         exposures = read_exposures(parts.coarse / "exposures.json", "blocks")
         exposure = "affine" if exposures else "off"
-        # The cap keeps its memory: what the process holds besides, as of blocks before, is not to end its growth.
+        # The cap limits its memory: other memory of the process, e.g. of earlier blocks, must not end its growth.
         decided = {
             "max_gaussians": task.trained,
             "max_memory_bytes": 0,
@@ -158,15 +158,15 @@ class Block:
         return Block(parts, task, device, whole, surveyor, exposures)
 
     def start(self) -> Gaussians:
-        """What it begins with."""
+        """The initial Gaussians."""
         return self.surveyor.start(self.task.trained)
 
     def views(self, windows: Parts) -> list[View]:
-        """The photos that it sees, in the order of all."""
+        """The photos of its windows, in dataset order."""
         return [self.surveyor.views[row] for row in rows_of(windows)]
 
     def plan(self, windows: Parts) -> TrainingPlan:
-        """What it does; no iterations where it sees nothing, or has nothing to train."""
+        """The block's plan; without iterations if it has no photos or nothing to train."""
         options, cameras = self.whole.options, [view.camera for view in self.views(windows)]
         sizes = sizes_of(cameras)
         count = len(self.start())
@@ -186,12 +186,12 @@ class Block:
         return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
 
     def course(self, plan: TrainingPlan, prospect: BlockScope, out: Path) -> TrainingSetup:
-        """What it goes through.
+        """The block's training setup.
 
         Args:
-            plan: Its plan.
-            prospect: What it looks at.
-            out: Has its surroundings.
+            plan: The block's plan.
+            prospect: The block's scope.
+            out: Folder of its frozen Gaussians.
         """
         windows = prospect.windows
         views, place = self.views(windows), {row: place for place, row in enumerate(rows_of(windows))}
@@ -217,11 +217,11 @@ class Block:
         )
 
     def techniques(self, plan: TrainingPlan, views: Sequence[View]) -> Techniques:
-        """Those of the options; sky and exposures are the coarse pass's.
+        """The techniques set by the options; sky and exposures come from the coarse pass.
 
         Args:
-            plan: Its plan.
-            views: The photos that it sees.
+            plan: The block's plan.
+            views: The photos of its windows.
         """
         names, where = set(plan.train_views), self.device.tensors
         panorama = read_panorama(self.parts.coarse / "sky.npz")
@@ -238,12 +238,12 @@ class Block:
         return Techniques((*made, *more))
 
     def fence(self, plan: TrainingPlan) -> Fence:
-        """What keeps its Gaussians to cell and margin."""
+        """The technique that keeps its Gaussians within cell and margin."""
         return Fence(self.parts.partition, self.task.number, self.task.share, plan.schedule.density)
 
 
 def _leave(block: Block, plan: TrainingPlan, out: Path, trained: tuple[Gaussians, History]) -> dict[str, JSON]:
-    """Write the outcome: of the Gaussians those that are the block's to leave."""
+    """Write the results: only the Gaussians within the block's shares."""
     gaussians, history = trained
     gaussians = gaussians.select(block.fence(plan).kept(gaussians))
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])

@@ -1,9 +1,9 @@
 """Which photos, and which parts of them, a block trains on: those that see its cell.
 
-By what they see, not by where they are: of a photo straight above a cell only the part that shows it counts, and an
-oblique one from far away counts where it shows the cell's walls. Photos that only look through the air over a cell are
-not asked: the rest of the scene is drawn, so what a block puts there would be wrong in its own photos, too; and
-floaters go by the free space of all photos (`splat.free_space`), whose rays every block knows.
+Selection is by what photos see, not where they are: of a nadir photo above a cell only the part that shows it counts,
+and a distant oblique photo counts where it shows the cell's walls. Photos that only look through the air above a cell
+are not needed: the rest of the scene is rendered, so anything a block puts there would be wrong in its own photos too,
+and floaters are pruned by the free space of all photos (`splat.free_space`), which every block knows.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from splatpipe.pipeline.train.blocks.partition import NOBODY, Partition
 from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, Samples
 from splatpipe.pipeline.train.windows import windows_of
 
-LEAST_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner of it that its neighbours show whole
-LEAST_POINTS = 4  # observed by the photo, in the cell and in the window: thin things that a coarse depth misses
+LEAST_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner that neighbouring windows show whole
+LEAST_POINTS = 4  # observed points in the cell and the window: thin objects that a coarse depth misses
 
 Windows = Int64[np.ndarray, "w 4"]  # left, top, right and bottom of each in the dataset's photo, the last two exclusive
 
@@ -30,11 +30,11 @@ class BlockPhoto:
     """A photo that sees a block's cell.
 
     Attributes:
-        photo: Its row among the sights.
-        windows: Which parts of it see the cell.
-        pixels: Of those parts.
-        seen: Pixels that show the cell, wherever in the photo.
-        covered: Those in the chosen parts.
+        photo: Its index among the coverages.
+        windows: Which of its windows see the cell.
+        pixels: Number of pixels in those windows.
+        seen: Number of pixels that show the cell, anywhere in the photo.
+        covered: Number of those in the chosen windows.
     """
 
     photo: int
@@ -46,32 +46,32 @@ class BlockPhoto:
 
 @dataclass(frozen=True)
 class BlockViews:
-    """What a block trains on.
+    """The photos that a block trains on.
 
     Attributes:
-        photos: In the sights' order.
+        photos: In order of the coverages.
     """
 
     photos: tuple[BlockPhoto, ...]
 
     @property
     def pixels(self) -> int:
-        """Of a visit of each of its windows: a block's work, and what it costs."""
+        """Pixels in one visit of each window: the block's work and cost."""
         return sum(photo.pixels for photo in self.photos)
 
     @property
     def covered(self) -> float:
-        """The part of the pixels that show the cell, which lies in its windows; 1 where nothing shows it."""
+        """Share of the pixels showing the cell that lie in its windows; 1 if nothing shows it."""
         seen = sum(photo.seen for photo in self.photos)
         return sum(photo.covered for photo in self.photos) / seen if seen > 0.0 else 1.0
 
 
 def windows(camera: Camera, window_pixels: int) -> Windows:
-    """How training cuts a photo at full size.
+    """The windows into which training cuts a photo at full size.
 
     Args:
-        camera: The photo's, at the finest size that is trained.
-        window_pixels: Of a window at most; 0 for the whole photo in one.
+        camera: The photo's camera, at the finest training size.
+        window_pixels: Most pixels of a window; 0 for the whole photo in one.
     """
     frames = windows_of(camera.width, camera.height, window_pixels)
     return np.array([[frame.left, frame.top, frame.right, frame.bottom] for frame in frames])
@@ -87,9 +87,9 @@ def block_views(
 
     Args:
         partition: The cells.
-        seen: What the photos see.
+        seen: The photos' coverages.
         xyz: All sparse points.
-        cut: How training cuts a photo at the finest size (``windows``); the parts cover it and do not overlap.
+        cut: Cuts a photo into windows at the finest size (``windows``); they cover it without overlap.
     """
     found: list[list[BlockPhoto]] = [[] for _ in partition.cells]
     for number, sight in enumerate(seen):
@@ -109,7 +109,7 @@ def block_views(
 
 
 def _counted(partition: Partition, samples: Samples, parts: Windows) -> Float64[np.ndarray, "cells w"]:
-    """Weights of the samples of each cell in each window."""
+    """Total weight of the samples in each cell and window."""
     owners = partition.owners(samples.places)
     inside = _window_of(samples.pixels, parts)
     rows = (owners != NOBODY) & (inside >= 0)
@@ -119,7 +119,7 @@ def _counted(partition: Partition, samples: Samples, parts: Windows) -> Float64[
 
 
 def _window_of(pixels: Float64[np.ndarray, "n 2"], parts: Windows) -> Int64[np.ndarray, " n"]:
-    """The window that each pixel lies in; -1 for none."""
+    """Index of the window that contains each pixel; -1 for none."""
     found = np.full(len(pixels), -1, np.int64)
     for number, (left, top, right, bottom) in enumerate(parts.tolist()):
         x, y = pixels.T
