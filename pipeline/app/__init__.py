@@ -1,1 +1,1 @@
-"""The command line and what it shows: console, report, live view."""
+"""The command line and its output: console, report, live view."""

@@ -1,6 +1,7 @@
-"""What about a place and its machine makes runs slow, unsafe or impossible, told before one is begun.
+"""Warns before a run about properties of a folder and its machine that make runs slow, unsafe or impossible.
 
-From the kernel's own texts alone: which file systems' locks other machines see is documented, and not to be tried out.
+Based on the kernel's files alone: which file systems propagate locks to other machines is documented, and cannot be
+tested here.
 """
 
 from __future__ import annotations
@@ -12,20 +13,20 @@ from pathlib import Path
 from splatpipe.pipeline.engine.machine import Mount, available_memory_bytes, mount_of, mounts
 from splatpipe.pipeline.engine.stage import JSON
 
-WINDOWS_KINDS = ("9p", "drvfs", "v9fs")  # of Windows' drives in WSL; 9p of other virtual machines' folders, too
+WINDOWS_KINDS = ("9p", "drvfs", "v9fs")  # Windows drives in WSL; 9p also for folders shared with other virtual machines
 NFS_KINDS = ("nfs", "nfs4")
 LOCAL_ONLY = ("nolock", "local_lock=all", "local_lock=flock", "nobrl", "localflock")  # options of NFS, SMB, Lustre
-# Of folders that a virtual machine or a container engine on Windows or macOS passes on, and of servers by FUSE.
+# Folders shared by a virtual machine or container engine on Windows or macOS, and servers mounted through FUSE.
 PASSED_ON = ("virtiofs", "vboxsf", "vmhgfs", "prl_fs", "fakeowner", "osxfs", "grpcfuse", "fuse", "fuseblk")
 FUSE_WITH_LOCKS = ("fuse.glusterfs", "fuse.ceph", "fuse.juicefs")  # pass locks on to their servers
 IN_MEMORY = ("tmpfs", "ramfs")
-SMALL_WSL_BYTES = 12e9  # less than what the larger captures take: worth a line in .wslconfig
-WSL = "microsoft"  # in the kernel's release, in any case of letters
+SMALL_WSL_BYTES = 12e9  # less than larger captures need: worth a line in .wslconfig
+WSL = "microsoft"  # in the kernel's release string, case-insensitive
 
 
 @dataclass(frozen=True)
 class Caution:
-    """Something to think of: one sentence, and what to do."""
+    """A warning in one sentence, and what to do about it."""
 
     message: str
     hint: str
@@ -35,11 +36,11 @@ class Caution:
 
 
 def cautions(place: Path, root: Path = Path("/")) -> list[Caution]:
-    """Everything that there is to think of before a run writes to a place.
+    """All warnings for a run that writes to a folder.
 
     Args:
-        place: An OUT, which need not be there yet.
-        root: Where ``proc`` and ``sys`` lie.
+        place: An OUT, which need not exist yet.
+        root: The folder that contains ``proc`` and ``sys``.
     """
     release = root / "proc/sys/kernel/osrelease"
     kernel = release.read_text(encoding="utf-8", errors="replace") if release.is_file() else ""
@@ -80,7 +81,7 @@ def _of_mount(place: Path, mount: Mount, *, in_wsl: bool) -> Sequence[Caution]:
 
 
 def _unshared_locks(mount: Mount) -> str:
-    """Why other machines do not see its locks, told after its name; empty where they do, or have no access."""
+    """Why other machines do not see the mount's locks, to follow its name; empty if they do or have no access."""
     options = [option for option in mount.options if option in LOCAL_ONLY]
     if options:
         return f" with {', '.join(dict.fromkeys(options))}"

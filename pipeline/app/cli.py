@@ -1,4 +1,4 @@
-"""The command line: thin commands over the engine, and one place where errors become exit codes."""
+"""The command line: thin commands over the engine, and the one place where errors become exit codes."""
 
 from __future__ import annotations
 
@@ -413,13 +413,13 @@ def _stop(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def main() -> NoReturn:
-    """Run the command line; every error becomes its message and its exit code here."""
+    """Run the command line; every error is turned into a message and an exit code here."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:  # nohup means it
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP on purpose
             signal.signal(number, _stop)
     try:
         app()
-    except SystemExit as error:  # typer has told what is wrong with the call
+    except SystemExit as error:  # typer has reported what is wrong with the call
         if error.code == EXIT_USAGE and "--json" in sys.argv:
             print_json(
                 {"exit_code": EXIT_USAGE, "error": {"message": "Invalid command line; see stderr.", "hint": "--help"}}

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.app.batch.snakemake_process import Profile
     from splatpipe.pipeline.app.batch.state import BatchState
 
-RETRIES = 2  # a training that died twice for want of memory got three times as much the last time
+RETRIES = 2  # a training that ran out of memory twice gets three times as much on the last try
 
 CapturesArgument = Annotated[
     Path, typer.Argument(help="Folder of capture folders, or a list of captures: TOML or CSV.", show_default=False)
@@ -80,7 +80,7 @@ def batch(
             check_command(notify)
         where = open_profile(profile)
         tables = tuple(with_files_from(Path.cwd(), table) for table in overrides(config, assignments, None).tables)
-        if where.local:  # what the machine or the options lack is told now
+        if where.local:  # problems of the machine or the options are reported now
             request_of(captures, out, overrides(config, assignments, None).resolve(load_preset(preset)), device)
         gpu = _uses_gpu(device, where)
         settings = Settings(preset, tables, until or "", device, gpu, threads, retries, retry_failed, where.local)
@@ -100,7 +100,7 @@ def batch(
 
 
 def _uses_gpu(device: str, profile: Profile) -> bool:
-    """Of another machine only who names it asks for one: a cluster without would never begin the job."""
+    """Whether to request a GPU; on a cluster only if named explicitly, since without GPUs the job would never start."""
     if device != "auto" or not profile.local:
         return device == "cuda"
     from splatpipe.pipeline.raster.cuda_library import why_not

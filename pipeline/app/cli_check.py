@@ -52,7 +52,7 @@ def check(
         finally:
             console.close()
         done.details = facts = preflight_as_json(preflight)
-        _show(preflight)  # first: what was found is told also where the page cannot be written
+        _show(preflight)  # first: the findings are shown even if the page cannot be written
         try:
             write_page(preflight, page)
         except OSError as error:

@@ -1,4 +1,4 @@
-"""``splatpipe edit``: crop, clean, move, turn, scale, merge and reduce a splat, in the order in which it is asked."""
+"""``splatpipe edit``: crop, clean, move, rotate, scale, merge and reduce a splat, in the order of the options."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ CROP, MOVE, REST = "Keep or remove", "Move, rotate, scale", "Clean, merge, reduc
 
 
 class OrderedCommand(TyperCommand):
-    """A command that remembers in which order its options were given, each as often as it was."""
+    """A command that records the order in which its options were given, including repetitions."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As ever; the options' names in their order are left in the context."""
+        """Parse as usual, and store the options' names in their order in the context."""
         _, _, order = self.make_parser(ctx).parse_args(args=list(args))
         ctx.meta[ORDER] = [parameter.name for parameter in order]
         return super().parse_args(ctx, args)
@@ -141,20 +141,20 @@ def edit(
 
 
 def steps_in_order(order: Sequence[str], options: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Each option with its value, as they stand on the command line.
+    """The options with their values, in command-line order.
 
     Args:
-        order: Names of all that was given, each as often as it was.
-        options: The values of steps, a list where an option may be repeated.
+        order: Names of all options given, including repetitions.
+        options: Values of the step options; a list if an option may be repeated.
 
     Raises:
-        UsageError: if one is given twice that may be given once.
+        UsageError: if a non-repeatable option is given twice.
     """
     left = {name: list(value) if isinstance(value, list) else [value] for name, value in options.items()}
     found = []
     for name in order:
         if name not in left:
-            continue  # no step
+            continue  # not a step
         if not left[name]:
             raise UsageError(
                 f"--{name.replace('_', '-')} can be given only once.",
@@ -179,7 +179,7 @@ def _edit(
 
     local, pictures, threads = how
     output = OutputFile(target[0], format_of_name(*target))
-    parse_steps(given, output, local)  # what makes no sense is told before anything is looked for
+    parse_steps(given, output, local)  # invalid steps are reported before anything is opened
     found = open_source(source)
     steps = parse_steps(given, output, local, found.trained_on())
     task = EditTask(found, output, steps, pictures)

@@ -1,4 +1,4 @@
-"""``--help`` of each command after its first sentence: what it reads and leaves, examples, where to read on."""
+"""The ``--help`` text of each command after its first sentence: inputs and outputs, examples, further reading."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class HelpPage:
     """The rest of a command's help.
 
     Args:
-        about: What it reads and what it leaves.
-        examples: Calls, without the program's name.
-        read_on: The page of the documentation.
-        exits: Exit codes, where they matter.
+        about: What it reads and writes.
+        examples: Example calls, without the program's name.
+        read_on: The documentation page.
+        exits: Exit codes, if relevant.
     """
 
     about: str
@@ -33,7 +33,7 @@ class HelpPage:
     exits: str = ""
 
     def epilog(self) -> str:
-        """What follows the options."""
+        """The text after the options."""
         calls = "\n".join(f"  splatpipe {call}" for call in self.examples)
         parts = ["Examples:" if len(self.examples) > 1 else "Example:", calls]
         if self.exits:
@@ -161,11 +161,11 @@ PAGES = {
 
 
 def helped(app: typer.Typer, **how: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command of the application, with its page of help.
+    """Decorator that registers a function as a command with its help page.
 
     Args:
-        app: Which application.
-        how: As for ``app.command``.
+        app: The application.
+        how: Keyword arguments for ``app.command``.
     """
 
     def register(function: Callable[..., None]) -> Callable[..., None]:

@@ -1,4 +1,4 @@
-"""What the commands' arguments and options are, once for all of them."""
+"""Arguments and options shared by the commands."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from splatpipe.pipeline.engine.errors import UsageError
 
 
 def expanded(path: Path) -> Path:
-    """A path with ``~`` for a user's folder; as it is where nobody has one, as in a container.
+    """Expand ``~`` in a path; other paths are returned unchanged.
 
     Raises:
-        UsageError: if it begins with ``~`` and there is no such folder.
+        UsageError: if it begins with ``~`` and there is no such home folder, as in a container.
     """
     try:
         return path.expanduser()
@@ -23,21 +23,21 @@ def expanded(path: Path) -> Path:
 
 
 def presets(incomplete: str) -> list[str]:
-    """The presets whose names begin so, for a shell that completes."""
+    """Presets whose names begin with ``incomplete``, for shell completion."""
     from splatpipe.pipeline.engine.config import preset_names
 
     return [name for name in preset_names() if name.startswith(incomplete)]
 
 
 def stages(incomplete: str) -> list[str]:
-    """The stages whose names begin so."""
+    """Stages whose names begin with ``incomplete``."""
     from splatpipe.stages.line import LINE
 
     return [stage.name for stage in LINE if stage.name.startswith(incomplete)]
 
 
 def devices(incomplete: str) -> list[str]:
-    """The devices whose names begin so."""
+    """Devices whose names begin with ``incomplete``."""
     return [name for name in ("auto", "cpu", "cuda") if name.startswith(incomplete)]
 
 

@@ -1,4 +1,4 @@
-"""What a command of the line needs before it can begin: its options resolved, the request, an open session."""
+"""What a pipeline command needs before it can start: resolved options, the request, an open session."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SPENT_VARIABLE = "SPLATPIPE_SPENT_S"
 
 @dataclass(frozen=True)
 class Overrides:
-    """What the command line says about the configuration."""
+    """Configuration overrides from the command line."""
 
     tables: Sequence[dict[str, Any]]
 
@@ -35,7 +35,7 @@ class Overrides:
         train = merge(self.tables).get("train")
         budget = train.get("time_budget_s") if isinstance(train, dict) else None
         if budget:
-            below = (*below, {"train": {"max_megapixels": 0.0}})  # a preset's size goes with its own length
+            below = (*below, {"train": {"max_megapixels": 0.0}})  # a preset's image size fits its own length
             if isinstance(budget, int | float) and budget < PRODUCTS_FROM_BUDGET_S:
                 below = (*below, NO_PRODUCTS)
         return resolve(LineConfig, [*below, *self.tables])
@@ -46,7 +46,7 @@ def overrides(config: Path | None, assignments: Sequence[str] | None, seed: int 
     from splatpipe.stages.options import LineConfig
 
     tables = [load_file(config)] if config else []
-    for table in tables:  # OUT/config.toml has these two besides the options
+    for table in tables:  # OUT/config.toml contains these two besides the options
         table.pop("photos", None), table.pop("splatpipe", None)
     if seed is not None:
         tables.append(with_seed(LineConfig, seed))
@@ -54,7 +54,7 @@ def overrides(config: Path | None, assignments: Sequence[str] | None, seed: int 
 
 
 def with_budgets(assignments: Sequence[str] | None, time_budget: str | None, max_memory: str | None) -> list[str]:
-    """``--time-budget`` and ``--max-memory`` as the assignments that they are short for."""
+    """Append ``--time-budget`` and ``--max-memory`` as the assignments they abbreviate."""
     from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 
     budgets = []
@@ -66,7 +66,7 @@ def with_budgets(assignments: Sequence[str] | None, time_budget: str | None, max
 
 
 def with_boundary(assignments: Sequence[str] | None, boundary: str | None) -> list[str]:
-    """``--boundary`` as the assignment that it is short for."""
+    """Append ``--boundary`` as the assignment it abbreviates."""
     return [*([] if boundary is None else [f"georef.boundary={boundary}"]), *(assignments or ())]
 
 
@@ -80,14 +80,14 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     began_s = round(time.monotonic() - spent_s(), 3)
     if device not in ("auto", "cpu", "cuda"):
         raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
-    if device == "cuda":  # told now, not when training begins; `auto` takes the CPU where CUDA does not work
+    if device == "cuda":  # reported now, not when training begins; `auto` falls back to the CPU if CUDA does not work
         from splatpipe.pipeline.raster.cuda_library import why_not
 
         if unfit := config.train.unfit_for_cuda():
             raise UsageError(unfit, hint="Omit --device, or give --device cpu.")
         if missing := why_not():
             raise missing.error()
-    if os.environ.get("SPLATPIPE_ISA"):  # a wrong one is told now, not when training begins
+    if os.environ.get("SPLATPIPE_ISA"):  # an invalid one is reported now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)
     foresee = Forecaster(config, machine.threads)
@@ -95,7 +95,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
 
 
 def spent_s() -> float:
-    """Seconds that commands before this one have spent on the same capture, so that a time budget counts them."""
+    """Seconds that earlier commands spent on the same capture, which count towards a time budget."""
     try:
         return max(0.0, float(os.environ.get(SPENT_VARIABLE, "0")))
     except ValueError:
@@ -103,7 +103,7 @@ def spent_s() -> float:
 
 
 def print_forecast(request: Request, until: str | None) -> None:
-    """Say what the whole line will take, before its first training."""
+    """Print the forecast for the whole pipeline, before its first training."""
     from splatpipe.pipeline.app.command_summary import PART_VARIABLE
     from splatpipe.pipeline.app.console import say
     from splatpipe.pipeline.app.preflight.start import forecast_text
@@ -116,7 +116,7 @@ def print_forecast(request: Request, until: str | None) -> None:
 
 
 def existing(out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0) -> Request:
-    """What ran in OUT, to be run again, with what is to be otherwise."""
+    """The request that runs OUT again with the given overrides."""
     from splatpipe.pipeline.engine.run_folder import open_run_folder
     from splatpipe.stages.line import LINE
     from splatpipe.stages.options import LineConfig
@@ -143,7 +143,7 @@ def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | N
 
 
 def status_as_json(status: StageStatus) -> dict[str, Any]:
-    """Where a stage stands, and its shards if it has some, for ``status --json``."""
+    """The status of a stage and of its shards, for ``status --json``."""
     from splatpipe.pipeline.engine.needs import used_and_forecast
 
     artifact = status.artifact
@@ -159,7 +159,7 @@ def status_as_json(status: StageStatus) -> dict[str, Any]:
 
 
 class RunSession:
-    """An open session whose events go to the terminal, which is left tidy whatever happens."""
+    """An open session whose events go to the terminal, which is restored whatever happens."""
 
     def __init__(self, request: Request, wait: bool = False, shard: str = "") -> None:
         self._request, self._wait, self._shard = request, wait, shard
@@ -182,7 +182,7 @@ class RunSession:
         return stopped
 
     def _renew_viewer(self) -> None:
-        """Have the viewer show what was measured, while OUT is locked; what is wrong with it is told, no more."""
+        """Update the measurements in the viewer while OUT is locked; problems are only reported."""
         from splatpipe.pipeline.app.console import say
         from splatpipe.pipeline.app.measured_viewer import renew_viewer
 

@@ -1,4 +1,4 @@
-"""How a command ends: a summary for people, one JSON object for programs, a message and an exit code for errors."""
+"""The end of a command: a summary for people, one JSON object for programs, a message and an exit code for errors."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.verdict import Verdict
     from splatpipe.pipeline.engine.runner import Outcome
 
-PART_VARIABLE = "SPLATPIPE_PART"  # set where more stages follow at once, by other commands: a good end needs no report
-STOP_S = 4.0  # after Ctrl-C the report is over, too: an end within five seconds is promised, on a busy machine as well
+PART_VARIABLE = "SPLATPIPE_PART"  # set if further commands run more stages at once: success needs no report yet
+STOP_S = 4.0  # after Ctrl-C the report is limited to this: the command promises to end within five seconds
 
-NOTICE_S = 4.7  # and a notice has what is left of that time,
+NOTICE_S = 4.7  # and the notification gets what is left of this,
 LEAST_NOTICE_S = 0.5  # but at least this
 
 
 class CommandSummary:
-    """Tells the end of a command, good or bad: a summary for people on stderr, one JSON object for programs."""
+    """Reports the success or failure of a command: a summary on stderr, one JSON object for programs."""
 
     outcome: Outcome | None = None
-    reports: bool = True  # not who makes one shard: others may be at work in OUT, and the report is of all
+    reports: bool = True  # false when running a single shard: others may be working in OUT, and the report covers all
     details: Mapping[str, Any] | None = None
     news: Sequence[str] = ()
     _reported: Path | None = None
@@ -45,7 +45,7 @@ class CommandSummary:
         return self
 
     def notify_by(self, command: str | None) -> None:
-        """Have a command of the user's called at the end, if there is one.
+        """Register the user's command, if any, to be called at the end.
 
         Raises:
             UsageError: if it cannot be called.
@@ -69,7 +69,7 @@ class CommandSummary:
             self._notify(self._command, error)
 
     def _notify(self, command: str, error: BaseException | None) -> None:
-        """Call it; what is wrong with it is told, and changes nothing about the run."""
+        """Call the user's command; its problems are reported and do not affect the run."""
         from splatpipe.pipeline.app.console import say
 
         state: State = "done" if error is None else "failed"
@@ -83,7 +83,7 @@ class CommandSummary:
             say(trouble)
 
     def _report(self, error: BaseException | None) -> None:
-        """Have the report written; what is wrong with it is told, and changes nothing about the run."""
+        """Write the report; its problems are reported and do not affect the run."""
         from splatpipe.pipeline.app.console import say
         from splatpipe.pipeline.app.report import make_report
         from splatpipe.pipeline.engine.run_folder import LOG_FILE
@@ -135,7 +135,7 @@ class CommandSummary:
 
 
 def _insists(error: BaseException | None) -> bool:
-    """Whether the user pressed Ctrl-C once more while the first one was being obeyed: then nothing is waited for."""
+    """Whether the user pressed Ctrl-C again during the shutdown: then nothing is waited for."""
     before = None if error is None else error.__context__
     while before is not None and not isinstance(before, StopSignal):
         before = before.__context__
@@ -143,12 +143,12 @@ def _insists(error: BaseException | None) -> bool:
 
 
 def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The accuracy report, with the splat's own if it was measured, and the surveyed points; empty where not walked."""
+    """The accuracy report, with the splat's own if measured, and the surveyed points; empty if not computed."""
     artifacts = outcome.artifacts.values()
     parts = {name: part.path for artifact in artifacts for name, part in artifact.parts.items()}
     report: dict[str, Any] = {}
     points: list[dict[str, Any]] = []
-    with suppress(OSError, ValueError, KeyError, TypeError):  # what is damaged is told by ``status``
+    with suppress(OSError, ValueError, KeyError, TypeError):  # ``status`` reports damaged files
         if "evaluate.metrics" in parts:
             report = dict(json.loads(parts["evaluate.metrics"].read_text(encoding="utf-8"))["accuracy"])
         elif "georef.accuracy" in parts:
@@ -159,7 +159,7 @@ def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 
 def _verdict(out: Path) -> Verdict | None:
-    """The report's, where the run's record can be read: what is wrong with it does not spoil the run's end."""
+    """The report's verdict; None if the run's record cannot be read, which must not fail the command."""
     from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
     from splatpipe.pipeline.app.report.verdict import judge
 
@@ -180,7 +180,7 @@ def for_the_user(error: Exception) -> SplatpipeError:
     if isinstance(error, OSError):
         return MachineError(str(error), "Check the free space and the permissions.")
     hint = "Please report it."
-    with suppress(OSError):  # a container may have no place for it
+    with suppress(OSError):  # a container may have no writable folder for it
         with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:
             traceback.print_exception(error, file=file)
         hint = f"Please report it with {file.name}"

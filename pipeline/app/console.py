@@ -1,4 +1,4 @@
-"""Events and errors on the terminal: a bar with rate and time left, or plain lines where there is no terminal."""
+"""Shows events and errors: a progress bar with rate and time left on a terminal, else plain lines."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.line import StageStatus
 from splatpipe.pipeline.engine.stage import JSON, stage_name
 
-PLAIN_INTERVAL_S = 10.0  # a line that often in a log file tells enough
+PLAIN_INTERVAL_S = 10.0  # between progress lines in a log file
 PLAIN_WIDTH = 120  # columns of a table in a log file
-LEAST_OFFSET_M = 0.01  # of a flight's positions, to be told
-POINTS_SHOWN = 40  # more are in metrics.json alone
+LEAST_OFFSET_M = 0.01  # of a flight's positions; smaller offsets are not shown
+POINTS_SHOWN = 40  # more are only in metrics.json
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 MARKS = {"good": ("✓", "green"), "doubt": ("!", "yellow"), "bad": ("✗", "red")}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
-# What a file's name could tell a terminal, or write as colours into a file; tab and line feed stay.
+# Control characters with which a file name could control a terminal; tab and line feed are kept.
 CONTROLS = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "\ufffd")
 
 
 class _RateColumn(ProgressColumn):
-    """Done of total with the unit, and how many a second."""
+    """Done, total and unit, and the rate per second."""
 
     def render(self, task: Task) -> Text:
         unit = task.fields.get("unit", "")
@@ -80,7 +80,7 @@ class RunConsole:
             show(event.stage, event.data)
 
     def close(self) -> None:
-        """Take the bar away, so that what follows stands on its own line."""
+        """Remove the bar, so that further output starts on its own line."""
         if self._live is not None:
             self._live.stop()
             self._live = None
@@ -92,7 +92,7 @@ class RunConsole:
     def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
         self._stage_started_s = self._plain_said_s = time.monotonic()
         self._what = ""
-        self._shards.begin(stage, None if stage in self._order else data.get("shard"))  # None: it is made alone
+        self._shards.begin(stage, None if stage in self._order else data.get("shard"))  # None: the shard is run alone
         if not self._console.is_terminal:
             self._console.print(f"{self._label(stage)} started ({data['reason']})", markup=False)
             return
@@ -165,18 +165,18 @@ class RunConsole:
 
 
 class ShardTimes:
-    """How long the shards of a stage take, one after the other, so that the time left is told over all of them."""
+    """Durations of a stage's shards, run one after the other, to estimate the time left for all of them."""
 
     def __init__(self) -> None:
         self._took: dict[str, dict[str, float]] = {}
         self._stage, self._after = "", 0
 
     def begin(self, stage: str, shard: Mapping[str, int] | None) -> None:
-        """A stage, or a shard of one, begins.
+        """Record the start of a stage or of one of its shards.
 
         Args:
             stage: Its name.
-            shard: Its number and how many there are; None for a stage's own.
+            shard: Its number and count; None for the stage's own body.
         """
         self._stage, self._after = stage_name(stage), 0
         if shard is not None:
@@ -185,17 +185,17 @@ class ShardTimes:
             self._after = sum(name not in took for name in later)
 
     def end(self, stage: str, seconds: float) -> None:
-        """A shard is there."""
+        """Record the end of a shard."""
         if stage != stage_name(stage):
             self._took.setdefault(stage_name(stage), {})[stage] = seconds
 
     def left(self, seconds: float, done: float, total: float) -> str:
-        """About how long all take from here on, in words; empty for the last one, and where nothing tells yet.
+        """The approximate time left for all shards, in words; empty for the last one, and if unknown.
 
         Args:
-            seconds: That the one at work has taken.
-            done: Of it.
-            total: Of it.
+            seconds: Elapsed time of the current shard.
+            done: Its work done.
+            total: Its total work.
         """
         if not self._after or not done or not total:
             return ""
@@ -206,12 +206,12 @@ class ShardTimes:
 
 
 def escape(text: str) -> str:
-    """A text as it is, whatever it holds: neither rich nor a terminal takes anything in it for a command."""
+    """Escape a text so that neither rich nor a terminal interprets anything in it as markup or a command."""
     return without_markup(text.translate(CONTROLS))
 
 
 def show_error(error: SplatpipeError) -> None:
-    """The short panel that a user sees instead of a traceback."""
+    """Show an error as a short panel instead of a traceback."""
     lines = [escape(error.message)]
     if error.hint:
         lines.append(f"[bold]→[/] {escape(error.hint)}")
@@ -219,7 +219,7 @@ def show_error(error: SplatpipeError) -> None:
 
 
 def show_status(statuses: Iterable[StageStatus]) -> None:
-    """The table of ``splatpipe status``."""
+    """Print the table of ``splatpipe status``."""
     table = Table(box=None, pad_edge=False)
     for title in ("stage", "state", "took", "what"):
         table.add_column(title, overflow="fold")
@@ -234,7 +234,7 @@ def show_status(statuses: Iterable[StageStatus]) -> None:
 
 
 def show_verdict(verdict: Verdict) -> None:
-    """What is good about a run and what is doubtful: the report's first lines."""
+    """Print the verdict on a run, the report's first lines."""
     console = Console(file=sys.stderr, highlight=False)
     mark, colour = MARKS[verdict.level]
     console.print(f"\n[bold {colour}]{mark} {escape(verdict.headline)}.[/]  {escape(verdict.text)}", soft_wrap=True)
@@ -244,19 +244,19 @@ def show_verdict(verdict: Verdict) -> None:
 
 
 def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], news: Sequence[str] = ()) -> None:
-    """What a run left, for people.
+    """Print a run's outputs.
 
     Args:
         out: OUT.
-        seconds: How long it took; None where all was there already.
+        seconds: Duration of the run; None if everything was reused.
         files: Its files.
-        news: What was measured besides, a line each.
+        news: Measurement results, one line each.
     """
     console = Console(file=sys.stderr, highlight=False)
     done = "All results are up to date: nothing to do." if seconds is None else f"Done in {_duration(seconds)}."
     console.print(f"\n[bold]{done}[/]", soft_wrap=True)
     sizes: dict[Path, int] = {}
-    for path in files:  # what lies in a folder is told of as that
+    for path in files:  # files in a folder are shown as the folder
         shown = out / path.relative_to(out).parts[0]
         sizes[shown] = sizes.get(shown, 0) + path.stat().st_size
     for path, size in sizes.items():
@@ -268,10 +268,10 @@ def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], news: 
 
 
 def show_bad_cameras(verdict: Mapping[str, JSON]) -> None:
-    """The last and loudest words on a run whose cameras are wrong; nothing otherwise.
+    """Print a final, prominent warning if the cameras are wrong; nothing otherwise.
 
     Args:
-        verdict: Of the stage `sparse`.
+        verdict: The verdict of the stage `sparse`.
     """
     reasons = [reason for reason in verdict.get("reasons", []) if reason["level"] == "bad"]
     if not reasons:
@@ -284,11 +284,11 @@ def show_bad_cameras(verdict: Mapping[str, JSON]) -> None:
 
 
 def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON]]) -> None:
-    """The accuracy report as a table on stderr, and the surveyed points if they are few; nothing where there is none.
+    """Print the accuracy report as a table on stderr, and the surveyed points if few; nothing if there is none.
 
     Args:
         report: `accuracy` of metrics.json, or `accuracy.json`.
-        points: Of `control.json`.
+        points: The points of `control.json`.
     """
     splat = report.get("splat") or {"tables": {}, "points": []}
     found = [(title, (report.get("tables") or {}).get(name)) for name, title in GROUPS.items()]
@@ -319,7 +319,7 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
 
 
 def _offsets(flights: Iterable[Mapping[str, JSON]]) -> list[str]:
-    """What the positions of each flight are off together; the table is without it."""
+    """Each flight's common position offset, which the table excludes."""
     offsets = [(flight["flight"] + 1, *flight["offset_m"]) for flight in flights]
     return [
         f"Positions of flight {number}: common offset east {east:+.3f}, north {north:+.3f}, up {up:+.3f} m."
@@ -329,7 +329,7 @@ def _offsets(flights: Iterable[Mapping[str, JSON]]) -> list[str]:
 
 
 def _points_table(points: Sequence[Mapping[str, JSON]], splat: Mapping[str, Mapping[str, JSON]]) -> Table:
-    """Residuals of each surveyed point: estimated less surveyed, metres."""
+    """Residuals of each surveyed point: estimated minus surveyed, metres."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for title in ("point", "", "photos", "east", "north", "up", "px", "splat: east", "north", "up"):
         table.add_column(title, justify="left" if title in ("point", "") else "right", overflow="fold")
@@ -359,7 +359,7 @@ def _bounds(interval: Sequence[float] | None) -> str:
 
 
 def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
-    """A plain table on stdout."""
+    """Print a plain table on stdout."""
     table = Table(box=None, pad_edge=False)
     for title in titles:
         table.add_column(title, overflow="fold")
@@ -369,7 +369,7 @@ def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
 
 
 def say(text: str) -> None:
-    """One line to the user on stderr."""
+    """Print one line for the user on stderr."""
     Console(file=sys.stderr, highlight=False).print(escape(text), soft_wrap=True)
 
 

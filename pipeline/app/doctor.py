@@ -1,4 +1,4 @@
-"""What this machine can do, for `splatpipe doctor` and for a report of a problem."""
+"""The capabilities of this machine, for `splatpipe doctor` and for bug reports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def examine(place: Path) -> dict[str, JSON]:
     """Versions, cores, memory, disk, the rasterizer's instruction set, and whether CUDA is used.
 
     Args:
-        place: An OUT, which need not be there yet.
+        place: An OUT, which need not exist yet.
     """
     from splatpipe.pipeline.raster.rasterizer import isa_name, isa_names
 
@@ -43,7 +43,7 @@ def examine(place: Path) -> dict[str, JSON]:
 
 
 def _cuda() -> str:
-    """Whether trainings take CUDA here; if not, why not and what to do about it."""
+    """Whether training uses CUDA here; if not, why not and what to do about it."""
     from splatpipe.pipeline.raster.cuda_library import cannot_compute, load, why_not
 
     if missing := why_not() or cannot_compute():
@@ -53,13 +53,13 @@ def _cuda() -> str:
 
 
 def _cores() -> str:
-    """What runs may use, and what the machine has beyond that."""
+    """The cores that runs may use, and those of the machine if it has more."""
     usable, all_of_them = available_cores(), os.cpu_count() or 0
     return f"{usable} of {all_of_them}, limited for this process" if usable < all_of_them else str(usable)
 
 
 def _free(place: Path) -> str:
-    """What is free where a path lies or would lie."""
+    """The free space on the disk of a path, which need not exist."""
     there = next(folder for folder in (place.absolute(), *place.absolute().parents) if folder.exists())
     try:
         return f"{shutil.disk_usage(there).free / 1e9:.1f} GB"

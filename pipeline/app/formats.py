@@ -1,4 +1,4 @@
-"""A run or a file in more formats: what is asked for, whether it can be made, and the conversion of files."""
+"""Export of runs to more formats (option parsing, feasibility checks), and conversion of files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NEED_METRES, NEED_PLACE = {"laz"}, {"tiles"}
 
 
 def with_formats(out: Path, asked: str) -> dict[str, Any]:
-    """The option that asks for formats beside those that a run makes already.
+    """The option that adds formats to those that a run already exports.
 
     Raises:
         UsageError: if there is no such format.
@@ -28,10 +28,10 @@ def with_formats(out: Path, asked: str) -> dict[str, Any]:
 
 
 def check_possible(out: Path, asked: str) -> None:
-    """Say what cannot be made of a run before anything is begun.
+    """Check that a run can be exported to formats before anything starts.
 
     Raises:
-        SplatpipeError: if the run has no scale, or no place on the earth, and a format needs it.
+        SplatpipeError: if the run has no scale or is not georeferenced, and a format needs it.
     """
     from splatpipe.pipeline.survey.frames import load_frame
 
@@ -58,10 +58,10 @@ def _parsed(text: str) -> tuple[str, ...]:
 
 
 def convert_file(source: Path, target: Path, kind: SplatFormat) -> dict[str, Any]:
-    """Read a splat and write it.
+    """Convert a splat file.
 
     Returns:
-        Its figures: Gaussians, bytes, and the format's name.
+        Number of Gaussians, bytes, and the format's name.
 
     Raises:
         SplatpipeError: if it cannot be read, or the format cannot hold it.

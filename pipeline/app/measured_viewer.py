@@ -1,8 +1,8 @@
-"""OUT/viewer.html, and OUT/web/index.html, with what was measured on the surface model.
+"""Puts measurements on the surface model into OUT/viewer.html and OUT/web/index.html.
 
-The stage `export` makes the page before there is a surface model, and sections are cut on finished runs, at any time.
-So what was measured is put into the page as it lies in OUT; the artifact that it is a copy of stays as it is. The page
-keeps its time, by which the store takes it for that copy still (``is_copy``), and the same state gives the same bytes.
+The stage `export` writes the page before there is a surface model, and sections can be cut on a finished run at any
+time. So measurements are put into the copy of the page in OUT; the artifact itself is unchanged. The page keeps its
+mtime, so that the store still recognises it as that copy (``is_copy``), and the same state gives the same bytes.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
 PLACES = ("x", "y", "z")
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
-LARGEST = 1e9  # of a coordinate, metres: beyond it there is no earth, and a chart's steps drown in rounding
+LARGEST = 1e9  # of a coordinate, metres: larger ones are not on the earth, and a chart's steps are lost in rounding
 
 
 def renew_viewer(out: Path) -> str:
-    """Let the viewers in OUT show what was measured and still holds, no less and no more.
+    """Update the viewers in OUT to show exactly the measurements that are still valid.
 
-    Only who holds the lock of OUT may call this.
+    Only the holder of OUT's lock may call this.
 
     Args:
         out: OUT.
 
     Returns:
-        What the user should know; empty where all is well, or there is nothing to do.
+        A warning for the user; empty if all is well or there is nothing to do.
 
     Raises:
-        OSError: if the disk is full or not writable; each page is as before or renewed.
+        OSError: if the disk is full or not writable; each page is either unchanged or updated.
     """
     pages = [name for name in (PAGE, SITE_PAGE) if (out / name).is_file()]
     if not pages or not any_measured(out):
@@ -54,7 +54,7 @@ def renew_viewer(out: Path) -> str:
 
 
 def _renew(path: Path, shown: Mapping[str, Any] | None) -> None:
-    """Put it into a page; as it is, and with the time that it had, where it shows that already."""
+    """Put measurements into a page and keep its mtime; a page that already shows them is left alone."""
     page = path.read_bytes()
     renewed = with_measurements(page, shown)
     if renewed == page:
@@ -63,15 +63,15 @@ def _renew(path: Path, shown: Mapping[str, Any] | None) -> None:
 
     def fill(file: IO[bytes]) -> None:
         file.write(renewed)
-        file.flush()  # what is written later would change its time
+        file.flush()  # a later flush would change its mtime
         os.utime(file.fileno(), ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
 
     write_durably(path, fill)
 
 
 def shown_measurements(out: Path) -> dict[str, Any] | None:
-    """What the page is to show: of the present surface model, and in the frame of the page. None for nothing."""
-    from splatpipe.stages.line import DSM, EXPORT, LINE  # here: every run ends in this module, of any line
+    """The measurements to show: those of the current surface model, in the page's frame. None if there are none."""
+    from splatpipe.stages.line import DSM, EXPORT, LINE  # here: every run ends in this module, whatever its pipeline
 
     run = open_run_folder(out, LINE)
     of_surface, of_page = run.lineage(DSM), run.lineage(EXPORT)
@@ -100,7 +100,7 @@ def _volume(item: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_section_trace(trace: Any) -> bool:
-    """Whether the page can draw it: a damaged one may not cost people the rest."""
+    """Whether the page can draw it: a damaged one must not hide the rest."""
     if not _has_columns(trace, PROFILE) or not _has_columns(trace, POINTS) or None in trace["distance"]:
         return False
     return trace["distance"][-1:] > [0.0] and any(height is not None for height in trace["height"])
@@ -111,7 +111,7 @@ def _is_polygon_trace(trace: Any) -> bool:
 
 
 def _has_columns(trace: Any, names: Sequence[str]) -> bool:
-    """Whether these are there, equally long, and of numbers or None."""
+    """Whether these columns exist, have equal lengths, and contain only numbers or None."""
     if not isinstance(trace, dict) or not all(isinstance(trace.get(name), list) for name in names):
         return False
     if not all(

@@ -1,8 +1,7 @@
-"""What was measured on a run's surface model, kept so that later commands can show it: `stages/measured.json`.
+"""Stores measurements on a run's surface model for later commands: `stages/measured.json`.
 
-`OUT/sections` and `OUT/volumes.json` are for people and their programs. This file has the same figures, and where all
-of it lies in the world frame; with the digests of the surface model and of the frame that it was measured in, for on
-others it would be wrong.
+`OUT/sections` and `OUT/volumes.json` are for people and their programs. This file has the same figures and their
+geometry in the world frame, with the digests of the surface model and the frame for which they are valid.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ MEASURED = Path("stages/measured.json")
 SECTIONS = "sections"  # the folder in OUT
 VOLUMES = "volumes.json"
 FORMAT = 1
-LARGEST_FILE = 64 << 20  # bytes: ten times the largest that is written
+LARGEST_FILE = 64 << 20  # bytes: ten times the largest file ever written
 Kind = Literal["sections", "volumes"]
 Items = list[dict[str, Any]]
 FIGURES: Mapping[Kind, Sequence[str]] = {
@@ -34,16 +33,16 @@ FIGURES: Mapping[Kind, Sequence[str]] = {
 
 
 def read_measurements(out: Path, kind: Kind, surface: str, frame: str = "") -> Items:
-    """Sections or volumes that belong to a surface model, and whose files have not been removed since.
+    """Read the sections or volumes of a surface model whose files have not been removed since.
 
     Args:
         out: OUT.
-        kind: Which.
+        kind: Sections or volumes.
         surface: Digest of the surface model.
-        frame: Digest of the frame that they are to be shown in; empty for any.
+        frame: Digest of the frame in which to show them; empty for any.
 
     Returns:
-        Figures of each, with its ``trace``; none where the file is not there, is damaged, or tells of another model.
+        The figures of each, with its ``trace``; empty if the file is missing, damaged, or of another model.
     """
     kept = _kept(out).get(kind)
     if not isinstance(kept, dict) or not surface or kept.get("surface") != surface:
@@ -64,26 +63,26 @@ def any_measured(out: Path) -> bool:
 
 
 def outdated(out: Path, surface: str) -> bool:
-    """Whether what was measured lies in OUT still, and is of another surface model."""
+    """Whether OUT still has measurements, but of another surface model."""
     kept = {kind: found for kind, found in _kept(out).items() if isinstance(found, dict)}
     there = [kind for kind, name in (("sections", SECTIONS), ("volumes", VOLUMES)) if (out / name).exists()]
     return any(kept[kind].get("items") and kept[kind].get("surface") != surface for kind in there if kind in kept)
 
 
 def title_of(item: Mapping[str, Any]) -> str:
-    """What pages call a section or a volume."""
+    """The title of a section or a volume in pages."""
     if "polygon" in item:
         return printable(item["name"]) or f"Volume {item['polygon']}"
     return printable(item["name"]).replace("-", " ").capitalize()
 
 
 def write_measurements(out: Path, kind: Kind, digests: tuple[str, str], items: Sequence[Mapping[str, Any]]) -> None:
-    """Keep what was measured in place of what was kept of its kind. Only who holds the lock of OUT may call this.
+    """Replace the stored measurements of a kind. Only the holder of OUT's lock may call this.
 
     Args:
         out: OUT.
-        kind: Which.
-        digests: Of the surface model, and of the frame.
+        kind: Sections or volumes.
+        digests: Digests of the surface model and of the frame.
         items: As ``read_measurements`` returns them.
 
     Raises:
@@ -95,7 +94,7 @@ def write_measurements(out: Path, kind: Kind, digests: tuple[str, str], items: S
 
 
 def _is_whole(item: Any, kind: Kind) -> bool:
-    """Whether it has all figures that pages show."""
+    """Whether it has all the figures that pages show."""
     if not isinstance(item, dict) or not isinstance(item.get("name"), str):
         return False
     if kind == "volumes" and not isinstance(item.get("base"), dict):

@@ -1,7 +1,7 @@
-"""Tells a command of the user's that a run or a batch has ended.
+"""Calls a user's command when a run or a batch has ended.
 
-What it needs stands in its environment, where no name of a capture can become a part of the command. What it does, and
-whether it does it in time, changes nothing about the run.
+Its input is passed in environment variables, so that no capture name can become part of the command. What it does, and
+whether it finishes in time, does not affect the run.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from typing import Literal
 from splatpipe.pipeline.engine.errors import UsageError
 
 State = Literal["done", "failed", "stopped"]
-TIME_LIMIT_S = 30.0  # a message to a server takes a second; the next capture or the shell waits for it
+TIME_LIMIT_S = 30.0  # a message to a server takes a second, and the next capture or the shell waits for it
 LONGEST = 8192  # characters of a command: far below what Linux takes as one argument, 128 KiB
 SHELL = "/bin/sh"
-STDERR = 2  # for what the command says: stdout is the JSON object's alone
+STDERR = 2  # for the command's output: stdout is reserved for the JSON object
 
 
 def check_command(command: str) -> None:
-    """Refuse what cannot be called, before hours are spent.
+    """Check the command before hours are spent.
 
     Raises:
-        UsageError: if it is empty or too long, or has a character that no command can have.
+        UsageError: if it is empty, too long, or contains a character that no command can.
     """
     if not command.strip() or len(command) > LONGEST or "\0" in command:
         raise UsageError(
@@ -46,17 +46,17 @@ def notify(
     """Call the command and wait for it.
 
     Args:
-        command: A line for the shell; it finds ``SPLATPIPE_STATE``, ``SPLATPIPE_CAPTURE``, ``SPLATPIPE_REPORT`` and
+        command: A shell command line; it gets ``SPLATPIPE_STATE``, ``SPLATPIPE_CAPTURE``, ``SPLATPIPE_REPORT`` and
             ``SPLATPIPE_OUT`` in its environment, nothing on stdin, and writes to our stderr.
-        state: How it ended.
-        name: The capture's, or the batch's.
-        report: Its page; None where there is none, and the variable is empty.
-        out: The folder of results; that of the report by default.
-        time_limit_s: After that it is ended, with all that it started.
+        state: How the run or batch ended.
+        name: The capture's or the batch's name.
+        report: Its report page; None, and an empty variable, if there is none.
+        out: The results folder; by default that of the report.
+        time_limit_s: After this it is killed, with everything it started.
 
     Returns:
-        What went wrong with it, a sentence for the user without a word of the command, which may hold a secret; empty
-        where nothing did.
+        What went wrong with it, in a sentence that does not quote the command, which may contain a secret; empty if
+        nothing did.
     """
     folder = out or (report.parent if report is not None else None)
     told = {"STATE": state, "CAPTURE": name, "REPORT": str(report or ""), "OUT": str(folder or "")}
@@ -67,7 +67,7 @@ def notify(
             stdin=subprocess.DEVNULL,
             stdout=STDERR,
             env=environment,
-            start_new_session=True,  # so that what it starts can be ended with it
+            start_new_session=True,  # so that its child processes can be killed with it
         )
     except (OSError, ValueError) as error:
         return f"The --notify command could not be started: {getattr(error, 'strerror', None) or error}."
@@ -81,7 +81,7 @@ def notify(
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End what is left of it; nothing where it has ended and left nobody behind."""
+    """Kill what is left of the process and its children, if anything."""
     with suppress(ProcessLookupError, PermissionError):
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)

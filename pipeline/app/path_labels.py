@@ -1,7 +1,7 @@
-"""Text for pages that go to clients: without the folders of the machine that made them.
+"""Removes this machine's folders from text for pages that go to clients.
 
-A path tells a user's name, a customer's, a server's. What lies in OUT is named from there, photos from their folder,
-and of all else only the last name stays.
+A path may reveal the name of a user, a customer or a server. Paths in OUT are shown relative to it, photos relative to
+their folder, and of all others only the last component.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SYSTEM = ("dev", "proc", "sys")  # the same on every machine, and what a message on them is about
+SYSTEM = ("dev", "proc", "sys")  # the same on every machine, and needed to understand messages about them
 _END = r"\s\"'<>|,;:()\[\]"
 _ELSEWHERE = re.compile(rf"(?<![\w./~-])(?:file://)?~?/(?!(?:{'|'.join(SYSTEM)})\b)(?:[^/{_END}]+/)+([^/{_END}]*)")
 _BESIDE = re.compile(rf"(?<![\w./-])(?:\.\./)+(?:[^/{_END}]+/)*([^/{_END}]+)")
@@ -20,18 +20,18 @@ _BESIDE = re.compile(rf"(?<![\w./-])(?:\.\./)+(?:[^/{_END}]+/)*([^/{_END}]+)")
 
 @dataclass(frozen=True)
 class PathLabels:
-    """Folders and files that messages may name, with what they are called instead; longer ones come first."""
+    """Replacements for folders and files that messages may contain; longer paths come first."""
 
     names: tuple[tuple[str, str], ...]
 
     @staticmethod
     def of(out: Path, photos: Path | None = None, options: Mapping[str, Any] | None = None) -> PathLabels:
-        """Those of a run.
+        """The labels for a run.
 
         Args:
-            out: Its folder of results.
-            photos: Its folder of photos, if anybody knows.
-            options: Its options, sections of them or not; paths among them are those of a surveyor's files.
+            out: Its results folder.
+            photos: Its photo folder, if known.
+            options: Its options, by section or not; paths among them are survey files.
         """
         found = {str(path.parent): "" for path in _forms(out)} | {str(path): "OUT" for path in _forms(out)}
         for path in () if photos is None else _forms(photos):
@@ -39,12 +39,12 @@ class PathLabels:
         for value in _strings(options or {}):
             if value.startswith(("/", "~")):
                 found[value], found[str(Path(value).parent)] = Path(value).name, ""
-        # A folder right below the root tells nothing, and its name may be a word of the text.
+        # A folder directly below the root reveals nothing, and its name may be an ordinary word in the text.
         kept = {path: name for path, name in found.items() if path.count("/") > 1}
         return PathLabels(tuple(sorted(kept.items(), key=lambda item: -len(item[0]))))
 
     def plain(self, text: str) -> str:
-        """A text without folders of this machine."""
+        """Remove this machine's folders from a text."""
         if "/" not in text:
             return text
         for path, name in self.names:
@@ -53,9 +53,9 @@ class PathLabels:
         return _BESIDE.sub(r"\1", _ELSEWHERE.sub(r"\1", text))
 
     def plain_value(self, value: Any) -> Any:
-        """What a template is about to show: a text without folders; markup of ours and all else as it is.
+        """Remove folders from a template's value if it is text; our own markup and other types are unchanged.
 
-        For jinja2's ``finalize``, so that nothing that is shown can be forgotten.
+        For jinja2's ``finalize``, so that nothing shown is missed.
         """
         return self.plain(value) if type(value) is str else value
 
@@ -65,7 +65,7 @@ def _escaped(name: str) -> str:
 
 
 def _forms(path: Path) -> list[Path]:
-    """As the user wrote it and as it is, where that is absolute."""
+    """The path as the user wrote it and resolved, if absolute."""
     return [form for form in (path.absolute(), path.resolve()) if form != Path(form.anchor)]
 
 

@@ -1,4 +1,4 @@
-"""What ``splatpipe render`` does: films and stills of a finished run, along its cameras, around it, or by keyframes."""
+"""Implements ``splatpipe render``: films and stills of a finished run along its cameras, an orbit, or keyframes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ ORBIT_STILLS = 12
 FOLDER = "renders"  # below OUT
 OWN_PATHS = ("cameras", "orbit")
 READ = (*FLYTHROUGH.reads, "georef.frame")
-UP = np.array([0.0, 0.0, 1.0])  # of the world of `splat.ply`
+UP = np.array([0.0, 0.0, 1.0])  # in the world frame of `splat.ply`
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ class RenderRequest:
     Attributes:
         path: ``cameras``, ``orbit``, or a file of keyframes.
         what: ``colour``, ``depth`` or ``normals``.
-        stills: Pictures instead of a film.
-        size: `1280x720`; empty for one like the training's.
-        seconds: Of a film whose path has no times of its own.
-        fps: Frames a second.
+        stills: Whether to render stills instead of a film.
+        size: `1280x720`; empty for a size like that of the training images.
+        seconds: Duration of a film whose path has no times.
+        fps: Frames per second.
         to: The film, or the folder of stills; None for one below OUT.
     """
 
@@ -71,10 +71,10 @@ class RenderRequest:
     to: Path | None = None
 
     def checked(self) -> tuple[What, tuple[int, int] | None]:
-        """What is shown, and its size in pixels.
+        """Validate; returns what to render, and its size in pixels or None.
 
         Raises:
-            UsageError: if they make no sense.
+            UsageError: if a value is invalid.
         """
         what: What | None = next((known for known in get_args(What) if known == self.what), None)
         if what is None:
@@ -94,11 +94,11 @@ class RenderRequest:
         return what, size
 
     def target(self, out: Path) -> Path:
-        """Where it goes; the folder that it lies in is made.
+        """The output path; its parent folder is created.
 
         Raises:
-            UsageError: if it is no place for that.
-            MachineError: if it cannot be made.
+            UsageError: if it is not suitable.
+            MachineError: if the folder cannot be created.
         """
         stem = self.path if self.path in OWN_PATHS else flat_stems([Path(self.path).name])[0]
         target = self.to or out / FOLDER / f"{stem}-{self.what}{'' if self.stills else '.webm'}"
@@ -120,14 +120,14 @@ class RenderRequest:
 
 @dataclass(frozen=True, eq=False)
 class RenderTask:
-    """A scene, where it lies, and what is wanted of it.
+    """A scene, its georeference, and what to render of it.
 
     Attributes:
-        scene: The trained one, in its model's frame.
-        world_from_model: To that of `splat.ply`.
-        wanted: What.
-        keyframes: Of the path's file; None without one.
-        size: Pixels; None for one like the training's.
+        scene: The trained scene, in the model frame.
+        world_from_model: Transform to the world frame of `splat.ply`.
+        wanted: What to render.
+        keyframes: Keyframes from the path's file; None without one.
+        size: Image size in pixels; None for one like that of the training images.
     """
 
     scene: TrainedScene
@@ -137,7 +137,7 @@ class RenderTask:
     size: tuple[int, int] | None
 
     def film(self) -> list[Camera]:
-        """A camera a frame, in the model's frame."""
+        """The camera of each film frame, in the model frame."""
         seconds, fps = self.wanted.seconds, self.wanted.fps
         capture, lens = self.scene.capture, self.scene.lens(self.size)
         if self.keyframes is not None:
@@ -149,7 +149,7 @@ class RenderTask:
         return cameras_along(route, lens, capture.up)
 
     def stills(self) -> tuple[list[str], list[Camera]]:
-        """Names, and cameras in the model's frame: the photos' own, some around, or the keyframes."""
+        """Names and cameras of the stills, in the model frame: the photos' own, an orbit's, or the keyframes'."""
         if self.keyframes is not None:
             route = self.keyframes.route
             cameras = self._from_world(route, self._lenses(self.keyframes.angles_deg, len(route)))
@@ -167,7 +167,7 @@ class RenderTask:
         return [FilmCamera.of_angle(lens.width, lens.height, float(angle)) for angle in angles_deg]
 
     def _from_world(self, route: Route, lenses: Sequence[FilmCamera]) -> list[Camera]:
-        """A way in the world of `splat.ply` as cameras in the model's frame."""
+        """Convert a route in the world frame of `splat.ply` to cameras in the model frame."""
         similarity = self.world_from_model
         cameras = []
         for camera in cameras_along(route, lenses, UP):
@@ -180,19 +180,19 @@ class RenderTask:
 
 
 def render_run(out: Path, wanted: RenderRequest, threads: int, device: str = "auto") -> dict[str, Any]:
-    """Render a run that has been trained.
+    """Render a trained run.
 
     Args:
         out: Its OUT.
-        wanted: What.
-        threads: Of the rasterizer, at least 1.
+        wanted: What to render.
+        threads: Threads of the rasterizer, at least 1.
         device: ``auto``, ``cpu`` or ``cuda``.
 
     Returns:
-        What was written.
+        A summary of what was written.
 
     Raises:
-        SplatpipeError: if there is nothing to render, or the wish makes no sense.
+        SplatpipeError: if there is nothing to render, or the request is invalid.
         MachineError: if the device does not work.
     """
     what, size = wanted.checked()
@@ -230,11 +230,11 @@ def _render(task: RenderTask, what: What, target: Path, report: Reporter) -> dic
 
 
 def write_still(stem: Path, pictures: FrameRenderer, camera: Camera) -> None:
-    """Write a picture as PNG, and depths or normals as they are as TIFF beside it, float32.
+    """Write an image as PNG; for depths or normals, also the values as float32 TIFF.
 
     Args:
-        stem: Without the ending.
-        pictures: Makes it.
+        stem: The path without the suffix.
+        pictures: Renders the frame.
         camera: Its camera.
 
     Raises:
@@ -264,14 +264,14 @@ def _file(path: str) -> Path:
 
 
 def _parts(out: Path) -> dict[str, Path]:
-    """The parts that OUT's splat was made of; of the newest training where nothing was exported.
+    """The parts from which OUT's splat was made; those of the newest training if nothing was exported.
 
     Raises:
         UsageError: if training is not done.
     """
     found = {name: part.path for name, part in open_run_folder(out, LINE).lineage(EXPORT, CLEAN, TRAIN).items()}
     if "train.model" in found:
-        found.setdefault("clean.model", found["train.model"])  # not cleaned yet, or by a splatpipe that did not
+        found.setdefault("clean.model", found["train.model"])  # not cleaned yet, or by an older version
     missing = [name for name in READ if name not in found]
     if missing and "train.model" in found:
         raise UsageError(

@@ -1,7 +1,7 @@
-"""What a finished stage made, in a sentence: for its line on the terminal and for ``splatpipe status``.
+"""Describes a finished stage's result in one sentence, for the terminal and ``splatpipe status``.
 
-It says what a surveyor wants to know, with units, and is silent on what is as it should be. All figures are in the
-stage's summary, which ``--json``, the manifest and the report have.
+It says what a surveyor wants to know, with units, and omits what is as expected. All figures come from the stage's
+summary, which is also in ``--json``, the manifest and the report.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ PAIRINGS = {
 
 
 def sentence(stage: str, summary: Summary) -> str:
-    """One line without a full stop; empty where the summary is of another version and cannot be said.
+    """One line without a full stop; empty if the summary is from another version and does not fit.
 
     Args:
-        stage: Its name, or that of one of its shards.
-        summary: Of its artifact.
+        stage: The stage's or shard's name.
+        summary: The artifact's summary.
     """
     say = SENTENCES.get(stage_name(stage))
     if say is None:

@@ -1,4 +1,4 @@
-"""Sections and volumes of a finished run's surface model, into OUT/sections and OUT/volumes.json, and for pages."""
+"""Measures sections and volumes on a finished run's DSM, into OUT/sections, OUT/volumes.json and the pages."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
 MOST_SECTIONS = 100
 UNFINISHED = ".sections.making"
 SECTION_FILE = re.compile(r"section-\d+(_points)?\.(csv|dxf|png)")
-SECTION_PLACES = 2000  # that a section's trace has: more than a chart has pixels,
-ALL_PLACES = 60_000  # and those of all together: a page of 3 MB more at most,
-RING_PLACES = 400  # and a ring of a polygon,
-TRACED_VOLUMES = 200  # of which more are in volumes.json alone
+SECTION_PLACES = 2000  # most points in a section's trace: more than a chart has pixels
+ALL_PLACES = 60_000  # most points in all traces together: they add at most 3 MB to a page
+RING_PLACES = 400  # most points in a polygon's ring
+TRACED_VOLUMES = 200  # most volumes in pages; any more are only in volumes.json
 Base = Literal["rim", "lowest"] | float
 Line = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class MeasurementRequest:
-    """What is to be measured.
+    """What to measure.
 
     Attributes:
-        lines: Of sections, the run's CRS.
-        polygons: A GeoJSON file to measure volumes in; None for none.
-        base: Of volumes: ``rim``, ``lowest``, or a height in the CRS's unit.
+        lines: Lines of the sections, in the run's CRS.
+        polygons: A GeoJSON file with the polygons of volumes; None for none.
+        base: Base of the volumes: ``rim``, ``lowest``, or a height in the CRS's unit.
     """
 
     lines: tuple[Line, ...]
@@ -51,22 +51,22 @@ class MeasurementRequest:
 
     @property
     def anything(self) -> bool:
-        """Whether there is anything to do."""
+        """Whether there is anything to measure."""
         return bool(self.lines) or self.polygons is not None
 
     @staticmethod
     def of(sections: Sequence[str], polygons: Path | None, base: str) -> MeasurementRequest:
-        """As it stands on a command line.
+        """Parse the request from command-line options.
 
         Raises:
-            UsageError: if a section is no line or has no length, the base is none, or there is no such file.
+            UsageError: if a section is not a line or has no length, the base is invalid, or there is no such file.
         """
         if len(sections) > MOST_SECTIONS:
             raise UsageError(f"{len(sections)} sections are too many.", hint=f"At most {MOST_SECTIONS} at a time.")
         height = _number(base)
         if height is None and base not in ("rim", "lowest"):
             raise UsageError(f'There is no base "{base[:40]}".', hint="Choose rim, lowest, or a height.")
-        if polygons is not None and not polygons.is_file():  # told now: the products may take minutes
+        if polygons is not None and not polygons.is_file():  # reported now: the products may take minutes
             raise UsageError(f"There is no file {polygons}.", hint="Give --volume a GeoJSON file of polygons.")
         plane: Base = height if height is not None else "rim" if base == "rim" else "lowest"
         return MeasurementRequest(tuple(_line(text) for text in sections), polygons, plane)
@@ -95,9 +95,9 @@ class _SurfaceModel:
     """A finished surface model, and what it was made from.
 
     Attributes:
-        parts: By full name.
-        frame: georef's.
-        crs: Of the model.
+        parts: Parts by full name.
+        frame: The frame of `georef`.
+        crs: The model's CRS.
         model: Its heights.
     """
 
@@ -108,20 +108,20 @@ class _SurfaceModel:
 
     @property
     def digests(self) -> tuple[str, str]:
-        """Of the model and of the frame: what is measured holds for these alone."""
+        """Digests of the model and the frame; measurements are valid only for these."""
         return self.parts["dsm.files"].digest, self.parts["georef.frame"].digest
 
 
 def check_possible(out: Path, *tables: dict[str, Any]) -> None:
-    """Say what cannot be made before anything is begun or remembered.
+    """Check that products can be made before anything is started or saved.
 
     Args:
         out: OUT, of a run.
-        tables: Of options that are asked for now, over those of the run.
+        tables: Options given now, which override those of the run.
 
     Raises:
         SplatpipeError: if the run has no scale.
-        MachineError: if a mesh is asked for, and there is no open3d.
+        MachineError: if a mesh is requested and open3d is not installed.
     """
     from splatpipe.pipeline.survey.frames import load_frame
 
@@ -140,7 +140,7 @@ def check_possible(out: Path, *tables: dict[str, Any]) -> None:
 
 
 def measured_lines(out: Path, told: Mapping[str, Any]) -> list[str]:
-    """What was measured, a line each, for people.
+    """The measurements as text, one line each.
 
     Args:
         out: OUT.
@@ -160,17 +160,17 @@ def measured_lines(out: Path, told: Mapping[str, Any]) -> list[str]:
 
 
 def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict[str, Any]:
-    """Cut sections and measure volumes; each kind takes the place of what was measured before, or nothing changes.
+    """Cut sections and measure volumes; each kind replaces earlier measurements, or nothing changes.
 
-    Only who holds the lock of OUT may call this.
+    Only the holder of OUT's lock may call this.
 
     Args:
         out: OUT, of a run with a surface model.
-        wanted: What.
-        threads: Photos at a time.
+        wanted: What to measure.
+        threads: Number of photos processed at a time.
 
     Returns:
-        What the files tell, for programs.
+        The content of the files, for programs.
 
     Raises:
         SplatpipeError: if there is no surface model, or a line or a polygon misses it.
@@ -187,7 +187,7 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
         sections = _sections(surface, wanted.lines, aside, threads)
         volumes = _volumes(surface, wanted)
         if sections:
-            write_measurements(out, "sections", surface.digests, ())  # none, should it be killed on the way
+            write_measurements(out, "sections", surface.digests, ())  # none, in case this is killed on the way
             _publish(aside, out / SECTIONS)
             write_measurements(out, "sections", surface.digests, sections)
             told["sections"] = [_without_trace(item) for item in sections]
@@ -215,7 +215,7 @@ def _open_surface(out: Path) -> _SurfaceModel:
 
 
 def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threads: int) -> Items:
-    """Cut all of them, their files into a folder."""
+    """Cut all sections, and write their files into a folder."""
     from splatpipe.pipeline.mvs.depth_maps import kept_depth_maps
     from splatpipe.pipeline.photos.dataset import load_views
     from splatpipe.pipeline.surface.run_sources import metric_depths
@@ -237,7 +237,7 @@ def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threa
 
 
 def _publish(aside: Path, folder: Path) -> None:
-    """Move sections to where they belong, and remove those of an earlier call."""
+    """Move sections to their final folder, and remove those of an earlier call."""
     folder.mkdir(exist_ok=True)
     made = {path.name for path in aside.iterdir()}
     for path in sorted(aside.iterdir()):
@@ -262,7 +262,7 @@ def _volumes(surface: _SurfaceModel, wanted: MeasurementRequest) -> Items:
     area = placed_area(drawing, surface.frame)
     rings = sum(len(polygon) for polygon in area.polygons[:TRACED_VOLUMES])
     most = max(4, min(RING_PLACES, ALL_PLACES // rings))
-    uncertainty = surface.frame.residuals.get("uncertainty") or {}  # there is none where control places the run
+    uncertainty = surface.frame.residuals.get("uncertainty") or {}  # absent if control points georeference the run
     datum_sigma_m = float(uncertainty.get("offset_sigma_m", (0.0,))[-1])
     found: Items = []
     for number, (polygon, name) in enumerate(zip(area.polygons, drawing.names, strict=True), 1):

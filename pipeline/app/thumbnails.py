@@ -1,4 +1,4 @@
-"""Small pictures of photos, for pages that carry them within: shrunk, turned for people, and never too large."""
+"""Thumbnails of photos for embedding in pages: reduced, rotated upright, and limited in size."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pathlib import Path
 from markupsafe import Markup
 from PIL import Image, ImageOps
 
-FORMATS = ("JPEG", "PNG", "TIFF")  # as ingest takes them; an MPO opens as JPEG
+FORMATS = ("JPEG", "PNG", "TIFF")  # as ingest accepts; an MPO opens as JPEG
 MOST_BYTES = 512 << 20  # of a file
-MOST_PIXELS = 300_000_000  # of a photo that cannot be shrunk while it is read: some gigabyte of memory
+MOST_PIXELS = 300_000_000  # of a photo that cannot be reduced while decoding: about a gigabyte of memory
 END_OF_JPEG = b"\xff\xd9"
 QUALITY = 76
-TURNS = {  # by EXIF's orientation
+TURNS = {  # by EXIF orientation
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -27,18 +27,18 @@ TURNS = {  # by EXIF's orientation
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-MOST_KEPT = 1024  # small pictures of a page that is written again and again
+MOST_KEPT = 1024  # thumbnails cached for a page that is written repeatedly
 
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A small picture.
+    """A small image.
 
     Attributes:
-        picture: As a data address.
+        picture: The image as a data URL.
         width: Pixels.
         height: Pixels.
-        whole: False where the file ends before its picture does: what is missing is grey.
+        whole: False if the file is truncated: the missing part is grey.
     """
 
     picture: Markup
@@ -48,24 +48,24 @@ class Thumbnail:
 
 
 def thumbnail(path: Path, side: int, orientation: int = 1) -> Thumbnail | None:
-    """A photo, small; None where it cannot be read at all.
+    """Make a photo's thumbnail; None if the photo cannot be read at all.
 
     Args:
         path: The file.
-        side: Pixels of its longer side, at most.
-        orientation: As EXIF counts, of a file that does not say it itself.
+        side: Largest length of the longer side, pixels.
+        orientation: EXIF orientation to assume if the file has none.
     """
     stamp = _file_stamp(path)
     return None if stamp is None else _thumbnail(path, side, orientation, stamp)
 
 
 def cut_out(path: Path, width: int, height: int) -> Thumbnail | None:
-    """The middle of a photo, pixel by pixel; None where it cannot be read at all.
+    """Crop the middle of a photo at full resolution; None if the photo cannot be read at all.
 
     Args:
         path: The file.
-        width: Pixels across, of the photo's own.
-        height: Pixels down.
+        width: Width of the crop, pixels.
+        height: Height of the crop, pixels.
     """
     opened = _read(path, None)
     if opened is None:
@@ -80,14 +80,14 @@ def _file_stamp(path: Path) -> tuple[int, int] | None:
         told = path.stat()
     except (OSError, ValueError):
         return None
-    if not stat.S_ISREG(told.st_mode) or told.st_size > MOST_BYTES:  # a pipe would be waited for
+    if not stat.S_ISREG(told.st_mode) or told.st_size > MOST_BYTES:  # reading a pipe would block
         return None
     return told.st_mtime_ns, told.st_size
 
 
 @lru_cache(maxsize=MOST_KEPT)
 def _thumbnail(path: Path, side: int, orientation: int, _stamp: tuple[int, int]) -> Thumbnail | None:
-    """Of the file as it was at that stamp."""
+    """The thumbnail of the file as it was at that stamp."""
     opened = _read(path, side)
     if opened is None:
         return None
@@ -99,17 +99,17 @@ def _thumbnail(path: Path, side: int, orientation: int, _stamp: tuple[int, int])
 
 
 def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
-    """A photo in RGB, turned for people, about twice `side` large if that is quicker; and whether it is whole."""
+    """Read a photo as upright RGB, at about twice `side` if that is quicker; also returns whether it is complete."""
     if _file_stamp(path) is None:
         return None
     try:
         data = path.read_bytes()
     except (OSError, ValueError):
         return None
-    for more in (b"", END_OF_JPEG):  # libjpeg paints grey what is missing before an end
+    for more in (b"", END_OF_JPEG):  # with an end marker, libjpeg fills the missing part with grey
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of a large picture, or broken metadata: check has told
+                warnings.simplefilter("ignore")  # about large images or broken metadata: check has reported these
                 with Image.open(io.BytesIO(data + more), formats=FORMATS) as image:
                     if side is not None:
                         image.draft("RGB", (2 * side, 2 * side))

@@ -108,7 +108,7 @@ def _write_node(folder: Path, node: LevelNode, antialias: bool) -> dict[str, Any
 
 
 def _middle(gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
-    """The centre of the centres' bounding box: relative to it, 24-bit coordinates have steps of at most a millimetre."""
+    """Midpoint of the centres' bounding box: relative to it, 24-bit coordinates have steps of at most a millimetre."""
     means = gaussians.means.detach().numpy().astype(np.float64)
     middle: Float64[np.ndarray, " 3"] = (means.min(axis=0) + means.max(axis=0)) / 2.0
     return middle
@@ -117,7 +117,7 @@ def _middle(gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
 def _core(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
     """The box of nearly all centres, with which the viewer decides what is near and within the view.
 
-    A node's bounding box would enclose whole Gaussians: a few large, far ones in most nodes make it contain the viewpoint.
+    A node's bounding box encloses whole Gaussians: a few large, far ones in most nodes make it contain the viewpoint.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
     core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE, axis=0)

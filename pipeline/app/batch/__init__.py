@@ -1,1 +1,1 @@
-"""Many captures, nobody watching: the list, what of each has to run, Snakemake that runs it, and what is told of it."""
+"""Unattended runs of many captures: the list, the plan, Snakemake that runs it, and the status reports."""

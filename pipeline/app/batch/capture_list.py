@@ -1,4 +1,4 @@
-"""The captures of a batch: a folder of folders, or a list in TOML or CSV with options for each."""
+"""Reads the captures of a batch: a folder of folders, or a list in TOML or CSV with options for each."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from splatpipe.pipeline.survey.survey_text import TableKind, delimiter_of, read_
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
-MAX_CAPTURES = 2000  # of a list: years of flights; more is a folder named by mistake
-MAX_NAME = 100  # characters: with a suffix of ours a file name everywhere
+MAX_CAPTURES = 2000  # in a list: years of flights; with more, a folder was named by mistake
+MAX_NAME = 100  # characters: with our suffixes still a valid file name everywhere
 MAX_LIST_BYTES = 4 << 20
 OWN_NAMES = ("batch.html", "batch.csv", "batch.json")
 KEYS = ("name", "photos", "preset", "config", "time_budget", "max_memory", "set")
@@ -35,14 +35,14 @@ TOML_HINT = 'Write a table [[capture]] for each, with photos = "folder" and, if 
 
 @dataclass(frozen=True)
 class ListedCapture:
-    """A capture as it was listed.
+    """A capture as listed.
 
     Attributes:
-        name: Of its folder of results.
-        photos: Its folder of photos.
-        preset: By name; empty where the command's counts.
-        tables: Options, the later over the earlier, over the preset's and the command's.
-        trouble: What is wrong with its options; such a capture fails alone.
+        name: Name of its results folder.
+        photos: Its photo folder.
+        preset: Its preset's name; empty for the command's.
+        tables: Option tables; later ones override earlier ones, the preset's and the command's.
+        trouble: What is wrong with its options; only this capture then fails.
     """
 
     name: str
@@ -53,14 +53,14 @@ class ListedCapture:
 
 
 def read_captures(captures: Path, out: Path) -> tuple[ListedCapture, ...]:
-    """The captures that a batch is to run, in the order of the list, or of their names.
+    """Read the captures of a batch, in the order of the list or sorted by name.
 
     Args:
-        captures: A folder of folders of photos, or a list: ``.toml`` or ``.csv``.
-        out: The batch's folder, which is none of them.
+        captures: A folder of photo folders, or a ``.toml`` or ``.csv`` list.
+        out: The batch's folder, which is not taken for a capture.
 
     Raises:
-        UsageError: if it is neither, names none, or names two alike.
+        UsageError: if it is neither, has no captures, or has duplicate names.
     """
     path = captures.expanduser().resolve()
     if path.is_dir():
@@ -105,13 +105,13 @@ def _of_folder(folder: Path, out: Path) -> list[ListedCapture]:
 
 
 def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
-    """Tables of captures, what holds for all below what one says."""
+    """The captures' tables, each overlaid on the defaults for all."""
     name = f"The list of captures {path.name}"
     try:
         if path.stat().st_size > MAX_LIST_BYTES:
             raise UsageError(f"{name} is too large.", hint=TOML_HINT)
         told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, a number of thousands of digits
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a number with thousands of digits
         raise UsageError(f"{name} is not valid TOML: {error}.", hint=TOML_HINT) from error
     except OSError as error:
         raise UsageError(f"{name} cannot be read: {error.strerror}.", hint="Check its permissions.") from error
@@ -124,7 +124,7 @@ def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
 
 
 def _known(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[str, JSON]:
-    """A table, once its keys and their kinds are known to be right."""
+    """Validate a table's keys and value types."""
     taken = dict(table)
     for key, value in taken.items():
         if key not in keys:
@@ -139,7 +139,7 @@ def _known(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[s
 
 
 def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]]:
-    """Rows by our names of the columns, and the options that have columns of their own."""
+    """Yield each row by our column names, and the options that have their own columns."""
     try:
         lines = written_lines(read_lines(path, CSV_KIND), path, CSV_KIND)
         rows = list(csv.reader([line for _, line in lines], delimiter=delimiter_of(lines[0][1]), strict=True))
@@ -165,7 +165,7 @@ def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]
 
 
 def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> ListedCapture:
-    """A capture from its row or table; paths in it count from the list's folder."""
+    """Build a capture from its row or table; paths are relative to the list's folder."""
     if not told.get("photos"):
         raise UsageError("A capture in the list has no photos.", hint="Set photos to its folder.")
     try:
@@ -194,23 +194,23 @@ def _tables(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) 
 
 
 def _below(folder: Path, text: str) -> Path:
-    """A path as it was written, counted from a folder.
+    """Resolve a path relative to a folder.
 
     Raises:
-        SplatpipeError: if no file can be called that.
+        SplatpipeError: if it is not a valid path.
     """
     try:
         if "\0" in text:
             raise ValueError("a NUL")
         return folder / Path(text).expanduser()
-    except (ValueError, RuntimeError) as error:  # ~nobody, or ~ where no HOME is
+    except (ValueError, RuntimeError) as error:  # ~nobody, or ~ without HOME
         raise SplatpipeError(
             f"{text!r} cannot be expanded to a path on this machine.", "Write the full path, without ~."
         ) from error
 
 
 def with_files_from(folder: Path, table: Table) -> Table:
-    """Options with the paths of files in them made absolute: those that are not count from a folder."""
+    """Make the file paths in options absolute; relative ones are relative to the given folder."""
     files = {(stage.name, option) for stage in LINE for option in stage.files}
     taken = merge([table])
     for section, option in files:
@@ -221,7 +221,7 @@ def with_files_from(folder: Path, table: Table) -> Table:
 
 
 def _check_places(captures: Sequence[ListedCapture], out: Path) -> None:
-    """One capture's results must not lie among another's photos: its pictures would count as such."""
+    """Check that no capture's results lie among another's photos, where its images would be taken for photos."""
     around = {out, *out.parents}
     for capture in captures:
         if capture.photos.resolve() in around:
@@ -232,7 +232,7 @@ def _check_places(captures: Sequence[ListedCapture], out: Path) -> None:
 
 
 def _check_names(captures: Sequence[ListedCapture], listed: Path) -> None:
-    """Each becomes a folder, on any file system."""
+    """Check that each name is a valid, unique folder name on any file system."""
     if len(captures) > MAX_CAPTURES:
         raise UsageError(f"{listed} has {len(captures):,} captures.", hint=f"A batch takes at most {MAX_CAPTURES:,}.")
     seen: set[str] = set()
@@ -243,7 +243,7 @@ def _check_names(captures: Sequence[ListedCapture], listed: Path) -> None:
                 f"{name[:MAX_NAME]!r} cannot be used as the name of a results folder.",
                 hint="Rename the capture's folder, or give the capture another name in a list.",
             )
-        plain = unicodedata.normalize("NFC", name).casefold()  # some file systems take é in both its forms for one
+        plain = unicodedata.normalize("NFC", name).casefold()  # some file systems equate both forms of é
         if plain in seen:
             raise UsageError(f'Two captures are called "{name}".', hint="Give one of them another name in a list.")
         seen.add(plain)

@@ -1,4 +1,4 @@
-"""Runs a call: holds the batch's folder, starts Snakemake and the guard, tells where it stands until it is over."""
+"""Runs a batch call: locks the batch's folder, starts Snakemake and the guard, and reports the status to the end."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from splatpipe.stages.line import LINE
 
 POLL_S = 1.0
 STOPPED_NOTICE_S = 1.5  # after a signal: the jobs may have taken eight seconds to end, and Docker kills after ten
-CHANGED_EVERY_S = 5.0  # progress is told that often; another state of a capture at once
-LOCK_PATIENCE_S = 15.0  # a killed call's guard ends its jobs within that
+CHANGED_EVERY_S = 5.0  # between progress updates; a capture's change of state is reported at once
+LOCK_PATIENCE_S = 15.0  # a killed call's guard ends its jobs within this time
 NAMES_FILE = "captures.json"  # below BATCH_FOLDER: every capture that was ever listed
 ENDS = {"done": "done", "failed": "failed", "stopped": "stopped"}
 
 
 def check_folder(out: Path) -> None:
-    """Refuse an OUT that can be no batch's.
+    """Check that an OUT can be a batch's folder.
 
     Raises:
         UsageError: if it is a file, or the folder of one run.
@@ -57,13 +57,13 @@ def check_folder(out: Path) -> None:
 
 @contextmanager
 def hold(out: Path) -> Iterator[int]:
-    """Hold a batch's folder; two calls at a time would tell different things of it.
+    """Lock a batch's folder; two concurrent calls would report different states.
 
     Yields:
         The lock's file descriptor, for the guard to inherit.
 
     Raises:
-        UsageError: if it is no batch's folder, or another call works in it.
+        UsageError: if it is not a batch's folder, or another call is working in it.
         MachineError: if it cannot be written.
     """
     check_folder(out)
@@ -84,7 +84,7 @@ def hold(out: Path) -> Iterator[int]:
 
 
 def fresh_call(out: Path, name: str = "call") -> Call:
-    """An empty folder for a call; what an earlier one left there is over."""
+    """Create an empty folder for a call; that of an earlier call is deleted."""
     folder = (out / BATCH_FOLDER / name).resolve()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -92,7 +92,7 @@ def fresh_call(out: Path, name: str = "call") -> Call:
 
 
 def with_unlisted(plan: BatchPlan) -> BatchPlan:
-    """The plan with the captures of earlier calls that are not listed any more; this call's names are kept."""
+    """Add to the plan the captures of earlier calls that are no longer listed, and save this call's names."""
     path = Path(plan.out) / BATCH_FOLDER / NAMES_FILE
     known: list[JSON] = []
     with suppress(OSError, ValueError):
@@ -105,11 +105,11 @@ def with_unlisted(plan: BatchPlan) -> BatchPlan:
 
 @dataclass(frozen=True)
 class Notifications:
-    """Who is told, besides the files.
+    """Where changes are reported besides the files.
 
     Attributes:
-        say: Takes a line for the terminal.
-        command: Of ``--notify``; empty for none.
+        say: Prints a line on the terminal.
+        command: The command of ``--notify``; empty for none.
     """
 
     say: Callable[[str], None]
@@ -117,10 +117,10 @@ class Notifications:
 
 
 class Driver:
-    """Runs a call to its end.
+    """Runs a call to completion.
 
     Args:
-        call: Whose plan is written.
+        call: The call, whose plan is written already.
         profile: Where Snakemake runs jobs.
         notifications: Where changes are reported.
     """
@@ -136,17 +136,17 @@ class Driver:
         self._notice_s = TIME_LIMIT_S
 
     def run(self, lock: int) -> BatchState:
-        """Run it.
+        """Run the call.
 
         Args:
-            lock: The batch's, for the guard.
+            lock: File descriptor of the batch's lock, for the guard.
 
         Returns:
-            Where it stands at its end.
+            The final state.
 
         Raises:
-            SplatpipeError: if the workflow itself could not run; what is told of the captures is true all the same.
-            Stopped: by a signal, once all jobs have ended.
+            SplatpipeError: if the workflow itself could not run; the captures' states are reported correctly anyway.
+            StopSignal: if stopped by a signal, once all jobs have ended.
         """
         try:
             self._tell(self._account.state())
@@ -187,7 +187,7 @@ class Driver:
         self._check(process.returncode)
 
     def _check(self, code: int) -> None:
-        """Snakemake's bad end is its own where no capture's failure explains it."""
+        """Raise an error if Snakemake failed and no capture's failure explains it."""
         state = self._account.state()
         if code == 0 or any(capture.state == "failed" for capture in state.captures):
             over = all(capture.state in ("done", "reused", "failed") for capture in state.captures)
@@ -196,7 +196,7 @@ class Driver:
         raise WorkflowError(code, last_words(self._call), self._call.snakemake_log)
 
     def _tell(self, state: BatchState) -> None:
-        """Tell what has changed: on the terminal and by notice at once, in the files now and then."""
+        """Report changes: on the terminal and by notification at once, in the files periodically."""
         changed = [capture for capture in state.captures if _moved(self._before.get(capture.name), capture)]
         for capture in changed:
             if capture.state != "waiting":
@@ -205,14 +205,14 @@ class Driver:
         other = self._last is None or replace(state, as_of_s=0.0) != replace(self._last, as_of_s=0.0)
         if changed or not state.at_work or waited_s >= (CHANGED_EVERY_S if other else RENEWED_EVERY_S):
             self._publish(state)
-        for capture in changed if self._notice_s == TIME_LIMIT_S else ():  # a signal's end is told once, of the batch
+        for capture in changed if self._notice_s == TIME_LIMIT_S else ():  # after a signal, only for the batch
             before = self._before.get(capture.name)
             if capture.state in ENDS and (before is None or before.state != capture.state):
                 self._notify(ENDS[capture.state], capture.name, f"{capture.name}/{REPORT_FILE}")
         self._before = {capture.name: capture for capture in state.captures}
 
     def _publish(self, state: BatchState) -> None:
-        """A full disk stops nothing here: what runs says so itself, and room may be made."""
+        """Write the status files; a full disk is ignored here: the jobs report it, and space may be freed."""
         try:
             publish(state, self._call.out)
             self._unwritten = ""
@@ -233,7 +233,7 @@ class Driver:
 
 
 class WorkflowError(MachineError):
-    """Snakemake ended, and not because of a capture."""
+    """Snakemake failed for a reason other than a capture."""
 
     exit_code = EXIT_STAGE
 
@@ -246,10 +246,10 @@ class WorkflowError(MachineError):
 
 @contextmanager
 def _guarded(call: Call, lock: int) -> Iterator[Callable[[JSON], None]]:
-    """A guard for what happens here.
+    """Run a guard process for this call.
 
     Yields:
-        Tells it something.
+        A function that sends the guard a message.
     """
     guard = subprocess.Popen(
         [sys.executable, "-m", "splatpipe.pipeline.app.batch.guard", str(call.folder)],
@@ -263,7 +263,7 @@ def _guarded(call: Call, lock: int) -> Iterator[Callable[[JSON], None]]:
     pipe = guard.stdin
 
     def say(told: JSON) -> None:
-        with suppress(BrokenPipeError):  # somebody killed it: the batch goes on without
+        with suppress(BrokenPipeError):  # the guard was killed: the batch continues without it
             pipe.write(json.dumps(told).encode() + b"\n")
             pipe.flush()
 
@@ -277,7 +277,7 @@ def _guarded(call: Call, lock: int) -> Iterator[Callable[[JSON], None]]:
 
 
 def dry_run(call: Call, profile: Profile) -> int:
-    """Let Snakemake say what it would run, on stderr.
+    """Have Snakemake print what it would run, on stderr.
 
     Returns:
         Its exit code.
@@ -297,7 +297,7 @@ def _moved(before: CaptureState | None, now: CaptureState) -> bool:
 
 
 def _line(capture: CaptureState) -> str:
-    """A capture's news in a line."""
+    """A capture's change of state in one line."""
     where = f" {capture.stage}" if capture.stage and capture.state != "failed" else ""
     again = f" (try {capture.tries})" if capture.tries > 1 else ""
     why = " ".join(filter(None, [f"in {capture.stage}:" if capture.stage else "", capture.reason, capture.hint]))
@@ -306,6 +306,6 @@ def _line(capture: CaptureState) -> str:
 
 
 def summary(states: Sequence[CaptureState]) -> str:
-    """How many captures ended how."""
+    """The number of captures by outcome, as text."""
     counts = {name: sum(state.state == name for state in states) for name in ("done", "reused", "failed", "stopped")}
     return ", ".join(f"{count} {name}" for name, count in counts.items() if count)

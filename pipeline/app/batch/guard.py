@@ -1,9 +1,9 @@
-"""Watches a `splatpipe batch`, a process of its own: when that is killed, it ends the workflow and tells the truth.
+"""A process that watches a `splatpipe batch`: if that is killed, it ends the workflow and updates the status files.
 
     python -m splatpipe.pipeline.app.batch.guard CALL
 
-On stdin it is told of Snakemake's process group, and at the end that all is well; stdin's end without that word is the
-command's death. It inherits the batch's lock, so that the same command, begun again, waits until nothing runs any more.
+On stdin it receives Snakemake's process group, and at the end a message of success; if stdin closes without that, the
+command has died. It inherits the batch's lock, so that a repeated command waits until nothing is running any more.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ KILLED = "The batch command itself was killed, by a user or by the system for la
 
 
 def main() -> None:
-    """Wait for the end of the command that the command line names."""
+    """Wait for the end of the batch command whose call folder is on the command line."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # whoever ends the command ends this by it
+        signal.signal(number, signal.SIG_IGN)  # it ends with the batch command
     call = Call(Path(sys.argv[1]))
     group, local = 0, True
     for line in sys.stdin:

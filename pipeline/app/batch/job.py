@@ -1,9 +1,9 @@
-"""A job of the workflow, a process of its own: one stage of one capture by `splatpipe run --until`, or one shard.
+"""The process of a workflow job: runs one stage of one capture by `splatpipe run --until`, or one shard.
 
     python -m splatpipe.pipeline.app.batch.job CALL CAPTURE STAGE THREADS MARKER
 
-It stands between Snakemake and the run so that no end goes untold, a capture that cannot succeed is not tried again,
-and a signal reaches the run once, whoever sent it to whom.
+It sits between Snakemake and the run so that every outcome is recorded, a capture that cannot succeed is not retried,
+and a signal reaches the run exactly once, whoever sent it to which process.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from splatpipe.pipeline.engine.stage import JSON, stage_name
 from splatpipe.stages.line import LINE
 
 SPLATPIPE = (sys.executable, "-m", "splatpipe.pipeline.app.cli")
-RESERVE_BYTES = 256 << 20  # of the disk, for what other captures' stages are writing at the same time
+RESERVE_BYTES = 256 << 20  # of the disk, reserved for what other captures' stages write at the same time
 
 
 def main() -> None:
-    """Run the job that the command line names."""
+    """Run the job given on the command line."""
     end_with_parent()
     call = Call(Path(sys.argv[1]))
     key, stage, threads, marker = sys.argv[2], sys.argv[3], int(sys.argv[4]), Path(sys.argv[5])
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def _lacking(out: Path, job: StageJob) -> TryResult | None:
-    """Why the stage must not begin; None where it may."""
+    """The failure if the stage must not start, e.g. for lack of disk space; None if it may."""
     free = shutil.disk_usage(out).free
     if free >= job.disk_bytes + RESERVE_BYTES:
         return None
@@ -97,10 +97,10 @@ def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, th
 
 
 def command_of(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
-    """The `splatpipe run` of a job, of a shard's the `splatpipe stage`.
+    """The `splatpipe run` command of a job, or for a shard the `splatpipe stage` command.
 
-    The last stage's asks for all that the line has: export, which the film's stage does not need, is told of again.
-    A shard's options are those that the run before it has left in its OUT.
+    The last stage's command runs the whole pipeline, so that export, which the film's stage does not need, is reported
+    too. A shard uses the options that the preceding run saved in its OUT.
     """
     out = str(Path(plan.out) / capture.name)
     stage, _, shard = job.stage.partition(".")
@@ -120,7 +120,7 @@ def command_of(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJ
 
 
 def end_with_parent() -> None:
-    """Whoever is killed leaves nobody behind who works on: the run is asked to end, and keeps its checkpoint."""
+    """Arrange that the run ends if its parent is killed: it is asked to stop, and keeps its checkpoint."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
@@ -129,7 +129,7 @@ def _pass_on_signals(process: subprocess.Popen[bytes]) -> None:
     passed: list[int] = []
 
     def pass_on(number: int, _frame: FrameType | None) -> None:
-        if not passed:  # the second would tell a run not even to write its report
+        if not passed:  # a second signal would keep the run from writing its report
             passed.append(number)
             process.send_signal(signal.SIGTERM)
 
@@ -150,7 +150,7 @@ def _ending(code: int, told: bytes, events: Path) -> TryResult:
 
 
 def _may_pass(events: Path) -> bool:
-    """Whether it failed for photos that were changed, or gone for a while, as they are on a network disk."""
+    """Whether the failure may be temporary: photos changed or were briefly unavailable, as on a network disk."""
     culprit = read_history(events, running=False).culprit
     return culprit is not None and culprit.state == "failed" and not culprit.lasting
 
@@ -167,6 +167,6 @@ def _error(told: bytes) -> Mapping[str, JSON]:
 if __name__ == "__main__":
     try:
         main()
-    except OSError as error:  # the disk is full or gone: there is nowhere else to say so
+    except OSError as error:  # the disk is full or gone: there is nowhere else to report it
         sys.stderr.write(f"{error}\n")
         sys.exit(EXIT_MACHINE if error.errno else EXIT_STAGE)

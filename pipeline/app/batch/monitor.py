@@ -1,4 +1,4 @@
-"""Where a call stands, from what lies on the disk alone: so whoever outlives a kill can tell it as well."""
+"""Determines a call's state from the disk alone, so that any process that survives a kill can report it."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from splatpipe.pipeline.engine.stage import stage_name
 
 VIEWER_FILE = "viewer.html"
 STOPPED = "It was stopped with the batch."
-LIVELY = ("running", "waiting", "failed", "stopped", "done", "reused")  # of shards side by side, the first one found
+LIVELY = ("running", "waiting", "failed", "stopped", "done", "reused")  # of parallel shards' states, the first counts
 GO_ON = "Repeat the command: it goes on from what is finished."
 
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """What a capture's folder of results holds; the fields are those of ``CaptureState``."""
+    """Facts read from a capture's results folder; the fields are those of ``CaptureState``."""
 
     verdict: str = ""
     level: Level = ""
@@ -43,10 +43,10 @@ class CaptureFacts:
 
 
 class BatchMonitor:
-    """Tells where a call stands, again and again; what cannot have changed since is not read again.
+    """Reports a call's state repeatedly; what cannot have changed is not read again.
 
     Args:
-        call: Whose plan is written.
+        call: The call, whose plan is written already.
     """
 
     def __init__(self, call: Call) -> None:
@@ -55,7 +55,7 @@ class BatchMonitor:
         self._facts: dict[str, tuple[object, CaptureFacts]] = {}
 
     def state(self) -> BatchState:
-        """Where it stands now."""
+        """The current state."""
         end = self._call.end()
         ended = bool(end)
         captures, left_s = [], {}
@@ -91,7 +91,7 @@ class BatchMonitor:
         return self._with_facts(self._capture_state(planned, tries, ended=ended), planned, tries)
 
     def _capture_state(self, planned: PlannedCapture, tries: Sequence[Try], *, ended: bool) -> CaptureState:
-        """Its state and what belongs to it, by its jobs' tries; of shards side by side the liveliest one's."""
+        """A capture's state from its jobs' tries; for parallel shards, the first of ``LIVELY``."""
         done = {each.stage for each in tries if each.succeeded}
         jobs = self._call.jobs(planned)
         rest = [job for job in jobs if job.stage not in done]
@@ -110,7 +110,7 @@ class BatchMonitor:
         )
 
     def _job(self, planned: PlannedCapture, stage: str, tries: Sequence[Try], *, ended: bool) -> CaptureState:
-        """What the capture's state is as far as one job goes; ``progress`` is the job's."""
+        """The capture's state judged by one job only; ``progress`` is the job's."""
         own = [each for each in tries if each.stage == stage]
         told = CaptureState(planned.name, "waiting", stage, tries=len(own), earlier=_reasons(tries))
         if own and own[-1].alive and not ended:
@@ -121,14 +121,14 @@ class BatchMonitor:
         return replace(told, state="stopped", reason=STOPPED, hint=GO_ON) if ended else told
 
     def _is_over(self, own: Sequence[Try]) -> bool:
-        """Whether a stage that ended badly is not begun again."""
+        """Whether a failed stage will not be retried."""
         last = own[-1]
         if self._call.stop_file.exists() and last.exit_code in (None, EXIT_INTERRUPTED, EXIT_TERMINATED):
             return False  # it was ended with the batch
         return last.final or len(own) > self._plan.retries
 
     def _fraction(self, planned: PlannedCapture, stage: str) -> float:
-        """How far a running stage is, by its own events."""
+        """The progress of a running stage from its events, 0 to 1."""
         out = self._call.out / planned.name
         path = out / EVENTS_FILE if stage == stage_name(stage) else shard_events(out, stage)
         history = read_history(path, running=True)
@@ -147,7 +147,7 @@ class BatchMonitor:
         under_way = time.time() - tries[-1].began_s if told.state == "running" else 0.0
         return replace(
             told,
-            verdict="" if told.state == "failed" else facts.verdict,  # it would say no more than that
+            verdict="" if told.state == "failed" else facts.verdict,  # it would add nothing
             level="bad" if told.state == "failed" else facts.level,
             seconds=round(facts.seconds + under_way, 1),
             photos=planned.photo_count,
@@ -158,7 +158,7 @@ class BatchMonitor:
         )
 
     def _read(self, planned: PlannedCapture, told: CaptureState) -> CaptureFacts:
-        """What its folder holds, with a picture of it."""
+        """The facts from its results folder, with an image."""
         facts = read_facts(self._call.out, planned.name, told.state in ("done", "reused", "failed"))
         try:
             folder = self._call.out
@@ -168,7 +168,7 @@ class BatchMonitor:
         return facts if picture is None else replace(facts, picture=picture.relative_to(folder).as_posix())
 
     def _left_s(self, left_s: Mapping[str, float]) -> float:
-        """Of the whole batch: captures run side by side, as many as the machine has threads for."""
+        """Time left for the whole batch, s: as many captures run in parallel as the machine has threads for."""
         threads = max((job.threads for capture in self._plan.captures for job in capture.jobs), default=1)
         beside = max(1, available_cores() // threads) if self._plan.local else len(left_s)
         return max(*left_s.values(), sum(left_s.values()) / beside)
@@ -180,7 +180,7 @@ class BatchMonitor:
             return None
 
     def _needed_bytes(self, captures: Sequence[CaptureState]) -> int:
-        """Disk that is still to be taken."""
+        """Bytes of disk space still needed."""
         over = {capture.name for capture in captures if capture.state in ("done", "reused", "failed", "stopped")}
         needed = 0
         for planned in self._plan.captures:
@@ -191,12 +191,12 @@ class BatchMonitor:
 
 
 def read_facts(out: Path, name: str, judged: bool) -> CaptureFacts:
-    """What lies in a capture's folder of results; as far as it can be read.
+    """Read the facts from a capture's results folder, as far as they are readable.
 
     Args:
         out: The batch's folder.
-        name: The capture's.
-        judged: With the verdict: nothing is to be said of what still goes on.
+        name: The capture's name.
+        judged: Whether to include the verdict, which makes no sense while the run is going on.
     """
     folder = out / name
     facts = CaptureFacts(
@@ -227,13 +227,13 @@ def _link(name: str, file: str, folder: Path) -> str:
 _SUMMARIES = (
     ("sparse", ("registered",)),
     ("train", ("gaussians",)),
-    ("clean", ("gaussians",)),  # what of them is delivered
+    ("clean", ("gaussians",)),  # those that are delivered
     ("evaluate", ("psnr", "ssim")),
 )
 
 
 def _figures(inputs: ReportInputs) -> dict[str, float | int]:
-    """What people ask for first."""
+    """The key figures."""
     found: dict[str, float | int] = {}
     for stage, names in _SUMMARIES:
         summary = inputs.summary(stage)
@@ -244,14 +244,14 @@ def _figures(inputs: ReportInputs) -> dict[str, float | int]:
 
 
 def _reasons(tries: Sequence[Try]) -> tuple[str, ...]:
-    """Why tries ended badly, each with its stage."""
+    """Why tries failed, each with its stage."""
     return tuple(f"{each.stage}: {each.reason}" for each in tries if each.reason)
 
 
 def _progress(
     planned: PlannedCapture, jobs: Sequence[StageJob], rest: Sequence[StageJob], fractions: Mapping[str, float]
 ) -> float:
-    """Of the whole capture; what was there before counts. A stage's weight is its jobs' in equal parts."""
+    """Progress of the whole capture, including reused stages. A stage's weight is shared equally by its jobs."""
     total = sum(planned.weights.values())
     if not total:
         return 0.0

@@ -1,4 +1,4 @@
-"""A batch's page: a card a capture, true at any moment; while the batch is at work it loads itself again."""
+"""A batch's page: one card per capture, always up to date; while the batch is running it reloads itself."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from splatpipe.pipeline.app.thumbnails import Thumbnail, thumbnail
 from splatpipe.pipeline.engine.durable import write_durably
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
-REFRESH_S = 10  # as often as a reader would look; the batch renews the page somewhat less often
+REFRESH_S = 10  # the page's reload interval; the batch rewrites the page somewhat less often
 PICTURE_SIDE = 480  # pixels, of a card on a good display
-SMALL_SIDE = 240  # where there are so many that the page would take long to load each time
+SMALL_SIDE = 240  # if there are so many that the page would load slowly
 MANY = 60  # captures
-MOST_LINES = 50  # of a reason; the report has all
-GROUPS: Sequence[tuple[State, str]] = (  # first what somebody has to see to
+MOST_LINES = 50  # of a reason; the full text is in the report
+GROUPS: Sequence[tuple[State, str]] = (  # those that need attention first
     ("failed", "Failed"),
     ("running", "Running"),
     ("stopped", "Stopped"),
@@ -35,23 +35,23 @@ STAGE_WORDS: Mapping[State, str] = {"running": "in {}", "failed": "in {}", "stop
 
 @dataclass(frozen=True)
 class Card:
-    """What is drawn of a capture.
+    """A capture's card.
 
     Attributes:
-        name: As people can read it.
-        state: How it stands.
-        picture: Small; None where there is none.
-        stage: At which stage, in words; empty where there is nothing to say.
-        percent: Done of it; None where it does not run.
-        left: Done and left in words; empty where it does not run.
+        name: Its printable name.
+        state: Its state.
+        picture: A thumbnail, or None.
+        stage: The current stage in words; empty if there is nothing to show.
+        percent: Progress; None if it is not running.
+        left: Progress and time left in words; empty if it is not running.
         facts: Figures in words: photos, time, tries.
         verdict: The report's headline.
-        level: How good that is.
-        reason: Why it failed or was stopped, in its first line.
-        more: Further lines of that.
+        level: The verdict's level.
+        reason: First line of why it failed or was stopped.
+        more: Further lines of the reason.
         hint: What to do about it.
-        earlier: Why earlier tries ended.
-        links: Titles and addresses.
+        earlier: Why earlier tries failed.
+        links: Titles and URLs.
     """
 
     name: str
@@ -80,11 +80,11 @@ class Group:
 
 
 def write_page(state: BatchState, path: Path) -> None:
-    """Write a batch's page, whole or not at all.
+    """Write a batch's page atomically.
 
     Args:
-        state: Where the batch stands.
-        path: The page, in the batch's folder: pictures and links are sought beside it.
+        state: The batch's state.
+        path: The page, in the batch's folder; images and links are relative to it.
 
     Raises:
         OSError: if it cannot be written.
@@ -94,11 +94,11 @@ def write_page(state: BatchState, path: Path) -> None:
 
 
 def batch_page(state: BatchState, folder: Path) -> str:
-    """The page as one HTML text that needs nothing else.
+    """The page as one self-contained HTML text.
 
     Args:
-        state: Where the batch stands.
-        folder: The batch's.
+        state: The batch's state.
+        folder: The batch's folder.
 
     Raises:
         MachineError: if this installation lacks the page's script or style.
@@ -156,7 +156,7 @@ def _headline(state: BatchState) -> tuple[Level, str]:
 
 
 def _text(state: BatchState) -> str:
-    """When, for how long, and what it takes."""
+    """Start time, duration and resources in words."""
     until_s = state.as_of_s if state.ended_s is None else state.ended_s
     poor = sum(capture.level == "bad" and capture.state in FINISHED for capture in state.captures)
     told = [state.message, f"Of what finished, {poor:,} have poor results." if poor else ""]
@@ -192,7 +192,7 @@ def _card(capture: CaptureState, folder: Path, side: int) -> Card:
         percent=percent if running else None,
         left=left if running else "",
         facts=" · ".join(filter(None, facts)),
-        verdict="" if reason else capture.verdict,  # which says no more than the state and the reason
+        verdict="" if reason else capture.verdict,  # the verdict would repeat the state and the reason
         level=capture.level,
         reason=reason,
         more=tuple(more[:MOST_LINES]) + ((f"and {len(more) - MOST_LINES:,} more",) if len(more) > MOST_LINES else ()),
@@ -211,7 +211,7 @@ def _picture(relative: str, folder: Path, side: int) -> Thumbnail | None:
 
 
 def _lies_in(folder: Path, relative: str) -> bool:
-    """Whether it is a file below the folder: a page leads nowhere else."""
+    """Whether it is a file below the folder: the page must not link anywhere else."""
     path = PurePosixPath(relative)
     if not relative or path.is_absolute() or ".." in path.parts:
         return False
@@ -222,7 +222,7 @@ def _lies_in(folder: Path, relative: str) -> bool:
 
 
 def _moment(seconds: float) -> str:
-    """A point in time by this machine's clock, with its zone."""
+    """A point in time in this machine's time zone, with the zone."""
     try:
         return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
     except (OverflowError, OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Which picture stands for a capture on its card: a render that training never saw, and until there is one a photo."""
+"""Chooses a capture's image for its card: a render of a held-out view, or until there is one, a photo."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from splatpipe.pipeline.photos.names import PHOTO_SUFFIXES
 from splatpipe.pipeline.photos.photo_list import photo_root
 
 SIDE = 480  # pixels, of a card on a good display
-POOR_DB = 12.0  # PSNR, exposure included: a render that is so little like its photo does not show which capture it is
+POOR_DB = 12.0  # PSNR without exposure compensation: a worse render does not show which capture it is
 LOOKED_AT = 5  # photos, spread over the capture: some show little but sky, grass, or the ground before take-off
 
 
 def capture_picture(out: Path, photos: Path, kept: Path) -> Path | None:
-    """A small picture of a capture, of what there is of it now.
+    """Make a small image of a capture from what exists of it now.
 
     Args:
-        out: The folder of its results, which may not be there yet.
-        photos: Its photos.
-        kept: Folder that keeps the pictures of all captures; made where there is none.
+        out: Its results folder, which may not exist yet.
+        photos: Its photo folder.
+        kept: The folder for the images of all captures; created if missing.
 
     Returns:
-        The picture in `kept`; it is written anew where another one is better now. None where there is nothing to show.
+        The image in `kept`, rewritten if a better one is available now. None if there is nothing to show.
 
     Raises:
         OSError: if it cannot be written.
@@ -54,7 +54,7 @@ def capture_picture(out: Path, photos: Path, kept: Path) -> Path | None:
 
 
 def _render(out: Path) -> tuple[Path, int] | None:
-    """Of the held-out views that are like their photos the one with most to see, and how to turn it."""
+    """Of the held-out views that match their photos, the render with the most detail, and its EXIF orientation."""
     try:
         inputs = read_report_inputs(out)
         folder = inputs.part("evaluate.views")
@@ -71,7 +71,7 @@ def _render(out: Path) -> tuple[Path, int] | None:
         photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
         turned = {photo["name"]: int(photo.get("orientation") or 1) for photo in photos}
         return path, turned.get(view["name"], 1)
-    except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # of a run that is not whole yet
+    except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # of an incomplete run
         return None
 
 
@@ -80,7 +80,7 @@ def _likeness(view: Mapping[str, Any]) -> float:
 
 
 def _photo(photos: Path) -> Path | None:
-    """Of photos spread over the capture the one with most to see."""
+    """Of photos spread over the capture, the one with the most detail."""
     try:
         root = photo_root(photos)
         every = sorted(path for path in root.rglob("*") if path.suffix.lower().lstrip(".") in PHOTO_SUFFIXES)

@@ -1,4 +1,4 @@
-"""What a call of `splatpipe batch` is to do, as a file: the jobs, the guard and whoever tells of them read it."""
+"""The plan of a `splatpipe batch` call, stored as a file that the jobs, the guard and the monitor read."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from pathlib import Path
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import JSON, stage_name
 
-BATCH_FOLDER = ".batch"  # below the batch's folder: what is the command's own
+BATCH_FOLDER = ".batch"  # below the batch's folder: the command's own files
 PLAN_FILE = "plan.json"
-RUNTIME_FACTOR, RUNTIME_MIN = 3.0, 15.0  # a cluster kills at the limit: minutes too many cost nothing
+RUNTIME_FACTOR, RUNTIME_MIN = 3.0, 15.0  # a cluster kills jobs at the limit, and extra minutes cost nothing
 MEGABYTE = 10**6
-SHARDS_FOLDER = "shards"  # below a call's
+SHARDS_FOLDER = "shards"  # below a call's folder
 LEAST_S = 1.0  # of a process that only joins
 
 
 @dataclass(frozen=True)
 class StageJob:
-    """One stage of one capture, or one of the shards that it is made of: a job of the workflow.
+    """A job of the workflow: one stage of one capture, or one of its shards.
 
     Attributes:
-        stage: Its name; of a shard ``train.2``.
-        threads: That it gets.
-        memory_bytes: That it is expected to take at its peak, with a margin.
-        seconds: That it is expected to take with these threads.
-        disk_bytes: That it is expected to take at its end, or while it runs.
+        stage: Its name; for a shard e.g. ``train.2``.
+        threads: Threads it gets.
+        memory_bytes: Expected peak memory, with a margin.
+        seconds: Expected duration with these threads.
+        disk_bytes: Expected disk space at its end, or while it runs.
     """
 
     stage: str
@@ -38,26 +38,26 @@ class StageJob:
 
     @property
     def resources(self) -> list[int]:
-        """What the workflow asks for: threads, megabytes of memory, minutes, megabytes of disk."""
+        """The resources requested in the workflow: threads, megabytes of memory, minutes, megabytes of disk."""
         minutes = round(RUNTIME_MIN + RUNTIME_FACTOR * self.seconds / 60.0)
         return [self.threads, max(1, self.memory_bytes // MEGABYTE), minutes, max(1, self.disk_bytes // MEGABYTE)]
 
 
 @dataclass(frozen=True)
 class PlannedCapture:
-    """A capture and what is to be done about it.
+    """A capture and the jobs planned for it.
 
     Attributes:
-        name: The capture's.
-        key: What it is called in the workflow: letters, digits and hyphens.
-        photos: Its folder of photos.
-        preset: By name.
-        jobs: Stages that are not valid, in order; none where all are, or where it fails before it begins.
-        weights: Seconds of every stage that is asked for, by the forecast: what progress is measured by.
-        photo_count: How many it has; None where nobody could count.
-        message: Why it fails before it begins; empty where it does not.
+        name: The capture's name.
+        key: Its name in the workflow: letters, digits and hyphens.
+        photos: Its photo folder.
+        preset: The preset's name.
+        jobs: Jobs of stages that are not valid, in order; empty if all are valid or it fails before it starts.
+        weights: Forecast seconds of every requested stage, by which progress is measured.
+        photo_count: Number of photos; None if unknown.
+        message: Why it fails before it starts; else empty.
         hint: What to do about it.
-        stage: In which it failed the last time, where that is why.
+        stage: The stage in which it failed the last time, if that is the reason.
     """
 
     name: str
@@ -74,19 +74,19 @@ class PlannedCapture:
 
 @dataclass(frozen=True)
 class BatchPlan:
-    """What a call is to do.
+    """The plan of a call.
 
     Attributes:
         out: The batch's folder.
-        began_s: When the command began, seconds since the epoch.
-        captures: In the order of the list.
-        until: The last stage; empty for the whole line.
-        device: As the command was given it.
+        began_s: When the command started, seconds since the epoch.
+        captures: The captures, in the order of the list.
+        until: The last stage; empty for the whole pipeline.
+        device: The device given to the command.
         gpu: Whether the stages that can use a GPU get one.
-        retries: How often a stage that died is begun again.
-        local: Whether the jobs run on this machine, and not where a profile sends them.
-        warnings: What was noticed before.
-        unlisted: Captures of earlier calls that are not listed any more.
+        retries: How often a failed stage is retried.
+        local: Whether the jobs run on this machine rather than where a profile sends them.
+        warnings: Warnings from planning.
+        unlisted: Captures of earlier calls that are no longer listed.
     """
 
     out: str
@@ -102,11 +102,11 @@ class BatchPlan:
 
     @property
     def needed_bytes(self) -> int:
-        """Disk that all jobs together are expected to take."""
+        """Bytes of disk space that all jobs together are expected to need."""
         return sum(job.disk_bytes for capture in self.captures for job in capture.jobs)
 
     def capture(self, key: str) -> PlannedCapture:
-        """The capture of that key.
+        """The capture with that key.
 
         Raises:
             KeyError: if there is none.
@@ -119,7 +119,7 @@ class BatchPlan:
 
 @dataclass(frozen=True)
 class Call:
-    """The folder of a call of the command.
+    """The folder of one call of the command.
 
     Attributes:
         folder: Absolute; below the batch's folder.
@@ -134,12 +134,12 @@ class Call:
 
     @property
     def stop_file(self) -> Path:
-        """Lies there once the call is to end: no job begins any more."""
+        """Exists once the call is to end: no further job starts."""
         return self.folder / "stop"
 
     @property
     def end_file(self) -> Path:
-        """Says when and how the call ended."""
+        """Records when and how the call ended."""
         return self.folder / "end.json"
 
     @property
@@ -151,33 +151,33 @@ class Call:
         return self.folder / "config" / f"{key}.toml"
 
     def tries_file(self, key: str, job: str = "") -> Path:
-        """What became of a capture's jobs, a JSON object a line; shards have files of their own: they run side by side.
+        """The log of a capture's tries, one JSON object per line; shards, which run in parallel, have their own files.
 
         Args:
-            key: The capture's.
-            job: The name of a job's stage; any that is no shard has the same file.
+            key: The capture's key.
+            job: The name of a job's stage; all stages that are not shards share one file.
         """
         return self.folder / "tries" / f"{key}{_shard(job)}.jsonl"
 
     def tries_files(self, key: str) -> list[Path]:
-        """All of a capture's; none need be there."""
+        """All tries files of a capture; they may not exist."""
         return [self.tries_file(key), *sorted(self.tries_file(key).parent.glob(f"{key}.*.jsonl"))]
 
     def log(self, name: str, job: str = "") -> Path:
-        """What a capture's jobs said; it outlives the call.
+        """The output of a capture's jobs; it outlives the call.
 
         Args:
-            name: The capture's.
-            job: As of ``tries_file``.
+            name: The capture's name.
+            job: As for ``tries_file``.
         """
         return self.folder.parent / "logs" / f"{name}{_shard(job)}.log"
 
     def shards_file(self, key: str) -> Path:
-        """The jobs of a capture's shards, by stage, as far as they are known; the workflow reads it, too."""
+        """The known jobs of a capture's shards by stage; the workflow reads this file too."""
         return self.folder / SHARDS_FOLDER / f"{key}.json"
 
     def write_shards(self, key: str, jobs: Mapping[str, Sequence[StageJob]]) -> None:
-        """Keep the jobs of shards by stage; of a stage whose jobs are known already they stay as they are."""
+        """Store the jobs of shards by stage; those of stages already stored are not changed."""
         told = {
             stage: {
                 "jobs": [asdict(job) for job in of_stage],
@@ -190,7 +190,7 @@ class Call:
         write_durably(path, json.dumps({**told, **self._shards(key)}))
 
     def jobs(self, capture: PlannedCapture) -> list[StageJob]:
-        """A capture's jobs in order, those of shards before their stage's, which is left with the rest of the time."""
+        """A capture's jobs in order, shards before their stage, which keeps the remaining time."""
         known = {stage: [StageJob(**job) for job in told["jobs"]] for stage, told in self._shards(capture.key).items()}
         found = []
         for job in capture.jobs:
@@ -218,7 +218,7 @@ class Call:
         write_durably(self.end_file, json.dumps(told))
 
     def end(self) -> Mapping[str, JSON]:
-        """``ended_s``, ``exit_code`` and ``message``; empty while it is at work."""
+        """``ended_s``, ``exit_code`` and ``message``; empty while it is running."""
         try:
             told: Mapping[str, JSON] = json.loads(self.end_file.read_text(encoding="utf-8"))
         except FileNotFoundError:
@@ -227,7 +227,7 @@ class Call:
 
 
 def _shard(job: str) -> str:
-    """What a shard's files have in their names that a stage's have not."""
+    """The file name suffix for a shard; empty for a stage."""
     return f".{job}" if job != stage_name(job) else ""
 
 

@@ -1,4 +1,4 @@
-"""What each capture still needs: its options resolved, its folder of results surveyed, its stages forecast."""
+"""Plans what each capture still needs: resolves options, checks the results folder, forecasts stages."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from splatpipe.pipeline.engine.stage import Shard, stage_name
 from splatpipe.pipeline.engine.store import Part, is_copy
 from splatpipe.stages.forecast import forecast, machine_speed
 
-CLUSTER_THREADS = 8  # of a job that another machine runs; a profile's set-threads says otherwise
+CLUSTER_THREADS = 8  # of a job on another machine; a profile's set-threads overrides it
 LONGEST_SLUG = 40
 UNTRIED = "Nothing has changed since, so it was not tried again; use --retry-failed to do so."
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the command says of all captures.
+    """The command's settings for all captures.
 
     Attributes:
-        preset: By name, for captures that name none.
-        tables: Options, below a capture's own.
-        until: The last stage; empty for the whole line.
+        preset: The preset's name, for captures that name none.
+        tables: Options, which a capture's own override.
+        until: The last stage; empty for the whole pipeline.
         device: ``auto``, ``cpu`` or ``cuda``.
         gpu: Whether the stages that can use a GPU get one.
-        threads: Of a job; 0 to divide the machine.
-        retries: How often a stage that died is begun again.
-        retry_failed: Try again what failed for its photos or options, too, though nothing changed.
+        threads: Threads per job; 0 to divide the machine.
+        retries: How often a failed stage is retried.
+        retry_failed: Also retry what failed because of its photos or options, even if nothing changed.
         local: Whether the jobs run on this machine.
     """
 
@@ -65,14 +65,14 @@ class Settings:
 
 @dataclass(frozen=True)
 class _CaptureForecast:
-    """A capture before threads are divided.
+    """A capture's plan before threads are divided.
 
     Attributes:
-        planned: What is known of it.
-        needed: Stages that are asked for.
+        planned: The capture without its jobs.
+        needed: The requested stages.
         names: Those of them that are not valid.
-        foresee: What each stage needs with so many threads.
-        shards: That are not there, by those of ``names`` that are made of them, as far as their number is known.
+        foresee: Returns each stage's need for a number of threads.
+        shards: Missing shards by stage, for those of ``names`` whose number of shards is known.
     """
 
     planned: PlannedCapture
@@ -83,12 +83,12 @@ class _CaptureForecast:
 
 
 def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings) -> BatchPlan:
-    """Look at every capture and say what is to be done; nothing is run, and no capture's trouble is another's.
+    """Plan every capture without running anything; a problem with one capture does not affect the others.
 
     Args:
-        captures: As they were listed.
-        call: Takes each capture's resolved options, for its jobs.
-        settings: Of the command.
+        captures: The captures as listed.
+        call: The call, which stores each capture's resolved options for its jobs.
+        settings: The command's settings.
     """
     began_s = time.time()
     outlooks = [
@@ -149,14 +149,14 @@ def _outlook(capture: ListedCapture, planned: PlannedCapture, call: Call, settin
         planned = _with_broken_file(planned, request)
     memory = available_memory_bytes() if settings.local else 0
     foresee = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
-    # Where the stage that counts them is to run, it says how many there are then.
+    # If the stage that counts the shards has to run, it will determine their number.
     counted = [each for each in statuses if each.stage.name in names] if first else []
     shards = {} if planned.message else missing_shards(counted)
     return _CaptureForecast(planned, tuple(needed), () if planned.message else names, foresee, shards)
 
 
 def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCapture:
-    """What the run would end with before its first stage is told without one: such an end leaves no trace in OUT."""
+    """Detect errors that would end the run before its first stage: such a failure leaves no trace in OUT."""
     try:
         require_readable(request)
         require_memory(request)
@@ -172,9 +172,9 @@ def _statuses(request: Request, needed: Sequence[str]) -> list[StageStatus]:
 
 
 def _to_run(request: Request, needed: Sequence[str], statuses: Sequence[StageStatus]) -> tuple[str, ...]:
-    """Stages that are not valid; the last one where all are, but not all of what it delivered lies in OUT.
+    """Stages that are not valid; the last one if all are valid but not all of its deliverables are in OUT.
 
-    Before shards comes the stage that counts them, a moment's work where it is valid: it leaves the options for them.
+    The stage that counts shards precedes them even if valid, which is quick: it saves the options for them.
     """
     if not statuses:
         return tuple(needed)
@@ -193,7 +193,7 @@ def _to_run(request: Request, needed: Sequence[str], statuses: Sequence[StageSta
 
 
 def _with_kept_failure(planned: PlannedCapture, first: StageStatus, out: Path) -> PlannedCapture:
-    """A stage that could do nothing with its input gets the same input: what it said then holds, and nothing runs."""
+    """If a stage failed on its input and the input is unchanged, keep that failure and run nothing."""
     for status in (first, *first.shards):
         for path in (out / EVENTS_FILE, shard_events(out, status.stage.name)):
             history = read_history(path, running=is_locked(out))
@@ -208,9 +208,9 @@ def _with_kept_failure(planned: PlannedCapture, first: StageStatus, out: Path) -
 
 
 def _threads(outlooks: Sequence[_CaptureForecast], *, local: bool) -> int:
-    """Threads of a job: the machine divided by the captures that can be under way at once.
+    """Threads per job: the machine's threads divided by the captures that can run at once.
 
-    Many captures side by side are done sooner than one after the other with all threads, of which some always wait.
+    Many captures in parallel finish sooner than one after the other with all threads, some of which are always idle.
     """
     if not local:
         return CLUSTER_THREADS
@@ -224,7 +224,7 @@ def _threads(outlooks: Sequence[_CaptureForecast], *, local: bool) -> int:
 
 
 def _of(outlook: _CaptureForecast, threads: int, names: Sequence[str]) -> dict[str, Need]:
-    """What stages need; one that the forecast does not know costs next to nothing."""
+    """The needs of stages; stages without a forecast count as almost nothing."""
     foreseen = outlook.foresee(threads)
     return {name: foreseen.get(name, NOTHING) for name in names}
 

@@ -1,4 +1,4 @@
-"""Writes where a batch stands into its folder: `batch.json`, `batch.csv` and `batch.html`, each whole or as before."""
+"""Writes a batch's state into its folder: `batch.json`, `batch.csv` and `batch.html`, each atomically."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ COLUMNS = (
 
 
 def publish(state: BatchState, out: Path) -> None:
-    """Write all three.
+    """Write all three files.
 
     Raises:
-        OSError: if the disk is full or gone; what could not be written is as it was.
+        OSError: if the disk is full or gone; files that could not be written are unchanged.
         MachineError: if this installation lacks the page's style.
     """
     write_durably(out / JSON_FILE, json.dumps(as_json(state), indent=1) + "\n")
@@ -33,7 +33,7 @@ def publish(state: BatchState, out: Path) -> None:
 
 
 def table_text(state: BatchState) -> str:
-    """A row a capture; the last column says when that was so."""
+    """The table as CSV, one row per capture; the last column is the time of the state."""
     when = time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(state.as_of_s))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -50,5 +50,5 @@ def _row(capture: CaptureState, when: str) -> list[str | int | float | None]:
 
 
 def _cell(value: str | int | float | None) -> str | int | float | None:
-    """Spreadsheets calculate a text that begins like a formula; a capture's name may."""
+    """Escape text that a spreadsheet would evaluate as a formula, as a capture's name might be."""
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t") else value

@@ -1,4 +1,4 @@
-"""Jobs of the shards that stages are made of: how many there are is known when the stage that counts them has run."""
+"""Jobs of stages' shards, whose number is known once the stage that counts them has run."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from splatpipe.pipeline.engine.session import status_of
 from splatpipe.pipeline.engine.stage import Shard, Stage, stage_name
 
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
-NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000)  # a process that looks and ends
+NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000)  # a process that finds nothing to do
 
 
 def stage_job(name: str, need: Need, threads: int) -> StageJob:
-    """A job by what it is expected to take."""
+    """A job from its expected resource use."""
     memory = round(MEMORY_MARGIN * need.memory_bytes)
     return StageJob(name, threads, memory, need.seconds(threads), need.disk_bytes + need.scratch_bytes)
 
 
 def missing_shards(statuses: Iterable[StageStatus]) -> dict[str, list[Shard]]:
-    """Shards that are still to be made, by stage, of stages whose number of shards is known."""
+    """Shards still to be run, by stage, for stages whose number of shards is known."""
     return {
         status.stage.name: [
             Shard(number, len(status.shards))
@@ -42,7 +42,7 @@ def shard_jobs(
     Args:
         missing: Shards by stage.
         needs: The forecast.
-        threads: Of a job.
+        threads: Threads per job.
     """
     return {
         stage: [
@@ -53,17 +53,17 @@ def shard_jobs(
 
 
 def counts_shards(stage: str, line: Sequence[Stage]) -> bool:
-    """Whether a stage says how many shards another has."""
+    """Whether a stage determines how many shards another has."""
     return any(each.shards is not None and stage_name(each.shards.counted_by) == stage for each in line)
 
 
 def tell_shards(call: Call, key: str, threads: int) -> None:
-    """Leave the jobs of a capture's shards for Snakemake, once the stage that counts them has run.
+    """Store the jobs of a capture's shards for Snakemake, once the stage that counts them has run.
 
     Args:
-        call: Whose job has run it.
-        key: The capture's.
-        threads: Of a job.
+        call: The call.
+        key: The capture's key.
+        threads: Threads per job.
     """
     request = existing(call.out / call.plan().capture(key).name)
     statuses = list(line_status(*status_of(request)))

@@ -1,9 +1,9 @@
-"""Snakemake as a process: found, started in a group of its own, and ended in order with all that it started.
+"""Snakemake as a process: found, started in its own process group, and shut down with everything it started.
 
     python -m splatpipe.pipeline.app.batch.snakemake_process ARGUMENTS
 
-is Snakemake that hears a Ctrl-C of ours also where the shell that called us told its children not to, and that does not
-outlive us.
+runs Snakemake so that it receives our SIGINT even if the calling shell made its children ignore it, and so that it does
+not outlive us.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
 
 END_PATIENCE_S = 8.0  # a run ends within five seconds and Docker kills after ten
 POLL_S = 0.05
-LOG_TAIL = 4000  # characters of Snakemake's log in which its last words are looked for
+LOG_TAIL = 4000  # characters of Snakemake's log that are searched for its last message
 PROFILE_FILES = ("config.v9+.yaml", "config.v8+.yaml", "config.yaml")
 SAID = re.compile(r"^(?:[A-Za-z]*(?:Error|Exception)\b.*|.*\berror: .*)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Where Snakemake is to run jobs: this machine without a profile.
+    """Where Snakemake runs jobs: on this machine if there is no profile.
 
     Attributes:
-        folder: The profile's; None without one.
-        text: Of its configuration.
+        folder: The profile's folder; None without one.
+        text: Its configuration file's text.
     """
 
     folder: Path | None = None
@@ -53,15 +53,15 @@ class Profile:
         return found is None or found[1] == "local"
 
     def says(self, option: str) -> bool:
-        """Whether it has an option."""
+        """Whether the profile sets an option."""
         return re.search(rf"^{re.escape(option)}\s*:", self.text, re.MULTILINE) is not None
 
 
 def open_profile(folder: Path | None) -> Profile:
-    """A profile of Snakemake's, a folder with a ``config.yaml``.
+    """Open a Snakemake profile, a folder with a ``config.yaml``.
 
     Raises:
-        UsageError: if it is none.
+        UsageError: if it is not a profile.
     """
     if folder is None:
         return Profile()
@@ -73,7 +73,7 @@ def open_profile(folder: Path | None) -> Profile:
 
 
 def require_snakemake() -> None:
-    """Say what is missing before hours are planned.
+    """Check that Snakemake is installed.
 
     Raises:
         MachineError: if Snakemake is not installed.
@@ -90,7 +90,7 @@ def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str
     command += ["--retries", str(plan.retries), "--scheduler", "greedy", "--rerun-triggers", "input"]
     if profile.folder is not None:
         command += ["--profile", str(profile.folder)]
-    if not profile.local and not profile.says("cores"):  # no job elsewhere gets more threads than this
+    if not profile.local and not profile.says("cores"):  # caps the threads of jobs elsewhere
         command += ["--cores", str(max((job.threads for each in plan.captures for job in each.jobs), default=1))]
     if profile.local:
         memory = free_memory_bytes() // MEGABYTE
@@ -101,15 +101,15 @@ def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str
 
 
 def snakemake_environment(call: Call) -> dict[str, str]:
-    """Variables for it: no profile that nobody named, no cache outside the batch's folder."""
+    """Environment variables for Snakemake: no implicit profile, no cache outside the batch's folder."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SNAKEMAKE_")}
-    # Snakemake does not start without a HOME and a name, which a container's arbitrary user has not.
+    # Snakemake does not start without HOME and a user name, which an arbitrary container user lacks.
     nobody = {"HOME": str(call.folder), "LOGNAME": f"user-{os.getuid()}"}
     return {**nobody, **environment, "XDG_CACHE_HOME": str(call.folder / "cache")}
 
 
 def start_snakemake(call: Call, plan: BatchPlan, profile: Profile) -> subprocess.Popen[bytes]:
-    """Begin a call's workflow; the terminal's Ctrl-C does not reach it."""
+    """Start a call's workflow; the terminal's Ctrl-C does not reach it."""
     with call.snakemake_log.open("ab") as log:
         return subprocess.Popen(
             snakemake_command(call, plan, profile),
@@ -123,15 +123,15 @@ def start_snakemake(call: Call, plan: BatchPlan, profile: Profile) -> subprocess
 
 
 def end_group(call: Call, group: int, *, local: bool, gone: Callable[[], bool]) -> None:
-    """End a workflow: no job begins, those that run are asked to end, and what does not is killed.
+    """End a workflow: no job starts, running ones are asked to stop, and those that do not are killed.
 
     Args:
         call: The call.
-        group: Number of Snakemake's process group.
-        local: Jobs here are asked themselves; those elsewhere are cancelled by Snakemake.
-        gone: Whether Snakemake has ended.
+        group: ID of Snakemake's process group.
+        local: Local jobs are signalled directly; Snakemake cancels those elsewhere.
+        gone: Returns whether Snakemake has ended.
     """
-    with suppress(OSError):  # on a full disk the signals do it alone
+    with suppress(OSError):  # on a full disk the signals must suffice
         call.stop_file.touch()
     deadline = time.monotonic() + END_PATIENCE_S
     with suppress(ProcessLookupError):
@@ -142,7 +142,7 @@ def end_group(call: Call, group: int, *, local: bool, gone: Callable[[], bool]) 
 
 
 def group_gone(group: int) -> bool:
-    """Whether no process of a group is left, of one that is not ours to wait for."""
+    """Whether no process of a group is left, for a group whose processes are not our children."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:
@@ -151,7 +151,7 @@ def group_gone(group: int) -> bool:
 
 
 def last_words(call: Call) -> str:
-    """What Snakemake said at its end, a line; empty where it said nothing."""
+    """The last line of Snakemake's log; empty if there is none."""
     with suppress(OSError):
         text = call.snakemake_log.read_text(encoding="utf-8", errors="replace")[-LOG_TAIL:]
         found = SAID.findall(text) or [line for line in text.splitlines() if line.strip()]

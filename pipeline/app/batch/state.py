@@ -1,4 +1,4 @@
-"""Where a batch stands: what the page, the table, ``batch.json`` and ``--json`` all tell."""
+"""The state of a batch, as shown in the page, the table, ``batch.json`` and ``--json``."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ State = Literal["waiting", "running", "done", "reused", "failed", "stopped"]
 Level = Literal["", "good", "doubt", "bad"]
 
 FINISHED: tuple[State, ...] = ("done", "reused")
-RENEWED_EVERY_S = 15.0  # at work what is told is written anew at least that often, so an older one tells that nobody is
-STALE_S = 60.0  # four of those missed: a busy machine misses one, never four
+RENEWED_EVERY_S = 15.0  # longest interval between updates of a running batch
+STALE_S = 60.0  # older means that nobody is working: four missed updates, where a busy machine misses one
 
 
 @dataclass(frozen=True)
 class CaptureState:
-    """Where a capture stands.
+    """The state of a capture.
 
     Attributes:
-        name: The capture's; its results lie in the folder of that name in the batch's folder.
-        state: ``waiting`` for its turn, ``running``, ``done`` in this batch, ``reused``: it was finished before,
-            ``failed``, or ``stopped`` before its end with the batch.
-        stage: The stage that runs, failed, was stopped or comes next; empty where all are done.
-        progress: Of the whole capture, 0 to 1; by the forecast, so by time and not by the number of stages.
-        verdict: The report's headline; empty while there is none.
-        level: How good that is; empty while there is none.
-        reason: Why it failed or was stopped, one sentence; empty else.
+        name: The capture's name, also that of its results folder in the batch's folder.
+        state: ``waiting``, ``running``, ``done`` in this batch, ``reused`` (finished before), ``failed``, or
+            ``stopped`` with the batch.
+        stage: The stage that is running, failed, was stopped or comes next; empty if all are done.
+        progress: Progress of the whole capture, 0 to 1, by forecast time.
+        verdict: The report's headline; empty if there is none yet.
+        level: The verdict's level; empty if there is none yet.
+        reason: Why it failed or was stopped, in one sentence; else empty.
         hint: What to do about it.
-        tries: How often the stage was begun in this batch; once all are done, the one that was begun most often.
-        earlier: Why earlier tries ended, with their stages, also where a later one went well.
-        seconds: That its stages took together, by their manifests, with what runs now.
-        left_s: About what it still takes once it runs, by the forecast; None where nothing tells.
-        photos: How many it has; None while nobody has counted.
-        figures: For the table: registered, gaussians, psnr, ssim, the root mean square at check points.
-        picture: Best picture of it, relative to the batch's folder; empty while there is none.
-        report: Its report, relative to the batch's folder; empty where there is none.
-        viewer: Its viewer, relative to the batch's folder; empty where there is none.
+        tries: Tries of the stage in this batch; once all are done, of the stage with the most.
+        earlier: Why earlier tries failed, with their stages, even if a later one succeeded.
+        seconds: Total duration of its stages from their manifests, including the current one.
+        left_s: Forecast time left once it runs; None if unknown.
+        photos: Number of photos; None if not known yet.
+        figures: For the table: registered, gaussians, psnr, ssim, RMSE at check points.
+        picture: The best image of it, relative to the batch's folder; empty if there is none yet.
+        report: Its report, relative to the batch's folder; empty if there is none.
+        viewer: Its viewer, relative to the batch's folder; empty if there is none.
     """
 
     name: str
@@ -63,21 +63,21 @@ class CaptureState:
 
 @dataclass(frozen=True)
 class BatchState:
-    """Where a batch stands.
+    """The state of a batch.
 
     Attributes:
-        name: The batch's folder's name.
-        captures: In the order of the list.
-        as_of_s: When this was so, seconds since the epoch.
-        began_s: When the command began.
-        ended_s: When it ended; None while it is at work, or when its end was never told (a power cut).
-        exit_code: What it ended with; None while it is at work.
-        message: What ended it before its captures were through; empty else.
-        left_s: About what is still to come, by the forecast; None where nothing tells.
-        free_bytes: On the disk of the batch's folder.
-        needed_bytes: That what is still to run takes there, by the forecast.
-        warnings: What whoever comes in the morning should read first.
-        unlisted: Captures of earlier calls that the list no longer names; their results are left as they are.
+        name: The name of the batch's folder.
+        captures: The captures, in the order of the list.
+        as_of_s: Time of this state, seconds since the epoch.
+        began_s: When the command started.
+        ended_s: When it ended; None while it is running, or if its end was never recorded (a power cut).
+        exit_code: Its exit code; None while it is running.
+        message: Why it ended before its captures were finished; else empty.
+        left_s: Forecast time left; None if unknown.
+        free_bytes: Free space on the disk of the batch's folder.
+        needed_bytes: Forecast disk space of what is still to run.
+        warnings: What to read first in the morning.
+        unlisted: Captures of earlier calls that are no longer listed; their results are kept.
     """
 
     name: str
@@ -95,12 +95,12 @@ class BatchState:
 
     @property
     def at_work(self) -> bool:
-        """Whether it had not ended by ``as_of_s``; ``STALE_S`` later nobody renewed it, so nobody is at work."""
+        """Whether it was running at ``as_of_s``; if not updated within ``STALE_S``, it no longer is."""
         return self.ended_s is None
 
     @property
     def counts(self) -> dict[State, int]:
-        """How many captures are in each state, those in none left out."""
+        """The number of captures by state, without empty states."""
         return dict(Counter(capture.state for capture in self.captures))
 
     @property
@@ -109,5 +109,5 @@ class BatchState:
 
 
 def as_json(state: BatchState) -> dict[str, JSON]:
-    """What ``batch.json`` and ``--json`` say."""
+    """The content of ``batch.json`` and ``--json``."""
     return {**asdict(state), "at_work": state.at_work, "counts": state.counts}

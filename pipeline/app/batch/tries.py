@@ -1,4 +1,4 @@
-"""What became of a capture's jobs: a line when one begins and one when it ends, as they happen."""
+"""The log of a capture's jobs: one line when a try starts and one when it ends."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pathlib import Path
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_USAGE
 from splatpipe.pipeline.engine.stage import JSON
 
-HOPELESS = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options fail again: no second try
+HOPELESS = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options would fail again: not retried
 NO_WORD = "It ended without an error message: its process was killed, usually by the system for lack of memory."
 
 
 @dataclass(frozen=True)
 class TryResult:
-    """How a go at a stage ended; the fields are those of ``Try``."""
+    """The outcome of a try; the fields are those of ``Try``."""
 
     exit_code: int
     message: str = ""
@@ -29,18 +29,18 @@ class TryResult:
 
 @dataclass(frozen=True)
 class Try:
-    """One go at a stage.
+    """One try to run a stage.
 
     Attributes:
-        stage: Its name.
-        began_s: Seconds since the epoch.
-        host: Where.
-        process: Its number there.
-        ended_s: None where no end was told.
-        exit_code: Of the end; None where none was told.
-        message: Why it ended badly; empty where it did not.
+        stage: The stage's name.
+        began_s: Start, seconds since the epoch.
+        host: The machine.
+        process: The process ID on that machine.
+        ended_s: End; None if not recorded.
+        exit_code: Exit code; None if not recorded.
+        message: Why it failed; else empty.
         hint: What to do about it.
-        final: Whether another try would end alike.
+        final: Whether a retry would fail in the same way.
     """
 
     stage: str
@@ -59,7 +59,7 @@ class Try:
 
     @property
     def alive(self) -> bool:
-        """Whether it goes on as far as one can tell from here: of another machine's the end is awaited."""
+        """Whether it is still running, as far as is known here; on another machine, until its end is recorded."""
         if self.ended_s is not None:
             return False
         if self.host != socket.gethostname():
@@ -74,14 +74,14 @@ class Try:
 
     @property
     def reason(self) -> str:
-        """Why it ended badly, in one sentence or two; empty while it goes on or where it went well."""
+        """Why it failed, in one or two sentences; empty while it is running or if it succeeded."""
         if self.succeeded or self.alive:
             return ""
         return self.message or NO_WORD
 
 
 def spent_s(tries: Iterable[Try]) -> float:
-    """Seconds in which any of these was at work: shards are side by side, and one that never told its end took none."""
+    """Seconds during which any of these tries was running, counted once; tries without a recorded end count as 0."""
     spent, until_s = 0.0, 0.0
     for each in sorted(tries, key=lambda each: each.began_s):
         ended_s = each.ended_s or each.began_s
@@ -91,32 +91,32 @@ def spent_s(tries: Iterable[Try]) -> float:
 
 
 def read_tries(paths: Iterable[Path]) -> list[Try]:
-    """The tries of several files, in the order in which they began."""
+    """The tries of several files, in order of their start."""
     return sorted((each for path in paths for each in TryLog(path).read()), key=lambda each: each.began_s)
 
 
 class TryLog:
-    """Tries of jobs of one capture of which one runs at a time.
+    """The tries of those jobs of a capture that run one at a time.
 
     Args:
-        path: Of the file.
+        path: The log file.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def begin(self, stage: str) -> Try:
-        """Tell that a stage begins, here and now."""
+        """Record that a stage starts here and now."""
         begun = Try(stage, time.time(), socket.gethostname(), os.getpid())
         self._append({"begun": asdict(begun)})
         return begun
 
     def end(self, ending: TryResult) -> None:
-        """Tell how what was begun last ended."""
+        """Record the outcome of the last try."""
         self._append({"ended": {"ended_s": time.time(), **asdict(ending)}})
 
     def read(self) -> list[Try]:
-        """All of them in order; lines that are none, as a power cut leaves them, are passed over."""
+        """All tries in order; malformed lines, e.g. after a power cut, are skipped."""
         try:
             lines = self._path.read_bytes().splitlines()
         except FileNotFoundError:

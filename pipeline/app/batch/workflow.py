@@ -1,8 +1,8 @@
-"""The workflow of a call for Snakemake: a rule a stage, with the jobs that the plan names and no others.
+"""Generates a call's Snakemake workflow: one rule per stage, with exactly the jobs of the plan.
 
-Ours stays the only cache: each call has a folder of its own, and outputs of names of their own, of which none is there
-yet, so that neither times of files nor what Snakemake remembers decides anything. An output is a marker that the job
-leaves when its stage is there.
+The artifact store remains the only cache: each call has its own folder and its own output names, none of which exist
+yet, so that neither file times nor Snakemake's records decide anything. An output is a marker file that the job writes
+when its stage is done.
 """
 
 from __future__ import annotations
@@ -82,24 +82,24 @@ def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
     """The Snakefile of a plan.
 
     Args:
-        call: Whose folder the jobs are told.
-        plan: What is to be done.
-        stages: The line, in order; a stage without a job gets no rule.
+        call: The call, whose folder is passed to the jobs.
+        plan: The plan.
+        stages: The pipeline, in order; a stage without a job gets no rule.
     """
     jobs: dict[str, dict[str, JSON]] = {
         capture.key: {job.stage: job.resources for job in capture.jobs} for capture in plan.captures if capture.jobs
     }
-    done = f"done-{plan.began_s:.3f}"  # a storage that outlives the call has those of earlier ones
+    done = f"done-{plan.began_s:.3f}"  # storage that outlives the call still has those of earlier calls
     wanted = {name for stages_of in jobs.values() for name in stages_of}
     words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder)]
-    job = shlex.join(words).encode("unicode_escape").decode("ascii")  # as it stands in a text of Python's
+    job = shlex.join(words).encode("unicode_escape").decode("ascii")  # as in a Python string literal
     job = job.replace('"', '\\"').replace("{", "{{").replace("}", "}}")
     rules, divided = [], False
     for place, stage in enumerate(stages):
         if stage.name not in wanted:
             continue
-        # Broken photos are told first; then what is nearest to its end goes first, so that captures are finished one
-        # after the other and not all in the morning.
+        # The first stage, which finds broken photos, goes first; then the later the stage, the higher its priority, so
+        # that captures finish one after the other.
         rule = {"done": done, "job": job, "priority": place or len(stages), "gpu": _gpu(stage.name, plan)}
         kind = "checkpoint" if counts_shards(stage.name, stages) else "rule"
         after = f'before(wildcards, "{stage.name}")'
@@ -116,7 +116,7 @@ def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
 
 
 def _shard_rule(stage: str, rule: Mapping[str, JSON], after: str) -> str:
-    """The rule of a stage's shards, a job each; how many is known when the stage before it is there, or already."""
+    """The rule of a stage's shards, one job each; their number is known now or once the preceding stage is done."""
     names = {"name": f"{stage}_shard", "output": f"{stage}.{{shard}}", "output_name": f"{stage}.{{wildcards.shard}}"}
     own = f'shards(wildcards.capture, "{stage}")["{stage}." + wildcards.shard]'
     return _RULE.format(**rule, **names, kind="rule", after=after, jobs=own)
