@@ -1,4 +1,4 @@
-"""What an edit of a large splat takes of memory: its peak above that of the bare program, over the splat's size.
+"""Measure the memory that edits of a large splat take: peak above that of the bare program, over the splat's size.
 
     python benchmarks/edit_memory.py FOLDER [--gaussians 5000000] [--edits crop merge …]
     python benchmarks/edit_memory.py FOLDER --steps "--rotate 37 --crop-box …" [--out out.sog]
@@ -25,7 +25,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import write_splat_parts
 from splatpipe.pipeline.splat.scene import SceneFacts, SplatOrigin
 
-BYTES = 236  # of a Gaussian of degree 3 in memory
+BYTES = 236  # per Gaussian of degree 3 in memory
 PART = 500_000
 FACTS = SceneFacts("z up", False, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
 CAMERA_HEIGHT_M, CAMERA_PX = 30.0, (1200, 900)  # of the photos of the run that is cleaned
@@ -34,12 +34,12 @@ CAMERA_PLACES_M = (-25.0, 0.0, 25.0)  # along both axes
 
 @dataclass(frozen=True)
 class MeasuredEdit:
-    """An edit that is measured.
+    """An edit to be measured.
 
     Attributes:
-        steps: As on the command line.
-        out: What is written, in the folder.
-        source: What is edited, there.
+        steps: Steps, as on the command line.
+        out: File that is written, in the folder.
+        source: File that is edited, in the folder.
     """
 
     steps: str
@@ -65,7 +65,7 @@ EDITS = {
 
 
 def part(count: int, seed: int) -> Gaussians:
-    """Small Gaussians on a hilly ground of 100 by 100 metres."""
+    """Create small Gaussians on hilly ground of 100 by 100 metres."""
     generator = torch.Generator().manual_seed(seed)
     gaussians = Gaussians.empty(count, 3)
     gaussians.means = torch.rand(count, 3, generator=generator) * 100.0 - 50.0
@@ -86,7 +86,7 @@ def write(path: Path, count: int) -> None:
 
 
 def write_run(folder: Path, splat: Path) -> None:
-    """What cleaning takes for a run: the splat, and cameras that look down on it."""
+    """Write what cleaning accepts as a run: the splat, and cameras that look down on it."""
     (folder / "stages").mkdir(parents=True, exist_ok=True)
     if not (folder / "splat.ply").exists():
         (folder / "splat.ply").hardlink_to(splat)
@@ -99,7 +99,7 @@ def write_run(folder: Path, splat: Path) -> None:
 
 
 def measured(command: list[str]) -> tuple[int, float]:
-    """Peak of its resident memory in bytes, and seconds."""
+    """Return a command's peak resident memory in bytes, and its seconds."""
     code = f"import resource, subprocess, sys; done = subprocess.run({command!r}, capture_output=True, text=True); "
     code += "print(done.stderr[-2000:], file=sys.stderr) if done.returncode else None; "
     code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(done.returncode)"
@@ -126,7 +126,9 @@ def main() -> None:
     for name, count in sizes.items():
         write(folder / f"{name}.ply", count)
     write_run(folder / "run-many.ply", folder / "many.ply")
-    if not (folder / "run-few.ply").exists():  # no run: to photos, a thousand scattered Gaussians are floaters
+    if not (
+        folder / "run-few.ply"
+    ).exists():  # without a run: photos would make a thousand scattered Gaussians floaters
         (folder / "run-few.ply").hardlink_to(folder / "few.ply")
     asked = {name: EDITS[name] for name in arguments.edits}
     if arguments.steps:

@@ -1,4 +1,4 @@
-"""Figures of finished runs of the line, kept in a work folder so that none is run twice."""
+"""Figures of finished pipeline runs, kept in a work folder so that no run is repeated."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ METRICS = "metrics.json"
 
 
 class ResultLog:
-    """Rows by key, a JSON line each in `results.jsonl`; a line that a crash cut off is passed over.
+    """Rows by key, one JSON line each in `results.jsonl`; a line truncated by a crash is skipped.
 
     Args:
-        work: The folder.
+        work: The work folder.
     """
 
     def __init__(self, work: Path) -> None:
@@ -39,7 +39,7 @@ class ResultLog:
         self._cut_off = bool(text) and not text.endswith(b"\n")
 
     def add(self, key: str, row: Row) -> None:
-        """Keep a row for good: one write, on the disk when this returns."""
+        """Store a row permanently: one write, flushed to disk before this returns."""
         line = json.dumps({"key": key, "row": row}, allow_nan=False).encode() + b"\n"
         with self._path.open("ab", buffering=0) as file:
             file.write(b"\n" + line if self._cut_off else line)
@@ -49,25 +49,25 @@ class ResultLog:
 
 
 def clear(out: Path) -> None:
-    """Remove what a run left that did not finish: its figures would miss the time it took."""
+    """Remove the output of an unfinished run: its figures would not include the time already spent."""
     with contextlib.suppress(FileNotFoundError):
         shutil.rmtree(out)
 
 
 def tidy(out: Path) -> None:
-    """Of what a run left in `out/`, keep `metrics.json`, beside its log."""
+    """Keep only `metrics.json` of a run's `out/`, beside its log."""
     with contextlib.suppress(FileNotFoundError):
         (out / "out" / METRICS).replace(out / METRICS)
     clear(out / "out")
 
 
 def figures(out: Path, end: CommandEnd, threads: int) -> Row:
-    """What a run's OUT and its end say: every number of `metrics.json`, nested ones under dotted names.
+    """Collect the figures of a run's OUT: every number of `metrics.json`, nested ones under dotted names.
 
     Args:
         out: The run's OUT.
-        end: Of its command.
-        threads: It had.
+        end: How its command ended.
+        threads: Threads that it had.
     """
     metrics = dict(_numbers("", json.loads((out / METRICS).read_text(encoding="utf-8"))))
     row: Row = {
@@ -84,7 +84,7 @@ def figures(out: Path, end: CommandEnd, threads: int) -> Row:
 
 
 def best_and_end(path: Path) -> Row:
-    """The highest held-out PSNR of a training that was followed, and how far below it the end is, dB."""
+    """Return the highest held-out PSNR of a followed training, and how far below it the end is, dB."""
     curve = [row["psnr"] for row in json.loads(path.read_text(encoding="utf-8"))["rows"]]
     return {"best_psnr": max(curve), "below_best": max(curve) - curve[-1]}
 
@@ -98,7 +98,7 @@ def _numbers(prefix: str, table: dict[str, Any]) -> Iterator[tuple[str, float]]:
 
 
 def _last_loss(out: Path) -> float | None:
-    """Of training's curve at its end, where it has one."""
+    """Return the last loss of the training curve, if there is one."""
     for path in (out / "stages").glob("train-*/history.json"):
         curve = json.loads(path.read_text(encoding="utf-8"))["curve"]
         return float(curve[-1]["loss"]) if curve and math.isfinite(curve[-1]["loss"]) else None
@@ -107,10 +107,10 @@ def _last_loss(out: Path) -> float | None:
 
 @contextlib.contextmanager
 def work_folder(wanted: Path | None) -> Iterator[Path]:
-    """The folder, ours alone while this lasts; a new temporary one if none is wanted.
+    """Yield the work folder, locked for this process; a new temporary one if none is wanted.
 
     Raises:
-        UsageError: if another process uses it.
+        UsageError: if another process uses the folder.
     """
     folder = wanted.resolve() if wanted is not None else Path(tempfile.mkdtemp(prefix="splatpipe-ablation-"))
     folder.mkdir(parents=True, exist_ok=True)

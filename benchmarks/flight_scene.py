@@ -1,8 +1,8 @@
-"""A flight whose cameras are known, as a database that matching might have left: grid strips and oblique ones.
+"""A synthetic flight with known cameras, written as a database of matches: grid strips and oblique strips.
 
-The ground is rough (houses and trees stand on it), keypoints err, a fifth of each pair's verified matches are wrong and
-lie along the epipolar line, as wrong ones do that a check of two views lets through, and the focal length that the
-database states is off. Pairs are chosen by the line's own rules from positions that err.
+The ground is rough (with houses and trees), keypoints are noisy, and the stated focal length is wrong. A fifth of each
+pair's verified matches are outliers close to the epipolar line, like those that pass two-view verification. Pairs are
+chosen by the pipeline's own rules from noisy positions.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from splatpipe.pipeline.sfm.pairs import Layout, Pair, select_pairs
 WIDTH, HEIGHT, FOCAL_PX, RADIAL = 2000, 1500, 1500.0, -0.04
 FLYING_M = 60.0
 GSD_M = FLYING_M / FOCAL_PX
-ROUGH_M = 8.0  # the ground's heights, from the lowest to the highest
-FORWARD_M, SIDE_M = 15.0, 26.0  # between photos of a strip and between strips: three quarters and two thirds overlap
-OBLIQUE = 5  # every so many strips one looks to the side, 35° off the vertical
+ROUGH_M = 8.0  # range of the ground's heights
+FORWARD_M, SIDE_M = 15.0, 26.0  # between photos of a strip and between strips: 3/4 and 2/3 overlap
+OBLIQUE = 5  # every n-th strip looks to the side, 35° off the vertical
 OBLIQUE_DEG = 35.0
 LONGEST_TRACK = 12
-OBSERVATIONS = 1700  # a photo; what is at the rim has fewer
-DETECTED = 0.75  # of the points in a photo have a keypoint there
-MATCHED = 0.8  # of the keypoints that two photos share
+OBSERVATIONS = 1700  # per photo; fewer near the border
+DETECTED = 0.75  # share of the points in a photo that have a keypoint there
+MATCHED = 0.8  # share of the keypoints common to two photos
 NOISE_PX = 0.7
-WRONG = 0.2  # of the verified matches
-EPIPOLAR_PX = 4.0  # from the line, which COLMAP's check of two views lets pass
+WRONG = 0.2  # share of the verified matches
+EPIPOLAR_PX = 4.0  # distance from the epipolar line that COLMAP's two-view verification accepts
 FOCAL_OFF = 1.03
 POSITION_NOISE_M = 2.0
 LEAST_MATCHES = 15
@@ -39,15 +39,15 @@ LEAST_MATCHES = 15
 
 @dataclass(frozen=True)
 class SyntheticFlight:
-    """The truth; photo i has COLMAP's number i + 1.
+    """The true geometry; photo i is COLMAP's image i + 1.
 
     Attributes:
         centres_m: East, north, up.
         cam_from_enu: Rotations; camera x right, y down, z forward.
-        points_m: On the ground and on what stands there.
-        photo: Of each observation, photo after photo.
-        point: Of each observation.
-        places: Of each observation with its noise, pixels.
+        points_m: Points on the ground and on the objects that stand there.
+        photo: Photo of each observation, sorted by photo.
+        point: Point of each observation.
+        places: Noisy image position of each observation, pixels.
     """
 
     centres_m: Float64[np.ndarray, "n 3"]
@@ -58,19 +58,19 @@ class SyntheticFlight:
     places: Float64[np.ndarray, "m 2"]
 
     def rows(self, photo: int) -> slice:
-        """Its observations; keypoint k of a photo is the k-th of them."""
+        """Return the rows of a photo's observations; its keypoint k is the k-th of them."""
         first, last = np.searchsorted(self.photo, [photo, photo + 1])
         return slice(int(first), int(last))
 
 
 def lens(off: float = 1.0) -> pycolmap.Camera:
-    """The true camera; its focal length off by a factor and then without distortion, where one is given."""
+    """Return the true camera; with a factor other than 1, its focal length is scaled and its distortion dropped."""
     parameters = [FOCAL_PX * off, WIDTH / 2, HEIGHT / 2, RADIAL if off == 1.0 else 0.0]
     return pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=parameters)
 
 
 def make_flight(count: int, seed: int, observations: int = OBSERVATIONS) -> SyntheticFlight:
-    """Fly so many photos over ground without end, and see about so many points in each."""
+    """Fly ``count`` photos over unbounded ground, with about ``observations`` points in each."""
     rng = np.random.default_rng(seed)
     centres, rotations = _poses(count, rng)
     low, high = centres[:, :2].min(axis=0) - FLYING_M, centres[:, :2].max(axis=0) + FLYING_M
@@ -87,7 +87,7 @@ def make_flight(count: int, seed: int, observations: int = OBSERVATIONS) -> Synt
 
 
 def _poses(count: int, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3 3"]]:
-    """Strips to and fro over a square, with a drone's tremble."""
+    """Return poses of back-and-forth strips over a square, with a drone's jitter."""
     across = max(1, round(np.sqrt(count * FORWARD_M / SIDE_M)))
     along = -(-count // across)
     centres, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
@@ -115,7 +115,7 @@ def _tremble(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:
 
 
 def _heights(places: Float64[np.ndarray, "p 2"], rng: np.random.Generator) -> Float64[np.ndarray, " p"]:
-    """Rolling ground with boxes on it."""
+    """Return the heights of rolling ground with boxes on it."""
     rolling = np.sin(places[:, 0] / 37.0) * np.cos(places[:, 1] / 51.0)
     block = np.floor(places / 14.0).astype(np.int64)
     houses = rng.uniform(-1.0, 1.0, 4096)[(block[:, 0] * 61 + block[:, 1] * 17) % 4096]
@@ -128,20 +128,22 @@ def _see(
     rotation: Float64[np.ndarray, "3 3"],
     rng: np.random.Generator,
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
-    """Points that a photo shows, and where, with noise."""
+    """Return the points visible in a photo, and their noisy pixel positions."""
     near = np.flatnonzero((np.abs(points[:, :2] - centre[:2]) < 2.5 * FLYING_M).all(axis=1))
     local = (points[near] - centre) @ rotation.T
     near, local = near[local[:, 2] > 1.0], local[local[:, 2] > 1.0]
-    inside = (np.abs(local[:, :2] / local[:, 2:]) < 1.0).all(axis=1)  # far outside the polynomial turns back
+    inside = (np.abs(local[:, :2] / local[:, 2:]) < 1.0).all(
+        axis=1
+    )  # far outside, the distortion polynomial turns back
     near, local = near[inside], local[inside]
     places = np.asarray(lens().img_from_cam(local)) + rng.normal(0.0, NOISE_PX, (len(local), 2))
     shown = (places > 0.0).all(axis=1) & (places < [WIDTH, HEIGHT]).all(axis=1) & (rng.random(len(local)) < DETECTED)
-    order = rng.permutation(np.flatnonzero(shown))  # keypoints have no order that mapping could use
+    order = rng.permutation(np.flatnonzero(shown))  # the keypoints' order must not help mapping
     return near[order], places[order]
 
 
 def _capped(point: Int64[np.ndarray, " m"], rng: np.random.Generator) -> np.ndarray:
-    """(m,) whether an observation stays when no point has more than the longest track."""
+    """Return (m,) whether an observation is kept if tracks are limited to the longest length."""
     order = np.lexsort((rng.random(len(point)), point))
     counts = np.bincount(point)
     rank = np.arange(len(point)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -151,7 +153,7 @@ def _capped(point: Int64[np.ndarray, " m"], rng: np.random.Generator) -> np.ndar
 
 
 def choose_pairs(flight: SyntheticFlight, seed: int, neighbours: int = 20) -> list[Pair]:
-    """The line's own choice, from positions that err and angles of the gimbal."""
+    """Choose pairs by the pipeline's rules, from noisy positions and gimbal angles."""
     rng = np.random.default_rng(seed)
     count = len(flight.centres_m)
     centres = flight.centres_m + rng.normal(0.0, POSITION_NOISE_M, (count, 3))
@@ -171,7 +173,7 @@ def choose_pairs(flight: SyntheticFlight, seed: int, neighbours: int = 20) -> li
 def matches(
     flight: SyntheticFlight, pairs: list[Pair], seed: int
 ) -> Iterator[tuple[Pair, Int64[np.ndarray, "_ 2"], np.ndarray]]:
-    """Verified matches of the pairs that have enough, a fifth of them wrong, with the true fundamental matrix."""
+    """Yield verified matches of the pairs that have enough, a fifth of them wrong, with the true fundamental matrix."""
     rng = np.random.default_rng(seed)
     pinhole = lens().calibration_matrix()
     for i, j in pairs:
@@ -204,7 +206,7 @@ def _wrong(
     wanted: int,
     rng: np.random.Generator,
 ) -> Int64[np.ndarray, "_ 2"]:
-    """Matches of keypoints that have no true one, close to the epipolar line, each keypoint once."""
+    """Return wrong matches of keypoints without a true match, close to the epipolar line, each keypoint used once."""
     places = flight.places[rows[0]], flight.places[rows[1]]
     free = [np.delete(np.arange(len(places[side])), true[:, side]) for side in (0, 1)]
     tried = rng.permutation(free[0])[: 2 * wanted]
@@ -223,7 +225,7 @@ def _wrong(
 
 
 def write_database(flight: SyntheticFlight, path: Path, seed: int) -> int:
-    """Write what matching would leave; returns how many pairs have matches."""
+    """Write what matching would produce; return the number of pairs with matches."""
     prior = lens(FOCAL_OFF)
     prior.has_prior_focal_length = True
     pinhole = prior.calibration_matrix()

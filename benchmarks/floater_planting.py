@@ -1,4 +1,4 @@
-"""Floaters of known kinds in a trained model, planted between its cameras and what they see."""
+"""Plant floaters of known kinds into a trained model, between its cameras and the surfaces that they see."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from splatpipe.pipeline.raster.reference import project
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 KINDS = ("single", "cluster", "near a surface", "haze", "oversized")
-SHARES = (1.0, 1.0, 1.0, 0.5, 0.2)  # of each kind: what is large is rare
-CLUSTER = 40  # Gaussians
-NEAREST = 0.06  # of the depth: what is nearer to a camera is haze
-SIGMAS = 2.0  # that a floater's extent keeps from the surface
-SEEN_ALPHA = 8.0 / 255.0  # at its centre: what is fainter no photo shows
-DEPTH_MARGIN = 0.03  # of a depth: so near to the surface, a Gaussian is of it
-TOUCHING = 0.01  # of a depth: what is so near to it in two views is no floater
-CAMERAS = 24  # whose depths are rendered, spread over the capture
-FAR = 2.0  # times a picture's median depth: what is farther is not what it was taken for
-SURE_VIEWS = 2  # that see a Gaussian at its surface, for it to be of the building
+SHARES = (1.0, 1.0, 1.0, 0.5, 0.2)  # of each kind: large floaters are rare
+CLUSTER = 40  # Gaussians per cluster
+NEAREST = 0.06  # share of the depth: anything nearer to a camera is haze
+SIGMAS = 2.0  # clearance between a floater's extent and the surface
+SEEN_ALPHA = 8.0 / 255.0  # at its centre: fainter Gaussians are invisible in photos
+DEPTH_MARGIN = 0.03  # share of a depth: a Gaussian this close to the surface belongs to it
+TOUCHING = 0.01  # share of a depth: anything this close to the surface in two views is not a floater
+CAMERAS = 24  # number whose depths are rendered, spread over the capture
+FAR = 2.0  # times an image's median depth: farther surfaces are unreliable
+SURE_VIEWS = 2  # that must see a Gaussian at its surface for it to count as building
 LARGEST_DONOR = 0.9  # quantile of sizes: backgrounds have Gaussians as large as the scene
 
 Points = Float64[np.ndarray, "n 3"]
@@ -37,7 +37,7 @@ class FloaterView:
     """What a camera sees of a model.
 
     Attributes:
-        camera: At the size of ``depth``.
+        camera: Camera at the size of ``depth``.
         depth: Median depths; 0 where there is no surface.
     """
 
@@ -45,7 +45,7 @@ class FloaterView:
     depth: Depth
 
     def gaps(self, points: Points) -> Float64[np.ndarray, " n"]:
-        """How far the surface is behind each point as a share of its depth; NaN outside of the picture."""
+        """Return each point's distance to the surface behind it, as a share of its depth; NaN outside the image."""
         found = np.full(len(points), np.nan)
         rows, pixels, depths = self.camera.in_view(points)
         surface = self.depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
@@ -56,13 +56,13 @@ class FloaterView:
 
 @dataclass(frozen=True, eq=False)
 class FloaterScene:
-    """Floaters, and what they were planted into.
+    """Planted floaters and the model that contains them.
 
     Attributes:
-        model: All of the trained model, then the floaters.
-        kinds: Of the floaters, an index into ``KINDS``.
-        trained: How many Gaussians are the trained model's.
-        building: Which of those are of a surface that photos see.
+        model: The trained model, followed by the floaters.
+        kinds: Kind of each floater, an index into ``KINDS``.
+        trained: Number of Gaussians of the trained model.
+        building: Which of these belong to a surface that photos see.
     """
 
     model: Gaussians
@@ -72,7 +72,7 @@ class FloaterScene:
 
 
 def sights_of(model: Gaussians, cameras: Sequence[Camera], options: rasterizer.RenderOptions) -> list[FloaterView]:
-    """Depths of a model from some cameras, spread evenly."""
+    """Render depths of a model from some cameras, spread evenly."""
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(CAMERAS, len(cameras))).round().astype(int))
     found = []
     with torch.no_grad():
@@ -89,13 +89,13 @@ def plant(
     per_kind: int,
     generator: np.random.Generator,
 ) -> FloaterScene:
-    """Plant floaters of each kind, as many as are asked for or their share of that.
+    """Plant floaters of each kind: ``per_kind`` of them, or that kind's share of it.
 
-    Each lies on a ray of a random pixel of a random camera before the surface there, as far along it as is uniform in
-    the volume that the pixel sees (near a surface: 1.5 to 5 % of the depth before it; haze: 6 to 15 % from the camera),
-    and keeps clear of the surface by twice its size; and no two cameras see a surface just there. It is a copy of a
-    Gaussian of a surface, in a size of its kind, and as opaque as real ones. What none shows that sees it is planted
-    again elsewhere.
+    Each lies on the ray of a random pixel of a random camera, in front of the surface, uniformly distributed in the
+    volume that the pixel sees (near a surface: 1.5 to 5 % of the depth in front of it; haze: 6 to 15 % from the
+    camera). It keeps twice its size clear of the surface, and no two cameras may see a surface there. It is a copy of a
+    surface's Gaussian, with a size of its kind and a realistic opacity. A floater that is visible in no photo
+    is planted again elsewhere.
     """
     building = on_surfaces(model, sights)
     donors = _donors(model, building)
@@ -113,7 +113,7 @@ def plant(
 
 
 def on_surfaces(model: Gaussians, sights: Sequence[FloaterView]) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians lie where at least two cameras see a surface."""
+    """Return which Gaussians lie where at least two cameras see a surface."""
     opaque = torch.sigmoid(model.opacity_logits).numpy() > SEEN_ALPHA
     return np.asarray(_at_surfaces(model, sights, DEPTH_MARGIN) & opaque)
 
@@ -138,7 +138,7 @@ def _attempt(
     options: rasterizer.RenderOptions,
     generator: np.random.Generator,
 ) -> Gaussians:
-    """Some floaters of a kind before one camera; fewer, or none, where they would not do."""
+    """Create some floaters of a kind in front of one camera; fewer, or none, where they do not meet the conditions."""
     count = CLUSTER if KINDS[kind] == "cluster" else 8
     rows, columns = np.nonzero((sight.depth > 0.0) & (sight.depth < FAR * np.median(sight.depth[sight.depth > 0.0])))
     pick = generator.integers(len(rows), size=1 if KINDS[kind] == "cluster" else count)
@@ -161,7 +161,7 @@ def _attempt(
 
 
 def _share_of_way(kind: int, count: int, generator: np.random.Generator) -> Float64[np.ndarray, " n"]:
-    """Of the depth, from the camera."""
+    """Return the distance from the camera as a share of the depth."""
     if KINDS[kind] == "near a surface":
         return 1.0 - generator.uniform(0.015, 0.05, count)
     if KINDS[kind] == "haze":
@@ -172,13 +172,13 @@ def _share_of_way(kind: int, count: int, generator: np.random.Generator) -> Floa
 def _sizes(
     donor: Gaussians, kind: int, surface: Float64[np.ndarray, " n"], generator: np.random.Generator
 ) -> Float[torch.Tensor, "n 3"]:
-    """Logarithms of scales: the donor's, or of its shape and a size by the depth."""
+    """Return log scales: the donor's, or its shape with a size relative to the depth."""
     shares = {"haze": (0.004, 0.02), "oversized": (0.04, 0.12)}.get(KINDS[kind])
     if shares is None:
         return donor.log_scales.clone()
     wanted = np.log(generator.uniform(*shares, len(surface)) * surface)
     largest = donor.log_scales.max(dim=1, keepdim=True).values
-    shape = (donor.log_scales - largest).clamp(min=math.log(0.3))  # blobs: what is thin is no haze
+    shape = (donor.log_scales - largest).clamp(min=math.log(0.3))  # blobs: thin Gaussians are not haze
     return shape + torch.from_numpy(wanted).float()[:, None]
 
 
@@ -189,7 +189,7 @@ def _logits(kind: int, count: int, generator: np.random.Generator) -> Float[torc
 
 
 def _stands(found: Gaussians, sight: FloaterView, options: rasterizer.RenderOptions) -> Bool[np.ndarray, " n"]:
-    """Which are clear of the surface, before the camera, and to be seen."""
+    """Return which are clear of the surface, in front of the camera, and visible."""
     means = found.means.double().numpy()
     depth = sight.camera.depths(means)
     reach = SIGMAS * np.exp(found.log_scales.max(dim=1).values.double().numpy()) / np.maximum(depth, 1e-9)

@@ -1,4 +1,4 @@
-"""Fits the costs of forecasts to finished runs, and shows how far they are off runs that they were not fitted to.
+"""Fit the forecasts' costs to finished runs, and show the errors on runs that were left out of the fit.
 
 python benchmarks/forecast.py                       # the table of figures that is kept: fits, leaves one capture out
 python benchmarks/forecast.py --add OUT NAME PRESET # reads a finished run's manifests into that table
@@ -23,14 +23,14 @@ from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
 
 TABLE = Path(__file__).with_name("forecast.json")
-FITTED_TO = "preview"  # runs of other presets are told, not fitted to
+FITTED_TO = "preview"  # runs of other presets are reported, not fitted
 MEMORY_WITHIN = 0.3
 CPU_WITHIN = 1.5
 SHOWN = ("features", "matches", "sparse", "initialize", "train")
 
 
 def main() -> int:
-    """The exit code."""
+    """Run the command; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--add", nargs=3, metavar=("OUT", "NAME", "PRESET"))
     parser.add_argument("--costs", action="store_true")
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def told(costs: Costs) -> str:
-    """Costs as `stages/costs.py` has them, to three digits."""
+    """Format costs as in `stages/costs.py`, to three digits."""
     lines = [f"{name}: {getattr(costs, name):.3g}" for name in ("pairs", "gaussians", "flat")]
     lines.append(f"keypoints: { {name: round(count) for name, count in costs.keypoints.items()} }")
     for stage, of in costs.stages.items():
@@ -64,23 +64,23 @@ def told(costs: Costs) -> str:
 
 
 def configured(preset: str, differing: Mapping[str, Any] | None = None) -> LineConfig:
-    """A preset's options as they were when it was run: but for those that it has otherwise by now."""
+    """Return a preset's options as they were at the time of the run: current ones except for ``differing``."""
     return resolve(LineConfig, [load_preset(preset), differing or {}])
 
 
 def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[FinishedRun], list[FinishedRun]]:
-    """The runs of the preset that is fitted to, and the others."""
+    """Split the runs into those of the fitted preset and the others."""
     runs = [(row["preset"], FinishedRun.of_row(row, configured(row["preset"], row.get("set")))) for row in rows]
     return [run for preset, run in runs if preset == FITTED_TO], [run for preset, run in runs if preset != FITTED_TO]
 
 
 def holds(outcome: ForecastRatio) -> tuple[bool, bool]:
-    """Whether the whole run's peak memory and its CPU time were foretold well enough."""
+    """Whether the forecasts of the whole run's peak memory and CPU time were accurate enough."""
     return abs(outcome.memory - 1.0) <= MEMORY_WITHIN, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
 
 
 def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
-    """Print what came of it."""
+    """Print the outcomes."""
     table = []
     for outcome in outcomes:
         used = outcome.run.used.values()

@@ -1,4 +1,4 @@
-"""Costs of forecasts fitted to finished runs, and how well they tell a run that they were not fitted to."""
+"""Fit the forecasts' costs to finished runs, and measure how well they predict runs that were left out of the fit."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from splatpipe.stages.work import NEIGHBOURS, CaptureSize, CaptureWork, WorkUnit
 
 KINDS = ("cpu_seconds", "peak_memory_bytes", "disk_bytes")
 BY_GAUSSIANS = ("train", "clean", "evaluate", "export")
-"""Stages whose memory grows with Gaussians, of which runs at `preview` have too few to tell how: what one takes is
-counted in training (`train/limits.py`), and was seen on seneca's 325,000 in the stages after it."""
+"""Stages whose memory grows with the Gaussians, of which runs at `preview` have too few to show how: the memory per
+Gaussian is counted in training (`train/limits.py`), and was measured on seneca's 325,000 in the later stages."""
 
 SELDOM = ("control", "targets", "blocks")
-"""Stages that have nothing to do for most captures, so that nothing is fitted to them."""
+"""Stages that have nothing to do for most captures, so nothing is fitted to them."""
 
 BY_HAND = ("matches", "train")
-"""Stages whose memory is taken as it stands: matching runs in processes of its own; two of them took 346 to 388 MB on
-the demo, beside 250 of the stage's own. Training's is from before its frames were freed early; two runs since then say
-0.31 GB, but of few Gaussians, and limits of memory rest on it."""
+"""Stages whose memory is not fitted. Matching runs in its own processes; two of them took 346 to 388 MB on the demo,
+beside 250 of the stage itself. Training's value dates from before its frames were freed early; two runs since then say
+0.31 GB, but with few Gaussians, and memory limits rely on it."""
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A finished run, as its manifests tell it.
+    """A finished run, read from its manifests.
 
     Attributes:
-        name: Of the capture.
-        size: Of the capture.
+        name: Name of the capture.
+        size: Size of the capture.
         config: The options that it ran with.
-        threads: It was given.
-        counts: Keypoints of all photos, pairs, Gaussians at the end, iterations done.
-        used: ``KINDS`` by stage.
+        threads: Threads that it had.
+        counts: Keypoints of all photos, pairs, final Gaussians, iterations done.
+        used: Use of each of ``KINDS``, by stage.
     """
 
     name: str
@@ -52,7 +52,7 @@ class FinishedRun:
     used: Mapping[str, Mapping[str, float]]
 
     def as_row(self, preset: str) -> dict[str, Any]:
-        """For the table that is kept."""
+        """Return the row for the stored table."""
         return {
             "name": self.name,
             "preset": preset,
@@ -70,10 +70,10 @@ class FinishedRun:
 
 
 def read_run(out: Path, config: LineConfig, name: str) -> FinishedRun:
-    """A run from the newest manifest of each stage in its OUT.
+    """Read a run from the newest manifest of each stage in its OUT.
 
     Raises:
-        ValueError: if it did not begin with photos, or is not finished.
+        ValueError: if it did not start from photos, or is not finished.
     """
     manifests: dict[str, dict[str, Any]] = {}
     for path in out.glob("stages/*/manifest.json"):
@@ -105,9 +105,9 @@ def _used(manifest: Mapping[str, Any]) -> dict[str, float]:
 
 
 def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
-    """The costs that explain these runs: what scenes typically have, and what a unit of the work takes that they had.
+    """Fit the costs to these runs: typical properties of scenes, and the cost per unit of their work.
 
-    What these runs do not tell (of an extractor that none used, of a film) is taken from ``base``.
+    What these runs do not cover (an extractor that none used, a flythrough) is taken from ``base``.
     """
     scenes = [scene_of(run, base) for run in runs]
     works = [CaptureWork.of(run.size, run.config, scene, run.threads) for run, scene in zip(runs, scenes, strict=True)]
@@ -141,7 +141,7 @@ def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
 
 
 def scene_of(run: FinishedRun, base: Costs) -> Costs:
-    """Costs with what this run's scene had, which is known afterwards only: the units of its work come out as done."""
+    """Replace typical scene properties by this run's, known only afterwards, so that its units of work are exact."""
     bare = CaptureWork.of(run.size, run.config, replace(base, gaussians=1.0), run.threads)
     options, counts = run.config, run.counts
     keypoints = {
@@ -166,12 +166,12 @@ def _every(run: FinishedRun) -> float:
 
 
 def _typical(values: Sequence[float], otherwise: float) -> float:
-    """Geometric mean: as often too high as too low by the same factor."""
+    """Return the geometric mean: as often too high as too low by the same factor."""
     return math.exp(sum(math.log(value) for value in values) / len(values)) if values else otherwise
 
 
 def _line(those: Sequence[tuple[Mapping[str, float], WorkUnits]], slope: float | None = None) -> tuple[float, float]:
-    """A stage's memory: what is there whatever the size, and a unit's; neither below zero (relative least squares)."""
+    """Fit a stage's memory: a constant and a cost per unit, neither negative (relative least squares)."""
     units = np.array([of.memory for _, of in those])
     used = np.array([found["peak_memory_bytes"] for found, _ in those])
     if slope is not None:
@@ -184,14 +184,14 @@ def _line(those: Sequence[tuple[Mapping[str, float], WorkUnits]], slope: float |
 
 @dataclass(frozen=True)
 class ForecastRatio:
-    """A run beside its forecast: forecast over used.
+    """A run beside its forecast: forecast over actual use.
 
     Attributes:
-        run: What was used.
-        memory: Of the whole run's peak.
-        cpu: Of the whole run.
-        disk: Of all that is left.
-        stages: Of the CPU time of single stages.
+        run: The run.
+        memory: Ratio of the whole run's peak.
+        cpu: Ratio of the whole run's CPU time.
+        disk: Ratio of all remaining output.
+        stages: Ratios of the CPU time of single stages.
     """
 
     run: FinishedRun
@@ -202,7 +202,7 @@ class ForecastRatio:
 
 
 def compared(run: FinishedRun, costs: Costs) -> ForecastRatio:
-    """What the costs tell of a run, over what it used."""
+    """Return the ratios of a run's forecast by these costs to its actual use."""
     needs = forecast(run.size, run.config, run.threads, costs=costs)
     used = run.used
 
@@ -219,5 +219,5 @@ def compared(run: FinishedRun, costs: Costs) -> ForecastRatio:
 
 
 def left_out(runs: Sequence[FinishedRun]) -> list[ForecastRatio]:
-    """Each run against costs fitted to the other captures."""
+    """Compare each run with costs fitted to the other captures."""
     return [compared(run, fit([other for other in runs if other.name != run.name])) for run in runs]

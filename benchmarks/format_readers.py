@@ -1,8 +1,8 @@
-"""Our files read by others' programs: ``format_readers.py OUT``, a line a check.
+"""Read our files with third-party programs: ``format_readers.py OUT``, one line per check.
 
-Splat files are written anew of the run's splat; COLMAP's folder and LAZ are those of ``splatpipe export OUT --format
-colmap,laz``. Readers: splat-transform, gltf-validator, three and spark in headless Chromium, pycolmap, laspy, pyproj
-(CesiumJS: `cesium_tiles.py`). Before, once: npm ci --prefix benchmarks/readers.
+Splat files are written afresh from the run's splat; COLMAP's folder and LAZ are those of ``splatpipe export OUT
+--format colmap,laz``. Readers: splat-transform, gltf-validator, three and spark in headless Chromium, pycolmap, laspy,
+pyproj (CesiumJS: `cesium_tiles.py`). Set up once: npm ci --prefix benchmarks/readers.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
 from splatpipe.pipeline.splat.ply import write_splat
 
-SAME_DB = 0.1  # below what our own reader makes of the file
-SURE_DB = 100.0  # beyond, it is rounding that differs
-LIKE_OURS_DB = 30.0  # spark draws in another way
-WORSE_DB = 0.5  # than what the format loses and what spark draws otherwise of the PLY together
+SAME_DB = 0.1  # below the result of our own reader
+SURE_DB = 100.0  # above this, differences are rounding
+LIKE_OURS_DB = 30.0  # spark renders differently
+WORSE_DB = 0.5  # than the format's loss and spark's difference on the PLY together
 ACCESSORS = 1e-5
-PIXELS = 200_000  # of a picture in the browser
+PIXELS = 200_000  # of an image in the browser
 EXPECTED = "MESH_PRIMITIVE_INVALID_ATTRIBUTE"  # gltf-validator does not know the extension's names
 
 COLUMNS = {"reader": "reader:", "of": "format:", "what": "what:", "figure": "figure:", "bars": "bars:"}
@@ -40,13 +40,13 @@ COLUMNS = {"reader": "reader:", "of": "format:", "what": "what:", "figure": "fig
 
 @dataclass(frozen=True)
 class Bench:
-    """What checks need.
+    """Common inputs of the checks.
 
     Attributes:
         capture: The run.
         out: Its OUT.
-        folder: For files.
-        others: Programs.
+        folder: Folder for files.
+        others: Third-party programs.
     """
 
     capture: CaptureRun
@@ -55,18 +55,18 @@ class Bench:
     others: OtherPrograms
 
     def file(self, kind: SplatFormat) -> Path:
-        """The run's splat in a format; written once."""
+        """Return the run's splat in a format, written once."""
         path = self.folder / self.capture.name / kind.file
         return path if path.exists() else written(self.capture.scene, kind, self.folder / self.capture.name)
 
 
 def line(reader: str, name: str, what: str, figure: str, met: bool) -> Row:
-    """A row of the table."""
+    """Return a row of the table."""
     return {"reader": reader, "format": name, "what": what, "figure": figure, "bars": "met" if met else "missed"}
 
 
 def check_splat_transform(bench: Bench) -> Iterator[Row]:
-    """Each format that it reads: how many, and whether they look as our own reader has them."""
+    """Check each format that splat-transform reads: the count, and whether it looks as by our own reader."""
     capture = bench.capture
     originals = capture.pictures(capture.scene)
     for kind in SPLAT_FORMATS:
@@ -84,7 +84,7 @@ def check_splat_transform(bench: Bench) -> Iterator[Row]:
 
 
 def check_streamed_sog(bench: Bench) -> Iterator[Row]:
-    """Streamed SOG of `splatpipe export`: each file of the first level is a SOG, and together they are the splat."""
+    """Check streamed SOG of `splatpipe export`: each file of the first level is a SOG; together they are the splat."""
     path = bench.out / "export/streamed-sog/lod-meta.json"
     if not path.is_file():
         yield line("splat-transform", "streamed-sog", "is there", "splatpipe export OUT --format streamed-sog", False)
@@ -98,7 +98,7 @@ def check_streamed_sog(bench: Bench) -> Iterator[Row]:
 
 
 def check_validator(bench: Bench) -> Iterator[Row]:
-    """gltf-validator: no error but that it does not know the extension's attributes."""
+    """Run gltf-validator: the only errors allowed are unknown attributes of the extension."""
     path = bench.file(format_named("glb"))
     ended = bench.others.run(READERS / "validate.mjs", path.resolve())
     messages = json.loads(ended.said)["messages"]
@@ -115,7 +115,7 @@ def _is_expected(message: dict[str, str]) -> bool:
 
 
 def check_accessors(bench: Bench) -> Iterator[Row]:
-    """Our GLB's accessors beside those of splat-transform's."""
+    """Compare our GLB's accessors with those of splat-transform's."""
     source = bench.folder / "theirs_from.ply"
     write_splat(source, bench.capture.scene.turned(THEIR_AXES).gaussians)
     theirs, _ = bench.others.write("glb", source, bench.folder)
@@ -134,7 +134,7 @@ def check_accessors(bench: Bench) -> Iterator[Row]:
 
 
 def check_spark(bench: Bench) -> Iterator[Row]:
-    """Pictures of spark, of GLB by three's loader, beside our rasterizer's."""
+    """Compare spark's images (GLB by three's loader) with our rasterizer's."""
     scene, camera = bench.capture.scene, bench.capture.cameras[0]
     shrink = math.sqrt(min(1.0, PIXELS / (camera.width * camera.height)))
     camera = camera.scaled(round(camera.width * shrink), round(camera.height * shrink))
@@ -164,7 +164,7 @@ def check_spark(bench: Bench) -> Iterator[Row]:
 
 
 def check_exports(bench: Bench) -> Iterator[Row]:
-    """pycolmap and laspy, of what `splatpipe export` made."""
+    """Read with pycolmap and laspy what `splatpipe export` wrote."""
     for reader, name, what, figure, met in (*check_colmap(bench.out), *check_laz(bench.out, bench.capture.scene)):
         yield line(reader, name, what, figure, met)
 
@@ -180,7 +180,7 @@ CHECKS: dict[str, Callable[[Bench], Iterator[Row]]] = {
 
 
 def run_checks(bench: Bench, names: Sequence[str]) -> list[Row]:
-    """All rows; a check that cannot be made is a row, too."""
+    """Return all rows; a check that cannot be run is a row, too."""
     rows = []
     for name in names:
         try:

@@ -1,9 +1,8 @@
-"""Times and sizes of every format for a million Gaussians: ``format_speed.py OUT [--count 1000000]``.
+"""Measure times and sizes of every format for a million Gaussians: ``format_speed.py OUT [--count 1000000]``.
 
-The run's splat is laid side by side with small differences until it is so large. Each format is written, and read, in
-a process of its own: CPU seconds of all its threads, and its peak of memory over what it had before; beside
-splat-transform where it writes the format. Asked: written in 5 s, SOG in 120; 5 % larger at most; SOG a fifteenth of
-the PLY.
+The run's splat is tiled with small differences up to that count. Each format is written, and read, in a process of its
+own: CPU seconds of all its threads, and the rise of its peak memory; beside splat-transform where that writes the
+format. Required: written in 5 s, SOG in 120; at most 5 % larger; SOG a fifteenth of the PLY.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ COLUMNS = {
 
 
 def laid_out(scene: Scene, count: int) -> Scene:
-    """A splat of so many Gaussians: copies of one side by side, each with its own small differences."""
+    """Return a splat of ``count`` Gaussians: copies of one side by side, each with its own small differences."""
     found, generator = scene.gaussians, torch.Generator().manual_seed(SEED)
     copies = -(-count // len(found))
     low, high = (torch.quantile(found.means[:: max(1, len(found) // 100_000)], q, dim=0) for q in (0.02, 0.98))
@@ -77,7 +76,7 @@ def laid_out(scene: Scene, count: int) -> Scene:
 
 
 def measured(kind: SplatFormat, source: Path, folder: Path, what: str) -> Row:
-    """What a process that writes (or reads what it wrote) took."""
+    """Return what a process that writes (or reads back) a file took."""
     command = [sys.executable, __file__, str(source), "--task", what, "--formats", kind.name, "--work", str(folder)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode:
@@ -87,7 +86,7 @@ def measured(kind: SplatFormat, source: Path, folder: Path, what: str) -> Row:
 
 
 def do_task(what: str, kind: SplatFormat, source: Path, folder: Path) -> None:
-    """Write, or read, in this process; a line of JSON."""
+    """Write or read in this process, and print a line of JSON."""
     scene = read_scene(source) if what == "written" else None
     before = _used()
     path = folder / kind.file
@@ -100,14 +99,14 @@ def do_task(what: str, kind: SplatFormat, source: Path, folder: Path) -> None:
 
 
 def _used() -> tuple[float, int]:
-    """CPU seconds and peak memory of this process, and of what it started and waited for."""
+    """Return CPU seconds and peak memory of this process and its finished children."""
     own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
     return seconds, 1024 * (own.ru_maxrss + children.ru_maxrss)
 
 
 def row_of(kind: SplatFormat, source: Path, folder: Path, theirs: tuple[int, ProgramEnd] | None) -> Row:
-    """A format's row."""
+    """Return a format's row."""
     wrote = measured(kind, source, folder, "written")
     row: Row = {"format": kind.name, "bytes": wrote["size"], "write_s": wrote["cpu_s"], "write_bytes": wrote["bytes"]}
     row["shrunk"] = source.stat().st_size / row["bytes"]
@@ -127,7 +126,7 @@ def row_of(kind: SplatFormat, source: Path, folder: Path, theirs: tuple[int, Pro
 
 
 def theirs_of(kind: SplatFormat, scene: Scene, folder: Path, others: OtherPrograms) -> tuple[int, ProgramEnd]:
-    """The size of splat-transform's file of a splat, and what it took."""
+    """Return the size of splat-transform's file of a splat, and what writing it took."""
     source = folder / "theirs_from.ply"
     write_splat(source, scene.turned(THEIR_AXES).gaussians)
     path, ended = others.write(kind.name, source, folder)

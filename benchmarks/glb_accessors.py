@@ -1,4 +1,4 @@
-"""A binary glTF of splats, read as the specification says and by nothing of ours; two of them compared."""
+"""Read a binary glTF of splats from its specification, without our own reader, and compare two of them."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class SplatGlb:
     """One primitive.
 
     Attributes:
-        document: The JSON.
-        primitive: Of the only mesh.
-        attributes: By name, a row a splat; integers that stand for 0..1 as such.
+        document: The JSON document.
+        primitive: The primitive of the only mesh.
+        attributes: Attributes by name, a row per splat; integers that represent 0..1 are converted.
     """
 
     document: dict[str, Any]
@@ -38,7 +38,7 @@ class SplatGlb:
 
 
 def read_glb(path: Path) -> SplatGlb:
-    """Read a file that holds one primitive, of our own or of splat-transform."""
+    """Read a file that contains one primitive, by us or by splat-transform."""
     data = path.read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
     document, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -59,9 +59,9 @@ def _values(document: dict[str, Any], binary: bytes, index: int) -> npt.NDArray[
 
 
 def largest_differences(ours: SplatGlb, theirs: SplatGlb) -> dict[str, float]:
-    """By attribute, between two files of the same splat in the same order, the other one turned to our heading.
+    """Return the largest difference per attribute between two files of one splat in the same order, headings aligned.
 
-    Relative where a value is larger than 1; quaternions up to their sign.
+    Relative where a value exceeds 1; quaternions up to their sign.
     """
     turned = _turned(theirs.attributes, HALF_TURN)
     found = {}
@@ -79,7 +79,9 @@ def _turned(
     found = dict(attributes)
     found["POSITION"] = attributes["POSITION"] @ turn.T
     x, y, z, w = attributes[f"{PREFIX}ROTATION"].T
-    found[f"{PREFIX}ROTATION"] = np.stack([z, w, -x, -y], axis=1)  # (0, 1, 0, 0) times it: half a turn about y
+    found[f"{PREFIX}ROTATION"] = np.stack(
+        [z, w, -x, -y], axis=1
+    )  # (0, 1, 0, 0) times the quaternion: half a turn about y
     names = [f"{PREFIX}SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)]
     names = [name for name in names if name in attributes]
     sh = torch.from_numpy(np.stack([attributes[name] for name in names], axis=1))

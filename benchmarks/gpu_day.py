@@ -1,12 +1,12 @@
-"""What is to be shown on an NVIDIA GPU, in two calls of less than ten minutes on a bare machine; see docs/cuda.md.
+"""Prove and measure everything on an NVIDIA GPU in two calls of under ten minutes on a bare machine; see docs/cuda.md.
 
 Where the line runs:     ``gpu_day.py prepare --data ../shared/data``    packs captures and wheels into .gpu_day
 Where the GPU is:        ``gpu_day.py prove --out FOLDER``               builds, tests, agreement, sanitizer, trainings
                          ``gpu_day.py measure --out FOLDER``             speed, memory, peers
 
-The machine with the GPU needs torch, nvcc, CMake, ninja and nanobind, and no network. Everything is done piece by
-piece: what fails is told, and the rest goes on. All figures go to FOLDER/prove.json and FOLDER/measure.json; a table is
-printed last.
+The machine with the GPU needs torch, nvcc, CMake, ninja and nanobind, but no network. The work is split into parts:
+failures are reported, and the remaining parts still run. All figures go to FOLDER/prove.json and FOLDER/measure.json; a
+table is printed at the end.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ ROOT = Path(__file__).resolve().parents[1]
 NATIVE = ROOT / "pipeline" / "raster" / "native"
 ROOM = ROOT / "pipeline" / "raster"
 SCRATCH = Path(tempfile.gettempdir()) / "splatpipe-gpu-day"
-SECONDS = 540.0  # of a call's 600: the start, the transfers and the table take some
+SECONDS = 540.0  # of the 600 of a call: startup, transfers and the table take the rest
 SEEDS = (0, 1, 2)
 TRAININGS = ("sceaux", "ochota")
 TOOLS = ("memcheck", "racecheck", "synccheck")
 COUNTS = (100_000, 1_000_000, 5_000_000)
 
 
-LINES = ("demo-standard", "ochota-standard")  # with `high` the pack is too large to travel
+LINES = ("demo-standard", "ochota-standard")  # with `high` the pack is too large to transfer
 
 
 def proofs(iterations: int) -> list[GpuPart]:
-    """What has to be right; trainings on the CPU run beside the rest, two threads each."""
+    """Return the correctness checks; trainings on the CPU run alongside, two threads each."""
     trainings = [{"capture": name, "seed": seed, "iterations": iterations} for name in TRAININGS for seed in SEEDS]
     return [
         *(
@@ -65,7 +65,7 @@ def proofs(iterations: int) -> list[GpuPart]:
 
 
 def measures() -> list[GpuPart]:
-    """What is to be fast and small, the most telling first; the peer is compiled beside it."""
+    """Return the measurements of speed and memory, the most informative first; the peer is compiled alongside."""
     return [
         GpuPart("peers compiled", "gpu_peers:compiled", {}, 400, beside=True),
         GpuPart("the card", "gpu_speed:card", {}, 30),
@@ -82,7 +82,7 @@ def measures() -> list[GpuPart]:
 
 
 def environment(pack: Path) -> dict[str, str]:
-    """Of the parts: splatpipe by links to its sources, the wheels that were carried, the compiled peers."""
+    """Return the parts' environment: splatpipe by links to its sources, the carried wheels, the compiled peers."""
     links = SCRATCH / "links"
     (links / "splatpipe").mkdir(parents=True, exist_ok=True)
     for room in ("pipeline", "stages", "configs", "demo"):
@@ -105,7 +105,7 @@ def environment(pack: Path) -> dict[str, str]:
 
 
 def build() -> PartOutcome:
-    """Both libraries, beside their Python: what the CPU does, and CUDA for the device that is there."""
+    """Build both libraries beside their Python modules: the CPU's, and CUDA's for the device present."""
     began, said = time.monotonic(), []
     folder = SCRATCH / "build"
     ask = [sys.executable, "-m", "nanobind", "--cmake_dir"]
@@ -129,7 +129,7 @@ def build() -> PartOutcome:
 
 
 def machine() -> Row:
-    """What all this was measured on."""
+    """Describe the machine that the figures were measured on."""
     ask = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total,clocks.sm,clocks.mem", "--format=csv,noheader"]
     told = subprocess.run(ask, capture_output=True, text=True, check=False).stdout if shutil.which(ask[0]) else ""
     commit = ""

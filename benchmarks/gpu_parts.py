@@ -1,7 +1,7 @@
-"""Parts of a day with a GPU: each in a process of its own, within its time, and none ends the others.
+"""Run the parts of a GPU session: each in its own process with a time limit, none able to end the others.
 
-A part is a generator function of a module beside this one; every row that it yields is kept at once, so that a part
-that fails, hangs or runs out of time leaves what it had.
+A part is a generator function of a module in this folder. Every row that it yields is saved at once, so a part that
+fails, hangs or runs out of time keeps its earlier rows.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from typing import Any
 
 Row = dict[str, Any]
 
-LEAST_S = 10.0  # a part that has less left is not begun: to load torch takes half of that
-LONGEST_ERROR = 1200  # characters of what a failed part said last
-GRACE_S = 3.0  # from the polite signal to the other one
+LEAST_S = 10.0  # a part with less time left is not started: loading torch takes half of it
+LONGEST_ERROR = 1200  # characters of a failed part's last output
+GRACE_S = 3.0  # from SIGTERM to SIGKILL
 
 
 @dataclass(frozen=True)
 class GpuPart:
-    """Something to be proven or measured.
+    """Something to be checked or measured.
 
     Attributes:
-        name: For people.
+        name: Name to display.
         entry: ``module:function``; the function takes the arguments and yields rows.
-        arguments: Its keyword arguments, as JSON has them.
-        limit_s: It is ended after that.
-        beside: It runs beside the parts after it, on the CPU.
+        arguments: Keyword arguments, JSON-serializable.
+        limit_s: Time limit; the part is terminated after it.
+        beside: Run it on the CPU alongside the parts after it.
     """
 
     name: str
@@ -47,14 +47,14 @@ class GpuPart:
 
 @dataclass
 class PartOutcome:
-    """What became of a part.
+    """Result of a part.
 
     Attributes:
-        name: The part's.
-        state: done, failed, late (ended at its limit), or not begun.
-        seconds: That it took.
-        rows: What it yielded.
-        error: What it said last, where it did not end well.
+        name: The part's name.
+        state: done, failed, late (terminated at its limit), or not begun.
+        seconds: Its duration.
+        rows: The rows that it yielded.
+        error: Its last output, if it did not succeed.
     """
 
     name: str
@@ -78,7 +78,7 @@ class PartProcess:
             self._process = subprocess.Popen(words, stdout=log, stderr=log, env=environment, start_new_session=True)
 
     def end(self, deadline: float) -> PartOutcome:
-        """Wait until it has ended or its time is over."""
+        """Wait until it has ended or its time is up."""
         limit = min(deadline, self._began + self.part.limit_s)
         state = "late"
         try:
@@ -91,7 +91,7 @@ class PartProcess:
         return PartOutcome(self.part.name, state, round(time.monotonic() - self._began, 1), rows, error)
 
     def _stop(self) -> None:
-        """It and all that it started, politely and then for certain."""
+        """Terminate the process and everything it started, first politely, then by force."""
         for number in (signal.SIGTERM, signal.SIGKILL):
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, number)
@@ -102,13 +102,13 @@ class PartProcess:
 def run_parts(
     parts: Sequence[GpuPart], folder: Path, environment: dict[str, str], deadline: float
 ) -> Iterator[list[PartOutcome]]:
-    """Run parts in their order, those ``beside`` beside the others.
+    """Run parts in order, those marked ``beside`` alongside the others.
 
     Args:
-        parts: What is to be done, the most important first.
-        folder: For rows and logs.
-        environment: Of their processes.
-        deadline: By ``time.monotonic()``; nothing runs on after it.
+        parts: The parts, the most important first.
+        folder: Folder for rows and logs.
+        environment: Environment of their processes.
+        deadline: By ``time.monotonic()``; nothing runs past it.
 
     Yields:
         All outcomes so far, after each part.
@@ -137,7 +137,7 @@ def run_parts(
 
 
 def print_outcome(outcome: PartOutcome) -> None:
-    """A part's rows, one a line."""
+    """Print a part's rows, one per line."""
     print(f"-- {outcome.name}: {outcome.state}, {outcome.seconds:.1f} s", flush=True)
     for row in outcome.rows:
         print("   " + "  ".join(f"{key} {_shown(value)}" for key, value in row.items()), flush=True)
@@ -150,7 +150,7 @@ def _shown(value: Any) -> str:
 
 
 def main(entry: str, arguments: str, rows: str) -> None:
-    """One part: what its function yields, a row a line."""
+    """Run one part and write the rows that its function yields, one per line."""
     module, _, function = entry.partition(":")
     with Path(rows).open("w", encoding="utf-8", buffering=1) as file:
         for row in getattr(importlib.import_module(module), function)(**json.loads(arguments)):

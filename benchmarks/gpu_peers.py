@@ -1,7 +1,7 @@
-"""Parts of ``gpu_day.py measure``: gsplat on the same Gaussians and cameras, where it compiles.
+"""Parts of ``gpu_day.py measure``: gsplat on the same Gaussians and cameras, if it compiles.
 
-gsplat 1.5.3 as its own trainer calls it: ``packed=False``, SelectiveAdam, and fused-ssim where that was carried and
-compiles; else SSIM by torch's convolutions, and the row says so.
+gsplat 1.5.3 as its own trainer calls it: ``packed=False``, SelectiveAdam, and fused-ssim if it was carried and
+compiles; otherwise SSIM by torch's convolutions, which the row states.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TARGET = Path(tempfile.gettempdir()) / "splatpipe-gpu-day" / "peers"
 
 
 def compiled() -> Iterator[Row]:
-    """Compile what was carried: gsplat does it itself when it is first used.
+    """Compile what was carried: gsplat compiles itself on first use.
 
     Raises:
         SystemExit: if gsplat does not compile.
@@ -56,7 +56,7 @@ def _install(source: Path) -> str:
 
 
 def speed(count: int, megapixels: float = MEGAPIXELS) -> Iterator[Row]:
-    """Whole iterations and the rasterizer alone, as ``gpu_speed.speed`` has them of ours."""
+    """Time whole iterations and the rasterizer alone, as ``gpu_speed.speed`` does for ours."""
     where = torch.device("cuda")
     rasterization = importlib.import_module("gsplat").rasterization
     given = _parameters(count, where)
@@ -138,7 +138,7 @@ def _ssim() -> tuple[Callable[[Tensor, Tensor], Tensor], str]:
 
 
 def torch_ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean SSIM of (1, 3, h, w) pictures, by separable convolutions."""
+    """Return the mean SSIM of (1, 3, h, w) images, by separable convolutions."""
     places = torch.arange(WINDOW, device=a.device) - WINDOW // 2
     weights = torch.exp(-(places**2) / (2 * SIGMA**2))
     weights = (weights / weights.sum()).repeat(3, 1, 1, 1)

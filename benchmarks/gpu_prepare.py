@@ -1,4 +1,4 @@
-"""What a day with a GPU needs from a machine with the whole line: packed captures, and wheels that the other lacks."""
+"""Prepare a GPU session on a machine with the whole pipeline: pack captures, and wheels that the other one lacks."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from splatpipe.pipeline.photos.options import SplitConfig
 from splatpipe.stages.line import INITIALIZE, LINE
 
 ROOT = Path(__file__).resolve().parents[1]
-PROVED = ("sceaux", "ochota")  # the captures that `prove` trains on; `measure` takes the others
+PROVED = ("sceaux", "ochota")  # captures that `prove` trains on; `measure` uses the others
 BENCHES = {  # name: dataset, its points, megapixels
     "sceaux": ("bench_sceaux", "sparse", 0.4),
     "ochota": ("bench_ochota", "sparse", 0.4),
     "speed": ("bench_sceaux", "sparse", 1.6),
 }
-LINES = {"demo": None, "ochota": "ochota/photos"}  # run up to initialize; None: the capture that ships
-QUALITY = 90  # of the JPEGs that travel: a third of what PNG takes, and both devices train on the same
+LINES = {"demo": None, "ochota": "ochota/photos"}  # run up to initialize; None: the bundled demo capture
+QUALITY = 90  # of the transferred JPEGs: a third of PNG's size, and both devices train on the same
 MEBIBYTE = 1 << 20
-MOST_MEBIBYTES = 64  # that the tree and what it carries may have
-WHEELS = ("pydantic", "pydantic-core", "annotated-types", "typing-inspection", "beartype")  # which that machine lacks
+MOST_MEBIBYTES = 64  # limit for the tree and everything carried
+WHEELS = ("pydantic", "pydantic-core", "annotated-types", "typing-inspection", "beartype")  # missing on that machine
 PEERS = ("gsplat==1.5.3",)
 PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014", "manylinux1")
 
@@ -40,9 +40,9 @@ def main(data: Path, pack: Path, lines: list[str], peers: list[Path]) -> None:
 
     Args:
         data: The folder of real captures.
-        pack: A folder that git ignores, to be carried.
-        lines: Which runs of the line are packed, as ``demo-standard``.
-        peers: Folders with the sources of peers, each with a ``setup.py``.
+        pack: A git-ignored folder, to be carried.
+        lines: Runs of the pipeline to pack, as ``demo-standard``.
+        peers: Folders with the peers' sources, each with a ``setup.py``.
     """
     captures = pack / "captures"
     for name, (dataset, points, megapixels) in BENCHES.items():
@@ -61,7 +61,7 @@ def main(data: Path, pack: Path, lines: list[str], peers: list[Path]) -> None:
 
 
 def pack_bench(dataset: Path, points: str, megapixels: float, target: Path) -> None:
-    """A dataset that is undistorted already, in another size, every eighth photo held out as the line does."""
+    """Pack an undistorted dataset at another size, with every eighth photo held out as the pipeline does."""
     names = [path.name for path in sorted((dataset / IMAGES).iterdir())]
     split = split_views(names, SplitConfig().every, "")
     with tempfile.TemporaryDirectory() as scratch:
@@ -76,7 +76,7 @@ def pack_bench(dataset: Path, points: str, megapixels: float, target: Path) -> N
 
 
 def pack_line(photos: Path | None, preset: str, target: Path) -> None:
-    """A run of the line up to where training begins."""
+    """Pack a run of the pipeline up to the start of training."""
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "out"
         command = [
@@ -96,7 +96,7 @@ def pack_line(photos: Path | None, preset: str, target: Path) -> None:
 
 
 def copy_parts(parts: dict[str, Path], target: Path) -> None:
-    """Parts under the line's names; photos as JPEG, under whatever name they have: readers look at the content."""
+    """Copy parts under the pipeline's names; photos become JPEG whatever their names say: readers go by content."""
     scratch = target.with_name(f"{target.name}.new")
     shutil.rmtree(scratch, ignore_errors=True)
     for name in PARTS:
@@ -111,13 +111,13 @@ def copy_parts(parts: dict[str, Path], target: Path) -> None:
         picture = cv2.imread(str(photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         if len(data) < photo.stat().st_size:
-            photo.unlink()  # not overwritten: it may be a link of the store's
+            photo.unlink()  # not overwritten: it may be a link into the store
             photo.write_bytes(data.tobytes())
     scratch.rename(target)
 
 
 def fetch_wheels(folder: Path) -> None:
-    """For Python 3.12 on the machine with the GPU: our versions, and gsplat, which compiles itself there."""
+    """Fetch wheels for Python 3.12 on the GPU machine: our versions, and gsplat, which compiles itself there."""
     wanted = [f"{name}=={version(name)}" for name in WHEELS]
     platforms = [word for name in PLATFORMS for word in ("--platform", f"{name}_x86_64")]
     for one in (*wanted, *PEERS):
@@ -131,10 +131,10 @@ def fetch_wheels(folder: Path) -> None:
 
 
 def tell_size(pack: Path) -> None:
-    """What each call carries, beside the tree, of what may travel.
+    """Report what each call carries beside the tree, and the limit.
 
     Raises:
-        SystemExit: if that is too much.
+        SystemExit: if it is too much.
     """
     listed = subprocess.run(["git", "ls-files", "-z"], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     tree = sum((ROOT / name).stat().st_size for name in listed.split("\0") if name and (ROOT / name).is_file())

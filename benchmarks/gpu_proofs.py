@@ -1,4 +1,4 @@
-"""Parts of ``gpu_day.py prove``: what has to be right on a GPU."""
+"""Parts of ``gpu_day.py prove``: correctness checks on a GPU."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ from splatpipe.stages import evaluate
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = tuple(f"tests/test_cuda_{what}.py" for what in ("device", "iterations", "sky", "trainer"))
 LEAST_DB = 60.0  # between the CPU's render and the device's
-MOST_RELATIVE = 1e-3  # difference of a gradient, of its norm
+MOST_RELATIVE = 1e-3  # difference of a gradient, relative to its norm
 SHORT = 300  # iterations after which a model counts as trained
 SSIM_WEIGHT = 0.2
-THREADS = 2  # of a training on the CPU: several run beside each other
-SMALL, SMALL_MP = 3000, 0.02  # Gaussians and size of what the sanitizer looks at: its tools take a hundredfold
+THREADS = 2  # of a training on the CPU: several run concurrently
+SMALL, SMALL_MP = 3000, 0.02  # Gaussians and image size under the sanitizer, whose tools slow it down a hundredfold
 SUMMARIES = re.compile(r"(?:ERROR|RACECHECK) SUMMARY: (\d+)")
 
 
 class SilentReporter:
-    """A stage's Reporter that tells nothing."""
+    """A stage's Reporter that discards everything."""
 
     def progress(self, done: float, total: float, what: str, unit: str = "") -> None: ...
     def metric(self, name: str, value: float, step: int | None = None) -> None: ...
@@ -57,17 +57,17 @@ class SilentReporter:
 
 
 def train_capture(capture: str, on: str, out: Path, *, start: Path | None = None, **options: object) -> tuple[Row, Row]:
-    """Train and evaluate a packed capture, as the line does.
+    """Train and evaluate a packed capture, as the pipeline does.
 
     Args:
-        capture: A packed one.
+        capture: Name of the packed capture.
         on: The device.
-        out: For what both leave.
-        start: The Gaussians to start with; None for the capture's.
-        **options: Of training.
+        out: Folder for the output of both.
+        start: The initial Gaussians; None for the capture's.
+        **options: Training options.
 
     Returns:
-        What training said, and what `evaluate` said.
+        The facts that training reports, and those that `evaluate` reports.
     """
     given = gpu_scenes.inputs(capture, on, THREADS if on == "cpu" else os.cpu_count() or 1)
     if start is not None:
@@ -80,7 +80,7 @@ def train_capture(capture: str, on: str, out: Path, *, start: Path | None = None
 
 
 def training(capture: str, seed: int, iterations: int, on: str) -> Iterator[Row]:
-    """A training on a device, by its held-out views."""
+    """Train on a device and report the quality of the held-out views."""
     with tempfile.TemporaryDirectory() as scratch:
         began = time.perf_counter()
         trained, found = train_capture(capture, on, Path(scratch), iterations=iterations, seed=seed)
@@ -90,10 +90,10 @@ def training(capture: str, seed: int, iterations: int, on: str) -> Iterator[Row]
 
 
 def marked_tests() -> Iterator[Row]:
-    """The tests marked ``cuda``; tests/conftest.py wants a browser and is left out.
+    """Run the tests marked ``cuda``, without tests/conftest.py, which requires a browser.
 
     Raises:
-        SystemExit: if one fails.
+        SystemExit: if a test fails.
     """
     words = ["-m", "pytest", "-q", "-m", "cuda", "--noconftest", "-p", "no:cacheprovider", *TESTS]
     done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False, cwd=ROOT)
@@ -104,10 +104,10 @@ def marked_tests() -> Iterator[Row]:
 
 
 def agreement(megapixels: float = 0.4, views: int = 4, iterations: int = SHORT) -> Iterator[Row]:
-    """A trained model's renders, losses and gradients on the device, beside the CPU's.
+    """Compare a trained model's renders, losses and gradients on the device with the CPU's.
 
     Raises:
-        SystemExit: if one is farther from the CPU's than it may be.
+        SystemExit: if a difference exceeds its limit.
     """
     rasterizer.set_threads(os.cpu_count() or 1)
     with gpu_scenes.device() as where:
@@ -126,10 +126,10 @@ def agreement(megapixels: float = 0.4, views: int = 4, iterations: int = SHORT) 
 
 
 def same_bits_twice(iterations: int = 200) -> Iterator[Row]:
-    """Two trainings with one seed, by the digests of what they leave.
+    """Train twice with one seed and compare the digests of the outputs.
 
     Raises:
-        SystemExit: if they are not the same.
+        SystemExit: if they differ.
     """
     digests = set()
     for _ in range(2):
@@ -142,16 +142,16 @@ def same_bits_twice(iterations: int = 200) -> Iterator[Row]:
 
 
 def sanitized(tool: str) -> Iterator[Row]:
-    """Every kernel on a small scene under one of compute-sanitizer's tools, where the machine lets it run.
+    """Run every kernel on a small scene under one of compute-sanitizer's tools, if the machine permits it.
 
     Raises:
-        SystemExit: if it cannot run, or finds something.
+        SystemExit: if it cannot run, or reports an error.
     """
     program = shutil.which("compute-sanitizer")
     if program is None:
         raise SystemExit("compute-sanitizer is not installed here")
     words = [program, "--tool", tool, "--error-exitcode", "3", sys.executable, __file__]
-    environment = {**os.environ, "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}  # else it sees one large allocation
+    environment = {**os.environ, "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}  # otherwise it sees one large allocation
     done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
     said = done.stdout + done.stderr
     summary = SUMMARIES.findall(said)
@@ -161,7 +161,7 @@ def sanitized(tool: str) -> Iterator[Row]:
 
 
 def every_kernel() -> None:
-    """Renders, losses, backward passes, steps and draws of a small scene: what the sanitizer looks at."""
+    """Run renders, losses, backward passes, steps and draws of a small scene, for the sanitizer."""
     with gpu_scenes.device() as where:
         kernels = cuda.kernels_of(where)
         assert kernels is not None
@@ -189,7 +189,7 @@ def every_kernel() -> None:
 
 
 def _trained(capture: str, where: torch.device, iterations: int) -> Gaussians:
-    """A model after a short training; where the harness stands for the device, a start whose spheres are no longer."""
+    """Return a model after a short training; under the harness, an initial model with anisotropic Gaussians."""
     if where.type == "cpu":
         model = read_splat(gpu_scenes.inputs(capture, "cpu")["initialize.splat"])
         model.log_scales += 0.5 * torch.randn(model.log_scales.shape, generator=torch.Generator().manual_seed(0))
@@ -200,7 +200,7 @@ def _trained(capture: str, where: torch.device, iterations: int) -> Gaussians:
 
 
 def _photos(capture: str, megapixels: float, views: int) -> Iterator[tuple[Camera, Tensor]]:
-    """Cameras of a packed capture at a size, each with its photo at that size, (h, w, 3) of 0..1."""
+    """Yield cameras of a packed capture at a size, each with its photo at that size, (h, w, 3) of 0..1."""
     import cv2
 
     dataset = gpu_scenes.inputs(capture, "cpu")["undistort.dataset"]
@@ -211,7 +211,7 @@ def _photos(capture: str, megapixels: float, views: int) -> Iterator[tuple[Camer
 
 
 def _gradients(model: Gaussians, camera: Camera, photo: Tensor, where: torch.device) -> dict[str, Tensor]:
-    """A render, its loss, and the gradients of every parameter and of the places on the screen; on the CPU."""
+    """Return a render, its loss, and the gradients of all parameters and screen positions; on the CPU."""
     leaves = model.clone().to(where).requires_grad_()
     probe = torch.zeros(len(model), 2, device=where, requires_grad=True)
     options = RenderOptions(sh_degree=model.sh_degree, antialias=True, depth=False)

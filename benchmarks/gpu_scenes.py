@@ -1,4 +1,4 @@
-"""What the parts of a day with a GPU share: packed captures, Gaussians in any number, and the device."""
+"""Shared by the parts of a GPU session: packed captures, any number of Gaussians, and the device."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 
 PACK = Path(os.environ.get("SPLATPIPE_PACK", ".gpu_day"))
-HARNESS = "SPLATPIPE_HARNESS"  # a libsplat_cuda built for the CPU, to try the parts themselves without a GPU
+HARNESS = "SPLATPIPE_HARNESS"  # a libsplat_cuda built for the CPU, to try the parts without a GPU
 PARTS = ("undistort.dataset", "split.views", "initialize.splat", "georef.frame", "georef.control", "georef.accuracy")
-# No technique beside the Gaussians: what every trainer does.
+# No technique beyond plain Gaussian splatting, as in every trainer.
 PLAIN = {
     "antialias": False,
     "background": "black",
@@ -36,15 +36,15 @@ PLAIN = {
     "densify": False,
     "max_gaussians": 10**9,
 }
-PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
+PUBLISHED_ITERATIONS = 30_000  # learning rates of a long run, so the measured iterations hardly change the model
 
 
 @contextlib.contextmanager
 def device() -> Iterator[torch.device]:
-    """Where CUDA's kernels run: on a card, or under the harness where its library is named.
+    """Yield the device of the CUDA kernels: a GPU, or the CPU under the harness if its library is named.
 
     Raises:
-        MachineError: if neither is there.
+        MachineError: if neither is available.
     """
     if harness := os.environ.get(HARNESS):
         with cuda.use_kernels(cuda.CudaKernels(load(Path(harness)), torch.device("cpu"))):
@@ -56,7 +56,7 @@ def device() -> Iterator[torch.device]:
 
 
 def inputs(capture: str, device_name: str, threads: int = 2) -> Inputs:
-    """The stages' parts of a packed capture, by the line's names.
+    """Return a packed capture's inputs for the stages, under the pipeline's names.
 
     Raises:
         FileNotFoundError: if it is not packed.
@@ -69,7 +69,7 @@ def inputs(capture: str, device_name: str, threads: int = 2) -> Inputs:
 
 
 def cameras(capture: str, megapixels: float | None = None) -> list[Camera]:
-    """Of a packed capture, scaled to a size."""
+    """Return a packed capture's cameras, scaled to a size."""
     found = [view.camera for view in load_views(inputs(capture, "cpu")["undistort.dataset"])]
     if megapixels is None:
         return found
@@ -77,7 +77,7 @@ def cameras(capture: str, megapixels: float | None = None) -> list[Camera]:
 
 
 def scaled(camera: Camera, factor: float) -> Camera:
-    """A camera with more or fewer pixels."""
+    """Return a camera with more or fewer pixels."""
     width, height = round(camera.width * factor), round(camera.height * factor)
     x, y = width / camera.width, height / camera.height
     focal = {"fx": camera.fx * x, "fy": camera.fy * y, "cx": camera.cx * x, "cy": camera.cy * y}
@@ -85,18 +85,18 @@ def scaled(camera: Camera, factor: float) -> Camera:
 
 
 def gaussians(capture: str, count: int, where: torch.device, seed: int = 0) -> Gaussians:
-    """As many as wanted: those of the capture's start, each several times beside itself, smaller the more there are.
+    """Return ``count`` Gaussians: the initial ones, each repeated next to itself, smaller the more there are.
 
     Args:
-        capture: A packed one.
-        count: Gaussians.
-        where: Of the tensors.
-        seed: Of the places.
+        capture: Name of the packed capture.
+        count: Number of Gaussians.
+        where: Device of the tensors.
+        seed: Seed of the positions.
     """
     start = read_splat(inputs(capture, "cpu")["initialize.splat"])
     generator = torch.Generator(where).manual_seed(seed)
     rows = torch.arange(count, device=where) % len(start)
-    shrink = math.sqrt(min(1.0, len(start) / count))  # surfaces stay as covered as they were
+    shrink = math.sqrt(min(1.0, len(start) / count))  # keeps the coverage of surfaces
     scales = start.log_scales.to(where)[rows]
     noise = torch.randn(count, 3, generator=generator, device=where)
     sh = 0.05 * torch.randn(count, coefficient_count(3), 3, generator=generator, device=where)
@@ -111,7 +111,7 @@ def gaussians(capture: str, count: int, where: torch.device, seed: int = 0) -> G
 
 
 def plain_plan(capture: str, count: int, **options: object) -> TrainingPlan:
-    """Of a training that does what every trainer does, with all bands of colour from the first iteration."""
+    """Return the plan of a plain training, with all SH bands from the first iteration."""
     config = TrainConfig.model_validate({"iterations": PUBLISHED_ITERATIONS} | PLAIN | options)
     given = inputs(capture, "cpu")
     plan = make_plan(config, load_views(given["undistort.dataset"]), load_split(given["split.views"]), count)

@@ -1,4 +1,4 @@
-"""Parts of ``gpu_day.py measure``: what is to be fast and small on a GPU. Times by CUDA events, medians."""
+"""Parts of ``gpu_day.py measure``: speed and memory on a GPU. Times by CUDA events, medians."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import make_techniques
 from splatpipe.pipeline.train.windows import TrainingSize
 
-CAPTURE = "speed"  # as `prepare` packs it
+CAPTURE = "speed"  # as packed by `prepare`
 MEGAPIXELS = 1.6
-WARMUP, REPEATS = 30, 100  # iterations; the first ones find out how much room frames need
-COPY_BYTES = 1 << 32  # far beyond any cache
-# What a whole iteration cannot do without, float32: a visible Gaussian's 59 parameters and 118 moments are read and
-# written once, all else once more read by the render; a pixel's colour, gradient and photo (8 bits) once each way.
+WARMUP, REPEATS = 30, 100  # iterations; the first ones determine how much room frames need
+COPY_BYTES = 1 << 32  # far larger than any cache
+# Minimum traffic of a whole iteration, float32: a visible Gaussian's 59 parameters and 118 moments are read and written
+# once, and the parameters read once more by the render; a pixel's colour, gradient and photo (8 bits) once each way.
 FLOATS_A_GAUSSIAN = 2 * (59 + 118) + 59
 BYTES_A_PIXEL = 4 * 3 * 4 + 3
 MANY_PAIRS = 1 << 31
 FOUR_K = (3840, 2160)
-COVERING = 70_000  # Gaussians over all of a 4K picture: 2.27e9 pairs with its 32,400 tiles
-ENDING = 2000  # of them, more than any pixel blends: each takes a hundredth of the light
+COVERING = 70_000  # Gaussians covering all of a 4K image: 2.27e9 pairs with its 32,400 tiles
+ENDING = 2000  # of these, more than any pixel blends: each takes a hundredth of the light
 
 
 def event_times(function: Callable[[], object], repeats: int, where: torch.device) -> list[float]:
-    """Seconds of each call on the device; by the wall clock where that is the CPU."""
+    """Return the seconds of each call on the device; by the wall clock if that is the CPU."""
     if where.type != "cuda":
         return [_wall(function) for _ in range(repeats)]
     events = [torch.cuda.Event(enable_timing=True) for _ in range(repeats + 1)]
@@ -58,7 +58,7 @@ def event_times(function: Callable[[], object], repeats: int, where: torch.devic
 
 
 def card() -> Iterator[Row]:
-    """The device, and how fast it copies, bytes read and written both counted."""
+    """Report the device and its copy bandwidth, bytes read and written both counted."""
     with gpu_scenes.device() as where:
         kernels = cuda.kernels_of(where)
         assert kernels is not None
@@ -67,14 +67,14 @@ def card() -> Iterator[Row]:
 
 
 def copy_bandwidth(where: torch.device, size: int = COPY_BYTES) -> float:
-    """Bytes a second of a device-to-device copy."""
+    """Return the bandwidth of a device-to-device copy, bytes per second."""
     source = torch.empty(size, dtype=torch.uint8, device=where).random_()
     target = torch.empty_like(source)
     return 2 * size / statistics.median(event_times(lambda: target.copy_(source), 10, where))
 
 
 def speed(count: int, megapixels: float = MEGAPIXELS, repeats: int = REPEATS) -> Iterator[Row]:
-    """Whole iterations of training's own code, and the rasterizer alone, at a number of Gaussians that stays."""
+    """Time whole iterations of training's own code, and the rasterizer alone, at a fixed number of Gaussians."""
     with gpu_scenes.device() as where:
         row: Row = {"count": count, "megapixels": megapixels}
         row |= iteration_times(count, megapixels, where, repeats)
@@ -83,7 +83,7 @@ def speed(count: int, megapixels: float = MEGAPIXELS, repeats: int = REPEATS) ->
 
 
 def iteration_times(count: int, megapixels: float, where: torch.device, repeats: int) -> Row:
-    """Median of an iteration by the device and by the wall clock, and the most memory that tensors took."""
+    """Return median device and wall-clock times of an iteration, and the peak tensor memory."""
     given = gpu_scenes.inputs(CAPTURE, "cpu")
     views, split = load_views(given["undistort.dataset"]), load_split(given["split.views"])
     views = [view for view in views if view.camera.name in set(split.train)]
@@ -111,12 +111,12 @@ def iteration_times(count: int, megapixels: float, where: torch.device, repeats:
 
 
 def choose_rules(where: torch.device) -> AbstractContextManager[None]:
-    """What training tells torch on a device: one order of sums."""
+    """Select torch's settings as training does on a device: a fixed order of summation."""
     return choose_device("cuda" if where.type == "cuda" else "cpu").one_order()
 
 
 def alone(count: int, megapixels: float, where: torch.device, repeats: int) -> Row:
-    """The rasterizer's forward pass, and with its backward pass to all parameters."""
+    """Time the rasterizer's forward pass, alone and with its backward pass to all parameters."""
     model = gpu_scenes.gaussians(CAPTURE, count, where).requires_grad_()
     views = gpu_scenes.cameras(CAPTURE, megapixels)
     upstream = torch.randn(views[0].height, views[0].width, 3, device=where)
@@ -142,14 +142,14 @@ def alone(count: int, megapixels: float, where: torch.device, repeats: int) -> R
 
 
 def memory(count: int, megapixels: float = MEGAPIXELS) -> Iterator[Row]:
-    """The most that tensors take in iterations of so many Gaussians with all bands of colour."""
+    """Measure the peak tensor memory of iterations at ``count`` Gaussians with all SH bands."""
     with gpu_scenes.device() as where:
         row = iteration_times(count, megapixels, where, 20)
         yield {"count": count} | {name: row[name] for name in ("peak_gb", "iteration_ms", "visible")}
 
 
 def covering(count: int, where: torch.device) -> Gaussians:
-    """Gaussians behind one another, each over the whole picture, each taking about a hundredth of the light."""
+    """Return Gaussians behind one another, each covering the whole image and taking about a hundredth of the light."""
     model = Gaussians.empty(count, 0).to(where)
     model.means[:, 2] = 2.0 + 4.0 * torch.arange(count, device=where) / count
     model.log_scales[:] = torch.tensor([5.0, 5.0, -6.0], device=where)
@@ -159,7 +159,7 @@ def covering(count: int, where: torch.device) -> Gaussians:
 
 
 def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterator[Row]:
-    """A view of more pairs of a Gaussian and a tile than 31 bits count; it shows what its nearest Gaussians show.
+    """Render a view with more Gaussian-tile pairs than 31 bits can count; it must show its nearest Gaussians.
 
     Raises:
         SystemExit: if it does not.
@@ -176,7 +176,7 @@ def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterato
         pairs = count * tiles
         kernels = cuda.kernels_of(where)
         assert kernels is not None
-        # As a training would have learnt it: what is not foreseen is one block's work, and would take minutes here.
+        # As after some training: an unforeseen count is one block's work, and would take minutes here.
         most = kernels.forecast.most_pairs
         kernels.forecast.learn(FrameFacts(FrameSize(count, tiles), most, pairs, -(-pairs // most)))
         forget_peak(where)
@@ -190,7 +190,7 @@ def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterato
 
 
 def whole_training(count: int = 1_000_000, iterations: int = 30_000) -> Iterator[Row]:
-    """A training from beginning to end at 1.6 MP, density control included, with as many Gaussians as its cap."""
+    """Train from start to end at 1.6 MP, including density control, with the cap's number of Gaussians."""
     with gpu_scenes.device() as where, tempfile.TemporaryDirectory() as scratch:
         start = Path(scratch) / "start.ply"
         write_splat(start, gpu_scenes.gaussians(CAPTURE, count, where).to("cpu"))
@@ -201,10 +201,10 @@ def whole_training(count: int = 1_000_000, iterations: int = 30_000) -> Iterator
 
 
 def line(capture: str) -> Iterator[Row]:
-    """Train and evaluate what the line left, by the preset's own options.
+    """Train and evaluate a packed run of the pipeline, with the preset's own options.
 
     Raises:
-        SystemExit: if it was not packed.
+        SystemExit: if it is not packed.
     """
     from splatpipe.pipeline.engine.config import load_preset
 
@@ -218,13 +218,13 @@ def line(capture: str) -> Iterator[Row]:
 
 
 def trained_row(trained: Row, found: Row) -> Row:
-    """What is told of a training."""
+    """Return a training's row."""
     names = ("device", "iterations", "gaussians", "train_seconds", "train_megapixels")
     return {name: trained[name] for name in names} | {name: found[name] for name in ("psnr", "psnr_cc", "ssim")}
 
 
 def sum_visible(model: Gaussians, camera: Camera, megapixels: float) -> int:
-    """Gaussians that a view sees."""
+    """Count the Gaussians visible in a view."""
     factor = (1e6 * megapixels / (camera.width * camera.height)) ** 0.5
     with torch.no_grad():
         options = RenderOptions(sh_degree=0, depth=False)
@@ -232,14 +232,14 @@ def sum_visible(model: Gaussians, camera: Camera, megapixels: float) -> int:
 
 
 def forget_peak(where: torch.device) -> None:
-    """Let the record of the most memory begin anew."""
+    """Reset the record of peak memory."""
     if where.type == "cuda":
         torch.cuda.synchronize(where)
         torch.cuda.reset_peak_memory_stats(where)
 
 
 def peak_gb(where: torch.device) -> float | None:
-    """The most that tensors took since; None where nothing counts it."""
+    """Return the peak tensor memory since the reset; None if the device does not count it."""
     return 1e-9 * torch.cuda.max_memory_allocated(where) if where.type == "cuda" else None
 
 

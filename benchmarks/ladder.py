@@ -1,8 +1,8 @@
-"""What each mapper and each rung brought: ``ladder.py OUT PHOTOS [OUT PHOTOS …] [--mapper NAME] [--json FILE]``.
+"""Measure each mapper and each rung: ``ladder.py OUT PHOTOS [OUT PHOTOS …] [--mapper NAME] [--json FILE]``.
 
-OUT is the folder of a run that got as far as `matches`. Its keypoints and verified matches are taken from there;
-mapping and the ladder are the stage's own library code, on one thread. ``--left`` first makes a capture of which much
-is left: every second pair of every third photo is forgotten, and every sixth photo keeps but 200 of its keypoints.
+OUT is the folder of a run that got as far as `matches`. Its keypoints and verified matches are reused; mapping and the
+ladder are the stage's own library code, on one thread. ``--left`` first degrades the capture so that many photos stay
+unregistered: every second pair of every third photo is dropped, and every sixth photo keeps only 200 keypoints.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ WEAK_KEYPOINTS = 200
 
 
 class SilentReporter:
-    """A Reporter that tells nobody."""
+    """A Reporter that discards everything."""
 
     def progress(self, done: float, total: float, what: str, unit: str = "") -> None: ...
     def metric(self, name: str, value: float, step: int | None = None) -> None: ...
@@ -50,7 +50,7 @@ class SilentReporter:
 
 
 def read_capture(out: Path, photos_dir: Path, scratch: Path) -> MappingInput:
-    """A run's capture, from the artifacts of its stages."""
+    """Read a run's capture from the artifacts of its stages."""
     ingest, features, matches = (
         next((out / "stages").glob(f"{stage}-*")) for stage in ("ingest", "features", "matches")
     )
@@ -72,7 +72,7 @@ def read_capture(out: Path, photos_dir: Path, scratch: Path) -> MappingInput:
 
 
 def with_photos_left(capture: MappingInput) -> MappingInput:
-    """The same capture with pairs forgotten, and with photos that have hardly any keypoints."""
+    """Return the same capture with pairs dropped, and with photos that have hardly any keypoints."""
     target = capture.scratch / "left.db"
     forgotten = set()
     with pycolmap.Database.open(capture.database) as source:
@@ -97,7 +97,7 @@ def with_photos_left(capture: MappingInput) -> MappingInput:
 
 
 def measured(name: str, capture: MappingInput, mapper: str) -> list[Row]:
-    """The rows of one capture."""
+    """Return the rows of one capture."""
     began = time.process_time()
     config = SparseConfig(mapper=mapper)  # type: ignore[arg-type]
     found = climb(capture, reconstruct(capture, config, SilentReporter()), config, SilentReporter())

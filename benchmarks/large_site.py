@@ -1,9 +1,9 @@
-"""A site of a thousand photos, told and tried: ``large_site.py OUT WORK``.
+"""Forecast and train a site of a thousand photos: ``large_site.py OUT WORK``.
 
-OUT is a run that was trained; its photos (linked), cameras, points and splat are laid out again and again on a grid of
-its plan until they are ``--photos``. Told beforehand are the number of blocks and what they take; then the site is cut
-(with OUT's splat, thinned, in the place of a coarse pass, which is not run), and the block in its middle and the one
-farthest out are really trained, in a process of their own: memory at its peak, disk, CPU time, told against measured.
+OUT is a trained run; its photos (linked), cameras, points and splat are repeated on a grid in plan until there are
+``--photos``. The number of blocks and their cost are forecast first. Then the site is partitioned (with OUT's splat,
+thinned, in place of a coarse pass, which is not run), and the central and the outermost block are actually trained,
+each in its own process: peak memory, disk and CPU time, forecast against measured.
 
 A quick look: ``--photos 80 --max-memory 900M --gaussians 60000 --set train.iterations=600``.
 """
@@ -60,13 +60,13 @@ COLUMNS = {
 
 
 class WarningReporter:
-    """A reporter that tells notes and warnings alone."""
+    """A reporter that passes on only notes and warnings."""
 
     def progress(self, done: float, total: float, what: str, unit: str = "") -> None:
-        """Nobody waits for it."""
+        """Discard progress."""
 
     def metric(self, name: str, value: float, step: int | None = None) -> None:
-        """Nor for this."""
+        """Discard metrics."""
 
     def note(self, message: str) -> None:
         print(f"  {message}", flush=True)
@@ -76,10 +76,10 @@ class WarningReporter:
 
 
 class DiskUse:
-    """The most that a folder and the unnamed files of this process's children took, looked at now and then.
+    """Peak disk use of a folder and of the unlinked files of this process's children, sampled.
 
     Args:
-        folder: Where they work.
+        folder: Folder that they work in.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -88,7 +88,7 @@ class DiskUse:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Look as long as this lasts."""
+        """Sample while the context lasts."""
         thread = threading.Thread(target=self._watch, daemon=True)
         thread.start()
         try:
@@ -113,7 +113,7 @@ def _named_bytes(folder: Path) -> int:
 
 
 def _unnamed_bytes(folder: Path) -> int:
-    """Files in a folder that children have open and that have no name any more: decoded photos."""
+    """Return the size of unlinked files in a folder that children have open: decoded photos."""
     total = 0
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -135,7 +135,7 @@ def _unnamed_bytes(folder: Path) -> int:
 
 
 def trained(number: int, site: SitePlan, parts: dict[str, Path], config: LineConfig, work: Path, threads: int) -> Row:
-    """Train one block in a process of its own, and say what that took."""
+    """Train one block in a process of its own, and return what that took."""
     out = work / f"train.{number}"
     out.mkdir(exist_ok=True)
     task = Task(

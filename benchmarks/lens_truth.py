@@ -1,12 +1,12 @@
-"""The demo through a Brown lens like the DJI P1's, against its truth: ``lens_truth.py FOLDER [--preset preview]``.
+"""Compare the demo through a Brown lens like the DJI P1's with its truth: ``lens_truth.py FOLDER [--preset preview]``.
 
-The demo's photos, taken through a simple lens, are resampled into the other: each pixel's ray is looked up in the
-photo, by a Lanczos filter, and the marks of control and check points go the same way. The lens has the field of view
-that the photos cover. For comparison they are resampled into a simple lens of that field of view as well; both run
-through the line as far as ``georef``, with 12 of the 18 points as control.
+The demo's photos, taken through a simple lens, are resampled into the Brown lens: each pixel's ray is looked up in the
+photo with a Lanczos filter, and the marks of control and check points are transformed likewise. The lens has the field
+of view that the photos cover. For comparison they are also resampled into a simple lens of that field of view; both run
+through the pipeline as far as ``georef``, with 12 of the 18 points as control.
 
-Lenses are compared by where they see the rays of a grid over the picture: as they are, and after the one small rotation
-of all rays that brings them nearest, which the poses take (a principal point that is off turns every camera a little).
+Lenses are compared by where they project the rays of a grid over the image: as they are, and after the small rotation
+of all rays that aligns them best, which the poses absorb (a wrong principal point turns every camera a little).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from splatpipe.pipeline.sfm.lens_model import apart_px, simplest
 BORDER_PX = 8.0  # marks nearer to the edge are dropped
 QUALITY = 95
 FOCAL_TEXT = b'CalibratedFocalLength="853.000000"'
-WIDENED = 1.002  # the maker's calibration is off by as much as in the demo
+WIDENED = 1.002  # the manufacturer's calibration is off by as much as in the demo
 COLUMNS = {
     "lens": "lens:",
     "photos": "photos:",
@@ -57,7 +57,7 @@ def camera_of(lens: BrownLens) -> pycolmap.Camera:
 
 
 def covered(lens: BrownLens, source: BrownLens) -> BrownLens:
-    """The lens with the shortest focal length whose pictures the source's pictures cover."""
+    """Return the lens with the shortest focal length whose image is fully covered by the source's."""
     x, y = np.meshgrid(np.linspace(0.0, lens.width, 61), np.linspace(0.0, lens.height, 46))
     for focal in np.arange(source.f, 1.5 * source.f, 1.0):
         tried = replace(lens, f=float(focal))
@@ -69,7 +69,7 @@ def covered(lens: BrownLens, source: BrownLens) -> BrownLens:
 
 
 def make_capture(folder: Path, lens: BrownLens, source: BrownLens) -> None:
-    """Write the demo's photos and ``gcp_list.txt`` as the lens would have them."""
+    """Write the demo's photos and ``gcp_list.txt`` as seen through the lens."""
     (folder / "photos").mkdir(parents=True, exist_ok=True)
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.undistort((x.ravel() - lens.cx) / lens.f, (y.ravel() - lens.cy) / lens.f)
@@ -98,7 +98,7 @@ def make_capture(folder: Path, lens: BrownLens, source: BrownLens) -> None:
 
 
 def _metadata(jpeg: bytes) -> list[bytes]:
-    """The APP1 segments of a JPEG."""
+    """Return the APP1 segments of a JPEG."""
     found, at = [], 2
     while jpeg[at] == 0xFF and jpeg[at + 1] != 0xDA:
         size = int.from_bytes(jpeg[at + 2 : at + 4], "big")
@@ -109,7 +109,7 @@ def _metadata(jpeg: bytes) -> list[bytes]:
 
 
 def measure(name: str, out: Path, lens: BrownLens) -> Row:
-    """What the line found, against the lens."""
+    """Compare the lens estimated by the pipeline with the true one."""
     parts = {stage: next((out / "stages").glob(f"{stage}-*")) for stage in ("sparse", "georef")}
     models = json.loads((parts["sparse"] / "models.json").read_text(encoding="utf-8"))
     accuracy = json.loads((parts["georef"] / "accuracy.json").read_text(encoding="utf-8"))

@@ -1,12 +1,12 @@
-"""Levels of detail against the full model: equal counts beside splat-transform, errors on the screen, a way through.
+"""Compare levels of detail with the full model: counts, screen-space errors, a camera path.
 
     python benchmarks/levels.py OUT [--splat-transform 'node …/bin/cli.mjs']
 
-Prints decibels against pictures of the full model, from the photos' places, of reductions to some shares, and those of
-splat-transform's `--decimate`; decibels of nodes from where their error is 16 pixels, as drawn, and of the means of 4
-by 4 finer pixels, without what the rasterizer makes of Gaussians far smaller than a pixel; on a way from afar to the
-photos, how much more the picture changes from frame to frame than the full model's, and whether it is ever less opaque;
-with `--large`, seconds and peak memory of reducing and of levels for that many Gaussians, in a process of its own.
+Prints PSNR against renders of the full model from the photos' positions, for reductions to several shares and for
+splat-transform's `--decimate`; PSNR of nodes at the distance where their error is 16 pixels, as drawn and for means of
+4 by 4 finer pixels, without the rasterizer's treatment of Gaussians far smaller than a pixel; along a path from afar to
+the photos, how much more the image changes between frames than the full model's, and whether it is ever less opaque;
+with `--large`, seconds and peak memory of reduction and of levels for that many Gaussians, in a process of its own.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from splatpipe.pipeline.splat.scene import Scene
 SHARES = (50, 25, 10, 5)  # percent
 ERROR_PX = 16.0
 GREY = (0.5, 0.5, 0.5)
-SIDE, FOCAL = 384, 800.0  # of pictures of nodes, pixels
-FINER = 4  # times as many pixels along each side: the scene as it is, nearly
-LEAST_COVERED = 60  # pixels: of less a picture says nothing
+SIDE, FOCAL = 384, 800.0  # of the nodes' images, pixels
+FINER = 4  # times as many pixels along each side: nearly the true scene
+LEAST_COVERED = 60  # pixels: fewer say nothing
 FRAMES = 48
-FARTHEST = 60.0  # times the photos' distance: where the way begins
+FARTHEST = 60.0  # times the photos' distance: the start of the path
 
 
 def main() -> None:
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def photo_cameras(out: Path) -> list[Camera]:
-    """The run's cameras at half size."""
+    """Return the run's cameras at half size."""
     found = []
     for told in json.loads((out / "cameras.json").read_text(encoding="utf-8")):
         pose, turn = np.eye(4), np.array(told["rotation"]).T
@@ -86,7 +86,7 @@ def photo_cameras(out: Path) -> list[Camera]:
 
 
 def drawn(gaussians: Gaussians, camera: Camera, antialias: bool) -> Render:
-    """A picture on grey."""
+    """Render on grey."""
     with torch.no_grad():
         options = RenderOptions(gaussians.sh_degree, background=GREY, antialias=antialias, depth=False)
         return render(gaussians, camera, options)
@@ -98,7 +98,7 @@ def decibels(one: Tensor, other: Tensor) -> float:
 
 
 def equal_counts(scene: Scene, cameras: Sequence[Camera], source: Path, command: list[str]) -> None:
-    """Print decibels of reductions, ours and theirs."""
+    """Print the PSNR of reductions, ours and splat-transform's."""
     full = [drawn(scene.gaussians, camera, scene.facts.antialias).colour for camera in cameras]
 
     def likeness(gaussians: Gaussians) -> float:
@@ -121,7 +121,7 @@ def equal_counts(scene: Scene, cameras: Sequence[Camera], source: Path, command:
 
 
 def look(place: np.ndarray, target: np.ndarray, focal: float, width: int, height: int) -> Camera:
-    """A camera somewhere that looks at something, upright."""
+    """Return an upright camera at a place, looking at a target."""
     ahead = (target - place) / np.linalg.norm(target - place)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= max(float(np.linalg.norm(right)), 1e-9)
@@ -132,7 +132,7 @@ def look(place: np.ndarray, target: np.ndarray, focal: float, width: int, height
 
 
 def place_at(node: LevelNode, target: np.ndarray, towards: np.ndarray, distance: float) -> np.ndarray:
-    """On a ray from a point, so far from a node's box."""
+    """Return a place on a ray from a point, at a distance from a node's box."""
     near, far = 0.0, distance + float(np.linalg.norm(node.box[1] - node.box[0])) * 2.0
     for _ in range(60):
         middle = 0.5 * (near + far)
@@ -141,18 +141,18 @@ def place_at(node: LevelNode, target: np.ndarray, towards: np.ndarray, distance:
 
 
 def full_of(node: LevelNode) -> Gaussians:
-    """The full model below a node."""
+    """Return the full model below a node."""
     return Gaussians.concat([each.gaussians for each in node.nodes() if not each.children])
 
 
 def finer(gaussians: Gaussians, camera: Camera, antialias: bool) -> Tensor:
-    """A picture's colours, each pixel the mean of those of a finer one."""
+    """Return the colours of a render whose pixels are means of a finer one's."""
     colour = drawn(gaussians, camera.scaled(FINER * camera.width, FINER * camera.height), antialias).colour
     return colour.reshape(camera.height, FINER, camera.width, FINER, 3).mean(dim=(1, 3))
 
 
 def node_errors(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> None:
-    """Print the least decibels of what nodes cover, from where their error is 16 pixels, in photos' directions."""
+    """Print the lowest PSNR over what nodes cover, from where their error is 16 pixels, in the photos' directions."""
     found, antialias = [], scene.facts.antialias
     for node in (each for each in root.nodes() if each.children):
         full = full_of(node)
@@ -179,7 +179,7 @@ def node_errors(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> Non
 
 
 def way_through(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> None:
-    """Print what frames on a way from afar to a photo's place show, chosen as a viewer chooses."""
+    """Print what frames on a path from afar to a photo's position show, with levels chosen as in a viewer."""
     target = scene.gaussians.means.median(dim=0).values.double().numpy()
     photo = cameras[len(cameras) // 2]
     ray = photo.centre() - target
@@ -205,7 +205,7 @@ def way_through(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> Non
 
 
 def measure_large(gaussians: Gaussians, count: int) -> None:
-    """Print seconds and peak memory for so many Gaussians: copies of a model side by side."""
+    """Print seconds and peak memory for ``count`` Gaussians: copies of a model side by side."""
     side = float((gaussians.means.quantile(0.95, dim=0) - gaussians.means.quantile(0.05, dim=0)).max())
     copies = math.ceil(count / len(gaussians))
     row = math.ceil(math.sqrt(copies))

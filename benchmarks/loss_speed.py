@@ -1,4 +1,4 @@
-"""How long the photometric loss and an Adam step take, ours and the libraries': ``python benchmarks/loss_speed.py``."""
+"""Time the photometric loss and an Adam step, ours and the libraries': ``python benchmarks/loss_speed.py``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHAPES = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": ()
 
 
 def best_ms(work: Callable[[], object], repeats: int) -> float:
-    """The shortest of some runs, the first left out: what the machine can do when nobody disturbs it."""
+    """Return the shortest of several runs, the first excluded: what an undisturbed machine can do."""
     work()
     times = []
     for _ in range(repeats):

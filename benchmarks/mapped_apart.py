@@ -1,9 +1,10 @@
-"""One mapping in a process of its own, timed: ``mapped_apart.py HOW DATABASE FOLDER [COUNT SEED]``.
+"""Time one mapping in a process of its own: ``mapped_apart.py HOW DATABASE FOLDER [COUNT SEED]``.
 
-``before`` is the line's incremental mapping as it was, ``plain`` COLMAP's with its own options, ``ours`` and ``global``
-the line's mappers, ``oracle`` the adjustment of a made flight from its true cameras and tracks: what the noise leaves.
-All of them on one thread. ``pairs`` chooses the pairs of a made flight as the line does, by positions and by look. The
-figures are left in ``FOLDER/HOW.json``, the largest model in ``FOLDER/HOW``.
+``before`` is the pipeline's former incremental mapping, ``plain`` COLMAP's with its own options, ``ours`` and
+``global`` the pipeline's mappers, and ``oracle`` the adjustment of a synthetic flight from its true cameras and tracks:
+the error that noise alone causes. All run on one thread. ``pairs`` chooses the pairs of a synthetic flight as the
+pipeline does, by position and by appearance. Figures are written to ``FOLDER/HOW.json``, the largest model to
+``FOLDER/HOW``.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incre
 from splatpipe.pipeline.sfm.pairs import connect, nearest
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
-NEIGHBOURS = 20  # the line's own
+NEIGHBOURS = 20  # the pipeline's default
 
 COLUMNS = {
     "capture": "capture:",
@@ -43,7 +44,7 @@ COLUMNS = {
 
 
 def run_apart(how: str, database: Path, folder: Path, *made: int) -> Row:
-    """Map in a child process, which ends with us; its figures, and its largest model in ``folder / how``."""
+    """Map in a child process that ends with this one; return its figures; its largest model is in ``folder / how``."""
     words = [sys.executable, __file__, how, str(database), str(folder), *map(str, made)]
     subprocess.run(words, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     row: Row = json.loads((folder / f"{how}.json").read_text())
@@ -53,7 +54,7 @@ def run_apart(how: str, database: Path, folder: Path, *made: int) -> Row:
 def centre_errors(
     found: Float64[np.ndarray, "n 3"], true: Float64[np.ndarray, "n 3"]
 ) -> tuple[Float64[np.ndarray, " n"], float]:
-    """Distances after the best similarity (Umeyama, PAMI 1991), in the unit of the truth, and its scale."""
+    """Return distances after the best similarity (Umeyama, PAMI 1991), in the truth's unit, and its scale."""
     from_mean, to_mean = found - found.mean(axis=0), true - true.mean(axis=0)
     u, singular, vt = np.linalg.svd(to_mean.T @ from_mean)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -62,7 +63,7 @@ def centre_errors(
 
 
 def centres(model: pycolmap.Reconstruction) -> tuple[list[int], Float64[np.ndarray, "n 3"]]:
-    """Numbers of the placed photos, and where they were taken."""
+    """Return the image numbers of the registered photos, and their camera centres."""
     numbers = sorted(model.reg_image_ids())
     return numbers, np.array([model.images[number].projection_center() for number in numbers]).reshape(-1, 3)
 
@@ -85,7 +86,7 @@ def _map(how: str, database: Path, made: list[int]) -> list[pycolmap.Reconstruct
 
 
 def oracle(flight: SyntheticFlight) -> pycolmap.Reconstruction:
-    """Everything free, starting from the truth, without a wrong match: what noise alone leaves of it."""
+    """Adjust everything from the truth, without wrong matches: the error that noise alone causes."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(lens())
     for number in range(len(flight.centres_m)):
@@ -107,10 +108,10 @@ def oracle(flight: SyntheticFlight) -> pycolmap.Reconstruction:
 
 
 def pairs_by_look(count: int) -> int:
-    """Pairs that the photos' content gives, for descriptors that are asked for photo by photo.
+    """Count the pairs chosen by the photos' content, with descriptors requested photo by photo.
 
     Args:
-        count: Photos; neighbours share a third of their descriptors.
+        count: Number of photos; neighbours share a third of their descriptors.
     """
     common = np.random.default_rng(0).integers(0, 256, (PER_PHOTO, 128), np.uint8)
 
@@ -130,7 +131,7 @@ def pairs_by_look(count: int) -> int:
 
 
 def _pairs(count: int, seed: int) -> Row:
-    """CPU seconds and pairs a photo of either way to choose them; the flight itself is not counted."""
+    """Return CPU seconds and pairs per photo of either way to choose them; generating the flight is not counted."""
     flight = make_flight(count, seed, observations=10)
     began_s = time.process_time()
     by_position = len(choose_pairs(flight, seed, NEIGHBOURS))
