@@ -1,1 +1,1 @@
-"""The preflight: what is wrong with a capture, told in the field, before leaving."""
+"""The preflight: finds problems of a capture in the field, before leaving the site."""

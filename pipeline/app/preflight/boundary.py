@@ -1,4 +1,4 @@
-"""A boundary held against the photos before a run: broken, without coordinates to lay it by, or somewhere else."""
+"""Checks a boundary against the photos before a run: broken, impossible to georeference, or somewhere else."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 
 def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Position], controlled: bool) -> list[Finding]:
-    """Read the boundary as a run does, and hold it against where the photos were taken.
+    """Read the boundary as a run does, and compare it with the photos' positions.
 
     Args:
         path: The file.
-        config: Of the run that would follow.
+        config: The `georef` options of the run that would follow.
         stated: The photos' positions.
-        controlled: Whether there is a control file, which places a model whose photos have no positions.
+        controlled: Whether there is a GCP file, which can georeference a model whose photos have no positions.
     """
     try:
         drawing = read_boundary(path)
@@ -50,8 +50,8 @@ def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Positio
         vertices = np.concatenate([ring for polygon in area.polygons for ring in polygon])
         wide = float(np.linalg.norm(np.ptp(cameras[:, :2], axis=0)))
         apart = min(float(np.linalg.norm(vertices - camera, axis=1).min()) for camera in cameras[:, :2])
-        if apart > max(wide, LEAST_REACH_M):  # farther from all photos than the flight is wide
-            placed(drawing, frame, cameras)  # says where it is, unless it is around all of them
+        if apart > max(wide, LEAST_REACH_M):  # farther from all photos than the width of the flight
+            placed(drawing, frame, cameras)  # raises an error with its location, unless it surrounds all of them
     except SplatpipeError as error:
         return [Finding("boundary-broken", "error", error.message, error.hint)]
     return findings

@@ -1,4 +1,4 @@
-"""In how many footprints each place lies: the overlap, as few large shapes."""
+"""Image overlap: the number of footprints that cover each place, as a few large shapes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from jaxtyping import Int32
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame
 
 CELLS = 100  # across the map
-STEPS = (1, 2, 3, 5, 10)  # from so many photos on a shade of its own: below three a surface is hardly held
+STEPS = (1, 2, 3, 5, 10)  # numbers of photos at which a new shade begins; below three, a surface is poorly determined
 
 
 def covered(frame: MapFrame, footprints: Sequence[Sequence[Sequence[float]]]) -> Int32[np.ndarray, "rows columns"]:
-    """How many footprints hold the middle of each cell, northern rows first.
+    """The number of footprints that contain the centre of each cell, northern rows first.
 
     Args:
-        frame: Of the map.
-        footprints: Corners, in metres, of convex outlines, in either sense.
+        frame: The map's frame.
+        footprints: Corners of convex outlines, metres, in either orientation.
     """
     cell = WIDTH / CELLS
     rows = round(frame.height / cell)
@@ -38,7 +38,7 @@ def covered(frame: MapFrame, footprints: Sequence[Sequence[Sequence[float]]]) ->
 
 
 def shades(counts: Int32[np.ndarray, "rows columns"]) -> list[str]:
-    """For each of `STEPS` an SVG path: the cells that have so many photos, and fewer than the next; may be empty."""
+    """An SVG path for each of `STEPS`: cells with at least that many photos and fewer than the next; may be empty."""
     cell = WIDTH // CELLS
     steps = np.searchsorted(STEPS, counts, side="right")
     paths = [""] * len(STEPS)

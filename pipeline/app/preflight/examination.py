@@ -1,4 +1,4 @@
-"""A capture examined before it is run: all of the preflight, in the order in which it gets dearer."""
+"""Runs the whole preflight on a capture, cheapest checks first."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ NOTHING = MatchGraph({}, ())
 
 @dataclass(frozen=True)
 class PhotoExamination:
-    """What the photos themselves say.
+    """Results of examining the photos' content.
 
     Attributes:
-        findings: Of them.
-        overlap: Of the quick match.
-        gaps: In it.
-        sharpness: Of each photo against its neighbours.
-        brighter_ev: Likewise.
-        levels: Mean grey level of each.
+        findings: Findings about the photos.
+        overlap: Result of the quick match.
+        gaps: Gaps in the overlap.
+        sharpness: Sharpness of each photo relative to its neighbours.
+        brighter_ev: Brightness of each photo relative to its neighbours, EV.
+        levels: Mean grey level of each photo.
     """
 
     findings: tuple[Finding, ...]
@@ -79,13 +79,13 @@ class PhotoExamination:
 
 
 def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: int, report: Reporter) -> Preflight:
-    """All that can be said of a capture within a minute or two.
+    """Examine a capture as far as a minute or two allow.
 
     Args:
         photos: The user's folder.
-        configs: Of the run that would follow, by preset; the first one's files count.
-        threads: That work at a time.
-        report: Told of progress.
+        configs: Configurations of the run that would follow, by preset; the files of the first one are used.
+        threads: Number of threads.
+        report: Receives the progress.
 
     Raises:
         SplatpipeError: if there is no such folder, or a file that an option names.
@@ -96,7 +96,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     began_s, when_s = time.monotonic(), time.time()
     folder = photos.expanduser().resolve()
     config = next(iter(configs.values()))
-    # No OUT is written: any folder that does not lie in the photos stands for one.
+    # No OUT is written: any folder outside the photos will do.
     source = open_source(photos, folder.parent / f"{folder.name}-out", LINE, config)
     intake, findings = take_in(source, config, threads, report)
     look = examine_photos(intake, threads, report)
@@ -124,7 +124,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
 
 
 def examine_photos(intake: Intake, threads: int, report: Reporter) -> PhotoExamination:
-    """Read the photos, match them quickly, and compare them where they match."""
+    """Read the photos, match them quickly, and compare their quality where they match."""
     count = len(intake.photos)
     unknown = np.full(count, np.nan)
     if count < LEAST_PHOTOS:
@@ -166,7 +166,7 @@ def _control(source: RunSource, config: LineConfig, intake: Intake) -> tuple[tup
 def forecast_presets(
     intake: Intake, control: bool, configs: Mapping[str, LineConfig], threads: int
 ) -> tuple[tuple[PresetForecast, ...], MachineFacts]:
-    """What a run with each preset would need, and whether this machine has it."""
+    """Forecast what a run with each preset would need, and whether this machine has it."""
     from splatpipe.stages.costs import REFERENCE
     from splatpipe.stages.forecast import machine_speed, needs_of
     from splatpipe.stages.work import CaptureSize, CaptureWork

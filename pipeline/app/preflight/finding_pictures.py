@@ -1,4 +1,4 @@
-"""Small pictures of the photos that findings are about: few, small, and where it tells more, pixel by pixel."""
+"""Thumbnails of the photos that findings are about, or crops at full resolution where these show more."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from splatpipe.pipeline.app.report.wording import number
 from splatpipe.pipeline.app.thumbnails import Thumbnail, cut_out, thumbnail
 from splatpipe.pipeline.photos.photo_list import photo_root
 
-SIDE = 260  # pixels of a picture's longer side
-CUT = (260, 195)  # photo pixels of a cut-out: blur of a pixel or two is seen in no shrunk picture
+SIDE = 260  # pixels of a thumbnail's longer side
+CUT = (260, 195)  # photo pixels of a crop: blur of a pixel or two is invisible in a thumbnail
 MOST_A_FINDING = 8
 MOST_PICTURES = 40  # on the page: below a megabyte, and a second or two of decoding
-MOST_CUTS = 8  # of these cut-outs, for which a photo is decoded whole
-CLOSE = ("blurred",)  # findings whose photos are shown pixel by pixel
+MOST_CUTS = 8  # of these crops, for which a photo is decoded completely
+CLOSE = ("blurred",)  # findings whose photos are shown as crops
 EXAMPLES = 3  # of photos that are dull throughout
-SHARP = 0.9  # a neighbour to compare with is as sharp as the others, or nearly
+SHARP = 0.9  # least relative sharpness of a neighbour shown for comparison
 
 
 @dataclass(frozen=True)
 class FindingPicture:
-    """A picture under a finding.
+    """An image shown with a finding.
 
     Attributes:
-        name: Of the photo, as people can read it.
-        picture: None where the photo cannot be read.
-        fact: What was measured of it, in words; may be empty.
-        beside: It is not one of the finding's, and stands there to compare with.
+        name: The photo's printable name.
+        picture: The image; None if the photo cannot be read.
+        fact: What was measured, in words; may be empty.
+        beside: Whether it is not one of the finding's photos but shown for comparison.
     """
 
     name: str
@@ -41,7 +41,7 @@ class FindingPicture:
 
 
 def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
-    """Pictures for each finding, in their order; the first findings, which are the worst, take what there may be."""
+    """Images for each finding, in order; the worst findings, which come first, have priority within the limits."""
     photos = {photo.name: photo for photo in preflight.photos}
     root = photo_root(preflight.folder)
     left, cuts = MOST_PICTURES, MOST_CUTS
@@ -64,7 +64,7 @@ def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
 
 
 def facts_in_words(finding: Finding, photo: PhotoFacts | None) -> str:
-    """What was measured of a photo that has to do with a finding."""
+    """The measurements of a photo that are relevant to a finding, in words."""
     if photo is None:
         return ""
     if finding.code in CLOSE and photo.sharpness is not None:
@@ -79,7 +79,7 @@ def facts_in_words(finding: Finding, photo: PhotoFacts | None) -> str:
 
 
 def _examples(preflight: Preflight, finding: Finding) -> tuple[str, ...]:
-    """Photos that show what a finding of the whole capture is about: the worst of them, or those that it names."""
+    """Example photos for a finding: the worst ones if it concerns the whole capture, else those it names."""
     photos = preflight.photos
     if finding.code == "orphan":
         return tuple(photos[i].name for i in preflight.orphans)
@@ -103,7 +103,7 @@ def _pictured(
 
 
 def _sharp_neighbour(preflight: Preflight, name: str) -> PhotoFacts | None:
-    """The sharp photo that shows most of what another one shows."""
+    """The sharp photo that overlaps another one most."""
     numbers: Mapping[str, int] = {photo.name: i for i, photo in enumerate(preflight.photos)}
     own = numbers.get(name)
     beside: Sequence[tuple[int, int]] = [

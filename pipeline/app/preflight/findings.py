@@ -1,4 +1,4 @@
-"""What the preflight says of a capture: findings, and what they rest on."""
+"""The results of the preflight: findings, and the facts they are based on."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from splatpipe.pipeline.engine.stage import JSON
 
 Severity = Literal["error", "warning", "note"]
 RANK: dict[Severity, int] = {"error": 0, "warning": 1, "note": 2}
-Place = tuple[float, float]  # east, north about the preflight's origin, metres
+Place = tuple[float, float]  # east, north of the preflight's origin, metres
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that whoever flew should know.
+    """Something the pilot should know.
 
     Attributes:
-        code: What it is, for programs: ``blurred``, ``gap``, …
-        severity: ``error`` where nothing can be reconstructed, ``warning`` where photos or accuracy are lost, ``note``.
+        code: Its kind, for programs: ``blurred``, ``gap``, …
+        severity: ``error`` if nothing can be reconstructed, ``warning`` if photos or accuracy are lost, ``note``.
         message: One sentence.
-        hint: What to do about it; empty where there is nothing to do.
-        photos: Names of the photos that it is about, sorted; empty where it is about the whole capture.
+        hint: What to do about it; empty if there is nothing to do.
+        photos: Sorted names of the photos concerned; empty if it concerns the whole capture.
     """
 
     code: str
@@ -34,22 +34,22 @@ class Finding:
 
 @dataclass(frozen=True)
 class PhotoFacts:
-    """A photo that can be used.
+    """A usable photo.
 
     Attributes:
-        name: Relative to the folder.
-        width: Of the stored grid, pixels.
-        height: Likewise.
-        orientation: EXIF's, 1 to 8: how to turn it for people.
+        name: Its path relative to the folder.
+        width: Width of the stored pixel grid.
+        height: Height of the stored pixel grid.
+        orientation: EXIF orientation, 1 to 8.
         camera: Number of its camera group.
-        time: ISO 8601, local to the camera; None when EXIF does not say.
-        position_m: East, north, up about the origin; None without a position.
-        footprint_m: Corners of what it shows of the ground; None where that is not known.
-        sharpness: Detail of its finest scales over that of its neighbours in what both show: 1 is as sharp as they,
-            less is duller; None where nothing could be compared.
-        brightness_ev: Exposure values by which it is brighter than its neighbours in what both show; None likewise.
+        time: ISO 8601, local to the camera; None if EXIF has none.
+        position_m: East, north, up of the origin; None without a position.
+        footprint_m: Corners of its ground footprint; None if unknown.
+        sharpness: Fine detail relative to that of its neighbours in the area both show: 1 is equally sharp, less is
+            more blurred; None if nothing could be compared.
+        brightness_ev: Brightness relative to its neighbours in the area both show, EV; None likewise.
         mean_level: Mean grey level, 0 to 255.
-        matched: With so many other photos.
+        matched: Number of other photos it matches.
     """
 
     name: str
@@ -68,7 +68,7 @@ class PhotoFacts:
 
 @dataclass(frozen=True)
 class LeftOutPhoto:
-    """A file that takes no part, and why: ``reason`` ends a sentence that starts with the name."""
+    """An excluded file; ``reason`` completes a sentence that starts with the name."""
 
     name: str
     reason: str
@@ -76,7 +76,7 @@ class LeftOutPhoto:
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Two photos that were compared (numbers in ``Preflight.photos``, first < second), and keypoints that agree."""
+    """Two matched photos (indices into ``Preflight.photos``, first < second) and their number of inlier keypoints."""
 
     first: int
     second: int
@@ -85,7 +85,7 @@ class MatchedPair:
 
 @dataclass(frozen=True)
 class Gap:
-    """Where overlap is missing: its outline, and what is told of it."""
+    """An area without enough overlap: its outline and its description."""
 
     outline_m: tuple[Place, ...]
     text: str
@@ -93,14 +93,14 @@ class Gap:
 
 @dataclass(frozen=True)
 class ControlPlace:
-    """A point of the control file.
+    """A point of the GCP file.
 
     Attributes:
-        name: As written.
+        name: Its name as written.
         kind: Its role in the survey.
         position_m: East, north.
-        photos: So many photos may show it, by their footprints; None where these are not known.
-        marks: So many photos have it marked.
+        photos: Number of photos that may show it, by their footprints; None if these are unknown.
+        marks: Number of photos in which it is marked.
     """
 
     name: str
@@ -112,16 +112,16 @@ class ControlPlace:
 
 @dataclass(frozen=True)
 class PresetForecast:
-    """What a run would need with a preset.
+    """The forecast of a run with a preset.
 
     Attributes:
-        preset: Its name.
-        memory_bytes: Peak of its hungriest stage.
-        cpu_seconds: Of all stages.
-        seconds: On this machine's processors.
-        disk_bytes: That OUT takes.
-        lacking: Why it does not fit this machine; empty when it does.
-        blocks: That the scene is trained in; 1 where it is trained whole.
+        preset: The preset's name.
+        memory_bytes: Peak memory of the most demanding stage.
+        cpu_seconds: CPU seconds of all stages.
+        seconds: Duration on this machine's processors.
+        disk_bytes: Size of OUT.
+        lacking: Why it does not fit this machine; else empty.
+        blocks: Number of blocks in which the scene is trained; 1 if it is not divided.
     """
 
     preset: str
@@ -135,7 +135,7 @@ class PresetForecast:
 
 @dataclass(frozen=True)
 class MachineFacts:
-    """What there is here to run it: bytes of memory, processors, bytes free on the disk."""
+    """This machine's resources: bytes of memory, processors, bytes free on the disk."""
 
     memory_bytes: int
     cores: int
@@ -144,22 +144,22 @@ class MachineFacts:
 
 @dataclass(frozen=True)
 class Preflight:
-    """All that was found.
+    """The result of a preflight.
 
     Attributes:
-        folder: The user's; photos' names are relative to ``photo_root`` of it.
-        photos: Those that can be used, sorted by name.
-        left_out: The others.
-        findings: The worst first.
-        origin: Latitude and longitude, degrees, of what metres count from; None without positions.
-        pairs: What the quick match compared.
-        components: Photos (numbers) that hang together by these, the largest first; orphans are those of one.
-        gaps: Where overlap is missing.
-        control: The control file's points; empty without one, or where its CRS or the photos' positions are not known.
-        forecasts: A preset each.
-        machine: Which they are for.
-        when_s: When it was made, seconds since 1970.
-        seconds: How long that took.
+        folder: The user's folder; photo names are relative to its ``photo_root``.
+        photos: The usable photos, sorted by name.
+        left_out: The excluded files.
+        findings: The findings, worst first.
+        origin: Latitude and longitude, degrees, of the origin of metric positions; None without positions.
+        pairs: The pairs from the quick match.
+        components: Connected components of photos (indices), largest first; orphans are components of one.
+        gaps: Areas without enough overlap.
+        control: The GCP file's points; empty without one, or if its CRS or the photos' positions are unknown.
+        forecasts: One forecast per preset.
+        machine: The machine they apply to.
+        when_s: Time of the preflight, seconds since 1970.
+        seconds: Its duration.
     """
 
     folder: Path
@@ -178,7 +178,7 @@ class Preflight:
 
     @property
     def orphans(self) -> tuple[int, ...]:
-        """Photos (numbers) that hang together with no other."""
+        """Indices of photos that match no other."""
         return tuple(sorted(piece[0] for piece in self.components if len(piece) == 1))
 
     @property
@@ -188,12 +188,12 @@ class Preflight:
 
 
 def as_json(preflight: Preflight) -> JSON:
-    """What ``check --json`` prints; no path but the photos' names."""
+    """The output of ``check --json``; it has no paths other than the photos' names."""
     value = asdict(preflight)
     del value["folder"]
     return value | {"verdict": preflight.worst or "fine", "orphans": list(preflight.orphans)}
 
 
 def worst_first(findings: list[Finding]) -> tuple[Finding, ...]:
-    """The findings in the order in which they are told."""
+    """The findings sorted by severity, worst first."""
     return tuple(sorted(findings, key=lambda finding: (RANK[finding.severity], finding.code, finding.photos)))

@@ -1,4 +1,4 @@
-"""The photos of a capture as ingest takes them, with all that their metadata say: the preflight's first look."""
+"""The first step of the preflight: reads the photos as ingest does, with all their metadata."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
 
-LEAST_PHOTOS = 2  # as many as ingest asks for
+LEAST_PHOTOS = 2  # the number ingest requires
 
 
 @dataclass(frozen=True)
 class Intake:
-    """What there is.
+    """The photos of a capture and their metadata.
 
     Attributes:
-        photos: Those that can be used, sorted by name.
-        left_out: The others.
-        groups: Their cameras.
+        photos: The usable photos, sorted by name.
+        left_out: The excluded files.
+        groups: The camera groups.
         camera_of: The camera of each photo.
-        positions: What they state of their places.
-        layout: The same in metres, as pairs are chosen by it.
+        positions: The photos' stated positions.
+        layout: The same in metres, as used for pair selection.
     """
 
     photos: tuple[CheckedPhoto, ...]
@@ -57,18 +57,18 @@ class Intake:
 
 
 def take_in(source: RunSource, config: LineConfig, threads: int, report: Reporter) -> tuple[Intake, list[Finding]]:
-    """Check every photo whole, and what their metadata say.
+    """Check every photo completely, including its metadata.
 
     Args:
         source: The user's folder.
-        config: Of the run that would follow.
-        threads: That work at a time.
-        report: Told of progress.
+        config: Configuration of the run that would follow.
+        threads: Number of threads.
+        report: Receives the progress.
     """
     root = photo_root(source.folder)
     work = Preparation(config.ingest, threads, root, report)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # libraries warn of odd metadata tags in a text of their own
+        warnings.simplefilter("ignore")  # libraries print their own warnings about unusual metadata tags
         scan = scan_folder(root)
         checked, broken = check_photos(scan, work)
     photos, duplicates = split_duplicates(checked)
@@ -93,12 +93,12 @@ def take_in(source: RunSource, config: LineConfig, threads: int, report: Reporte
 
 
 def from_doubt(doubt: Doubt) -> Finding:
-    """A doubt as the preflight tells it."""
+    """Convert a doubt to a finding."""
     return Finding(doubt.code, doubt.weight, doubt.message, doubt.hint, doubt.photos)
 
 
 def listed(photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int]) -> list[Photo]:
-    """The photos as ingest's list has them; none is converted."""
+    """The photos as in ingest's list; none is converted."""
     return [
         Photo(
             photo.name,
@@ -132,7 +132,7 @@ def _layout(
 def _file_places(
     source: RunSource, config: LineConfig, photos: Sequence[CheckedPhoto]
 ) -> tuple[Mapping[str, FilePlace], list[Finding]]:
-    """What the file of positions says, where there is one; a run would end with what is wrong with it."""
+    """Read the positions file, if any; its errors, which would end a run, become findings."""
     path = source.part_path("source.geo")
     if not path.is_file() or not photos:
         return {}, []
@@ -148,7 +148,7 @@ def _file_places(
 
 
 def _unreadable(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
-    """One finding a reason."""
+    """One finding per reason."""
     by_reason: dict[str, list[str]] = {}
     for entry in entries:
         by_reason.setdefault(entry.reason, []).append(entry.name)
@@ -164,7 +164,7 @@ def _duplicates(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
         return []
     told = [f"{printable(entry.name)} {entry.reason}" for entry in entries]
     more = f"; and {len(told) - 5} more" if len(told) > 5 else ""
-    # The reason ends with the twin's name: who looks for the copy finds both.
+    # The reason ends with the twin's name, so that both can be found.
     twins = {entry.reason.partition(" as ")[2] for entry in entries}
     names = tuple(sorted({entry.name for entry in entries} | twins))
     text = f"Duplicate photos: {'; '.join(told[:5])}{more}."

@@ -1,4 +1,4 @@
-"""The frame of a capture's map: which metres it shows, and where they lie in the drawing."""
+"""The frame of a capture's map: the area shown, and its mapping to drawing coordinates."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from dataclasses import dataclass
 
 from splatpipe.pipeline.app.preflight.findings import Place, Preflight
 
-WIDTH = 2000  # of the drawing, in its own units: whole numbers are fine enough, and short
+WIDTH = 2000  # of the drawing, in its own units: integers are precise enough, and short
 NARROWEST, HIGHEST = 0.4, 1.0  # height over width
 MARGIN = 0.06  # of the longer side, around what is shown
-REACH = 0.3  # of the photos' span: footprints of slanting views and points that lie further out are cut off
+REACH = 0.3  # of the photos' extent: footprints of oblique views and points farther out are cut off
 LEAST_SPAN_M = 10.0  # a capture from one spot still has a map
-SCALE_SHARE = 0.25  # of the width, that the scale's bar takes at most
+SCALE_SHARE = 0.25  # of the width, the most that the scale bar occupies
 
 
 @dataclass(frozen=True)
 class MapFrame:
-    """East and north to the drawing's right and down.
+    """Maps east and north to the drawing's x (right) and y (down).
 
     Attributes:
-        west: Of the left edge, metres.
-        north: Of the upper edge.
-        metres: Across the drawing.
-        height: Of the drawing, in its units; it is `WIDTH` wide.
+        west: East coordinate of the left edge, metres.
+        north: North coordinate of the upper edge, metres.
+        metres: Width of the drawing in metres.
+        height: Height of the drawing in its units; it is `WIDTH` wide.
     """
 
     west: float
@@ -33,17 +33,17 @@ class MapFrame:
     height: int
 
     def point(self, place: Sequence[float]) -> tuple[int, int]:
-        """Where a place lies in the drawing, right and down."""
+        """Drawing coordinates, right and down, of a place."""
         scale = WIDTH / self.metres
         return round((place[0] - self.west) * scale), round((self.north - place[1]) * scale)
 
     def holds(self, place: Sequence[float]) -> bool:
-        """Whether a place lies within the drawing."""
+        """Whether a place is within the drawing."""
         x, y = self.point(place)
         return 0 <= x <= WIDTH and 0 <= y <= self.height
 
     def at_edge(self, place: Sequence[float]) -> tuple[int, int]:
-        """Where the way from the middle to a place beyond the drawing leaves it, a little within."""
+        """Where the line from the centre to a place outside the drawing crosses its edge, slightly inside."""
         x, y = self.point(place)
         right, down = x - WIDTH / 2, y - self.height / 2
         inside = min(0.47 * WIDTH / max(abs(right), 1e-9), 0.46 * self.height / max(abs(down), 1e-9))
@@ -55,7 +55,7 @@ class MapFrame:
 
     @property
     def scale_bar(self) -> tuple[int, float]:
-        """A round length that is easy to compare with: in the drawing's units, and in metres."""
+        """A round length for the scale bar, in the drawing's units and in metres."""
         most = SCALE_SHARE * self.metres
         power = 10.0 ** math.floor(math.log10(most))
         length = next(step * power for step in (5.0, 2.0, 1.0) if step * power <= most)
@@ -63,7 +63,7 @@ class MapFrame:
 
 
 def frame_of(preflight: Preflight) -> MapFrame | None:
-    """The frame that shows all photos with a position, what they show, gaps and control near them; None without any."""
+    """The frame of all photos with positions and their footprints, gaps and nearby control; None without any."""
     taken = [photo.position_m[:2] for photo in preflight.photos if photo.position_m is not None]
     if not taken:
         return None

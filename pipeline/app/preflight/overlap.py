@@ -1,4 +1,4 @@
-"""Which photos hang together: a quick match at low resolution, and what it says against overlap and positions."""
+"""Finds connected photos by a quick match at low resolution, and problems with overlap and positions."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from splatpipe.pipeline.survey.flight_gaps import MissingStrip, find_missing
 from splatpipe.pipeline.survey.swapped_positions import PositionEvidence, find_swapped
 
 EXHAUSTIVE_UP_TO = 40  # photos: 780 pairs, five seconds
-NEIGHBOURS = 8  # partners a photo by positions or sequence; the run takes 20
-LOOK_ALIKES = 4  # besides, whatever positions say: these may be wrong
-AGAIN = 16  # partners for photos that found none
-THIN_PARTNERS = 2.5  # matched photos each, by the median: fewer, and a run loses photos
-WELL_TOGETHER = 0.9  # of the photos in one piece; else the capture falls apart
-LEAST_TOGETHER = 0.2  # of them: less, and there is nothing to reconstruct
-OUTLINE_SHARE = 0.35  # of a gap's length: half the width that is drawn for it
+NEIGHBOURS = 8  # partners per photo by position or sequence; a run uses 20
+LOOK_ALIKES = 4  # further partners by appearance, since positions may be wrong
+AGAIN = 16  # partners tried for photos without a match
+THIN_PARTNERS = 2.5  # least median number of matched photos: with fewer, a run loses photos
+WELL_TOGETHER = 0.9  # least share of the photos in the largest component; else the capture is fragmented
+LEAST_TOGETHER = 0.2  # least share for a reconstruction
+OUTLINE_SHARE = 0.35  # half the width of a gap's outline as a share of its length
 
 
 @dataclass(frozen=True)
 class MatchGraph:
-    """What the quick match found.
+    """The result of the quick match.
 
     Attributes:
-        found: What agrees, by pair that was tried.
-        pieces: Photos that hang together, the largest first.
+        found: Inlier matches by tried pair.
+        pieces: Connected components of photos, largest first.
     """
 
     found: Mapping[Pair, InlierMatches]
@@ -50,11 +50,11 @@ class MatchGraph:
 
     @property
     def matches(self) -> dict[Pair, int]:
-        """Keypoints that agree, by pair."""
+        """Number of inlier keypoints by pair."""
         return {pair: len(agreed) for pair, agreed in self.found.items()}
 
     def partners(self, count: int) -> list[int]:
-        """How many photos each one matches."""
+        """The number of photos that each photo matches."""
         own = [0] * count
         for pair, agreed in self.found.items():
             for photo in pair:
@@ -63,7 +63,7 @@ class MatchGraph:
 
 
 def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: int, report: Reporter) -> MatchGraph:
-    """Match neighbours by what is known of the photos, look-alikes, and more of them for those that find no partner."""
+    """Match neighbours by metadata, similar-looking photos, and more of these for photos still without a match."""
     count = len(layout)
 
     @cache
@@ -87,7 +87,7 @@ def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: in
 
 
 def pieces_of(found: Mapping[Pair, InlierMatches], count: int) -> tuple[tuple[int, ...], ...]:
-    """Photos (numbers) that hang together, the largest piece first."""
+    """Connected components of photos (indices), largest first."""
     labels = components([pair for pair, agreed in found.items() if len(agreed)], count)
     pieces: dict[int, list[int]] = {}
     for photo, label in enumerate(labels.tolist()):
@@ -96,7 +96,7 @@ def pieces_of(found: Mapping[Pair, InlierMatches], count: int) -> tuple[tuple[in
 
 
 def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]:
-    """Orphans, pieces, and overlap that is thin throughout."""
+    """Findings on orphans, separate components, and overlap that is low throughout."""
     count = len(names)
     pieces = overlap.pieces
     if count < 2:
@@ -129,13 +129,13 @@ def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]
 
 
 def flight_of(layout: Layout, overlap: MatchGraph) -> PositionEvidence:
-    """The way of the flight; without places where these scatter no wider than their errors."""
+    """The flight path; without positions if these scatter no more than their errors."""
     places = layout.positions_m if positions_tell(layout) else np.full_like(layout.positions_m, np.nan)
     return PositionEvidence(places, layout.times, overlap.matches)
 
 
 def swap_findings(names: Sequence[str], flight: PositionEvidence) -> list[Finding]:
-    """Photos that have each other's position."""
+    """Photos whose positions are swapped."""
     findings = []
     for pair in find_swapped(flight):
         first, second = (names[k] for k in pair)
@@ -148,7 +148,7 @@ def swap_findings(names: Sequence[str], flight: PositionEvidence) -> list[Findin
 
 
 def gap_findings(names: Sequence[str], flight: PositionEvidence) -> tuple[list[Finding], list[Gap]]:
-    """Strips of photos that are missing along the way."""
+    """Strips of photos missing along the flight path."""
     findings, gaps = [], []
     for strip in find_missing(names, flight):
         before, after = printable(names[strip.before]), printable(names[strip.after])
@@ -164,7 +164,7 @@ def gap_findings(names: Sequence[str], flight: PositionEvidence) -> tuple[list[F
 
 
 def _outline(flight: PositionEvidence, strip: MissingStrip) -> tuple[tuple[float, float], ...]:
-    """A box along the gap."""
+    """A rectangle along the gap."""
     start, end = flight.places_m[strip.before, :2], flight.places_m[strip.after, :2]
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
     aside = np.array([-along[1], along[0]]) * max(strip.usual_m, OUTLINE_SHARE * strip.apart_m)

@@ -1,7 +1,7 @@
-"""The map of overlap as SVG: what photos show, which of them match, where they were taken, gaps, orphans and control.
+"""The overlap map as SVG: footprints, matches, camera positions, gaps, orphans and control.
 
-Without positions the photos stand in a ring, in the order of their names. Colours are the style's, right in light
-and dark; dots and lines keep their width whatever the screen's.
+Without positions the photos are drawn in a ring, in the order of their names. Colours come from the style sheet, for
+light and dark mode; dots and lines have the same width on all screens.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
 from splatpipe.pipeline.app.report.wording import count, length, plural
 
-MOST_PAIRS = 5_000  # lines; of more, those come first that hold photos which few others hold
-STRENGTHS = ((0, "weak"), (25, "fair"), (80, "strong"))  # from so many matches on
-CLEAR_PAIRS = 120  # lines that may be drawn in full; more of them are fainter, so that what is below shows through
+MOST_PAIRS = 5_000  # lines; if there are more, those of weakly connected photos come first
+STRENGTHS = ((0, "weak"), (25, "fair"), (80, "strong"))  # least number of matches of each class
+CLEAR_PAIRS = 120  # lines drawn opaque; more of them are fainter, so that what is below shows through
 FAINTEST = 0.25
 MANY = 400  # photos, whose dots are smaller
 MOST_NAMED = 40  # control points with their names on the map
 RADIUS, MIDDLE = 880, 1000  # of the ring
-LETTERS = {"wide": 34, "everywhere": 60}  # height of letters in the drawing's units: as in the style, and on a phone
-LONGEST_TITLE = 120  # characters of a name that a pointer is told
+LETTERS = {"wide": 34, "everywhere": 60}  # letter height in the drawing's units: as in the style sheet, and on a phone
+LONGEST_TITLE = 120  # characters of a name in a tooltip
 
 
 @dataclass(frozen=True)
 class OverlapMap:
-    """A map.
+    """An overlap map.
 
     Attributes:
-        svg: The element.
+        svg: The SVG element.
         kind: ``map``, or ``ring`` without positions.
-        layers: What can be hidden: name in the style, title; those of which there is nothing are left out.
+        layers: Layers that can be hidden: CSS name and title; empty layers are left out.
         unplaced: Photos without a position, which are not on the map.
     """
 
@@ -47,13 +47,13 @@ class OverlapMap:
 
 
 class Labels:
-    """The names on a map, none upon another: on a phone, whose letters are larger against the map, fewer of them."""
+    """Places labels on a map without overlap; fewer on phones, where letters are larger relative to the map."""
 
     def __init__(self) -> None:
         self._taken: dict[int, list[tuple[float, float, float, float]]] = {size: [] for size in LETTERS.values()}
 
     def room(self, x: int, y: int, text: str, side: str) -> str:
-        """Where there is room for a name at a place: ``everywhere``, on ``wide`` screens; empty where there is none."""
+        """Where a label fits at a place: ``everywhere``, or only on ``wide`` screens; empty if nowhere."""
         free = [name for name, size in LETTERS.items() if self._take(x, y, text, side, size)]
         return "everywhere" if "everywhere" in free else "wide" if free else ""
 
@@ -69,14 +69,14 @@ class Labels:
 
 
 def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> OverlapMap | None:
-    """Draw a capture.
+    """Draw the overlap map of a capture.
 
     Args:
-        preflight: What was found.
-        doubtful: For photos that findings are about, what they say, in a few words.
+        preflight: The preflight's result.
+        doubtful: For photos with findings, the findings in a few words.
 
     Returns:
-        None without photos.
+        The map; None without photos.
     """
     if not preflight.photos:
         return None
@@ -127,7 +127,7 @@ def _svg(size: tuple[int, int], summary: str, many: bool, inner: str) -> Markup:
 
 
 def _summary(preflight: Preflight, kind: str) -> str:
-    """What the picture shows, for those who cannot see it."""
+    """A text alternative for the map."""
     what = "Map of the photos" if kind == "map" else "The photos in a ring, in name order"
     parts = [plural(len(preflight.photos), "photo"), plural(len(preflight.pairs), "pair") + " compared"]
     parts += [plural(len(preflight.gaps), "gap"), plural(len(preflight.orphans), "photo") + " that match no other"]
@@ -156,13 +156,13 @@ def _gaps(frame: MapFrame, preflight: Preflight) -> str:
 
 
 def _pairs(pairs: Sequence[MatchedPair], places: Mapping[int, tuple[int, int]], *, curved: bool) -> str:
-    """The matched pairs, in a path for each strength."""
+    """The matched pairs, as one path per strength class."""
     known = [pair for pair in pairs if pair.matches > 0 and pair.first in places and pair.second in places]
     paths = dict.fromkeys((name for _, name in STRENGTHS), "")
     for pair in _strongest(known):
         (x0, y0), (x1, y1) = places[pair.first], places[pair.second]
         name = [name for least, name in STRENGTHS if pair.matches >= least][-1]
-        if curved:  # towards the middle, the more so the further apart
+        if curved:  # towards the centre, more strongly for photos farther apart
             pull = 0.75 * min(1.0, math.hypot(x1 - x0, y1 - y0) / RADIUS)
             x, y = ((a + b) / 2 * (1 - pull) + MIDDLE * pull for a, b in ((x0, x1), (y0, y1)))
             paths[name] += f"M{x0} {y0}Q{x:.0f} {y:.0f} {x1} {y1}"
@@ -174,11 +174,11 @@ def _pairs(pairs: Sequence[MatchedPair], places: Mapping[int, tuple[int, int]], 
 
 
 def _strongest(pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
-    """The pairs to draw, the weakest first; of too many, each photo's best before the rest."""
+    """The pairs to draw, weakest first; if there are too many, each photo's strongest have priority."""
     ranked = sorted(pairs, key=lambda pair: (-pair.matches, pair.first, pair.second))
     if len(ranked) > MOST_PAIRS:
         held: dict[int, int] = {}
-        needed = []  # how little the photo of a pair that has fewer lines by then is held
+        needed = []  # for each pair, the smaller number of lines so far of its two photos
         for pair in ranked:
             needed.append(min(held.get(pair.first, 0), held.get(pair.second, 0)))
             for photo in (pair.first, pair.second):
@@ -189,7 +189,7 @@ def _strongest(pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
 
 
 def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtful: Mapping[str, str]) -> str:
-    """A dot a photo: those in doubt, in a piece apart, and orphans are marked, and drawn above the others."""
+    """One dot per photo; those with findings, in separate components, and orphans are marked and drawn on top."""
     pieces = {photo: number for number, piece in enumerate(preflight.components) for photo in piece}
     orphans = set(preflight.orphans) if len(preflight.photos) > 1 else set()
     drawn: dict[str, list[str]] = {"plain": [], "doubtful": [], "apart": [], "orphan": []}
@@ -253,7 +253,7 @@ def _scale(frame: MapFrame) -> str:
 
 
 def _ring(photos: int) -> dict[int, tuple[int, int]]:
-    """Where each photo stands in the ring, from the top to the right."""
+    """The position of each photo in the ring, clockwise from the top."""
     angles: Iterable[float] = (2.0 * math.pi * i / max(photos, 1) for i in range(photos))
     return {
         i: (round(MIDDLE + RADIUS * math.sin(angle)), round(MIDDLE - RADIUS * math.cos(angle)))

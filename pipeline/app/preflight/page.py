@@ -1,4 +1,4 @@
-"""The preflight's page: the verdict first, the map of overlap, findings with pictures, and what a run would take."""
+"""The preflight's page: verdict, overlap map, findings with images, and the forecast of a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.durable import write_durably
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 MOST_FINDINGS = 200
-MOST_NAMES = 300  # photos of a finding that are named
+MOST_NAMES = 300  # photos listed per finding
 MOST_CONTROL = 500  # rows
 LEVELS: Mapping[Severity, Literal["note", "doubt", "bad"]] = {"error": "bad", "warning": "doubt", "note": "note"}
 SIGNS = {"bad": "✗", "doubt": "!", "note": "i"}
@@ -28,15 +28,15 @@ SIGNS = {"bad": "✗", "doubt": "!", "note": "i"}
 
 @dataclass(frozen=True)
 class FindingCard:
-    """A finding as it is drawn.
+    """A finding's card.
 
     Attributes:
-        finding: What was found.
-        level: Its tone.
-        sign: That as one character.
-        pictures: Of some of its photos.
-        names: All its photos, as people can read them, up to a limit.
-        more: Photos beyond it.
+        finding: The finding.
+        level: Its level.
+        sign: The level as one character.
+        pictures: Images of some of its photos.
+        names: Printable names of its photos, up to a limit.
+        more: Number of photos beyond the limit.
     """
 
     finding: Finding
@@ -48,11 +48,11 @@ class FindingCard:
 
 
 def write_page(preflight: Preflight, path: Path) -> None:
-    """Write the page, whole or not at all.
+    """Write the page atomically.
 
     Args:
-        preflight: What was found.
-        path: Where to.
+        preflight: The preflight's result.
+        path: The output file.
 
     Raises:
         OSError: if it cannot be written.
@@ -62,7 +62,7 @@ def write_page(preflight: Preflight, path: Path) -> None:
 
 
 def check_page(preflight: Preflight) -> str:
-    """The page as one HTML text that needs nothing else.
+    """The page as one self-contained HTML text.
 
     Raises:
         MachineError: if this installation lacks the page's style.
@@ -103,7 +103,7 @@ def check_page(preflight: Preflight) -> str:
 
 
 def _verdict(preflight: Preflight) -> tuple[str, str, str]:
-    """Level, headline and sentence that the page begins with."""
+    """Level, headline and sentence at the top of the page."""
     if not preflight.photos:
         return "bad", "There are no usable photos", "No readable photo was found in the folder."
     counts = Counter(finding.severity for finding in preflight.findings)
@@ -133,7 +133,7 @@ def _card(finding: Finding, pictures: list[FindingPicture]) -> FindingCard:
 
 
 def _doubts(preflight: Preflight) -> dict[str, str]:
-    """For each photo that a warning or an error names, what its findings are called."""
+    """The findings, by name, of each photo with a warning or an error."""
     doubts: dict[str, list[str]] = {}
     for finding in preflight.findings:
         if RANK[finding.severity] < RANK["note"]:
@@ -174,7 +174,7 @@ def _span(times: list[str]) -> str:
 
 
 def _moment(seconds: float) -> str:
-    """A point in time by this machine's clock, with its zone."""
+    """A point in time in this machine's time zone, with the zone."""
     try:
         return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
     except (OverflowError, OSError, ValueError):

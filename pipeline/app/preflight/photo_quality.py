@@ -1,4 +1,4 @@
-"""Looking at the photos themselves: blur, exposure, copies that were saved again."""
+"""Checks the photos' content: blur, exposure, copies that were saved again."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import printable, some
 from splatpipe.pipeline.sfm.quick_match import QuickFeatures
 
-DULL = 0.85  # of a logarithm of energies: a shake of 3 px gives 1.1 and more, sharp photos 0.5 at most
-DULL_SPREADS = 4.0  # times the usual deviation between photos, where a whole capture is shaken
-MANY = 0.08  # of the photos: then it is the capture's, and told once
+DULL = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
+DULL_SPREADS = 4.0  # times the usual deviation between photos, if a whole capture is blurred
+MANY = 0.08  # share of the photos above which it is reported once, for the whole capture
 MAD_TO_SIGMA = 1.4826  # of Gaussian noise
-JUMP_EV = 1.1  # against the neighbours; light and automatic exposure change by 1.0 in good captures
-CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of pixels without drawing, and by how much more than in most photos
+JUMP_EV = 1.1  # relative to the neighbours; light and automatic exposure vary by 1.0 in good captures
+CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of clipped pixels, and its excess over most photos
 DARK_LEVEL, BRIGHT_LEVEL = 14.0, 244.0  # mean grey levels of a photo that shows nothing
-SAME_PICTURE = 1.0  # grey levels between small pictures of one photo that was saved twice
+SAME_PICTURE = 1.0  # largest grey level difference between thumbnails of a photo saved twice
 
 
 def sharpness(duller: Float64[np.ndarray, "n directions"]) -> Float64[np.ndarray, " n"]:
-    """Amplitude of fine detail over that of neighbours, in the direction in which it is least; NaN where unknown."""
+    """Amplitude of fine detail relative to the neighbours, in the direction where it is least; NaN if unknown."""
     known = np.isfinite(duller).any(axis=1)
     worst = np.where(known, np.max(np.where(np.isfinite(duller), duller, -np.inf), axis=1), np.nan)
     return np.asarray(np.exp(-worst / 2.0))
 
 
 def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n directions"]) -> list[Finding]:
-    """Photos that show less fine detail than their neighbours do of the same things."""
+    """Find photos with less fine detail than their neighbours in the area both show."""
     worst = -2.0 * np.log(sharpness(duller))
     known = worst[np.isfinite(worst)]
     if not len(known):
@@ -62,7 +62,7 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
 def find_exposures(
     photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures], brighter_ev: Float64[np.ndarray, " n"]
 ) -> list[Finding]:
-    """Photos much brighter or darker than their neighbours where both show the same, and photos that show nothing."""
+    """Find photos much brighter or darker than their neighbours in the area both show, and white or black photos."""
     findings = []
     jumps = np.flatnonzero(np.abs(np.nan_to_num(brighter_ev)) > JUMP_EV).tolist()
     for k in jumps:
@@ -83,7 +83,7 @@ def find_exposures(
 def _empty(
     photos: Sequence[CheckedPhoto], code: str, shares: Sequence[float], beyond: Sequence[bool], told: set[int]
 ) -> list[Finding]:
-    """Photos that are white, or black, for the most part; those that were told do not count again."""
+    """Find mostly white or black photos, except those already reported."""
     level = "white" if code == "overexposed" else "black"
     usual = float(np.median(shares)) if shares else 0.0
     if usual > CLIPPED:
@@ -99,7 +99,7 @@ def _empty(
 
 
 def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:
-    """Whether shutter, aperture and sensitivity say the same, against the photos taken before and after."""
+    """Whether shutter, aperture and ISO explain the step, compared with the photos before and after."""
     own = photos[at].exif.exposure_ev
     beside = [photos[k].exif.exposure_ev for k in (at - 2, at - 1, at + 1, at + 2) if 0 <= k < len(photos)]
     known = [value for value in beside if value is not None]
@@ -110,7 +110,7 @@ def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:
 
 
 def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures]) -> list[Finding]:
-    """Photos that are another one saved again: the same picture and time, other bytes."""
+    """Find copies saved again: the same image and time, but different bytes."""
     if len(photos) < 2:
         return []
     small = np.stack([glimpse.signature.ravel() for glimpse in glimpses])

@@ -1,4 +1,4 @@
-"""Where photos were taken, what they show of the ground, whether their views leave the focal length open; control."""
+"""Checks positions, footprints, whether the views determine the focal length, and control points."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from splatpipe.pipeline.survey.position_doubts import WELL_KNOWN_M
 from splatpipe.pipeline.survey.scale_bars import read_scale_bars
 from splatpipe.pipeline.survey.surveyed_points import missing_photos
 
-DOWN_DEG = -75.0  # pitch of the gimbal: further up, walls are seen, and the focal length with them
-ONE_HEIGHT = 0.1  # spread of the heights above take-off over their median
-OUTSIDE_SHARE = 0.3  # of the marks beyond their photos: they were made in photos of another size, and a run ends there
+DOWN_DEG = -75.0  # gimbal pitch: views less steep show walls, which determine the focal length
+ONE_HEIGHT = 0.1  # spread of the heights above take-off relative to their median
+OUTSIDE_SHARE = 0.3  # of the marks outside their photos: they were made in photos of another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
-REACH_SPACINGS, LEAST_REACH_M = 3.0, 60.0  # around photos of which it is not known where they look
+REACH_SPACINGS, LEAST_REACH_M = 3.0, 60.0  # around photos whose viewing direction is unknown
 
 
 def origin_of(intake: Intake) -> tuple[float, float] | None:
-    """Latitude and longitude that the layout's metres count from."""
+    """Latitude and longitude of the layout's origin."""
     first = next(iter(intake.positions.positions), None)
     return None if first is None else (first.latitude, first.longitude)
 
 
 def footprint(views: StatedPoses | None, photo: int) -> tuple[Place, ...] | None:
-    """Corners of what a photo shows of the ground, as far as it reaches; None where that is not known."""
+    """Corners of a photo's ground footprint, limited in range; None if unknown."""
     if views is None or not bool(views.known()[photo]):
         return None
     signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -53,7 +53,7 @@ def footprint(views: StatedPoses | None, photo: int) -> tuple[Place, ...] | None
 
 
 def focal_findings(intake: Intake) -> list[Finding]:
-    """A flight that looks straight down from one height leaves the focal length open, and with it the heights."""
+    """Warn of nadir-only flights at one height, which do not determine the focal length and thus the heights."""
     stated = intake.positions.positions
     pitches = [each.pitch_deg for each in stated if each.pitch_deg is not None]
     if len(pitches) < max(3, len(intake.photos) // 2) or max(pitches) > DOWN_DEG:
@@ -75,13 +75,13 @@ def focal_findings(intake: Intake) -> list[Finding]:
 def control_findings(
     path: Path, approximate: bool, intake: Intake, half_pixel: float
 ) -> tuple[list[Finding], list[ControlPlace]]:
-    """Read the control file as a run does, and hold it against the photos.
+    """Read the GCP file as a run does, and compare it with the photos.
 
     Args:
         path: The file.
         approximate: Whether a CRS whose grid is missing may be used.
         intake: The photos.
-        half_pixel: What brings the file's pixels to those of the stored grid.
+        half_pixel: Offset from the file's pixel coordinates to those of the stored grid.
     """
     try:
         file = read_control_file(path)
@@ -115,7 +115,7 @@ def control_findings(
 
 
 def scale_bar_findings(path: Path) -> list[Finding]:
-    """What is wrong with the file of scale bars, where there is one."""
+    """Problems with the scale bars file, if any."""
     if not path.is_file():
         return []
     try:
@@ -155,7 +155,7 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
 
 
 def _shown_by(at: Float64[np.ndarray, " 2"], intake: Intake) -> int | None:
-    """How many photos may show a place of the ground; None where it is not known how they were taken."""
+    """The number of photos that may show a place on the ground; None if their poses are unknown."""
     views = intake.layout.views
     if views is None:
         return None
@@ -195,5 +195,5 @@ def _outside(
 
 
 def _is_beyond(photos: int | None, metres: float, reach_m: float) -> bool:
-    """Whether no photo shows a point, by their footprints or, where these are not known, by its distance."""
+    """Whether no photo shows a point, judged by footprints or, if these are unknown, by distance."""
     return metres > reach_m if photos is None else photos == 0

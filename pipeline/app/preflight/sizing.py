@@ -1,4 +1,4 @@
-"""How large a capture is, from the headers of a few photos: what forecasts ask before anything is done."""
+"""Estimates a capture's size from the headers of a few photos, for forecasts before anything is done."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatpipe.pipeline.photos.names import is_photo
 from splatpipe.stages.forecast import has_control
 from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
 
-SAMPLED = 9  # photos whose size is looked at; those of a capture are mostly alike
+SAMPLED = 9  # photos whose size is read; within a capture most are alike
 
 
 def size_of(source: RunSource) -> CaptureSize:
@@ -24,11 +24,11 @@ def size_of(source: RunSource) -> CaptureSize:
 
 
 def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
-    """What the forecast asks of a capture, from the headers of a few photos.
+    """The capture size for the forecast, from the headers of a few photos.
 
     Args:
-        paths: Of all photos.
-        has_file: Whether a file has their positions.
+        paths: Paths of all photos.
+        has_file: Whether there is a positions file.
     """
     from PIL import Image
 
@@ -37,7 +37,7 @@ def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
     sizes, placed = [], 0
     step = max(1, len(paths) // SAMPLED)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of odd tags; what is wrong with a photo is told by the run
+        warnings.simplefilter("ignore")  # about unusual tags; the run reports problems with photos
         for path in sorted(paths)[::step][:SAMPLED]:
             try:
                 with Image.open(path) as picture:

@@ -1,4 +1,4 @@
-"""The cheap part of the preflight, with which every run begins: what would end it only hours later, what it takes."""
+"""The quick checks at the start of every run: errors that would end it only hours later, and the forecast."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 def require_readable(request: Request) -> None:
-    """Read the surveyor's files as georef will, and tell now what is wrong with them.
+    """Read the survey files as georef will, to report errors now.
 
     Raises:
-        SplatpipeError: if the control file, the scale bars or the boundary cannot be read.
+        SplatpipeError: if the GCP file, the scale bars or the boundary cannot be read.
     """
     from splatpipe.pipeline.engine.source import open_source
 
@@ -32,10 +32,10 @@ def require_readable(request: Request) -> None:
 
 
 def require_memory(request: Request) -> None:
-    """Refuse a limit of memory within which no training goes; a CUDA device's is known only when it is asked.
+    """Check that training fits the memory limit; a CUDA device's memory is known only when training starts.
 
     Raises:
-        MachineError: if the training's own libraries and the least model are more.
+        MachineError: if the training libraries and the smallest model need more.
     """
     from splatpipe.pipeline.engine.errors import MachineError
     from splatpipe.stages.forecast import least_memory_bytes
@@ -50,7 +50,7 @@ def require_memory(request: Request) -> None:
 
 
 def forecast_text(request: Request) -> str:
-    """What the whole line takes of this machine, in a sentence; empty where nothing is known of the capture."""
+    """The forecast for the whole pipeline on this machine, in a sentence; empty if the capture's size is unknown."""
     from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.app.report.wording import roughly
     from splatpipe.pipeline.engine.machine import available_memory_bytes
@@ -86,7 +86,7 @@ def forecast_text(request: Request) -> str:
 
 
 def blocks_text(blocks: BlockWork) -> str:
-    """How a scene is cut, and what a block takes, in words."""
+    """How the scene is divided into blocks, and what a block needs, in words."""
     division = blocks.division
     told = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians and "
     told += f"{division.memory_bytes / 1e9:.1f} GB of memory at most"
@@ -94,7 +94,7 @@ def blocks_text(blocks: BlockWork) -> str:
 
 
 def _on_cuda(request: Request) -> bool:
-    """Whether the training will be on a CUDA device."""
+    """Whether training will run on a CUDA device."""
     from splatpipe.pipeline.raster.cuda_library import why_not
 
     return request.machine.device != "cpu" and why_not() is None

@@ -1,7 +1,7 @@
-"""The report of a run: one page for the client, built from the events and the manifests.
+"""The report of a run: one page for the client, built from events and manifests.
 
-`write_report` makes it here; `make_report` in a process of its own, as the commands do: a fault or a crash in it can
-neither spoil a good run nor hold one up that is to end, and the command does not pay for its libraries.
+`write_report` writes it in this process; `make_report`, which the commands use, in a separate one: an error or crash
+there can neither fail a good run nor delay its end, and the command need not load its libraries.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from splatpipe.pipeline.engine.errors import MachineError
 
 REPORT_FILE = "report.html"
 PATIENCE_S = 600.0  # far more than hundreds of photos take
-LEAST_S = 2.0  # where the time is over at once: enough for the report without pictures, also on a busy machine
+LEAST_S = 2.0  # least time granted: enough for the report without images, even on a busy machine
 POLL_S = 0.02
 
 
 def write_report(out: Path, *, drawn: bool = True) -> Path:
-    """Write OUT/report.html, whole or not at all.
+    """Write OUT/report.html atomically.
 
     Args:
-        out: The run's folder; the run may be finished, stopped, failed, or go on.
-        drawn: With charts and pictures.
+        out: The run's folder; the run may be finished, stopped, failed, or still running.
+        drawn: Whether to include charts and images.
 
     Returns:
         Its path.
@@ -45,13 +45,13 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
 
 
 def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
-    """Have OUT/report.html written by a process of its own.
+    """Write OUT/report.html in a separate process.
 
     Args:
         out: The run's folder.
-        log: Takes what it says if something is wrong.
-        until_s: ``time.monotonic()`` by which it has to be over: then a page without pictures comes first, which
-            stays if the time does not suffice for the other. None: there is time.
+        log: File for its error output.
+        until_s: ``time.monotonic()`` by which it must finish: a page without images is then written first, and kept
+            if there is no time for the full one. None: no limit.
 
     Returns:
         Its path.
@@ -86,9 +86,9 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
 
 
 def _run(command: Sequence[str], said: IO[str], over: Callable[[], bool], out: Path) -> int:
-    """Run a process to its end, or until its time is over; its exit code. Whatever interrupts the wait ends it, too.
+    """Run a process to its end or until its time is up; returns its exit code. An interrupted wait also kills it.
 
-    What it leaves unfinished in OUT is removed; another process may write a report there beside it.
+    Its unfinished files in OUT are removed; another process may be writing a report there at the same time.
     """
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
     try:

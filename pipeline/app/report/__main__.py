@@ -10,8 +10,8 @@ from splatpipe.pipeline.app.report import write_report
 
 
 def main() -> None:
-    """Write it; in a hurry the plain one first, since the other may not come to its end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C reaches the command, which decides
+    """Write the report; with ``--hurry`` first without images, since there may be no time for the full one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the command, which decides
     out = Path(sys.argv[1])
     if "--hurry" in sys.argv[2:]:
         write_report(out, drawn=False)

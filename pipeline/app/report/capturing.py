@@ -1,4 +1,4 @@
-"""The report's chapters on the photos: what was captured and left out, and how the cameras were found."""
+"""The report's chapters on the photos: what was captured and excluded, and how the cameras were estimated."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
 
 Chapter = dict[str, Any]
 MOST_LISTED = 200  # rows of a table of photos
-LEAST_POINTS = 100  # observed by a photo that is placed well
+LEAST_POINTS = 100  # observed by a well registered photo
 
 
 def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: bool) -> Chapter:
-    """What was captured: photos, cameras, positions, map, overlap, and what was left out and why.
+    """The chapter on the capture: photos, cameras, positions, map, overlap, and excluded photos with reasons.
 
     Args:
-        inputs: What there is.
-        geometry: Of the model, if there is one.
+        inputs: The report's inputs.
+        geometry: The sparse model's geometry, if there is a model.
         drawn: Whether to draw maps.
     """
     summary = inputs.summary("ingest")
@@ -57,7 +57,7 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
 
 
 def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter:
-    """How the cameras were found: matches, tracks, reprojection errors, calibration."""
+    """The chapter on camera registration: matches, tracks, reprojection errors, calibration."""
     sparse, matches, features = (inputs.summary(name) for name in ("sparse", "matches", "features"))
     models = inputs.read("sparse.summary")
     facts = [
@@ -89,7 +89,7 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Cha
 
 
 def unit_of(inputs: ReportInputs) -> str:
-    """``m`` of a model that has its place, ``metres`` of one that has a scale alone, else nothing."""
+    """``m`` for a georeferenced model, ``metres`` for one with only a scale, else empty."""
     frame = inputs.read("georef.frame")
     if frame.get("kind") == "enu":
         return "m"
@@ -97,7 +97,7 @@ def unit_of(inputs: ReportInputs) -> str:
 
 
 def held_out(inputs: ReportInputs) -> list[str]:
-    """Names of the photos that training never saw, as far as it is known."""
+    """Names of the held-out photos, if known."""
     return [str(name) for name in inputs.read("split.views").get("held_out", [])]
 
 
@@ -161,7 +161,7 @@ def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
 
 
 def _source(told: object) -> str:
-    """Where a figure is from, as people write it: ``xmp-calibrated`` is XMP calibrated."""
+    """The source of a value in words: ``xmp-calibrated`` becomes XMP calibrated."""
     words = str(told or "").replace("-", " ")
     return words.replace("exif", "EXIF").replace("xmp", "XMP")
 
@@ -180,7 +180,7 @@ def _camera(camera: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, str
 
 
 def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str, str]:
-    """A camera's lens as it was found, and what of it was freed."""
+    """A camera's estimated calibration, and which parameters were refined."""
     prior, focal = camera.get("prior_focal_px"), camera.get("focal_px")
     change = (focal / prior - 1.0) if camera.get("has_prior") and prior and focal else math.nan
     told = f"{change:+.2%}".replace("%", " %") if math.isfinite(change) else "–"
@@ -202,7 +202,7 @@ def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str,
 
 
 def _tried(row: Mapping[str, Any]) -> dict[str, str]:
-    """A way of mapping that was tried; figures that it has not are dashes."""
+    """A table row for a mapping attempt; missing figures are dashes."""
     against, pairs = row.get("contradicted") or (None, None)
     return {
         "how": str(row.get("how", row.get("mapper", ""))),
@@ -220,7 +220,7 @@ def _tried(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _rung(row: Mapping[str, Any]) -> dict[str, str]:
-    """A rung of the ladder for photos that were left."""
+    """A table row for a step of the attempts to register the remaining photos."""
     return {
         "rung": str(row.get("rung", "")).replace("_", " "),
         "left": count(row.get("left")),

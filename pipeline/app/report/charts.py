@@ -30,19 +30,19 @@ from splatpipe.pipeline.app.report.drawing import (
 )
 from splatpipe.pipeline.app.report.geometry import Geometry, OverlapGrid, ResidualField
 
-POINTS_DRAWN = 20_000  # of a cloud: more add nothing at this size
-PAIRS_DRAWN = 3_000  # lines, the strongest
-OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # from so many photos on a colour of its own
+POINTS_DRAWN = 20_000  # of a point cloud: more would add nothing at this size
+PAIRS_DRAWN = 3_000  # lines, for the strongest pairs
+OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # numbers of photos at which a new colour begins
 OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa564", "#1a6b3c")
-ARROW_SHARE = 0.12  # of the map's width, that the longest residual is drawn as
-SQUASHED = 4.0  # times the iterations reached: a planned end further off leaves no room for the curve
-METRES_A_DEGREE = 111_195.0  # of a sphere: enough to draw by
+ARROW_SHARE = 0.12  # length of the longest residual as a share of the map's width
+SQUASHED = 4.0  # times the iterations reached: a planned end farther away would squash the curve
+METRES_A_DEGREE = 111_195.0  # on a sphere: accurate enough for drawing
 MOST_NAMES = 30  # points with their names on a map
-Residual = tuple[str, Sequence[float], Sequence[float]]  # name; place and residual: east, north, up, metres
+Residual = tuple[str, Sequence[float], Sequence[float]]  # name, position and residual: east, north, up, metres
 
 
 def survey_map(geometry: Geometry, unit: str, held_out: Sequence[str]) -> Markup:
-    """Where the photos were taken, whereto they look and what ground they show, over the sparse points."""
+    """Map of camera positions, viewing directions and footprints over the sparse points."""
     photos, box = geometry.photos, _with_cameras(geometry)
     figure, axes = new_figure(*map_size(box))
     _draw_points(axes, geometry)
@@ -64,7 +64,7 @@ def survey_map(geometry: Geometry, unit: str, held_out: Sequence[str]) -> Markup
 
 
 def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
-    """Where the photos say that they were taken: all there is before the cameras are found.
+    """Map of the photos' stated positions, used before the cameras are estimated.
 
     Args:
         places: Latitude and longitude, degrees.
@@ -80,7 +80,7 @@ def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
 
 
 def overlap_map(overlap: OverlapGrid, unit: str) -> Markup:
-    """How many footprints cover each place."""
+    """Map of the number of footprints that cover each place."""
     figure, axes = new_figure(*map_size(overlap.box), right=1.15)
     norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
     shown = np.ma.masked_equal(overlap.counts, 0)
@@ -116,7 +116,7 @@ def match_map(geometry: Geometry, pairs: Sequence[tuple[str, str, int]], unit: s
 
 
 def observations_bars(geometry: Geometry) -> Markup:
-    """Sparse points that each photo observes, in name order."""
+    """Bar chart of the sparse points observed per photo, in name order."""
     figure, axes = new_figure(WIDTH, 2.6)
     counts = geometry.photos.points
     axes.bar(np.arange(len(counts)) + 1, counts, width=0.85, color=np.where(counts < 100, RED, BLUE))
@@ -127,7 +127,7 @@ def observations_bars(geometry: Geometry) -> Markup:
 
 
 def track_histogram(geometry: Geometry) -> Markup:
-    """In how many photos the sparse points were found."""
+    """Histogram of the sparse points' track lengths."""
     figure, axes = new_figure(WIDTH, 2.6)
     longest = int(np.clip(geometry.tracks.max(), 3, 20))
     lengths = np.clip(geometry.tracks, 2, longest)
@@ -142,7 +142,7 @@ def track_histogram(geometry: Geometry) -> Markup:
 
 
 def error_histogram(geometry: Geometry) -> Markup:
-    """Mean reprojection errors of the sparse points."""
+    """Histogram of the sparse points' mean reprojection errors."""
     figure, axes = new_figure()
     errors = geometry.errors_px[np.isfinite(geometry.errors_px)]
     top = float(np.percentile(errors, 99.5)) if len(errors) else 1.0
@@ -156,7 +156,7 @@ def error_histogram(geometry: Geometry) -> Markup:
 
 
 def residual_field(field: ResidualField, camera: int) -> Markup:
-    """Mean residuals over the picture: a pattern tells that the lens model does not fit."""
+    """Mean residuals over the image: a pattern indicates that the lens model does not fit."""
     width, height = field.size
     figure, axes = new_figure(*map_size((0.0, float(width), 0.0, float(height))))
     largest = float(np.linalg.norm(field.residuals, axis=1).max())
@@ -174,11 +174,11 @@ def residual_field(field: ResidualField, camera: int) -> Markup:
 
 
 def residual_map(geometry: Geometry, groups: Mapping[str, Sequence[Residual]]) -> Markup:
-    """Residuals as arrows on the map, far longer than they are.
+    """Map of residuals as exaggerated arrows.
 
     Args:
-        geometry: Of the scene.
-        groups: Of points or photos, by kind.
+        geometry: The scene's geometry.
+        groups: Residuals of points or photos, by kind.
     """
     every = [entry for entries in groups.values() for entry in entries]
     box = _about(np.array([entry[1][:2] for entry in every], np.float64))
@@ -205,7 +205,7 @@ def residual_map(geometry: Geometry, groups: Mapping[str, Sequence[Residual]]) -
 
 
 def training_curve(name: str, curve: Mapping[float, float], planned: float | None, log: bool) -> Markup:
-    """A figure over the iterations, with the planned end where it was not reached."""
+    """A metric over the iterations, with the planned end if it was not reached."""
     figure, axes = new_figure(WIDTH, 2.8)
     steps = sorted(curve)
     axes.plot(steps, [curve[step] for step in steps], color=BLUE, lw=1.2)
@@ -223,7 +223,7 @@ def training_curve(name: str, curve: Mapping[float, float], planned: float | Non
 
 
 def view_bars(views: Sequence[tuple[str, float]], unit: str) -> Markup:
-    """A measure of each held-out photo, the worst first."""
+    """Bar chart of a metric for each held-out photo, worst first."""
     figure, axes = new_figure(WIDTH, 2.6)
     values = [value for _, value in views]
     axes.bar(np.arange(len(values)) + 1, values, width=0.8, color=BLUE)
@@ -236,7 +236,7 @@ def view_bars(views: Sequence[tuple[str, float]], unit: str) -> Markup:
 
 
 def stage_bars(rows: Sequence[tuple[str, float]], label: str, title: str) -> Markup:
-    """A figure a stage, as bars to the right."""
+    """Horizontal bar chart of one value per stage."""
     figure, axes = new_figure(WIDTH, HEIGHT * max(0.4, len(rows) / 11))
     names, values = [name for name, _ in rows][::-1], [value for _, value in rows][::-1]
     axes.barh(names, values, color=BLUE, height=0.7)

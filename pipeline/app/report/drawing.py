@@ -1,4 +1,4 @@
-"""How the report's charts look, and how they become SVG within the page."""
+"""The style of the report's charts, and their conversion to inline SVG."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 
 INK, FAINT, LINE = "#1b1f24", "#5b6570", "#d8dde3"
 BLUE, ORANGE, GREEN, RED, GREY = "#0b66c3", "#d9730d", "#1a7f37", "#cf222e", "#8b949e"
-WIDTH, HEIGHT = 5.4, 3.5  # inches: half of a page, or the whole of a phone, with letters that can be read on both
+WIDTH, HEIGHT = 5.4, 3.5  # inches: half a page's width, or a phone's, with legible letters on both
 MARGINS = (0.78, 0.12, 0.5, 0.3)  # inches: left, right, bottom, top
 STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",  # letters stay letters: small, searchable, in the page's own font
+    "svg.fonttype": "none",  # text stays text: small, searchable, in the page's own font
     "font.family": "sans-serif",
     "font.size": 9.0,
     "axes.edgecolor": LINE,
@@ -32,18 +32,18 @@ STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "grid.color": "#eceff2",
     "text.color": INK,
-    "text.parse_math": False,  # a point may be called $5
+    "text.parse_math": False,  # a point may be named $5
     "xtick.color": FAINT,
     "ytick.color": FAINT,
     "legend.frameon": False,
     "figure.dpi": 100,
-    "savefig.dpi": 110,  # of what is drawn as pixels: clouds of points
+    "savefig.dpi": 110,  # of rasterized parts: point clouds
 }
 
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Charts made and written within look alike, whatever the user's matplotlibrc says."""
+    """Context in which charts have the report's style, whatever the user's matplotlibrc says."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(STYLE)
@@ -51,8 +51,8 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(width: float = WIDTH, height: float = HEIGHT, right: float = MARGINS[1]) -> tuple[Figure, Axes]:
-    """An empty chart and its axes; inches, `right` of the margin there."""
-    figure = Figure(figsize=(width, height))  # fixed margins: a layout engine would draw everything twice
+    """An empty chart and its axes; sizes in inches, `right` is the right margin."""
+    figure = Figure(figsize=(width, height))  # margins are fixed: a layout engine would draw everything twice
     FigureCanvasSVG(figure)
     left, _, bottom, top = MARGINS
     figure.subplots_adjust(left / width, bottom / height, 1.0 - right / width, 1.0 - top / height)
@@ -60,11 +60,11 @@ def new_figure(width: float = WIDTH, height: float = HEIGHT, right: float = MARG
 
 
 def to_svg(figure: Figure, title: str) -> Markup:
-    """A chart as an SVG element for the page; two charts never share an id.
+    """A chart as an SVG element for the page; IDs are unique across charts.
 
     Args:
         figure: The chart.
-        title: What it shows, for those who cannot see it.
+        title: The text alternative.
     """
     salt = hashlib.sha256(title.encode()).hexdigest()[:12]
     with matplotlib.rc_context({"svg.hashsalt": salt}):
@@ -80,12 +80,12 @@ def to_svg(figure: Figure, title: str) -> Markup:
 
 
 def as_map(axes: Axes, box: tuple[float, float, float, float], unit: str) -> None:
-    """Make axes a map: equal scales, east and north.
+    """Format axes as a map: equal scales, east and north.
 
     Args:
-        axes: Of the chart.
+        axes: The chart's axes.
         box: West, east, south, north.
-        unit: ``m``; ``metres`` of a model whose axes are not east and north; empty of one without a scale.
+        unit: ``m``; ``metres`` if the axes are not east and north; empty without a scale.
     """
     axes.set_xlim(box[0], box[1])
     axes.set_ylim(box[2], box[3])
@@ -96,7 +96,7 @@ def as_map(axes: Axes, box: tuple[float, float, float, float], unit: str) -> Non
 
 
 def map_size(box: tuple[float, float, float, float]) -> tuple[float, float]:
-    """Inches of a map of that box: as wide as any chart, and hardly higher."""
+    """Width and height, inches, of a map of that box: as wide as any chart, and not much higher."""
     ratio = (box[3] - box[2]) / max(box[1] - box[0], 1e-9)
     left, right, bottom, top = MARGINS
     return WIDTH, float(np.clip((WIDTH - left - right) * ratio, 2.0, 4.8)) + bottom + top

@@ -1,4 +1,4 @@
-"""The sparse model in the world: where the photos were taken, what ground they show, how often each place is seen."""
+"""The sparse model in world coordinates: camera positions, ground footprints and overlap."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity
 
-BORDER_STEPS = 6  # rays along each side of a picture, for its footprint
+BORDER_STEPS = 6  # rays along each side of an image, for its footprint
 GROUND_PERCENTILE = 5.0  # of the sparse points' heights: roofs and walls are above
-REACH_PERCENTILE = 95.0  # of the distances of a photo's own points: what lies behind is not told by it
-REACH_POINTS = 20_000  # are enough for that; all of them, for each of hundreds of photos, would cost seconds
-LEAST_DROP = 0.02  # of a ray's length: flatter rays meet the ground beyond reach
-BOX_PERCENTILES = (4.0, 96.0)  # of the sparse points: some lie far behind what was photographed
+REACH_PERCENTILE = 95.0  # of the distances of a photo's own points, which limits its footprint
+REACH_POINTS = 20_000  # points used for that: all of them, for hundreds of photos, would take seconds
+LEAST_DROP = 0.02  # of a ray's length: flatter rays meet the ground beyond the reach
+BOX_PERCENTILES = (4.0, 96.0)  # of the sparse points: some lie far behind the scene
 BOX_MARGIN = 0.15  # of its longer side
 GRID_CELLS = 240  # along the longer side of the overlap map
-FIELD_CELLS = 16  # along the longer side of a picture, for the mean residuals
-FIELD_PHOTOS = 24  # enough observations for them; more would cost seconds
-LEAST_IN_CELL = 5  # observations, for a mean that says something
+FIELD_CELLS = 16  # along the longer side of an image, for the mean residuals
+FIELD_PHOTOS = 24  # photos used for them: enough observations, and more would take seconds
+LEAST_IN_CELL = 5  # observations needed for a meaningful mean
 
 
 @dataclass(frozen=True)
 class RegisteredPhotos:
-    """The registered photos, by name.
+    """The registered photos, sorted by name.
 
     Attributes:
-        names: Sorted.
+        names: The photos' names.
         centres: Camera centres, world units.
         axes: Unit viewing directions in the world.
-        points: How many sparse points each observes.
-        footprints: Outline of the ground that each shows, east and north; cut off at its reach.
+        points: Number of sparse points each observes.
+        footprints: Outline of each ground footprint, east and north, cut off at the photo's reach.
     """
 
     names: Sequence[str]
@@ -50,12 +50,12 @@ class RegisteredPhotos:
 
 @dataclass(frozen=True)
 class ResidualField:
-    """Mean residuals of the sparse points by their place in one camera's pictures.
+    """Mean residuals of the sparse points by position in one camera's images.
 
     Attributes:
-        size: Width and height, pixels.
-        places: Middle of each cell, pixels.
-        residuals: Mean of projected less observed there, pixels.
+        size: Image width and height, pixels.
+        places: Centre of each cell, pixels.
+        residuals: Mean of projected minus observed in each cell, pixels.
     """
 
     size: tuple[int, int]
@@ -65,12 +65,12 @@ class ResidualField:
 
 @dataclass(frozen=True)
 class OverlapGrid:
-    """In how many photos' footprints each place lies.
+    """The number of footprints that cover each place.
 
     Attributes:
-        counts: Northernmost row first; 0 outside of all.
+        counts: Number of footprints per cell, northernmost row first; 0 outside all.
         box: West, east, south, north.
-        shares: Of the places with sparse points: in at least so many footprints, by number.
+        shares: Share of the cells with sparse points covered by at least n footprints, by n.
     """
 
     counts: Int64[np.ndarray, "h w"]
@@ -80,18 +80,18 @@ class OverlapGrid:
 
 @dataclass(frozen=True)
 class Geometry:
-    """What the sparse model tells.
+    """The geometry of the sparse model.
 
     Attributes:
         photos: The registered photos.
         points: Sparse points in the world, (n, 3).
-        colours: Theirs, 0 to 255.
-        tracks: In how many photos each was found.
-        errors_px: Mean reprojection error of each; NaN where unknown.
+        colours: Their RGB colours, 0 to 255.
+        tracks: Track length of each point.
+        errors_px: Mean reprojection error of each point; NaN if unknown.
         box: West, east, south, north of the scene.
-        ground: Its height.
-        overlap: The map.
-        fields: Of each camera with enough observations.
+        ground: Height of the ground.
+        overlap: The overlap grid.
+        fields: Residual fields of the cameras with enough observations.
     """
 
     photos: RegisteredPhotos
@@ -106,14 +106,14 @@ class Geometry:
 
 
 def read_geometry(model_path: Path, frame_path: Path | None) -> Geometry:
-    """Read a sparse model and place it.
+    """Read a sparse model and transform it to world coordinates.
 
     Args:
         model_path: Its folder.
         frame_path: `frame.json`; None leaves the model in its own frame.
 
     Raises:
-        OSError, ValueError, RuntimeError: if something of it cannot be read, or it is empty.
+        OSError, ValueError, RuntimeError: if it is empty or any part cannot be read.
     """
     similarity = Similarity.from_matrix(np.eye(4)) if frame_path is None else _similarity(frame_path)
     model = pycolmap.Reconstruction(str(model_path))
@@ -172,7 +172,7 @@ def _reach(
     rotation: Float64[np.ndarray, "3 3"],
     otherwise: float,
 ) -> float:
-    """How far a photo looks: to most of the points within its view, taken for a cone of 30° about its axis."""
+    """A photo's reach: the distance to most points within its view, approximated by a cone of 30° about its axis."""
     to_point = points - centre
     distances = np.linalg.norm(to_point, axis=1)
     inside = to_point @ rotation[:, 2] > np.cos(np.radians(30.0)) * distances
@@ -180,7 +180,7 @@ def _reach(
 
 
 def _border_rays(camera: pycolmap.Camera) -> Float64[np.ndarray, "b 3"]:
-    """Rays through a picture's border, x / z, y / z, 1."""
+    """Rays through an image's border: x / z, y / z, 1."""
     steps = np.arange(BORDER_STEPS) / BORDER_STEPS
     ones, zeros = np.ones(BORDER_STEPS), np.zeros(BORDER_STEPS)
     sides = [(steps, zeros), (ones, steps), (1.0 - steps, ones), (zeros, 1.0 - steps)]
@@ -192,7 +192,7 @@ def _border_rays(camera: pycolmap.Camera) -> Float64[np.ndarray, "b 3"]:
 def _footprint(
     rays: Float64[np.ndarray, "b 3"], centre: Float64[np.ndarray, " 3"], ground: float, reach: float
 ) -> Float64[np.ndarray, "b 2"]:
-    """Where the rays meet the ground, or end at the photo's reach."""
+    """Points where the rays meet the ground, or end at the photo's reach."""
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     height = centre[2] - ground
     falls = (unit[:, 2] < -LEAST_DROP) & (height > 0.0)

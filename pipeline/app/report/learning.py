@@ -1,4 +1,4 @@
-"""The report's chapters on training and on the photos that it never saw."""
+"""The report's chapters on training and on the held-out photos."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, number, share, size
 
 Chapter = dict[str, Any]
-MEASURES = {  # of a held-out photo: title, digits, which way is better
+MEASURES = {  # metrics of a held-out photo: title with the unit, digits
     "psnr": ("PSNR (dB)", 2),
     "psnr_cc": ("after colour fit (dB)", 2),
     "ssim": ("SSIM", 3),
@@ -21,10 +21,10 @@ MOST_ROWS = 200  # of the table of held-out photos
 
 
 def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
-    """The plan, what came of it, and the curves; None where training was not reached.
+    """The chapter on training: plan, result and curves; None if training was not reached.
 
     Args:
-        inputs: What there is.
+        inputs: The report's inputs.
         drawn: Whether to draw charts.
     """
     stage = inputs.history.stages.get("train")
@@ -69,10 +69,10 @@ def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
 
 
 def removed_in_words(summary: Mapping[str, Any]) -> str:
-    """How many Gaussians were removed from what was trained, and why; nothing where nobody looked.
+    """The number of Gaussians removed after training, with reasons; empty if not cleaned.
 
     Args:
-        summary: Of the stage `clean`.
+        summary: The summary of the stage `clean`.
     """
     reasons = summary.get("reasons")
     if reasons is None:
@@ -82,12 +82,12 @@ def removed_in_words(summary: Mapping[str, Any]) -> str:
 
 
 def views_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
-    """The held-out photos, the worst first; None where evaluate did not finish."""
+    """The chapter on the held-out photos, worst first; None if evaluate did not finish."""
     if "evaluate" not in inputs.artifacts:
         return None
     metrics = inputs.read("evaluate.metrics")
     views = sorted(metrics["per_view"], key=lambda view: view["psnr"] if view.get("psnr") is not None else -1.0)
-    if "whole" in metrics:  # what shows nothing inside the boundary is not the worst, but no witness
+    if "whole" in metrics:  # a view that shows nothing inside the boundary has no figures, and goes last
         views = sorted(views, key=lambda view: view.get("psnr") is None)
     measures = [(name, *told) for name, told in MEASURES.items() if any(view.get(name) is not None for view in views)]
     chapter: Chapter = {
@@ -156,7 +156,7 @@ def _floaters(floaters: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _curves(inputs: ReportInputs, history: Mapping[str, Any]) -> dict[str, dict[float, float]]:
-    """Loss and Gaussians over the iterations: of the finished training, else as far as its events tell."""
+    """Loss and number of Gaussians over the iterations, from the finished training or else from its events."""
     points = history.get("curve") or []
     if points:
         names = ("loss", "gaussians")
@@ -204,7 +204,7 @@ def _why_earlier(summary: Mapping[str, Any]) -> str:
 
 
 def _blocks(inputs: ReportInputs) -> str:
-    """How many blocks it was trained in, or how far they are; empty where it is trained whole."""
+    """The number of training blocks, or their progress; empty if the scene is not divided."""
     blocks = inputs.summary("blocks").get("blocks", 1)
     if blocks == 1:
         return ""

@@ -1,4 +1,4 @@
-"""The report's last chapters: every stage with time and memory, versions, options, and the files that were made."""
+"""The report's last chapters: every stage with time and memory, versions, options, and output files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WHAT = {
     "sparse.glb": "sparse points and cameras, for any 3D viewer",
     "sky.ply": "the sky as a dome of Gaussians",
 }
-FIRST = ("viewer.html", "flythrough.webm", "splat.ply")  # what people want to open, so linked at the top, too
+FIRST = ("viewer.html", "flythrough.webm", "splat.ply")  # the files that people open first, so also linked at the top
 FOLDERS = {
     "undistort.dataset": "undistorted photos and cameras, for other trainers",
     "evaluate.views": "held-out photos, renders and errors at full size",
@@ -41,10 +41,10 @@ RECORDS = {
 
 
 def making_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
-    """How it was made: stages, machine, versions, seeds, options.
+    """The chapter on processing: stages, machine, versions, seeds, options.
 
     Args:
-        inputs: What there is.
+        inputs: The report's inputs.
         drawn: Whether to draw charts.
     """
     names = dict.fromkeys((*(stage.name for stage in LINE), *inputs.history.stages))
@@ -77,7 +77,7 @@ def making_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
 
 
 def files_chapter(inputs: ReportInputs) -> Chapter:
-    """Links to what lies beside the report; what an earlier run left is told as that."""
+    """Links to the files beside the report; those of an earlier run are labelled as such."""
     files = [
         {"href": quote(file.name), "name": file.name, "what": WHAT.get(file.name, ""), "size": size(file.size)}
         | {"current": file.current}
@@ -116,7 +116,7 @@ def said_chapter(inputs: ReportInputs) -> Chapter:
 
 
 def _is_in_stage(inputs: ReportInputs, name: str) -> bool:
-    """Whether a row is a shard's, of which its stage's tells already."""
+    """Whether a row is that of a shard, which its stage's row already includes."""
     return name != stage_name(name) and stage_name(name) in inputs.artifacts
 
 
@@ -146,7 +146,7 @@ def _stage_row(inputs: ReportInputs, name: str) -> dict[str, Any]:
 
 
 def _forecast(needs: Sequence[Mapping[str, Any]]) -> str:
-    """CPU time and memory as they had been forecast for one stage or several; empty where they had not."""
+    """Forecast CPU time and memory of one or several stages; empty without a forecast."""
     if not needs:
         return ""
     seconds = sum(float(need["cpu_seconds"]) for need in needs)
@@ -154,7 +154,7 @@ def _forecast(needs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _made_otherwise(inputs: ReportInputs, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Stages that an earlier run made with other versions, and which."""
+    """Stages reused from an earlier run with other versions, and these versions."""
     told = []
     for name, artifact in inputs.artifacts.items():
         other = artifact.manifest.get("versions", {})

@@ -1,4 +1,4 @@
-"""The report's tables of sections and volumes, with how far they may be off."""
+"""The report's tables of sections and volumes, with their uncertainties."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, outdated, rea
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import length
 
-MOST_ROWS = 200  # of volumes: all are in the file
+MOST_ROWS = 200  # of volumes; the file has all of them
 BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated"}
-SIGMA_DIGITS = 2  # that a deviation is told with
+SIGMA_DIGITS = 2  # significant digits of a standard deviation
 
 
 def measures(inputs: ReportInputs) -> dict[str, Any]:
-    """What was measured on the surface model that the report tells of.
+    """The measurements on the report's surface model.
 
     Returns:
-        ``sections`` (``picture`` is where theirs lies), ``volumes``, ``more`` volumes than these, ``volumes_file``, and
-        whether what lies in OUT is ``outdated``.
+        ``sections`` (``picture`` is the image's path), ``volumes``, the number of ``more`` volumes, ``volumes_file``,
+        and whether the measurements in OUT are ``outdated``.
     """
     part = inputs.contents.parts.get("dsm.files")
     surface = "" if part is None else part.digest
@@ -62,7 +62,7 @@ def _volume(item: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_sigma(m3: float, sigma_m3: float) -> str:
-    """As many digits as mean something."""
+    """A volume with its standard deviation, rounded to significant digits."""
     digits = 3
     while digits and sigma_m3 * 10.0 ** (digits - 1) >= 10.0 ** (SIGMA_DIGITS - 1):
         digits -= 1

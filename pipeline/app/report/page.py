@@ -1,4 +1,4 @@
-"""Puts the report together: chapters from what there is, one template, one file."""
+"""Assembles the report: the chapters for which there is data, one template, one file."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ TEMPLATES = Path(__file__).resolve().parent / "templates"
 
 
 def report_page(inputs: ReportInputs, *, drawn: bool) -> str:
-    """The report as one HTML text that needs nothing else.
+    """The report as one self-contained HTML text.
 
     Args:
-        inputs: What there is.
-        drawn: With charts and pictures; without, it is made within a moment.
+        inputs: The report's inputs.
+        drawn: Whether to include charts and images; without them it is quick.
 
     Raises:
         MachineError: if this installation lacks the page's script or style.
@@ -88,15 +88,15 @@ def _matched(inputs: ReportInputs) -> bool:
 
 
 def _guarded(build: Callable[[], dict[str, Any] | None]) -> dict[str, Any] | None:
-    """A chapter; where its artifact is damaged, or of another version, what is wrong with it."""
+    """Build a chapter; if its artifact is damaged or from another version, return the error instead."""
     try:
         return build()
-    except Exception as error:  # one damaged part may not cost the client the rest
+    except Exception as error:  # one damaged part must not hide the rest from the client
         return {"trouble": f"This part could not be read: {type(error).__name__}: {error}"}
 
 
 def _geometry(inputs: ReportInputs) -> tuple[Geometry | None, str | None]:
-    """The sparse model, placed if it is; or what is wrong with it."""
+    """The sparse model's geometry, in world coordinates if georeferenced; or the error if it cannot be read."""
     frame = inputs.part("georef.frame")
     path = inputs.part("georef.model") if frame is not None else inputs.part("sparse.model")
     if path is None:
@@ -110,7 +110,7 @@ def _geometry(inputs: ReportInputs) -> tuple[Geometry | None, str | None]:
 
 
 def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:
-    """Title, figure and explanation of what people ask for first."""
+    """Title, value and explanation of the key figures."""
     sparse, train, evaluate = (inputs.summary(name) for name in ("sparse", "train", "evaluate"))
     accuracy = inputs.read("georef.accuracy") if "georef" in inputs.artifacts else {}
     tables = accuracy.get("tables") or {}

@@ -1,4 +1,4 @@
-"""The report's pictures: held-out photos beside their renders, and a cut-out of the photo for each surveyor's mark."""
+"""The report's images: held-out photos beside their renders, and a crop of the photo around each GCP mark."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from splatpipe.pipeline.photos.photo_list import Photo, decode, load_photo_list
 
 VIEW_SIDE = 960  # pixels of the longer side of a held-out photo in the report
 VIEW_QUALITY = 82
-MOST_VIEWS = 12  # pictures of the worst, and of the best; the table has the figures of all
-CHIP_SIDE = 48  # photo pixels across a cut-out: a mark, its surroundings, and a reprojection that is far off
-WIDEST_CHIP = 768  # where the reprojection is further off than that
-CHIP_PIXELS = 96  # at most so many pixels in the report; the browser enlarges what has fewer
+MOST_VIEWS = 12  # the worst and the best; the table has the figures of all
+CHIP_SIDE = 48  # photo pixels across a crop: a mark, its surroundings, and a large reprojection error
+WIDEST_CHIP = 768  # if the reprojection error is larger than that
+CHIP_PIXELS = 96  # most pixels across in the report; the browser enlarges smaller crops
 CHIP_QUALITY = 80
-MOST_CHIPS = 600  # some two megabytes; then the worst of each point come first
-MOST_DECODED = 1_500_000_000  # pixels of photos decoded for them: some fifteen seconds on a core
+MOST_CHIPS = 600  # about two megabytes; if there are more, the worst of each point have priority
+MOST_DECODED = 1_500_000_000  # pixels of photos decoded for them: about fifteen seconds on one core
 TURNS = {3: 180, 6: 90, 8: 270}  # degrees, clockwise, by EXIF orientation; mirrored ones are left as they are
 CODES = {180: cv2.ROTATE_180, 90: cv2.ROTATE_90_CLOCKWISE, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """A held-out photo, its render and the error between them, as data addresses; turned for people."""
+    """A held-out photo, its render and their difference, as data URLs, rotated upright."""
 
     photo: Markup
     render: Markup
@@ -42,13 +42,13 @@ class ViewPictures:
 
 @dataclass(frozen=True)
 class Chip:
-    """A cut-out of a photo about a mark.
+    """A crop of a photo around a mark.
 
     Attributes:
-        picture: As a data address; None where the photo could not be read.
-        turn_deg: Clockwise, for people.
-        marked: The mark in it, x and y as per cent of its side.
-        reprojected: Where the model has the point, likewise; None where that is not known.
+        picture: The image as a data URL; None if the photo could not be read.
+        turn_deg: Clockwise rotation that makes it upright.
+        marked: Position of the mark, x and y in per cent of the crop's side.
+        reprojected: The model's point reprojected, likewise; None if unknown.
         side_px: Photo pixels across.
     """
 
@@ -60,11 +60,11 @@ class Chip:
 
 
 def view_pictures(stem: Path, orientation: int) -> ViewPictures | None:
-    """The pictures of one held-out view, small enough for a page; None if they are gone.
+    """The images of one held-out view, reduced for the page; None if they are missing.
 
     Args:
-        stem: Path of the pictures that `evaluate` left, without their endings.
-        orientation: EXIF's.
+        stem: Path of the images that `evaluate` wrote, without suffixes.
+        orientation: EXIF orientation.
     """
     made = []
     shape = (0, 0)
@@ -84,7 +84,7 @@ def view_pictures(stem: Path, orientation: int) -> ViewPictures | None:
 
 
 def chosen_views(views: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Those to show of the views, the worst first: of many, the worst and the best."""
+    """The views to show, worst first; if there are many, the worst and the best."""
     if len(views) <= MOST_VIEWS:
         return list(views)
     return [*views[: MOST_VIEWS - 1], views[-1]]
@@ -93,15 +93,15 @@ def chosen_views(views: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 def cut_chips(
     points: Sequence[Mapping[str, Any]], photos_part: Path | None, photos_dir: Path | None
 ) -> dict[tuple[int, int], Chip]:
-    """A cut-out for each observation of the surveyed points.
+    """Make a crop for each observation of the surveyed points.
 
     Args:
-        points: Of `control.json`.
-        photos_part: The part ``ingest.photos``; None leaves the pictures out.
+        points: The points of `control.json`.
+        photos_part: The part ``ingest.photos``; None leaves the images out.
         photos_dir: The user's folder.
 
     Returns:
-        By the point's and the observation's index; of too many the worst of each point, and those in the same photos.
+        Crops by point and observation index; if too many, the worst of each point and those in the same photos.
     """
     photos = {} if photos_part is None else load_photo_list(photos_part).by_name()
     by_photo: dict[str, list[tuple[int, int]]] = {}
@@ -123,11 +123,11 @@ def cut_chips(
 
 
 def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> Markup:
-    """A picture as a data address.
+    """Encode an image as a JPEG data URL.
 
     Args:
-        pixels: BGR.
-        quality: JPEG's.
+        pixels: The image, BGR.
+        quality: JPEG quality.
     """
     done, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
@@ -178,7 +178,7 @@ def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, or
 
 
 def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> UInt8[np.ndarray, "side side 3"]:
-    """A square of a photo; grey where it reaches beyond."""
+    """Crop a square from a photo; grey outside the photo."""
     height, width = pixels.shape[:2]
     square = np.full((side, side, 3), 128, np.uint8)
     x0, x1, y0, y1 = max(left, 0), min(left + side, width), max(top, 0), min(top + side, height)
@@ -188,7 +188,7 @@ def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> 
 
 
 def shrunk(pixels: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """A picture whose longer side has so many pixels at most."""
+    """Reduce an image so that its longer side has at most ``side`` pixels."""
     height, width = pixels.shape[:2]
     factor = side / max(width, height)
     if factor >= 1.0:

@@ -1,4 +1,4 @@
-"""The report's chapter on georeferencing: frame, accuracy tables, each surveyed point, and a cut-out of each mark."""
+"""The report's chapter on georeferencing: frame, accuracy tables, each surveyed point, and a crop of each mark."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
 Chapter = dict[str, Any]
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
-MOST_POINTS = 200  # rows of the table; thousands are in metrics.json
+MOST_POINTS = 200  # rows of the table; metrics.json has all
 MOST_BARS = 20
 AXES = ("east", "north", "up", "horizontal", "3d")
 
 
 def placing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter | None:
-    """Where the model is and how well that is known; None where georef did not finish.
+    """The chapter on the model's georeference and its accuracy; None if georef did not finish.
 
     Args:
-        inputs: What there is.
-        geometry: Of the model; None for a report without pictures.
+        inputs: The report's inputs.
+        geometry: The sparse model's geometry; None for a report without images.
     """
     if "georef" not in inputs.artifacts:
         return None
@@ -50,7 +50,7 @@ def placing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter 
 
 
 def _splat(inputs: ReportInputs) -> Mapping[str, Any]:
-    """What evaluate found of the splat's own accuracy; nothing where that is damaged, which its own chapter tells."""
+    """The splat's own accuracy from evaluate; empty if damaged, which its own chapter reports."""
     with suppress(OSError, ValueError, AttributeError):
         found = inputs.read("evaluate.metrics").get("accuracy", {}).get("splat")
         if found:
@@ -92,7 +92,7 @@ def _frame_facts(
 
 
 def _bars(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What scale bars say, of `accuracy.json`; nothing where there are none."""
+    """The scale bar results from `accuracy.json`; empty if there are none."""
     scale = report.get("scale")
     if not scale:
         return []
@@ -109,7 +109,7 @@ def _bars(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _vertical(datum: str, *, named: bool) -> str:
-    """The datum by its name, or as the frame has it where there is no time to load pyproj."""
+    """The vertical datum's name, or its text from the frame if there is no time to load pyproj."""
     if not named:
         return datum
     from splatpipe.pipeline.survey.crs import describe_vertical
@@ -118,7 +118,7 @@ def _vertical(datum: str, *, named: bool) -> str:
 
 
 def _crs(inputs: ReportInputs, frame: Mapping[str, Any]) -> str:
-    """As `georef.json` has it where it was written, else as the frame has it."""
+    """The CRS from `georef.json` if written, else from the frame."""
     from splatpipe.pipeline.survey.georeference import accuracy_in_words
 
     path = inputs.part("export.georef")
@@ -184,7 +184,7 @@ def _rms_px(observations: Sequence[Mapping[str, Any]]) -> float | None:
 def _drawn(
     inputs: ReportInputs, geometry: Geometry, frame: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
 ) -> Chapter:
-    """The maps of residuals, and the cut-outs point by point."""
+    """The residual maps, and the crops for each point."""
     from splatpipe.pipeline.app.report.charts import residual_map
     from splatpipe.pipeline.app.report.pictures import cut_chips
 
@@ -206,7 +206,7 @@ def _drawn(
 
 
 def _marks(index: int, point: Mapping[str, Any], chips: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
-    """A point's cut-outs, the worst first."""
+    """A point's crops, worst first."""
     entries = []
     for j, seen in enumerate(point["observations"]):
         chip = chips.get((index, j))

@@ -1,4 +1,4 @@
-"""What OUT holds that belongs together: the artifacts of one line, and the files that were handed over from them."""
+"""Reads a report's inputs from OUT: a consistent set of artifacts and the deliverables made from them."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from splatpipe.pipeline.engine.store import Artifact
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
-MAX_JSON_BYTES = 256 << 20  # an accuracy report of thousands of points is far below
+MAX_JSON_BYTES = 256 << 20  # an accuracy report of thousands of points is far smaller
 
 BAD = ("failed", "stopped", "broken off", "running")
 
 
 @dataclass(frozen=True)
 class Deliverable:
-    """A file in OUT for people.
+    """A deliverable in OUT.
 
     Attributes:
-        name: Its path in OUT, in POSIX form.
+        name: Its POSIX path relative to OUT.
         size: Bytes.
-        current: Whether it was made by what the report tells of; else by an earlier run.
+        current: Whether it was made from the report's artifacts; else by an earlier run.
     """
 
     name: str
@@ -37,15 +37,15 @@ class Deliverable:
 
 @dataclass(frozen=True)
 class ReportInputs:
-    """All that a report is made from.
+    """Everything that a report is made from.
 
     Attributes:
         out: The run's folder.
-        history: What happened.
-        config: The options as they were; None where they cannot be read.
-        photos_dir: The user's folder; None where nobody knows.
-        contents: The artifacts that belong together.
-        deliverables: Files in OUT for people.
+        history: The history of the last run.
+        config: The run's options; None if they cannot be read.
+        photos_dir: The user's folder; None if unknown.
+        contents: The consistent set of artifacts.
+        deliverables: The deliverables in OUT.
     """
 
     out: Path
@@ -57,46 +57,46 @@ class ReportInputs:
 
     @property
     def artifacts(self) -> Mapping[str, Artifact]:
-        """Those that belong together, by stage."""
+        """The consistent set of artifacts by stage."""
         return self.contents.artifacts
 
     def part(self, name: str) -> Path | None:
-        """Where a part lies, e.g. ``georef.frame``; None if it was not made."""
+        """The path of a part, e.g. ``georef.frame``; None if it does not exist."""
         found = self.contents.parts.get(name)
         return None if found is None else found.path
 
     def read(self, name: str) -> Any:
-        """A part that is a JSON file; an empty table where it was not made.
+        """Read a part that is a JSON file; an empty dict if it does not exist.
 
         Raises:
             OSError: if it cannot be read.
-            ValueError: if it is no JSON, or far too large.
+            ValueError: if it is not JSON, or far too large.
         """
         path = self.part(name)
         return {} if path is None else read_json(path)
 
     def read_in_part(self, name: str, file: str) -> Any:
-        """A JSON file in a part that is a folder; an empty table where the part was not made.
+        """Read a JSON file in a folder part; an empty dict if the part does not exist.
 
         Raises:
             OSError: if it cannot be read.
-            ValueError: if it is no JSON, or far too large.
+            ValueError: if it is not JSON, or far too large.
         """
         path = self.part(name)
         return {} if path is None else read_json(path / file)
 
     def summary(self, stage: str) -> Mapping[str, Any]:
-        """What a stage returned; empty where it did not finish."""
+        """A stage's summary; empty if it did not finish."""
         artifact = self.artifacts.get(stage)
         return {} if artifact is None else artifact.summary
 
 
 def read_json(path: Path) -> Any:
-    """A JSON file of ours.
+    """Read one of our JSON files.
 
     Raises:
         OSError: if it cannot be read.
-        ValueError: if it is no JSON, or far too large.
+        ValueError: if it is not JSON, or far too large.
     """
     if path.stat().st_size > MAX_JSON_BYTES:
         raise ValueError(f"{path.name} is too large to be one of a run's")
@@ -107,7 +107,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_report_inputs(out: Path) -> ReportInputs:
-    """Look at a run's folder, which may be that of a running, a stopped or a failed one.
+    """Read the inputs from the folder of a run, which may be running, stopped or failed.
 
     Args:
         out: The folder.

@@ -1,4 +1,4 @@
-"""What happened in the last run, from `events.jsonl`: which stages came how far, and what they said."""
+"""The history of the last run from `events.jsonl`: the progress of its stages and their messages."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from splatpipe.pipeline.engine.stage import shards_first
 Facts = Mapping[str, Any]
 State = Literal["finished", "reused", "failed", "stopped", "broken off", "running", "not reached"]
 
-MAX_BYTES = 64 << 20  # of the file's end: hundreds of runs' events
+MAX_BYTES = 64 << 20  # read from the end of the file: events of hundreds of runs
 MAX_LINE = 1 << 20
 STOPPED = (130, 143)  # exit codes of Ctrl-C and of SIGTERM
 
 
 @dataclass
 class StageMessages:
-    """What one stage said, in all attempts at one artifact.
+    """The messages of one stage, over all attempts at one artifact.
 
     Attributes:
-        notes: Of the last attempt.
+        notes: Notes of the last attempt.
         warnings: Messages and hints of the last attempt.
-        metrics: Value by step, by name; of all attempts, since one goes on where the other was stopped.
-        progress: The last one: done, total, what, unit.
+        metrics: Values by step, by name; of all attempts, since each resumes where the last one stopped.
+        progress: The last progress: done, total, what, unit.
     """
 
     notes: list[str] = field(default_factory=list)
@@ -37,19 +37,19 @@ class StageMessages:
 
 @dataclass
 class StageHistory:
-    """What became of a stage in the last run.
+    """A stage in the last run.
 
     Attributes:
-        name: The stage's.
-        state: How it ended.
-        key: Of its artifact; empty where an older version ran.
+        name: The stage's name.
+        state: Its state.
+        key: Its artifact's key; empty if an older version ran.
         reason: Why it ran.
-        seconds: By the clock; None where unknown.
-        memory_bytes: Peak; None where unknown.
-        message: What it failed with.
+        seconds: Wall-clock time; None if unknown.
+        memory_bytes: Peak memory; None if unknown.
+        message: The error message if it failed.
         hint: What to do about it.
-        lasting: Whether the same input fails again.
-        messages: What it said.
+        lasting: Whether the same input will fail again.
+        messages: Its messages.
     """
 
     name: str
@@ -65,7 +65,7 @@ class StageHistory:
 
     @property
     def reached(self) -> float | None:
-        """How far it came, in its own unit: the last progress, or the last point of a curve if that is further."""
+        """How far it got, in its own unit: the last progress, or the last step of a curve if that is farther."""
         steps = [step for curve in self.messages.metrics.values() for step in curve]
         done = self.messages.progress.get("done")
         return max([*steps, *([] if done is None else [float(done)])], default=None)
@@ -73,19 +73,19 @@ class StageHistory:
 
 @dataclass
 class RunHistory:
-    """The last run.
+    """The history of the last run.
 
     Attributes:
-        stages: Those it was to walk, in order.
-        began_s: Seconds since the epoch; 0 where there is no run.
-        ended_s: Of its last event.
-        exit_code: None where it ended without a word, or has not ended.
-        message: Why it ended badly.
+        stages: The stages it was to run, in order.
+        began_s: Start, seconds since the epoch; 0 if there is no run.
+        ended_s: Time of its last event.
+        exit_code: None if its end was not recorded, or it has not ended.
+        message: Why it failed.
         hint: What to do about it.
         machine: Device, threads, cores.
-        versions: Of what computes.
-        running: Whether it goes on at this moment.
-        keys: The last known key of each stage, in any run.
+        versions: Versions of the libraries.
+        running: Whether it is running now.
+        keys: The last known key of each stage, from any run.
     """
 
     stages: dict[str, StageHistory] = field(default_factory=dict)
@@ -101,23 +101,23 @@ class RunHistory:
 
     @property
     def culprit(self) -> StageHistory | None:
-        """The stage in which it ended badly, or is."""
+        """The stage in which it failed or is running."""
         bad = ("failed", "stopped", "broken off", "running")
         return next((stage for stage in self.stages.values() if stage.state in bad), None)
 
     @property
     def complete(self) -> bool:
-        """Whether all that it was to walk is there."""
+        """Whether all its stages are done."""
         good = all(stage.state in ("finished", "reused") for stage in self.stages.values())
         return bool(self.stages) and good and not self.exit_code and not self.running
 
 
 def read_history(path: Path, *, running: bool) -> RunHistory:
-    """Read the events of a run's folder; lines that are none are passed over.
+    """Read the events of a run; invalid lines are skipped.
 
     Args:
-        path: `events.jsonl`; it need not be there.
-        running: Whether somebody works in the folder now.
+        path: `events.jsonl`; it may not exist.
+        running: Whether a splatpipe is working in the folder now.
     """
     reader = _EventReader()
     for event in _events(path):
@@ -141,7 +141,7 @@ def _events(path: Path) -> Iterator[Event]:
 
 
 class _EventReader:
-    """Takes one event after the other."""
+    """Builds the history from one event after the other."""
 
     def __init__(self) -> None:
         self._history = RunHistory()
@@ -174,7 +174,7 @@ class _EventReader:
         stage = self._stage(name, "running", data)
         stage.reason = str(data["reason"])
         before = stage.messages if stage.key else StageMessages()
-        # what it says again counts, and not what it said before; the curves go on
+        # a new attempt's messages replace the earlier ones, but the curves continue
         stage.messages = self._messages[name, stage.key] = StageMessages(
             metrics=before.metrics, progress=before.progress
         )

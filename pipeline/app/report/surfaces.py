@@ -1,4 +1,4 @@
-"""The report's chapter of what was made besides the splat: pictures, sizes, and how good heights are."""
+"""The report's chapter on surface products: images, sizes, and height accuracy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from splatpipe.pipeline.app.report.wording import count, length
 
 PICTURE_SIDE = 960  # pixels
 FACADE_SIDE = 480
-MOST_FACADES = 12  # with a picture; all are in the list
+MOST_FACADES = 12  # with an image; the list has all
 SECTION_SIDE = 720
 MOST_SECTIONS = 12  # likewise
 QUALITY = 85
@@ -20,11 +20,11 @@ Chapter = dict[str, Any]
 
 
 def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
-    """The surface model and the orthophoto; None where none was made.
+    """The chapter on the surface model and the orthophoto; None if there are none.
 
     Args:
-        inputs: What there is.
-        drawn: With pictures.
+        inputs: The report's inputs.
+        drawn: Whether to include images.
     """
     dsm, ortho = inputs.summary("dsm"), inputs.summary("ortho")
     if not dsm.get("cells"):
@@ -51,7 +51,7 @@ def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
 
 
 def _measured(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
-    """Sections and volumes, with small pictures of the first sections."""
+    """Sections and volumes, with thumbnails of the first sections."""
     told = measures(inputs)
     for number, row in enumerate(told["sections"]):
         path = row.pop("picture")
@@ -60,7 +60,7 @@ def _measured(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
 
 
 def _facades(inputs: ReportInputs, *, drawn: bool) -> list[dict[str, Any]]:
-    """Elevations, the largest first, with small pictures of the first ones."""
+    """Façades, largest first, with thumbnails of the first ones."""
     if not inputs.summary("facades").get("facades"):
         return []
     told = inputs.read_in_part("facades.files", "facades/facades.json")["facades"]

@@ -1,7 +1,7 @@
-"""What is good about a run and what is doubtful, in plain words: the page's first lines.
+"""The verdict on a run, in plain words, at the top of the page: what is good and what is doubtful.
 
-The bounds are the usual ones of the trade (Pix4D's quality report asks for 95 % of the photos and a focal length within
-5 %; surveyors expect check points within one to two ground sample distances horizontally and three vertically).
+The limits are common practice (Pix4D's quality report requires 95 % of the photos and a focal length within 5 %;
+surveyors expect check points within one to two ground sampling distances horizontally and three vertically).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from splatpipe.stages.line import LINE
 
 Level = Literal["good", "doubt", "bad"]
 
-PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # share of the photos
+PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # registered share of the photos
 ERROR_GOOD_PX, ERROR_DOUBT_PX = 1.0, 2.0  # mean reprojection error
-FOCAL_GOOD = 0.05  # of the prior
-HORIZONTAL_GSDS, VERTICAL_GSDS = 2.0, 3.0  # root mean square at check points
-SURFACE_GSDS = 6.0  # of one surveyed point: twice what is usual in height, root mean square
+FOCAL_GOOD = 0.05  # relative deviation from the prior
+HORIZONTAL_GSDS, VERTICAL_GSDS = 2.0, 3.0  # RMSE at check points
+SURFACE_GSDS = 6.0  # of one surveyed point: twice the usual RMSE in height
 MOST_NAMED = 3
-FEW_CHECKS = 3  # fewer prove little
-PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos at 2 megapixels, their exposure apart (trials.md)
+FEW_CHECKS = 3  # check points; fewer prove little
+PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos at 2 megapixels, exposure compensated (trials.md)
 CAMERAS = "Cameras"
 CAMERAS_BAD = "The camera poses are unreliable"
-VEIL = 0.03  # of the light before held-out photos' points: 8 of 255 grey values, which begin to show
+VEIL = 0.03  # share of the light in front of held-out photos' points: 8 of 255 grey values, which begin to show
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class VerdictLine:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the page begins with."""
+    """The verdict at the top of the page."""
 
     level: Level
     headline: str
@@ -50,7 +50,7 @@ class Verdict:
 
 
 def judge(inputs: ReportInputs) -> Verdict:
-    """Judge a run by what there is of it; what cannot be read is passed over, and told where it belongs."""
+    """Judge a run by its results so far; unreadable parts are skipped, and reported in their own chapters."""
     findings: list[VerdictLine] = []
     for look in (_cameras, _photos, _reprojection, _focal, _place, _splat, _views, _floaters):
         try:
@@ -64,7 +64,7 @@ def judge(inputs: ReportInputs) -> Verdict:
     wrong = next((it for it in findings if it.title == CAMERAS and it.level == "bad"), None)
     if ended is not None and (ended.level == "bad" or wrong is None):
         return Verdict(ended.level, ended.title, ended.text, findings)
-    if wrong is not None:  # nothing that follows from them can be better
+    if wrong is not None:  # results based on them cannot be better
         return Verdict("bad", CAMERAS_BAD, " ".join(filter(None, [text, ended.text if ended else ""])), findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
     if any(finding.level == "bad" for finding in doubtful):
@@ -75,7 +75,7 @@ def judge(inputs: ReportInputs) -> Verdict:
 
 
 def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
-    """How the run ended, if not as it should; else when."""
+    """A line on how the run ended if it was not successful, and a sentence on when."""
     history = inputs.history
     when = f"{moment(history.ended_s)}, after {duration(history.ended_s - history.began_s)}"
     if not history.stages:
@@ -114,7 +114,7 @@ def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
 
 
 def _far(inputs: ReportInputs) -> str:
-    """How far the stage came in which it ended."""
+    """How far the last stage got."""
     stage = inputs.history.culprit
     if stage is None or not stage.messages.progress:
         return ""
@@ -123,7 +123,7 @@ def _far(inputs: ReportInputs) -> str:
 
 
 def _cameras(inputs: ReportInputs) -> VerdictLine | None:
-    """What the mapping holds of its own answer."""
+    """The mapping stage's own verdict on the cameras."""
     told = inputs.read("sparse.summary").get("verdict") or {"level": "good"}
     if told["level"] == "good":
         return None
@@ -169,7 +169,7 @@ def _focal(inputs: ReportInputs) -> VerdictLine | None:
 
 
 UNPLACED = "Lengths and heights can be measured; its position on the earth and north are unknown."
-SCALE_GOOD = 0.005  # relative standard deviation of scale bars: five millimetres a metre
+SCALE_GOOD = 0.005  # relative standard deviation of scale bars: five millimetres per metre
 
 
 def _place(inputs: ReportInputs) -> VerdictLine | None:
@@ -272,12 +272,12 @@ def _views(inputs: ReportInputs) -> VerdictLine | None:
 
 
 def _likeness(measures: Mapping[str, Any]) -> float:
-    """PSNR, what exposure did apart where that is known."""
+    """PSNR, exposure compensated if available."""
     return float(measures["psnr_cc"] if measures.get("psnr_cc") is not None else measures["psnr"])
 
 
 def _floaters(inputs: ReportInputs) -> VerdictLine | None:
-    """By the held-out photos, if any: what the training photos see through is cleared in training, by its own rule."""
+    """Verdict on floaters by the held-out photos, if any; training itself prunes what training photos see through."""
     veil = inputs.read("evaluate.metrics").get("floaters", {}).get("veil", {})
     if veil.get("mean") is None:
         return None

@@ -1,4 +1,4 @@
-"""Figures in words: lengths, sizes, durations and counts with their units, a dash where there is none."""
+"""Formats lengths, sizes, durations and counts with their units; a dash for missing values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def number(value: object, digits: int = 3) -> str:
 
 
 def count(value: object) -> str:
-    """A whole number with its thousands set apart."""
+    """An integer with thousands separators."""
     return f"{value:,.0f}" if _finite(value) else NONE
 
 
@@ -26,7 +26,7 @@ def metres(value: object) -> str:
 
 
 def length(value: object) -> str:
-    """A length in the unit that people would say it in."""
+    """A length in the most natural unit."""
     if not _finite(value):
         return NONE
     longest = abs(value)
@@ -38,12 +38,12 @@ def length(value: object) -> str:
 
 
 def share(value: object, digits: int = 0) -> str:
-    """A share in per cent."""
+    """A share as a percentage."""
     return f"{value:.{digits}%}".replace("%", " %") if _finite(value) else NONE
 
 
 def duration(seconds: object) -> str:
-    """A time in seconds, minutes or hours."""
+    """A duration in seconds, minutes or hours."""
     if not _finite(seconds):
         return NONE
     if seconds < 60:
@@ -53,7 +53,7 @@ def duration(seconds: object) -> str:
 
 
 def roughly(seconds: object) -> str:
-    """A time that was forecast, no finer than it is known."""
+    """A forecast duration, rounded to its accuracy."""
     if not _finite(seconds):
         return NONE
     minutes = seconds / 60
@@ -63,7 +63,7 @@ def roughly(seconds: object) -> str:
 
 
 def size(value: object) -> str:
-    """Bytes, by powers of ten."""
+    """A size in bytes, with decimal prefixes."""
     if not _finite(value):
         return NONE
     rest = float(value)
@@ -83,7 +83,7 @@ def moment(seconds: object) -> str:
 
 
 def interval(bounds: object) -> str:
-    """The interval that holds the true value with 95 %."""
+    """The 95 % confidence interval."""
     if not isinstance(bounds, list | tuple) or len(bounds) != 2:
         return NONE
     return f"{metres(bounds[0])} to {metres(bounds[1])}"
@@ -95,7 +95,7 @@ def plural(amount: int, one: str, more: str = "") -> str:
 
 
 def judged_size(metrics: Mapping[str, Any]) -> str:
-    """Megapixels at which held-out photos were measured; empty where that is not known: in runs of earlier versions."""
+    """Megapixels at which held-out photos were evaluated; empty if unknown, as in runs of earlier versions."""
     judged = metrics.get("judged_megapixels")
     return "" if judged is None else number(judged, 1 if judged >= 1.0 else 2)
 

@@ -1,1 +1,1 @@
-"""``splatpipe view``: a run's results, its training and its control points in the browser, on this machine only."""
+"""``splatpipe view``: shows a run's results and training, and marks control points, in a local browser."""

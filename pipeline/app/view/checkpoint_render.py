@@ -1,4 +1,4 @@
-"""The model of a training that runs, as far as it has come, and what our rasterizer shows of it."""
+"""The current model of a running training, and renders of it by our rasterizer."""
 
 from __future__ import annotations
 
@@ -29,16 +29,14 @@ from splatpipe.pipeline.survey.handover import in_world
 from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, viewer_rendering, viewer_scene, viewer_splat
 
-CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a training that runs
-COARSE_TOLD = "coarse.json"  # in the folder of blocks that are not laid out yet: the coarse pass is done
-FROZEN = "frozen.ply"  # beside a block's checkpoint: what is drawn around it
+CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a running training
+COARSE_TOLD = "coarse.json"  # in the folder of blocks not laid out yet: the coarse pass is done
+FROZEN = "frozen.ply"  # beside a block's checkpoint: the fixed Gaussians rendered around it
 COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # of a scene in blocks
 JPEG_QUALITY = 92
 SKY = "sky.colours"  # array of a checkpoint
-RENDER_BYTES = 1000  # of a card's for a Gaussian: 236 of parameters, 201 of a frame, 8 pairs of 64
-LEFT_SHARE = (
-    0.25  # of a card's memory for the training there, which goes on with less for good where it once lacks some
-)
+RENDER_BYTES = 1000  # of GPU memory per Gaussian: 236 for parameters, 201 for a frame, 8 pairs of 64
+LEFT_SHARE = 0.25  # of GPU memory kept free for training, which permanently reduces its use if it ever runs short
 
 
 @dataclass(frozen=True)
@@ -47,11 +45,11 @@ class ModelSource:
 
     Attributes:
         path: Its file.
-        kind: ``initial``, ``checkpoint``, ``coarse`` (the whole, which blocks go on from) or ``model`` (finished).
+        kind: ``initial``, ``checkpoint``, ``coarse`` (whole scene, from which blocks start) or ``model`` (finished).
         stamp: Changes with its content.
-        rendering: How it is rendered; None before training has begun.
-        sky: The finished sky, beside a finished model, or of a block.
-        block: Whose checkpoint it is; 0 for that of the whole.
+        rendering: Its rendering settings; None before training has begun.
+        sky: The finished sky beside a finished model, or that of a block.
+        block: Number of the block whose checkpoint it is; 0 for the whole scene.
     """
 
     path: Path
@@ -64,7 +62,7 @@ class ModelSource:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model as it is drawn."""
+    """A model loaded for rendering."""
 
     gaussians: Gaussians
     sky: Panorama | None
@@ -74,9 +72,9 @@ class LoadedModel:
 
 
 def newest(opened: Contents) -> ModelSource | None:
-    """The furthest that a training has come; None before it can begin."""
+    """The newest model of a training; None before it can begin."""
     if "train.model" in opened.parts:
-        if "train.rendering" not in opened.parts:  # of an earlier splatpipe: how it was rendered is not known
+        if "train.rendering" not in opened.parts:  # from an earlier version: its rendering settings are unknown
             return None
         part = opened.parts.get("clean.model", opened.parts["train.model"])
         rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
@@ -105,7 +103,7 @@ def newest(opened: Contents) -> ModelSource | None:
 
 
 def _coarse(opened: Contents) -> Path | None:
-    """Where the coarse pass of a scene in blocks left its model; None without blocks, or before it is done."""
+    """The coarse pass's model of a scene in blocks; None without blocks, or before it is done."""
     part = opened.parts.get("blocks.coarse")
     if part is not None and (part.path / COARSE_MODEL).is_file():
         return part.path
@@ -114,9 +112,9 @@ def _coarse(opened: Contents) -> Path | None:
 
 
 def _trainings(opened: Contents) -> list[tuple[Path, Path, int]]:
-    """Where trainings are at work, how what they train is rendered, which block it is: 0 for the whole, a coarse pass.
+    """Running trainings: checkpoint, rendering settings, and block number (0 for the whole scene or a coarse pass).
 
-    Of blocks the one that moved last comes first.
+    The block updated last comes first.
     """
     found = []
     if "train" in opened.working:
@@ -140,7 +138,7 @@ def _moved(path: Path) -> int:
 
 
 def iteration_of(source: ModelSource) -> int | None:
-    """How far a model is; None where its file does not say."""
+    """A model's training iteration; None if its file does not record it."""
     if source.kind == "initial":
         return 0
     try:
@@ -153,10 +151,10 @@ def iteration_of(source: ModelSource) -> int | None:
 
 
 def load(source: ModelSource, opened: Contents) -> LoadedModel:
-    """Read a model for drawing.
+    """Read a model for rendering.
 
     Raises:
-        SplatpipeError: if it cannot be read; a checkpoint that was replaced meanwhile is no longer there.
+        SplatpipeError: if it cannot be read, e.g. if a checkpoint was replaced meanwhile.
     """
     if source.kind == "checkpoint":
         gaussians, sky = _from_checkpoint(source.path, opened)
@@ -172,16 +170,16 @@ def load(source: ModelSource, opened: Contents) -> LoadedModel:
 
 
 def views_of(opened: Contents) -> tuple[View, ...]:
-    """The photos that are trained on and measured with; none before they are undistorted."""
+    """The training and held-out views; empty before they are undistorted."""
     part = opened.parts.get("undistort.dataset")
     if part is None:
         return ()
-    folder = part.path.resolve()  # an OUT from elsewhere may name pictures that lie elsewhere
+    folder = part.path.resolve()  # an OUT from elsewhere may refer to images outside it
     return tuple(view for view in load_views(part.path) if view.image_path.resolve().is_relative_to(folder))
 
 
 def held_out_of(opened: Contents) -> Sequence[str]:
-    """Names of the photos that are not trained on; none before that is decided."""
+    """Names of the held-out photos; empty before they are chosen."""
     part = opened.parts.get("split.views")
     try:
         return () if part is None else load_split(part.path).held_out
@@ -190,11 +188,11 @@ def held_out_of(opened: Contents) -> Sequence[str]:
 
 
 def device_of(opened: Contents, logged: str) -> str:
-    """The device that the training was given; where it is not done, that of the run.
+    """The device that training was given, or that of the run if training is not done.
 
     Args:
         opened: The run.
-        logged: What its last run was given, by its log.
+        logged: The device of its last run, from its log.
     """
     done = opened.artifacts.get("train")
     machine = None if done is None else done.manifest.get("machine")
@@ -202,14 +200,14 @@ def device_of(opened: Contents, logged: str) -> str:
 
 
 def pictures(shown: LoadedModel, view: View, threads: int, device: str = "auto") -> tuple[bytes, bytes]:
-    """JPEGs of a render and of its photo, both of the size that is trained on, 2 megapixels at most.
+    """JPEGs of a render and of its photo, both at training size, 2 megapixels at most.
 
     Args:
         shown: The model.
         view: The photo.
-        threads: Of the CPU.
-        device: Of the run: on the CPU where that is ``cpu``, else on the graphics card where there is one that what
-            trains there leaves room on; it has all of that again then.
+        threads: CPU threads.
+        device: The run's device: with ``cpu``, rendered on the CPU, else on the GPU if the training leaves enough
+            memory there, which is released afterwards.
 
     Raises:
         SplatpipeError: if the photo cannot be read.
@@ -223,7 +221,7 @@ def pictures(shown: LoadedModel, view: View, threads: int, device: str = "auto")
 
 
 def _on_card(shown: LoadedModel, camera: Camera) -> Pixels | None:
-    """A render by the graphics card; None where there is none, or too little memory is free."""
+    """A render by the GPU; None without a GPU or with too little free memory."""
     try:
         device = choose_device("auto")
         if device.name == "cpu":
@@ -235,7 +233,7 @@ def _on_card(shown: LoadedModel, camera: Camera) -> Pixels | None:
     except (torch.OutOfMemoryError, MachineError):
         return None
     finally:
-        torch.cuda.empty_cache()  # does nothing where CUDA was not used
+        torch.cuda.empty_cache()  # does nothing if CUDA was not used
 
 
 def _rendered(shown: LoadedModel, camera: Camera, device: Device) -> Pixels:
@@ -243,16 +241,16 @@ def _rendered(shown: LoadedModel, camera: Camera, device: Device) -> Pixels:
 
 
 def viewer(shown: LoadedModel, source: ModelSource, opened: Contents, name: str) -> tuple[str, bytes]:
-    """The 3D viewer's page of a model, and the splat that it loads from beside it, called ``SPLAT``.
+    """The 3D viewer's page of a model, and the splat file ``SPLAT`` that it loads from beside it.
 
     Args:
         shown: The model.
-        source: Where it is from.
+        source: Its source.
         opened: The run.
-        name: Of the run.
+        name: The run's name.
 
     Raises:
-        SplatpipeError: if the run is not so far that a model lies anywhere, or cannot be read.
+        SplatpipeError: if the run is not georeferenced yet or cannot be read.
     """
     if source.rendering is None or not {"georef.frame", "undistort.dataset"} <= set(opened.parts):
         raise SplatpipeError("There is nothing to show in 3D yet.")
@@ -266,13 +264,13 @@ def viewer(shown: LoadedModel, source: ModelSource, opened: Contents, name: str)
 
 
 def _from_checkpoint(path: Path, opened: Contents) -> tuple[Gaussians, Panorama | None]:
-    """The Gaussians as they are rendered; of a large file, only what that takes is read."""
+    """The Gaussians as rendered, and the sky; only the arrays needed for that are read from the file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             tensors = {name: torch.from_numpy(archive[name]) for name in PARAMETERS}
             colours = torch.from_numpy(archive[SKY]) if SKY in archive.files else None
         gaussians = Gaussians.from_tensors(tensors)
-    except Exception as error:  # the readers of zip, of headers and of arrays raise almost anything on broken files
+    except Exception as error:  # zip, header and array readers raise almost anything on broken files
         raise SplatpipeError(f"The checkpoint cannot be read: {' '.join(str(error).split())[:120]}") from error
     gaussians = gaussians.select(gaussians.finite())
     frozen = path.with_name(FROZEN)
@@ -280,7 +278,7 @@ def _from_checkpoint(path: Path, opened: Contents) -> tuple[Gaussians, Panorama 
         gaussians = Gaussians.concat([gaussians, read_splat(frozen)])
     sky = None
     if colours is not None and "georef.frame" in opened.parts:
-        # A checkpoint has no up of its own; the frame's is within a cell of it.
+        # A checkpoint does not store the up direction; the frame's is within a cell of it.
         up = load_frame(opened.parts["georef.frame"].path).world_from_model.rotation[2]
         sky = Panorama(np.asarray(up, np.float64), colours)
     return gaussians, sky

@@ -1,6 +1,6 @@
-"""What the marks made so far tell: where each point is, how well the frame is known, and where photos show the rest.
+"""Estimates from the marks so far: each point's position, the frame's accuracy, and where photos show the other points.
 
-It is georef's own fit, without its bundle adjustment: control and positions together, blunders named.
+It uses georef's own fit, without its bundle adjustment: control and positions together, with blunder detection.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, SurveyPoint, locate, residual_px, with_roles
 
 Marks = Mapping[str, Mapping[str, tuple[float, float]]]
-UNKNOWN_HEIGHT_M = 5.0  # of a point that has no height, or while the heights' datum is not known
+UNKNOWN_HEIGHT_M = 5.0  # of a point without a height, or while the vertical datum is unknown
 LEAST_RADIUS_PX = 6.0
-SURFACE_RADIUS_M = 8.0  # around a point, of whose sparse points the height is taken
-LEAST_NEAR = 3  # sparse points that tell a height
-RAY_TOLERANCE = 1e-3  # of x/z; beyond it a lens model has folded back what it does not show
+SURFACE_RADIUS_M = 8.0  # around a point: its height is taken from the sparse points within
+LEAST_NEAR = 3  # sparse points needed for a height
+RAY_TOLERANCE = 1e-3  # of x/z; beyond it, the lens model has folded a ray outside the image back into it
 BEYOND = np.array(
     [0.5, 2.0]
-)  # of a photo's sparse points' depths, nearest and farthest: how far a mark's ray is followed
-LINE_STEPS = 48  # along it: a bent lens bends the line
-NEIGHBOURS = 30  # sparse points around a place: a photo that shows none of them most likely has something before it
-MOST_WITNESSES = 50_000  # sparse points among which they are looked for
-HELPFUL_MARKS = 4  # of a point: from there on more tell little
+)  # times a photo's nearest and farthest sparse point depths: the range in which a mark's ray is followed
+LINE_STEPS = 48  # along the ray: lens distortion bends its image
+NEIGHBOURS = 30  # sparse points around a place: in a photo that shows none of them, the place is most likely occluded
+MOST_WITNESSES = 50_000  # sparse points searched for them
+HELPFUL_MARKS = 4  # of a point: further marks add little
 
 
 @dataclass
@@ -54,13 +54,13 @@ class WarningCollector:
     warnings: list[str] = field(default_factory=list)
 
     def progress(self, done: float, total: float, what: str, unit: str = "") -> None:
-        """Nobody waits for it."""
+        """Ignore progress."""
 
     def metric(self, name: str, value: float, step: int | None = None) -> None:
-        """Nor for this."""
+        """Ignore a metric."""
 
     def note(self, message: str) -> None:
-        """Nor for this."""
+        """Ignore a note."""
 
     def warning(self, message: str, hint: str = "") -> None:
         self.warnings.append(f"{message} {hint}".strip())
@@ -68,20 +68,20 @@ class WarningCollector:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is known of the points and of the frame.
+    """The estimated points and frame.
 
     Attributes:
-        survey: The points with their marks, roles and places in the model.
+        survey: The points with their marks, roles and positions in the model.
         tables: As in `accuracy.json`; empty without a frame.
-        expected_m: Standard deviation of the frame, horizontally and vertically, the median over the model (without
-            control, what the positions state); None where it is not known.
-        heights_tied: Whether heights are the survey's: a control point that has one took part.
+        expected_m: Standard deviation of the frame, horizontal and vertical, median over the model (without control,
+            from the stated accuracy of the positions); None if unknown.
+        heights_tied: Whether heights are tied to the survey: a control point with a height took part.
         gsd_m: Ground sampling distance; None without a frame.
-        places: Of the points in the model, by their marks or else by the survey; NaN where nothing tells.
-        radius_m: How well they are known there, in the model's units; 0 where by their marks.
-        by_marks: Which are known by their marks.
-        residual_m: East, north, up of each point, found less surveyed; NaN where not known.
-        warnings: In sentences.
+        places: Positions of the points in the model, from their marks or else from the survey; NaN if unknown.
+        radius_m: Their uncertainty in the model's units; 0 if from marks.
+        by_marks: Which are known from marks.
+        residual_m: East, north, up of each point, estimated minus surveyed; NaN if unknown.
+        warnings: Warnings in sentences.
     """
 
     survey: Survey
@@ -104,13 +104,13 @@ class _GeoreferencedSite:
 
 
 class Estimator:
-    """Estimates from marks; a point whose marks are as before is not looked for again.
+    """Estimates points and frame from marks; points with unchanged marks are not triangulated again.
 
     Args:
-        job: What is marked.
+        job: The marking job.
 
     Raises:
-        SplatpipeError: if the points lie elsewhere than the photos.
+        SplatpipeError: if the points are far from the photos.
     """
 
     def __init__(self, job: MarkingJob) -> None:
@@ -120,13 +120,13 @@ class Estimator:
         self._stations = stations_of(job.model, job.positions, job.frame)
         unmarked = [SurveyPoint(point, "control", "", ()) for point in job.points]
         self._geodetic = require_near(self._survey(unmarked), job.config, self._stations)
-        self._gsd = job.model.gsd(1.0)  # of the model's units: it takes a while, and no mark changes it
+        self._gsd = job.model.gsd(1.0)  # in the model's units: slow to compute, and independent of marks
 
     def estimate(self, marks: Marks) -> Estimate:
-        """What some marks tell.
+        """Compute the estimate for some marks.
 
         Args:
-            marks: Pixels by point and photo, (0, 0) the top-left corner of the first one.
+            marks: Pixel coordinates by point and photo; (0, 0) is the top-left corner of the first pixel.
         """
         job, told = self._job, WarningCollector()
         points = [self._locate(k, marks.get(point.name, {})) for k, point in enumerate(job.points)]
@@ -187,7 +187,7 @@ class Estimator:
         return _GeoreferencedSite(site, fit, survey)
 
     def _lifted(self, similarity: Similarity, site: LocalSurvey) -> Similarity:
-        """Before any mark: the model moved in height so that the points lie on it, whatever datum each is in."""
+        """Before any mark: shift the model vertically so that the points lie on it, whatever their datums."""
         cloud = similarity.apply(self._job.model.points)
         lifts = []
         for place in site.targets.enu[np.isfinite(site.targets.sigmas[:, 2])]:
@@ -200,7 +200,7 @@ class Estimator:
     def _expected(
         self, fitted: _GeoreferencedSite, wanted: Bool[np.ndarray, " n"]
     ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
-        """Where the survey has points in the model, and how well that is known, in the model's units."""
+        """The surveyed points' positions in the model, and their uncertainty, in the model's units."""
         similarity, enu = fitted.fit.similarity, fitted.site.targets.enu[wanted].copy()
         unknown = ~np.isfinite(fitted.site.targets.sigmas[wanted, 2])
         cloud = similarity.apply(self._job.model.points)
@@ -214,11 +214,11 @@ class Estimator:
         return places, np.linalg.norm(sigmas, axis=1) / similarity.scale
 
     def _stated_sigmas(self) -> Float64[np.ndarray, " 3"]:
-        """Of the photos' positions, which share most of their errors: what these alone are worth."""
+        """Standard deviations of a frame from the photos' positions alone, which share most of their errors."""
         return np.asarray(np.median(self._stations.sigmas, axis=0))
 
     def _sigmas(self, fitted: _GeoreferencedSite) -> tuple[float, float]:
-        """Standard deviations of the frame, horizontally and vertically: the median over the model."""
+        """Horizontal and vertical standard deviations of the frame: the median over the model."""
         if not fitted.survey.of_role("control"):
             east, north, up = self._stated_sigmas().tolist()
             return math.hypot(east, north), up
@@ -230,19 +230,19 @@ class Estimator:
 
 
 def marks_many(points: list[SurveyPoint]) -> bool:
-    """Whether enough is marked for a frame to be missed."""
+    """Whether enough points are marked that a frame should exist."""
     return sum(point.found is not None for point in points) >= 3
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Where photos show the points.
+    """Projections of the points into the photos.
 
     Attributes:
-        pixels: Of each point in each photo of the model; NaN where that does not show it.
-        radius_px: Around it, where it is to be looked for.
-        depth: In the model's units.
-        doubtful: Whether it lies beyond the border, if only just, or something seems to hide it.
+        pixels: Image coordinates of each point in each photo of the model; NaN if not shown.
+        radius_px: Search radius around them.
+        depth: Depths in the model's units.
+        doubtful: Whether a point is just outside the image, or seems to be occluded.
     """
 
     pixels: Float64[np.ndarray, "n m 2"]
@@ -252,10 +252,10 @@ class Projection:
 
 
 class Projector:
-    """Finds points in photos.
+    """Projects points into photos.
 
     Args:
-        job: What is marked.
+        job: The marking job.
     """
 
     def __init__(self, job: MarkingJob) -> None:
@@ -263,7 +263,7 @@ class Projector:
         self._cloud, self._shows = _cloud_of(job.model)
 
     def project(self, places: Float64[np.ndarray, "n 3"], radius_m: Float64[np.ndarray, " n"]) -> Projection:
-        """Where photos show places of the model, known to some radius (its units)."""
+        """Project positions in the model, with uncertainty radii in its units, into all photos."""
         count, photos = len(places), len(self._job.model.names)
         pixels = np.full((count, photos, 2), np.nan)
         radius, depth = np.full((count, photos), np.nan), np.full((count, photos), np.nan)
@@ -292,7 +292,7 @@ class Projector:
         return Projection(pixels, radius, depth, doubtful)
 
     def line(self, sighting: Sighting) -> Float64[np.ndarray, "steps m 2"]:
-        """Where photos may show what one photo shows at a mark: along its ray, NaN where they do not."""
+        """Project the ray of a mark in one photo into the others (the epipolar curve); NaN where not visible."""
         assert sighting.index is not None
         view = self._job.model.view(sighting.index, self._job.photos[sighting.photo].width)
         pose = view.cam_from_model
@@ -304,7 +304,7 @@ class Projector:
         return self.project(places, np.zeros(LINE_STEPS)).pixels
 
     def _witnessed(self, places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n m"]:
-        """Which photos show a sparse point close to each place: what hides that is no hindrance, then."""
+        """Which photos show a sparse point close to each position, so that it is probably not occluded there."""
         count = min(NEIGHBOURS, len(self._cloud))
         if count == 0:
             return np.ones((len(places), self._shows.shape[1]), dtype=bool)
@@ -316,7 +316,7 @@ class Projector:
 
 
 def _cloud_of(model: SparseModel) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.ndarray, "k m"]]:
-    """Sparse points, evenly thinned where there are many, and which photos show each."""
+    """Sparse points, evenly thinned if there are many, and which photos show each."""
     every = sorted(model.reconstruction.points3D.items())
     chosen = [point for _, point in every[:: max(1, len(every) // MOST_WITNESSES)]]
     number = {image: k for k, image in enumerate(model.image_ids)}
@@ -328,7 +328,7 @@ def _cloud_of(model: SparseModel) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.n
 
 
 def residual_of(sighting: Sighting, point: SurveyPoint, job: MarkingJob) -> list[float] | None:
-    """What a photo shows of a point less the mark, pixels; None where that is not known."""
+    """Reprojection error at a mark, projected minus marked, pixels; None if unknown."""
     if point.found is None:
         return None
     found = residual_px(sighting, point.found.xyz, job.model, job.photos)

@@ -1,4 +1,4 @@
-"""Files sent over HTTP: opened without following any link, whole or by a range, never more than was asked for."""
+"""Serves files over HTTP: opened without following links, whole or by range."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ TYPES = {
 
 
 class NotThereError(Exception):
-    """A path that is no file inside its folder, for whatever reason: who asks need not know."""
+    """A path is not a file inside its folder; the reason is not disclosed."""
 
 
 @dataclass(frozen=True)
 class OpenFile:
-    """A file that is being sent; its descriptor is closed by whoever sends it."""
+    """An open file to send; the sender closes its descriptor."""
 
     descriptor: int
     size: int
@@ -46,19 +46,19 @@ class OpenFile:
 
 
 def open_inside(folder: Path, relative: str) -> OpenFile:
-    """Open a regular file below a folder; a link on the way, or at its end, is no way.
+    """Open a regular file below a folder; symbolic links anywhere in the path are rejected.
 
     Args:
-        folder: Where it must lie; it is trusted itself.
+        folder: The folder that must contain it; trusted.
         relative: POSIX path below it.
 
     Raises:
-        NotThereError: if it is not there, or not there without leaving the folder.
+        NotThereError: if it does not exist, or only outside the folder.
     """
     parts = PurePosixPath(relative).parts
     if not parts or any(part in ("..", "/") or "\0" in part for part in parts):
         raise NotThereError
-    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK  # a pipe is not waited for
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK  # does not block on a pipe
     descriptor = -1
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -77,7 +77,7 @@ def open_inside(folder: Path, relative: str) -> OpenFile:
 
 
 def is_inside(folder: Path, relative: str) -> bool:
-    """Whether ``open_inside`` opens it."""
+    """Whether ``open_inside`` can open it."""
     try:
         os.close(open_inside(folder, relative).descriptor)
     except NotThereError:
@@ -86,9 +86,9 @@ def is_inside(folder: Path, relative: str) -> bool:
 
 
 def wanted_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """First byte and the one after the last that a Range header asks for; None for the whole file.
+    """Parse a Range header: the first byte and the one after the last; None for the whole file.
 
-    Several ranges, and what is no range of bytes, are answered by the whole file (RFC 9110, 14.2).
+    Multiple ranges and units other than bytes are answered with the whole file (RFC 9110, 14.2).
 
     Raises:
         IndexError: if the file has no such bytes.
@@ -97,7 +97,7 @@ def wanted_range(header: str | None, size: int) -> tuple[int, int] | None:
     if found is None or found.groups() == ("", ""):
         return None
     first, last = found.groups()
-    if first == "":  # the last so many
+    if first == "":  # a suffix range: the last bytes
         if int(last) == 0 or size == 0:
             raise IndexError
         return max(0, size - int(last)), size
@@ -110,7 +110,7 @@ def wanted_range(header: str | None, size: int) -> tuple[int, int] | None:
 
 
 class FileAnswer(Response):
-    """A file, or the range of it that the request asks for; closes it."""
+    """Sends a file, or the requested range of it, and closes it."""
 
     def __init__(self, file: OpenFile, kind: str, headers: Mapping[str, str]) -> None:
         super().__init__(headers=dict(headers), media_type=kind)

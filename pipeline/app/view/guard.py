@@ -1,9 +1,9 @@
-"""What every request has to be before anything of ours looks at it, and the headers of every answer.
+"""Checks every request before it is handled, and sets the headers of every response.
 
 The server listens on 127.0.0.1, which any page in the user's browser can reach. So the Host must name this machine (a
-foreign name that resolves to it is DNS rebinding), what comes from another origin is refused, and what writes carries
-the secret of this server, which only its own page knows. No path of ours needs an escape, a dot in front, or an empty
-part: paths that have them are refused before they are decoded.
+foreign name that resolves to it is DNS rebinding), requests from another origin are rejected, and writing requests must
+carry the secret of this server, which only its own page knows. None of our paths needs an escape, a leading dot or an
+empty segment: paths that have them are rejected before they are decoded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")  # any port: a tunnel from elsewhere has its own
+HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")  # any port: a tunnel may use a different one
 PATH = re.compile(rb"/(?:\w[\w.-]*(?:/\w[\w.-]*)*)?", re.ASCII)
 LONGEST_PATH = 200
 LARGEST_BODY = 16 << 10
@@ -29,13 +29,13 @@ CSP_OURS = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src"
     " 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-# Self-contained pages of a run: scripts and workers of their own, nothing from anywhere else but this server.
+# Self-contained pages of a run: their own scripts and workers, and nothing from anywhere but this server.
 CSP_OF_RUN = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; style-src 'unsafe-inline';"
     " img-src 'self' data: blob:; media-src 'self' data: blob:; font-src data:; connect-src 'self' data: blob:;"
     " worker-src blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
-# The run's folder for the web: as its own page states it.
+# The run's web folder: the same policy as in its own page.
 CSP_OF_SITE = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; style-src 'self'; img-src 'self' data: blob:;"
     " connect-src 'self' data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
@@ -49,7 +49,7 @@ HEADERS = {
 
 
 class RefusedError(Exception):
-    """A request that is not answered."""
+    """A rejected request."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -57,10 +57,10 @@ class RefusedError(Exception):
 
 
 class Guard:
-    """Lets through what our own pages send, and only that.
+    """Passes only requests from our own pages.
 
     Args:
-        app: What answers.
+        app: The application behind the guard.
         token: The secret of this server.
     """
 
@@ -91,10 +91,10 @@ class Guard:
         await self._app(scope, receive, guarded)
 
     def _check(self, scope: Scope) -> None:
-        """Refuse what is not for us.
+        """Check a request.
 
         Raises:
-            RefusedError: if so.
+            RefusedError: if it is not allowed.
         """
         host = _only(scope["headers"], b"host", "Host")
         if HOSTS.fullmatch(host) is None:

@@ -1,4 +1,4 @@
-"""What there is to see of a run, in a page: the way to the viewer, the report, the training, the files."""
+"""The landing page of a run, with links to the viewer, the report, the training and the files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE
 
-REPORT = "report.html"  # the one thing for people in OUT that no stage delivers
+REPORT = "report.html"  # the only file for people in OUT that no stage delivers
 VIEWER = "viewer.html"
 LARGEST_METRICS = 64 << 20
 WHAT = {
@@ -34,12 +34,12 @@ SHOWN_IN_BROWSER = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
 
 
 def fetchable(run: RunFolder) -> tuple[str, ...]:
-    """The files that may be fetched, relative to OUT: the report, and what stages deliver to people."""
+    """The files that may be fetched, relative to OUT: the report and the stages' deliverables."""
     return tuple(name for name in (REPORT, *run.deliverables()) if is_inside(run.out, name))
 
 
 def landing(run: RunFolder, marking: bool) -> dict[str, Any]:
-    """What the landing page says.
+    """The values for the landing page's template.
 
     Args:
         run: The run.
@@ -94,7 +94,7 @@ def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> 
 
 
 def _figures(metrics: Mapping[str, JSON]) -> list[dict[str, str]]:
-    """The figures that people ask for first."""
+    """The key figures."""
     rows = (
         ("photos placed", "registered", "{:,.0f}"),
         ("Gaussians", "gaussians", "{:,.0f}"),

@@ -1,4 +1,4 @@
-"""The training as it runs: how far it is, its curves, and its latest model beside the photos."""
+"""The live view of training: progress, curves, and the latest model beside the photos."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, Contents, RunFolde
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.dataset import View
 
-if TYPE_CHECKING:  # torch takes seconds to load, and marking does without
+if TYPE_CHECKING:  # torch takes seconds to load, and marking does not need it
     from splatpipe.pipeline.app.view.checkpoint_render import LoadedModel, ModelSource
 
 LOOK_EVERY_S = 2.0
-MOST_PICTURES = 64  # that are kept: pairs of JPEGs of some 100 kB
-RENDER_THREADS = 1  # the training wants the others
+MOST_PICTURES = 64  # cached pairs of JPEGs of about 100 kB
+RENDER_THREADS = 1  # the training needs the others
 CURVES = ("loss", "gaussians")
 
 
 class Live:
-    """What the live page shows.
+    """The content of the live page.
 
     Args:
         run: The run.
@@ -49,7 +49,7 @@ class Live:
         self._renderer.shutdown(wait=True, cancel_futures=True)
 
     def state(self) -> dict[str, JSON]:
-        """How far the run is, for the page."""
+        """The run's progress as JSON, for the page."""
         from splatpipe.pipeline.app.view import checkpoint_render
 
         with self._lock:
@@ -92,7 +92,7 @@ class Live:
             }
 
     def picture(self, number: int, what: str) -> bytes | None:
-        """A JPEG of a view: its ``render`` by the latest model or its ``photo``; None where there is no such.
+        """A JPEG of a view: its ``render`` by the latest model or its ``photo``; None if it does not exist.
 
         Raises:
             SplatpipeError: if it cannot be made.
@@ -101,7 +101,7 @@ class Live:
         return None if made is None else made[0 if what == "render" else 1]
 
     def viewer(self, what: str) -> bytes | None:
-        """The 3D viewer of the latest model: its ``page``, or the ``splat`` that it loads; None where there is none.
+        """The 3D viewer of the latest model: its ``page``, or the ``splat`` that it loads; None if there is none.
 
         Raises:
             SplatpipeError: if it cannot be made.
@@ -126,7 +126,7 @@ class Live:
         from splatpipe.pipeline.app.view import checkpoint_render
 
         if self._model is None or self._model[0] != source.stamp:
-            self._model = None  # two of them may not fit
+            self._model = None  # two models may not fit in memory
             self._model = source.stamp, checkpoint_render.load(source, opened)
         return self._model[1]
 
@@ -151,7 +151,7 @@ class Live:
         return made
 
     def _look(self) -> tuple[Contents, tuple[View, ...]]:
-        """What there is, at most so old; called with the lock held."""
+        """The run's contents and views, at most ``LOOK_EVERY_S`` old; called with the lock held."""
         from splatpipe.pipeline.app.view import checkpoint_render
 
         if time.monotonic() - self._looked_s >= LOOK_EVERY_S:

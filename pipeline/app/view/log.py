@@ -1,4 +1,4 @@
-"""What a run says of itself in ``events.jsonl``, read as it grows."""
+"""Reads a run's ``events.jsonl`` as it grows."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from splatpipe.stages.options import LineConfig
 
 LONGEST_LINE = 1 << 18
 READ_AT_ONCE = 8 << 20
-MOST_POINTS = 2000  # of a curve: twice what a screen is wide
+MOST_POINTS = 2000  # of a curve: twice the width of a screen
 MOST_NOTES = 200
-RATE_WINDOW_S = 60.0  # what the time left is judged by: iterations slow down as the model grows
+RATE_WINDOW_S = 60.0  # for the estimate of the time left: iterations slow down as the model grows
 
 
 @dataclass
 class StageState:
-    """A stage of the run that is logged.
+    """The state of a stage in the log.
 
     Attributes:
-        name: The stage's.
+        name: The stage's name.
         state: ``waiting``, ``running``, ``done``, ``reused`` or ``failed``.
-        seconds: That it took; None until then.
-        done: Progress.
-        total: Of it.
-        what: Is being done.
-        unit: Of progress.
-        trail: Times (seconds since the epoch) and progress, the last ``RATE_WINDOW_S``.
-        message: Of a failure.
-        shard: Its number and how many there are; empty for a stage's own.
-        began_s: When it began, seconds since the epoch; 0 where it did not.
+        seconds: Its duration; None until it has ended.
+        done: Work done.
+        total: Total work.
+        what: The current activity.
+        unit: The unit of ``done`` and ``total``.
+        trail: Times (seconds since the epoch) and progress over the last ``RATE_WINDOW_S``.
+        message: The error message of a failure.
+        shard: The shard's number and count; empty for a stage's own body.
+        began_s: Start, seconds since the epoch; 0 if not started.
     """
 
     name: str
@@ -53,7 +53,7 @@ class StageState:
     began_s: float = 0.0
 
     def progress(self, data: Mapping[str, JSON], time_s: float) -> None:
-        """Take an event of progress."""
+        """Process a progress event."""
         what = str(data["what"])
         if what != self.what:
             self.trail.clear()
@@ -65,7 +65,7 @@ class StageState:
 
     @property
     def seconds_left(self) -> float | None:
-        """At the pace of the last minute; None where nothing tells."""
+        """Seconds left at the rate of the last minute; None if unknown."""
         if self.state != "running" or len(self.trail) < 2:
             return None
         (first_s, first), (last_s, last) = self.trail[0], self.trail[-1]
@@ -73,21 +73,21 @@ class StageState:
         return max(0.0, self.total - last) / pace if pace > 0.0 else None
 
     def as_json(self) -> dict[str, JSON]:
-        """For the page."""
+        """The state as JSON, for the page."""
         kept = ("name", "state", "seconds", "done", "total", "what", "unit", "message")
         return {name: getattr(self, name) for name in kept} | {"seconds_left": self.seconds_left}
 
 
 @dataclass
 class Curve:
-    """A metric over its steps, of which every second point goes where they become too many."""
+    """A metric over its steps; every second point is dropped when there are too many."""
 
     points: list[tuple[int, float]] = field(default_factory=list)
     stride: int = 1
     seen: int = 0
 
     def add(self, step: int, value: float) -> None:
-        """Take a point; a step that was there already begins anew from it (a run that went on from a checkpoint)."""
+        """Add a point; an earlier step discards all points from there on (a run resumed from a checkpoint)."""
         while self.points and self.points[-1][0] >= step:
             self.points.pop()
         self.seen += 1
@@ -100,31 +100,31 @@ class Curve:
 
 
 class RunLog:
-    """The last run in a log that grows.
+    """The last run in a growing log.
 
     Args:
         out: The run's folder.
-        name: Of the log in it.
+        name: Name of the log in it.
     """
 
     def __init__(self, out: Path, name: str) -> None:
         self._out, self._name = out, name
         self._inode, self._offset, self._rest = "", 0, b""
-        self.keys: dict[str, str] = {}  # the last known one of each stage, in any run
+        self.keys: dict[str, str] = {}  # the last known key of each stage, from any run
         self._begin()
 
     def _begin(self) -> None:
         self.stages: dict[str, StageState] = {}
         self.curves: dict[str, Curve] = {}
-        self.curves_of = ""  # the stage, or the shard, whose they are
+        self.curves_of = ""  # the stage or shard they belong to
         self.notes: list[dict[str, JSON]] = []
-        self.device = "auto"  # as the run was given it
+        self.device = "auto"  # as given to the run
         self.started_s: float | None = None
         self.last_s: float | None = None
         self.finished = False
 
     def read(self) -> None:
-        """Take what was written since the last call; a log that was replaced or cut is read anew."""
+        """Read what was written since the last call; a replaced or truncated log is read from the start."""
         try:
             file = open_inside(self._out, self._name)
         except NotThereError:
@@ -148,7 +148,7 @@ class RunLog:
             os.close(file.descriptor)
 
     def _take(self, line: bytes) -> None:
-        """A line that is no event of ours is passed over: the log is for reading, not for believing."""
+        """Process a line; invalid ones are skipped, since the log is not trusted."""
         if len(line) > LONGEST_LINE:
             return
         event = parse_event(line)
@@ -178,14 +178,14 @@ class RunLog:
             told = {"kind": kind, "stage": stage, "message": str(data["message"]), "hint": str(data.get("hint", ""))}
             self.notes = [*self.notes, told][-MOST_NOTES:]
         elif stage_name(stage) in self.stages:
-            if stage not in self.stages:  # a shard that begins
+            if stage not in self.stages:  # a shard that starts
                 known = {**self.stages, stage: StageState(stage)}
                 self.stages = {name: known[name] for name in shards_first(known)}
             self._stage_event(kind, self.stages[stage], data, time_s)
 
     @property
     def left_after_s(self) -> float | None:
-        """About how long those shards take that come after the one at work; None where nothing tells, or none does."""
+        """Approximate seconds for the shards after the current one; None if unknown or if there are none."""
         running = next((stage for stage in self.stages.values() if stage.state == "running" and stage.shard), None)
         if running is None or running.seconds_left is None or self.last_s is None:
             return None
@@ -198,7 +198,7 @@ class RunLog:
 
     @property
     def unfinished(self) -> set[str]:
-        """Stages that the last run began and did not end."""
+        """Stages that the last run started and did not finish."""
         return {name for name, stage in self.stages.items() if stage.state in ("running", "failed")}
 
     def _stage_event(self, kind: str, state: StageState, data: Mapping[str, JSON], time_s: float) -> None:
@@ -216,11 +216,11 @@ class RunLog:
 
 
 def contents_of(run: RunFolder, log: RunLog) -> Contents:
-    """What there is of a run now.
+    """The current contents of a run.
 
     Args:
         run: The run.
-        log: Its log; it is read on.
+        log: Its log, which is read up to its current end.
     """
     log.read()
     try:

@@ -1,4 +1,4 @@
-"""The page on which control points are marked, and what it asks the server."""
+"""The HTTP routes of the page for marking control points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ACTIONS = ("mark", "unmark", "hide")
 
 
 class MarkPages:
-    """Marking over HTTP; points and photos go by their numbers.
+    """Marking over HTTP; points and photos are identified by number.
 
     Args:
         marking: The session.
@@ -32,7 +32,7 @@ class MarkPages:
         self._names = [point.name for point in marking.job.points]
 
     def routes(self) -> list[Route]:
-        """What is answered."""
+        """The routes."""
         return [
             Route("/mark", self._page),
             Route("/api/mark", self._overview),
@@ -44,7 +44,7 @@ class MarkPages:
         ]
 
     def _page(self, request: Request) -> Response:
-        # Only a window of its own gets the secret: a page of the run has our origin and might ask for it.
+        # Only a top-level window gets the secret: a page of the run has our origin and might request it.
         if request.headers.get("sec-fetch-dest", "document") != "document":
             raise HTTPException(403, "Open it in its own window.")
         return self._pages.page("mark.html", {"name": self._pages.run.name, "token": self._pages.token})
@@ -94,16 +94,16 @@ class MarkPages:
         return self._answer(self._names.index(change.point), self._marking.photos.index(change.photo))
 
     def _answer(self, point: int, photo: int | None = None) -> Response:
-        """All that a change changes; ``photo`` is where to look, after one that was taken back."""
+        """Everything that a change affects; after undo or redo, ``photo`` is the photo to show."""
         overview, detail = self._marking.overview(), self._marking.detail(self._names[point])
         return JSONResponse({"overview": overview, "detail": detail, "point": point, "photo": photo})
 
 
 def _body(request: Request) -> dict[str, Any]:
-    """The JSON object that was sent.
+    """The JSON object in the request's body.
 
     Raises:
-        HTTPException: if it is none.
+        HTTPException: if it is not a JSON object.
     """
     try:
         found = json.loads(request.scope["splatpipe.body"])

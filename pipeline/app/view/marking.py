@@ -1,7 +1,7 @@
-"""A session of marking: every change is on the disk before it is acknowledged, and can be taken back.
+"""A marking session: every change is written to disk before it is acknowledged, and can be undone.
 
-Targets that were found are shown like marks and count like them, but are never written: the file has what somebody
-marked, and what somebody said not to be visible.
+Detected targets are shown like marks and count like them, but are never written: the file contains only what a person
+marked or declared not visible.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.control_file import SurveyedPoint
 
 MOST_UNDONE = 10_000
-WIDE_RAD = math.radians(60.0)  # between rays: more tells no more
-HELPFUL_PHOTOS = 20  # of a point, in the order in which they tell most; the rest by their distance
-DIGITS = 2  # of pixels, as they are written
-State = tuple[float, float] | Literal["hidden"] | None  # of a point in a photo: its mark, or that it is not visible
+WIDE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing
+HELPFUL_PHOTOS = 20  # of a point, ordered by how much they help; the rest follow by distance
+DIGITS = 2  # decimal places of pixel coordinates in the file
+State = tuple[float, float] | Literal["hidden"] | None  # of a point in a photo: its mark, or not visible, or neither
 
 
 class WrongRequestError(Exception):
-    """What the page asked for cannot be; the text says why."""
+    """An invalid request from the page; the text says why."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What became of a point in a photo."""
+    """A change of a point's state in a photo."""
 
     point: str
     photo: str
@@ -51,10 +51,10 @@ class Change:
 
 
 class Marking:
-    """The marks, in memory as they are in the file.
+    """The marks, kept in memory as they are in the file.
 
     Args:
-        job: What is marked.
+        job: The marking job.
     """
 
     def __init__(self, job: MarkingJob) -> None:
@@ -71,21 +71,21 @@ class Marking:
 
     @property
     def photos(self) -> tuple[str, ...]:
-        """Names of all photos; their places in it are their numbers."""
+        """Names of all photos; a photo's number is its index here."""
         return self._photos
 
     def change(self, point: str, photo: str, after: State, nudge: bool = False) -> None:
-        """Mark a point in a photo, take the mark away, or say that the photo does not show it.
+        """Mark a point in a photo, remove the mark, or declare the point not visible.
 
         Args:
-            point: Its name.
-            photo: Its name.
-            after: What is to be.
-            nudge: Whether it goes on from the change before, to be undone with it.
+            point: The point's name.
+            photo: The photo's name.
+            after: The new state.
+            nudge: Whether it continues the previous change, to be undone together with it.
 
         Raises:
             WrongRequestError: if there is no such point, photo or pixel.
-            SplatpipeError: if the file cannot be read or written; it is as before, then.
+            SplatpipeError: if the file cannot be read or written; it is then unchanged.
         """
         after = self._checked(point, photo, after)
         with self._lock:
@@ -102,11 +102,11 @@ class Marking:
             self._undone.clear()
 
     def undo(self) -> Change | None:
-        """Take the last change back; None where there is none."""
+        """Undo the last change and return it; None if there is none."""
         return self._turn(self._done, self._undone, back=True)
 
     def redo(self) -> Change | None:
-        """Make the last change again that was taken back; None where there is none."""
+        """Redo the last undone change and return it; None if there is none."""
         return self._turn(self._undone, self._done, back=False)
 
     def _turn(self, source: list[Change], target: list[Change], back: bool) -> Change | None:
@@ -134,7 +134,7 @@ class Marking:
         return x, y
 
     def _fresh(self) -> ControlText:
-        """The file as it is now, with what somebody else wrote into it meanwhile; one taken away is written again."""
+        """The file's current content, including changes by others; a deleted file is restored."""
         if self.job.text.path.is_file():
             return ControlText.read(self.job.text.path, NameFinder(self._photos))
         return self._text
@@ -158,7 +158,7 @@ class Marking:
         self.revision += 1
 
     def overview(self) -> dict[str, JSON]:
-        """All points, and what the marks tell: what the page shows beside the photo."""
+        """All points and the estimates from the marks, for the lists beside the photo."""
         with self._lock:
             revision, estimate, projection = self._estimate()
             marks, found, hidden = self._text.marks, self._found(), self._text.hidden
@@ -188,7 +188,7 @@ class Marking:
         }
 
     def detail(self, name: str) -> dict[str, JSON]:
-        """A point in all photos, those first that are likely to help.
+        """A point in all photos, the most helpful ones first.
 
         Raises:
             WrongRequestError: if there is no such point.
@@ -228,12 +228,12 @@ class Marking:
         return {"revision": revision, "name": name, "by_marks": bool(estimate.by_marks[number]), "photos": rows}
 
     def _lines(self, estimate: Estimate, number: int) -> Float64[np.ndarray, "steps m 2"] | None:
-        """Of a point that is marked in one photo: where the others may show it; None of any other."""
+        """The epipolar curves of a point that is marked in exactly one photo; None for other points."""
         posed = [seen for seen in estimate.survey.points[number].sightings if seen.index is not None]
         return self._projector.line(posed[0]) if len(posed) == 1 else None
 
     def _found(self) -> dict[str, dict[str, tuple[float, float]]]:
-        """The targets that nobody marked, and of which nobody said that the photo does not show the point."""
+        """Detected targets, except where a person has marked the point or declared it not visible."""
         marks, hidden = self._text.marks, self._text.hidden
         return {
             name: {
@@ -249,14 +249,14 @@ class Marking:
         return round(pixel[0] + shift, DIGITS), round(pixel[1] + shift, DIGITS)
 
     def _seen(self, photo: str, index: int | None, number: int, projection: Projection) -> dict[str, Any]:
-        """Where a photo shows a point; near ones, in whose middle it is, rank first."""
+        """Where a photo shows a point; photos that are close and have it near the centre rank first."""
         row: dict[str, Any] = {"photo": self._photos.index(photo), "name": photo, "predicted": None, "radius_px": None}
         row |= {"doubtful": False, "rank": 0.0, "posed": index is not None}
         if index is None or not math.isfinite(projection.depth[number, index]):
             return row
         x, y = projection.pixels[number, index].tolist()
         size = self.job.photos[photo]
-        aside = max(abs(x / size.width - 0.5), abs(y / size.height - 0.5))  # beyond 0.5 it is outside
+        aside = max(abs(x / size.width - 0.5), abs(y / size.height - 0.5))  # beyond 0.5 it is outside the image
         return row | {
             "predicted": [round(x, DIGITS), round(y, DIGITS)],
             "radius_px": round(float(projection.radius_px[number, index]), 1),
@@ -265,7 +265,7 @@ class Marking:
         }
 
     def _estimate(self) -> tuple[int, Estimate, Projection]:
-        """For the marks as they are; called with the lock held."""
+        """Version, estimate and projection for the current marks; called with the lock held."""
         if self._estimated is None or self._estimated[0] != self.revision:
             marks = {name: dict(pixels) for name, pixels in self._found().items()}
             for name, seen in self._text.marks.items():
@@ -282,7 +282,7 @@ class Marking:
         marks: tuple[Marks, Marks],
         hidden: set[tuple[str, str]],
     ) -> dict[str, JSON]:
-        """A point for the list; ``marks`` are those in the file, and the targets that were found."""
+        """A point for the list; ``marks`` are those in the file, and the detected targets."""
         point, stated = estimate.survey.points[number], self.job.points[number]
         made, found = (each.get(stated.name, {}) for each in marks)
         seen = {*made, *found}
@@ -311,12 +311,12 @@ class Marking:
 def helpful_order(
     place: Float64[np.ndarray, " 3"], centres: Float64[np.ndarray, "n 3"], ranks: Float64[np.ndarray, " n"]
 ) -> list[int]:
-    """An order in which photos tell where a point is: near ones that see it from elsewhere than those before.
+    """Order photos by how much they help to locate a point: close ones with new viewing directions first.
 
     Args:
         place: The point.
-        centres: Of the cameras.
-        ranks: Their distances, ascending; greater for those that see the point less well.
+        centres: The camera centres.
+        ranks: Their distances, ascending; greater for cameras that see the point less well.
     """
     directions = centres - place
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-300)
@@ -330,7 +330,7 @@ def helpful_order(
 
 
 def _listed(line: Float64[np.ndarray, "steps 2"]) -> list[list[float]] | None:
-    """The part of a line that a photo shows."""
+    """The part of a line within the photo."""
     shown = line[np.isfinite(line).all(axis=1)]
     return np.round(shown, 1).tolist() if len(shown) > 1 else None
 

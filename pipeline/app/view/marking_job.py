@@ -1,4 +1,4 @@
-"""What is to be marked: the points of a survey, the photos of a run, and the file that the marks go into."""
+"""The input of a marking session: survey points, the photos of a run, and the file for the marks."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ Found = Mapping[str, Mapping[str, tuple[float, float]]]
 
 @dataclass(frozen=True)
 class MarkingJob:
-    """What marking starts from.
+    """The input of a marking session.
 
     Attributes:
-        points: Of the survey, with the coordinates as stated.
-        crs: Of them.
-        photos: Of the capture, by name.
-        photos_dir: Where they lie.
-        photos_part: What ingest left of them.
-        model: The one that georeferencing starts from.
-        positions: What the photos state.
-        frame: What these give; None where they give none.
-        config: georef's options, as the run has them.
-        found: Pixels, by point and photo, where the run's georeferencing found targets that nobody marked; (0, 0) is
-            the top-left corner of the first pixel.
-        text: The file that marks go into, as it was when the job began.
-        command: What makes a run take it.
+        points: The survey points, with coordinates as given.
+        crs: The points' CRS.
+        photos: The capture's photos by name.
+        photos_dir: The photo folder.
+        photos_part: The part ``ingest.photos``.
+        model: The sparse model before georeferencing.
+        positions: The photos' stated positions.
+        frame: The frame from these positions; None if they give none.
+        config: The run's `georef` options.
+        found: Image coordinates by point and photo of targets that georeferencing detected; (0, 0) is the top-left
+            corner of the first pixel.
+        text: The content of the file for the marks when the session began.
+        command: The command that makes a run use the marks.
     """
 
     points: tuple[SurveyedPoint, ...]
@@ -67,19 +67,19 @@ class MarkingJob:
 
     @property
     def pixel_shift(self) -> float:
-        """What the file's pixels lack to ours, whose (0, 0) is the first one's top-left corner."""
+        """Offset from the file's pixel coordinates to ours, whose (0, 0) is the top-left corner of the first pixel."""
         return 0.5 if self.config.pixel_origin == "centre" else 0.0
 
 
 def open_job(run: RunFolder, points_file: Path | None) -> MarkingJob:
-    """Read all that marking takes.
+    """Read everything that marking needs.
 
     Args:
-        run: With a sparse model, at least.
-        points_file: Points to be marked besides those that the run's control file has.
+        run: A run with at least a sparse model.
+        points_file: Points to mark in addition to those in the run's GCP file.
 
     Raises:
-        SplatpipeError: if the run is not so far, or there are no points, or they do not fit together.
+        SplatpipeError: if the run has not got that far, there are no points, or the files are inconsistent.
     """
     photos_dir, config = run.config(LineConfig)
     source = open_source(photos_dir, run.out, LINE, _without_missing_control(config))
@@ -105,7 +105,7 @@ def open_job(run: RunFolder, points_file: Path | None) -> MarkingJob:
 
 
 def _found(control: Path | None, points: Sequence[SurveyedPoint], photos: Mapping[str, Photo]) -> Found:
-    """The targets in georef's ``control.json``; none where the run was not georeferenced with control yet.
+    """The detected targets in georef's ``control.json``; empty if the run was not georeferenced with GCPs yet.
 
     Raises:
         SplatpipeError: if the file is broken.
@@ -128,7 +128,7 @@ def _found(control: Path | None, points: Sequence[SurveyedPoint], photos: Mappin
 
 
 def _without_missing_control(config: LineConfig) -> LineConfig:
-    """The options of a run whose control file was taken away: it is begun anew where it was."""
+    """The options of a run; if its GCP file was deleted, a new one is started in its place."""
     setting = config.georef.control
     if setting in (AUTO, NONE) or Path(setting).is_file():
         return config
@@ -149,7 +149,7 @@ def _text_and_points(
     place: tuple[Path, GeorefConfig],
     photos: Mapping[str, Photo],
 ) -> tuple[ControlText, tuple[SurveyedPoint, ...]]:
-    """The file to write into, and the points of both files."""
+    """The file for the marks, and the points of both files."""
     folder, config = place
     find = NameFinder(sorted(photos))
     stated = read_points_file(points_file) if points_file is not None else None
@@ -175,7 +175,7 @@ def _text_and_points(
 
 
 def _together(known: Sequence[SurveyedPoint], stated: Sequence[SurveyedPoint], path: Path) -> tuple[SurveyedPoint, ...]:
-    """The points of the control file, then those that it does not have yet."""
+    """The points of the GCP file, then those that it does not have yet."""
     by_name = {point.name: point for point in known}
     for point in stated:
         mine = by_name.setdefault(point.name, replace(point, marks=()))
@@ -189,14 +189,14 @@ def _together(known: Sequence[SurveyedPoint], stated: Sequence[SurveyedPoint], p
 
 
 def _new_file(run: RunFolder, folder: Path, config: GeorefConfig, name: str) -> Path:
-    """Where a control file begins: with the photos or, where nobody may write there, in OUT."""
+    """The path of a new GCP file: beside the photos or, if not writable, in OUT."""
     if config.control not in (AUTO, NONE):
         return Path(config.control)
     return (folder if os.access(folder, os.W_OK) else run.out) / name
 
 
 def _command(run: RunFolder, path: Path, setting: str, control: Path | None) -> str:
-    """What takes the marks into the result; a file that the run finds by itself need not be named."""
+    """The command that applies the marks; it names the file unless the run finds it automatically."""
     named = GEOREF.files["control"].names
     found = control is not None or (setting == AUTO and path.name in named and path.parent != run.out)
     return f"splatpipe georef {_quoted(run.out)}" + ("" if found else f" --gcp {_quoted(path)}")

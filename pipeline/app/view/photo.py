@@ -1,7 +1,7 @@
-"""Photos as a browser shows them: in the stored grid, in which marks count, whatever way EXIF would turn them.
+"""Photos for the browser in the stored pixel grid, to which marks refer, regardless of EXIF orientation.
 
-A JPEG goes out as it is but for its metadata: a browser that sees no EXIF turns nothing, and not a pixel is lost. What
-a browser does not draw (TIFF, 16 bits) is converted without loss.
+A JPEG is sent without its metadata: without EXIF the browser does not rotate it, and no pixel changes. Formats that
+browsers do not show (TIFF, 16 bits) are converted losslessly.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from splatpipe.pipeline.photos.photo_list import Photo, decode, open_picture, ph
 
 LARGEST_BYTES = 256 << 20
 SOI, SOS, APP0, APP1, APP15, COMMENT, APP2, APP14 = 0xD8, 0xDA, 0xE0, 0xE1, 0xEF, 0xFE, 0xE2, 0xEE
-KEPT = (APP0, APP14)  # what tells a decoder of colours; of APP2, the ICC profile alone
+KEPT = (APP0, APP14)  # segments with colour information; of APP2 only the ICC profile is kept
 ICC = b"ICC_PROFILE\0"
 PLAIN_MODES = ("RGB", "L")
 
 
 def shown_photo(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes, str]:
-    """A photo's bytes for a browser, and their media type.
+    """A photo's bytes for the browser, and their media type.
 
     Args:
-        photo: One of the capture's.
+        photo: The photo.
         part: The folder of the part ``ingest.photos``.
         photos_dir: The user's folder.
 
@@ -40,7 +40,7 @@ def shown_photo(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes, str]
             if plain:
                 return without_metadata(data), "image/jpeg"
     except (OSError, ValueError, SyntaxError):
-        pass  # told by the reader below
+        pass  # reported by the decoder below
     pixels = decode(photo, part, photos_dir)
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
@@ -48,10 +48,10 @@ def shown_photo(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes, str]
 
 
 def without_metadata(jpeg: bytes) -> bytes:
-    """A JPEG without EXIF, XMP, comments and what follows its picture.
+    """Remove EXIF, XMP, comments and trailing data from a JPEG.
 
     Raises:
-        ValueError: if it is no JPEG.
+        ValueError: if it is not a JPEG.
     """
     if jpeg[:2] != bytes((0xFF, SOI)):
         raise ValueError("no JPEG")

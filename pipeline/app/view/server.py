@@ -1,4 +1,4 @@
-"""``splatpipe view``: the server, on 127.0.0.1 unless a container publishes its port."""
+"""The server of ``splatpipe view``, on 127.0.0.1 unless a container publishes its port."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from splatpipe.stages.line import LINE
 
 ADDRESS = "127.0.0.1"
 MARKING_PORT = (
-    8474  # if it is free: marks that a browser keeps belong to an address, and the next server has to have it
+    8474  # if free: unsent marks in the browser's storage belong to an address, which the next server must have too
 )
 ASSETS = {
     "landing.css": "text/css",
@@ -47,18 +47,18 @@ ASSETS = {
 }
 OF_RUN = {"content-security-policy": CSP_OF_RUN, "cache-control": "no-cache"}
 OF_SITE = {"content-security-policy": CSP_OF_SITE, "cache-control": "no-cache"}
-FETCHABLE_FOR_S = 1.0  # a page of thousands of files asks for one after another; which there are is not asked each time
-ALONE = {"cross-origin-opener-policy": "same-origin"}  # from the run's pages, which have our origin
+FETCHABLE_FOR_S = 1.0  # the list of files is cached, since a page may request thousands of files
+ALONE = {"cross-origin-opener-policy": "same-origin"}  # isolates it from the run's pages, which have our origin
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How to view.
+    """Options of the server.
 
     Attributes:
-        port: Of the server; 0 for any that is free.
-        bind: The IPv4 address that it listens on. Another than 127.0.0.1 is for a container, where what comes through a
-            published port comes from outside: requests have to name 127.0.0.1 or localhost all the same.
+        port: The port; 0 for any free one.
+        bind: The IPv4 address to listen on. Other addresses than 127.0.0.1 are for containers, where requests through a
+            published port come from outside; they must name 127.0.0.1 or localhost all the same.
         open_browser: Whether to open the page.
         mark: Whether control points can be marked.
         points: File of points to mark.
@@ -76,8 +76,8 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
 
     Args:
         out: Its folder.
-        options: How.
-        say: Tells the user.
+        options: Options of the server.
+        say: Prints a line for the user.
 
     Raises:
         SplatpipeError: if there is no run, or nothing to mark.
@@ -103,7 +103,7 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
 
         _Server(_settings(make_app(routes, token)), ready).run(sockets=[listening])
     except StopSignal as stopped:
-        if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is how a server ends
+        if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is the normal way to end the server
             raise
     finally:
         live.close()
@@ -111,26 +111,26 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Says when it listens, and to signals as well."""
+    """Calls ``ready`` once it is listening and handles signals."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
         super().__init__(config)
         self._ready = ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to listen."""
+        """Start listening."""
         await super().startup(sockets)
         self._ready()
 
 
 def _take_signals_back() -> None:
-    """Put Python's handlers in place again: pyceres, once imported, takes SIGTERM for a crash and tells its stack."""
+    """Restore Python's signal handlers: pyceres, once imported, treats SIGTERM as a crash and prints its stack."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.getsignal(number))
 
 
 def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> list[Route]:
-    """What marking adds."""
+    """The routes for marking."""
     from splatpipe.pipeline.app.view.mark_routes import MarkPages
     from splatpipe.pipeline.app.view.marking import Marking
     from splatpipe.pipeline.app.view.marking_job import open_job
@@ -187,7 +187,7 @@ def _listen(bind: str, port: int) -> socket.socket:
 
 
 def make_app(routes: list[Route], token: str) -> ASGIApp:
-    """The application behind its guard."""
+    """The application behind the guard."""
     handlers: dict[Any, Any] = {SplatpipeError: _failed, HTTPException: _refused}
     app = Starlette(routes=routes, exception_handlers=handlers)
     app.router.redirect_slashes = False
@@ -210,7 +210,7 @@ class Pages:
     Args:
         run: The run.
         live: Its training.
-        token: The secret that writing takes.
+        token: The secret for writing requests.
     """
 
     marking = False
@@ -222,14 +222,14 @@ class Pages:
         self._templates = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True)
 
     def routes(self) -> list[Route]:
-        """What is answered; the rest is a file of the run, or nothing."""
+        """The routes; anything else is a file of the run, or not found."""
         return [
             Route("/", self._landing),
             Route("/live", self._live),
             Route("/api/live", self._state),
             Route(
                 "/live/{stamp}/{number:int}/{what}.jpg", self._picture
-            ),  # the stamp is the page's: a new one, new pictures
+            ),  # the page sets the stamp: a new one means new images
             Route("/live/{stamp}/viewer.html", self._viewer),
             Route("/live/{stamp}/splat.spz", self._splat),
             Route("/assets/{name}", self._asset),
@@ -237,7 +237,7 @@ class Pages:
         ]
 
     def page(self, template: str, values: dict[str, Any]) -> Response:
-        """A page of ours."""
+        """Render one of our pages."""
         style = PurePosixPath(template).stem
         text = self._templates.get_template(template).render(style=style, **values)
         return HTMLResponse(text, headers=ALONE)
@@ -279,7 +279,7 @@ class Pages:
         return Response(asset(name), media_type=ASSETS[name])
 
     def _file(self, request: Request) -> Response:
-        """A file that the run delivers: its name is compared, and nothing is made of it."""
+        """A deliverable of the run; its name is only compared with the known ones."""
         path = request.path_params["path"]
         if path not in self._fetchable():
             raise HTTPException(404)
