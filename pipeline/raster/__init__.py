@@ -1,1 +1,1 @@
-"""The rasterizer: Gaussians to pictures, and back to gradients."""
+"""The rasterizer: from Gaussians to images, and back to gradients."""

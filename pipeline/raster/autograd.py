@@ -1,4 +1,4 @@
-"""The native rasterizer under torch's autograd, and what is left of its backward pass for the optimiser."""
+"""The native rasterizer under torch's autograd, and the deferred end of its backward pass for the optimizer."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class UnfinishedRender:
     """A backward pass that stopped at the screen.
 
     Attributes:
-        frame: That was rendered, with what each of its Gaussians has there.
-        parameters: What was rendered, in the order of ``PARAMETERS``.
-        visible: The Gaussians that it showed.
+        frame: The rendered frame, with the screen-space gradients of its Gaussians.
+        parameters: The rendered parameters, in the order of ``PARAMETERS``.
+        visible: The visible Gaussians.
         probe: Gets its gradient when the pass is finished.
-        logits_are_leaf: False where a function of the model's logits was rendered; those have the derivative of the
-            rendered ones by them for a gradient, until the pass is finished.
+        logits_are_leaf: False if a function of the model's logits was rendered; until the pass is finished, the
+            gradient of the model's logits is then the derivative of the rendered logits with respect to them.
     """
 
     frame: _native.Frame
@@ -42,8 +42,10 @@ class UnfinishedRender:
     logits_are_leaf: bool
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
-        """Whether a step can be made with it at once: of what was seen of the render, or of its first rows, and by no
-        other gradient."""
+        """Whether the pass can be fused with a step.
+
+        That requires a step of the visible rows of what was rendered, or of its first rows, without other gradients.
+        """
         if tuple(parameters) != PARAMETERS or visible is None or visible.data_ptr() != self.visible.data_ptr():
             return False
         rendered = dict(zip(PARAMETERS, self.parameters, strict=True))
@@ -59,17 +61,17 @@ class UnfinishedRender:
         options: tuple[float, float, float, int],
         log_scale_limits: tuple[float, float],
     ) -> int:
-        """Finish the pass and step the visible rows of the parameters; the probe gets its gradient, sparse.
+        """Finish the pass and step the visible rows of the parameters; the probe gets a sparse gradient.
 
         Args:
             values: The parameters, or their first rows.
-            moments: Adam's, the first and the second.
-            rates: Of every value of a row.
-            options: As of ``_native.adam_step``.
-            log_scale_limits: The scales of these rows are held within them.
+            moments: Adam's first and second moments.
+            rates: Learning rate of every value of a row.
+            options: As for ``_native.adam_step``.
+            log_scale_limits: Limits to which the log-scales of these rows are clamped.
 
         Returns:
-            How many rows were left out for their gradients.
+            Number of rows skipped because their gradients were not finite.
         """
         shown = self.frame.visible
         seen = None if self.probe is None else (torch.empty(shown, dtype=torch.int64), torch.empty(shown, 2))
@@ -94,7 +96,7 @@ class UnfinishedRender:
         return skipped
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:
-        """Finish the pass: add what it gives to the parameters' gradients, as any backward pass does."""
+        """Finish the pass: add its gradients to those of the parameters, as any backward pass does."""
         gradients, means2d = _project_backward(self.frame, self.parameters)
         add_gradients(parameters, gradients, self.logits_are_leaf)
         if self.probe is not None:
@@ -108,11 +110,11 @@ def render_native(
     means2d_probe: Float[Tensor, "n 2"] | None,
     buffers: GradientBuffers | None = None,
 ) -> Render:
-    """Render with the native kernels; arguments as of ``render``.
+    """Render with the native kernels; arguments as for ``render``.
 
     Raises:
         ValueError: if a parameter is not float32 on the CPU.
-        SplatpipeError: if the Gaussians cover more of the picture than memory or 32-bit indices hold.
+        SplatpipeError: if the Gaussians cover more of the image than memory or 32-bit indices allow.
     """
     parameters = tuple(gaussians.tensors().values())
     for name, tensor in gaussians.tensors().items():
@@ -177,7 +179,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         upstream = (colour, alpha, depth_sum, depth_square_sum)
         pictures = tuple(None if grad is None else grad.contiguous() for grad in upstream)
-        parameters = ctx.saved_tensors  # raises where one was changed since
+        parameters = ctx.saved_tensors  # raises if one was changed since
         wanted = ctx.needs_input_grad[3:]
         try:
             ctx.frame.blend_backward(pictures, ctx.magnitudes)
@@ -196,7 +198,7 @@ class _Rasterize(torch.autograd.Function):
 def _project_backward(
     frame: _native.Frame, parameters: Sequence[Tensor]
 ) -> tuple[tuple[Tensor, ...], Float[Tensor, "n 2"]]:
-    """From what a frame has on the screen to the gradients of its parameters, and of the centres there."""
+    """From a frame's screen-space gradients to those of its parameters and of the projected centres."""
     gradients = tuple(torch.empty_like(tensor) for tensor in parameters)
     means2d = torch.empty(len(parameters[0]), 2)
     frame.project_backward(parameters, gradients, means2d)

@@ -12,15 +12,15 @@ __all__ = ["_native", "choose_isa", "isa_name", "isa_names", "use_isa_of_environ
 
 VARIABLE = "SPLATPIPE_ISA"
 INSTRUCTION_SETS = ("avx512", "avx2", "baseline")
-"""All that kernels are compiled for on some machine, best first."""
+"""All instruction sets that kernels are compiled for on some machine, best first."""
 
 
 def choose_isa(wanted: str, available: Sequence[str]) -> str:
-    """What SPLATPIPE_ISA asks for.
+    """The instruction set requested by SPLATPIPE_ISA.
 
     Args:
-        wanted: An instruction set; ``auto`` or nothing for the best.
-        available: Those that this machine has, best first.
+        wanted: An instruction set; ``auto`` or empty for the best.
+        available: Those that this machine supports, best first.
 
     Raises:
         UsageError: if there is no such instruction set.
@@ -42,17 +42,17 @@ def choose_isa(wanted: str, available: Sequence[str]) -> str:
 
 
 def use_isa_of_environment() -> None:
-    """Run the native kernels on what SPLATPIPE_ISA asks for; as of ``choose_isa``."""
+    """Run the native kernels on the instruction set of SPLATPIPE_ISA; errors as in ``choose_isa``."""
     _native.set_isa(choose_isa(os.environ.get(VARIABLE, ""), _native.isas()))
 
 
 def isa_name() -> str:
-    """The instruction set in use: the best of this CPU, or what SPLATPIPE_ISA asked for."""
+    """The instruction set in use: this CPU's best, or the one requested by SPLATPIPE_ISA."""
     return _native.isa()
 
 
 def isa_names() -> list[str]:
-    """Instruction sets that this CPU has, best first."""
+    """Instruction sets that this CPU supports, best first."""
     return _native.isas()
 
 

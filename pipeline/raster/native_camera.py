@@ -1,4 +1,4 @@
-"""A camera as native kernels take it."""
+"""A camera in the form that native kernels take."""
 
 from __future__ import annotations
 

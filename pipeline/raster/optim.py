@@ -1,4 +1,4 @@
-"""Adam over the Gaussians' parameters: fused, sparse over what was seen, its state open to density control."""
+"""Adam over the Gaussians' parameters: fused, sparse over visible rows, with its state open to density control."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _SQUARE = "square."
 _STEP = "step"
 
 Rate = float | Tensor
-"""A learning rate, or a tensor of them, on the CPU, that broadcasts to a row's shape."""
+"""A learning rate, or a CPU tensor of them that broadcasts to a row's shape."""
 Limits = Mapping[str, tuple[float, float]]
-"""The least and the most that values may be, by the parameter's name."""
+"""Minimum and maximum of the values, by parameter name."""
 
 
 class Adam:
-    """Adam (Kingma and Ba, ICLR 2015) over named tensors that share their rows, one a Gaussian.
+    """Adam (Kingma and Ba, ICLR 2015) over named tensors with common rows, one per Gaussian.
 
-    Only the moments live here, on the parameters' device; the parameters are handed to each step, with their ``.grad``.
-    The step count, and with it the bias correction, is one for all rows: a row that joins late, or sat out, is
-    corrected as the others are. The same bits for any number of threads, and on every run on a CUDA device.
+    Only the moments live here, on the parameters' device; the parameters are passed to each step, with their ``.grad``.
+    The step count, and thus the bias correction, is shared by all rows: a row that joins late or was skipped is
+    corrected like the others. Bit-identical for any number of threads, and on every run on a CUDA device.
 
     Attributes:
         step_count: Steps taken.
@@ -51,7 +51,7 @@ class Adam:
 
         Args:
             parameters: (n, ...) tensors, for their names and shapes.
-            betas: Decay a step of the moments, each in [0, 1).
+            betas: Decay per step of the moments, each in [0, 1).
             epsilon: Added to the root of the second moment; 3DGS's default.
 
         Raises:
@@ -65,14 +65,14 @@ class Adam:
         self.mean = {name: _zeros(tensor.shape, tensor.device) for name, tensor in parameters.items()}
         self.square = {name: _zeros(tensor.shape, tensor.device) for name, tensor in parameters.items()}
         self._skipped = torch.zeros((), dtype=torch.int64, device=self.device)
-        self._held: Limits | None = None  # within these all rows are: those that nobody steps stay so
+        self._held: Limits | None = None  # all rows are within these limits; rows that are not stepped stay so
 
     def __len__(self) -> int:
         return next((tensor.shape[0] for tensor in self.mean.values()), 0)
 
     @property
     def device(self) -> torch.device:
-        """Where the moments are."""
+        """Device of the moments."""
         return next((tensor.device for tensor in self.mean.values()), torch.device("cpu"))
 
     @torch.no_grad()
@@ -86,20 +86,20 @@ class Adam:
     ) -> None:
         """Step the parameters in place against their ``.grad``; those without one are left alone.
 
-        A row with a gradient that is not finite in any parameter is left as it is, moments included, and counted: see
-        ``take_skipped``. Where the backward pass left its end to the optimiser, that is done now, at once with the step
-        if nothing else gave the parameters gradients; the probe of the render then gets its gradient.
+        A row with a non-finite gradient in any parameter is left unchanged, moments included, and counted: see
+        ``take_skipped``. If the backward pass deferred its end to the optimizer, it is finished now, fused with the
+        step if the parameters have no other gradients; the render's probe then gets its gradient.
 
         Args:
             parameters: The tensors by the names given at the start: float32, contiguous, on the moments' device.
             rates: Learning rate of each; for ``sh`` see ``sh_rates``.
-            visible: Rows that take part; the others keep their moments too. None: all.
-            buffers: Those of the render that is learned from.
-            limits: Values are clamped to these after the step, those of rows that take no part, too (but on CUDA,
-                where they have been before).
+            visible: Rows to step; the others also keep their moments. None for all.
+            buffers: The gradient buffers of the render.
+            limits: Values are clamped to these after the step, including rows not stepped (except on CUDA, where those
+                have been clamped before).
 
         Raises:
-            ValueError: if a tensor is not what the moments belong to, or cannot be stepped in place.
+            ValueError: if a tensor does not match the moments, or cannot be stepped in place.
         """
         if parameters.keys() != self.mean.keys() or rates.keys() != self.mean.keys():
             raise ValueError(f"parameters and rates are not those of {sorted(self.mean)}")
@@ -107,7 +107,7 @@ class Adam:
         self._check(parameters, visible, [*self.mean] if unfinished else _with_gradients(parameters))
         fuses = unfinished is not None and _is_fused(rates, limits) and unfinished.can_step(parameters, visible)
         if unfinished is not None and not fuses:
-            unfinished.finish(parameters)  # before anything is changed: it wants memory
+            unfinished.finish(parameters)  # before anything is changed, because it needs memory
         self.step_count += 1
         if isinstance(unfinished, UnfinishedBackward) and fuses:
             self._step_fused(parameters, rates, unfinished, visible is not None, limits)
@@ -123,7 +123,7 @@ class Adam:
             self._held = limits
 
     def take_skipped(self) -> int:
-        """How many visible rows were left out for their gradients since this was last asked; waits for the device."""
+        """Number of visible rows skipped for their gradients since the last call; waits for the device."""
         skipped = int(self._skipped)
         self._skipped.zero_()
         return skipped
@@ -156,7 +156,7 @@ class Adam:
         unfinished: UnfinishedRender,
         limits: Limits | None,
     ) -> None:
-        """Finish a backward pass of the CPU and step what it showed at once."""
+        """Finish a backward pass on the CPU, fused with a step of the visible rows."""
         self._skipped += unfinished.step(
             parameters,
             (self.mean, self.square),
@@ -173,7 +173,7 @@ class Adam:
         sparse: bool,
         limits: Limits | None,
     ) -> None:
-        """Finish a backward pass and step at once."""
+        """Finish a backward pass on a CUDA device, fused with the step."""
         low, high = (limits or {}).get("log_scales", (-math.inf, math.inf))
         sh = torch.as_tensor(rates["sh"], dtype=torch.float32).reshape(-1)
         kernels = unfinished.frame.kernels
@@ -196,10 +196,10 @@ class Adam:
     def _check(
         self, parameters: Mapping[str, Tensor], visible: Bool[Tensor, " n"] | None, stepped: Iterable[str]
     ) -> None:
-        """Refuse what cannot be stepped.
+        """Reject tensors that cannot be stepped.
 
         Raises:
-            ValueError: as of ``step``.
+            ValueError: as in ``step``.
         """
         taken = self.device.type == "cpu" or kernels_of(self.device) is not None
         for name in stepped:
@@ -214,7 +214,7 @@ class Adam:
             )
 
     def select(self, index: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> None:
-        """Keep the rows of an index or a mask, in its order; one tensor after the other, for memory is tight."""
+        """Keep the rows of an index or a mask, in its order; one tensor at a time, because memory is tight."""
         self._held = None
         for moments in (self.mean, self.square):
             take_rows(moments, index)
@@ -230,24 +230,24 @@ class Adam:
         """Clear moments.
 
         Args:
-            rows: Which rows; None: all.
-            names: Of which parameters; None: of all.
+            rows: Rows to clear; None for all.
+            names: Parameters to clear; None for all.
         """
         for name in self.mean if names is None else names:
             for moments in (self.mean[name], self.square[name]):
                 moments[slice(None) if rows is None else rows] = 0.0
 
     def state_dict(self) -> dict[str, Tensor]:
-        """All that changes, as plain tensors, not copied."""
+        """Mutable state as plain tensors, not copied."""
         state = {_STEP: torch.tensor(self.step_count, dtype=torch.int64)}
         state |= {_MEAN + name: tensor for name, tensor in self.mean.items()}
         return state | {_SQUARE + name: tensor for name, tensor in self.square.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """The inverse of ``state_dict``; the number of rows may differ from this one's, the parameters not.
+        """The inverse of ``state_dict``; the number of rows may differ from the current one, the parameters may not.
 
         Raises:
-            ValueError: if the state is of other parameters.
+            ValueError: if the state belongs to other parameters.
         """
         given: list[dict[str, Tensor]] = []
         for prefix in (_MEAN, _SQUARE):
@@ -292,7 +292,7 @@ def _with_gradients(parameters: Mapping[str, Tensor]) -> list[str]:
 
 
 def _is_fused(rates: Mapping[str, Rate], limits: Limits | None) -> bool:
-    """Whether the step that is fused with the backward pass knows these: a rate each, two of sh, limits of scales."""
+    """Whether the fused step supports these: one rate per parameter, two for SH, limits for scales only."""
     plain = all(not isinstance(rate, Tensor) or rate.numel() == 1 for name, rate in rates.items() if name != "sh")
     sh = torch.as_tensor(rates.get("sh", 0.0)).reshape(-1)
     return plain and bool((sh[1:] == sh[-1]).all()) and (limits or {}).keys() <= {"log_scales"}

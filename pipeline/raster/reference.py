@@ -1,4 +1,4 @@
-"""The rasterizer's definition: slow, plain torch, differentiable by autograd in float32 and float64.
+"""The reference rasterizer: slow, plain torch, differentiable by autograd in float32 and float64.
 
 Formulas: "EWA Splatting" (Zwicker et al. 2002) for the projection of a Gaussian, "3D Gaussian Splatting" (Kerbl et al.
 2023) for blending; see ``definitions`` for the constants. The native backend computes the same.
@@ -39,22 +39,22 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import eval_sh
 
 _PAIRS_AT_ONCE = 1 << 22
-"""Pixel-Gaussian pairs that are held at a time: some ten tensors of 32 MB each in float64."""
+"""Pixel-Gaussian pairs in memory at a time: about ten tensors of 32 MB each in float64."""
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians on the screen, by depth from near to far where that matters.
+    """Gaussians projected to the screen, sorted from near to far where that matters.
 
     Attributes:
         means: Centres, pixels.
         depths: z in the camera, world units.
         covariances: xx, xy, yy with the blur, px².
-        determinants: Of the covariances.
-        depth_slopes: By how much the depth at which a ray is deepest in the Gaussian grows over a pixel, along x and y.
+        determinants: Determinants of the covariances.
+        depth_slopes: Change per pixel, along x and y, of the depth at which a ray peaks in the Gaussian.
         opacities: At the centre, compensated in the anti-aliased variant.
         colours: Red, green, blue, ≥ 0.
-        usable: False where anything is not finite, behind the near plane, across the camera's, or beyond the limits.
+        usable: False where anything is not finite, before the near plane, across the camera plane or beyond limits.
     """
 
     means: Float[Tensor, "n 2"]
@@ -67,11 +67,11 @@ class Splats:
     usable: Bool[Tensor, " n"]
 
     def select(self, index: Tensor) -> Splats:
-        """Those of an index."""
+        """The splats of an index."""
         return Splats(**{name: tensor[index] for name, tensor in vars(self).items()})
 
     def half_sizes(self) -> Float[Tensor, "n 2"]:
-        """Half width and height of the ellipse in which alpha ≥ 1/255, pixels; NaN if it is nowhere."""
+        """Half width and height of the ellipse in which alpha ≥ 1/255, pixels; NaN if there is none."""
         reach = 2.0 * torch.log(self.opacities / ALPHA_MIN)  # squared Mahalanobis distance
         return torch.sqrt(reach[:, None] * self.covariances[:, [0, 2]])
 
@@ -96,12 +96,12 @@ def rotation_from_quats(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 
 
 def projection_jacobian(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 2 3"]:
-    """d(pixel) / d(point in the camera frame), with x/z and y/z clamped to the widened frustum of each side.
+    """d(pixel) / d(point in the camera frame), with x/z and y/z clamped to the widened frustum.
 
     Args:
         points: Camera frame, z > 0.
-        camera: The view; its principal point need not be in the middle. Of a part of a picture the whole's frustum
-            counts, so that the part shows what the whole shows there.
+        camera: The view; its principal point need not be central. For a window of an image the whole image's frustum
+            counts, so that the window renders exactly as in the whole.
     """
     camera = camera.whole()
     fx, fy = camera.fx, camera.fy
@@ -124,7 +124,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> Spl
         options: SH degree, near plane, variant.
 
     Returns:
-        All of them, in order; the values of unusable ones mean nothing.
+        All splats, in order; the values of unusable ones are meaningless.
     """
     means = gaussians.means
     pose, centre = means.new_tensor(camera.cam_from_world), means.new_tensor(camera.centre())
@@ -168,7 +168,7 @@ def project(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> Spl
 
 
 def visible_splats(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
-    """Usable splats whose ellipse's box holds or touches the rectangle of the picture's pixel centres."""
+    """Usable splats whose ellipse's bounding box intersects the rectangle of the image's pixel centres."""
     half = splats.half_sizes()
     last = torch.tensor([camera.width - 0.5, camera.height - 0.5], dtype=half.dtype, device=half.device)
     inside = (splats.means + half >= 0.5) & (splats.means - half <= last)
@@ -181,7 +181,7 @@ def render_reference(
     options: RenderOptions,
     means2d_probe: Float[Tensor, "n 2"] | None = None,
 ) -> Render:
-    """Render by the definition; arguments as of ``render``."""
+    """Render by the definition; arguments as for ``render``."""
     with torch.no_grad():
         everything = project(gaussians, camera, options)
         visible = visible_splats(everything, camera)
@@ -214,7 +214,7 @@ def render_reference(
 
 
 class _SumOfMagnitudes(torch.autograd.Function):
-    """Spreads (n, 2) over r x w pixels; the gradient that comes back is the sum of the pixels' absolute values."""
+    """Broadcasts (n, 2) to r x w pixels; its gradient is the sum of the pixels' absolute values."""
 
     @staticmethod
     def forward(_ctx: Any, values: Tensor, rows: int, columns: int) -> Tensor:
@@ -237,7 +237,7 @@ def _blend_rows(
     opacities: Float[Tensor, " n"],
     colours: Float[Tensor, "n 3"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Rows top..bottom of the picture: colour (r, w, 3), alpha, depth sum, of squares, median depth (r, w)."""
+    """Rows top..bottom of the image: colour (r, w, 3), alpha, depth sum, sum of squares, median depth (r, w)."""
     top, bottom, width, magnitudes, depth_origin = size
     ys = torch.arange(top, bottom, dtype=means.dtype, device=means.device) + 0.5
     xs = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
@@ -251,7 +251,7 @@ def _blend_rows(
     distance2 = (dx - xy / yy * dy) ** 2 * (yy / determinants[:, None, None]) + dy**2 / yy  # (n, r, w)
     alphas = (opacities[:, None, None] * torch.exp(-0.5 * distance2)).clamp_max(ALPHA_MAX)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, 0.0)
-    # The transmittance never grows, so what is below the limit at one Gaussian is so at all that follow.
+    # The transmittance never grows, so once below the limit it stays there for all that follow.
     alphas = torch.where(torch.cumprod(1.0 - alphas, 0) >= TRANSMITTANCE_MIN, alphas, 0.0)
     after = torch.cumprod(1.0 - alphas, 0)
     ones = torch.ones_like(after[:1]) if len(after) else after.new_ones(1, bottom - top, width)

@@ -1,4 +1,4 @@
-"""A render laid over the sky, by a kernel: one pass over the picture forward, one back, the same bits every time."""
+"""Compositing a render over the sky with a kernel: one pass over the image each way, bit-identical every time."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from splatpipe.pipeline.splat.panorama import STEP_PX, between_nodes, composite_
 
 @dataclass(frozen=True, eq=False)
 class SkyLayer:
-    """What is to be behind a render, interpolated from nodes as ``splat.panorama.between_nodes`` does.
+    """The layer behind a render, interpolated from nodes as in ``splat.panorama.between_nodes``.
 
     Attributes:
-        background: What the render has behind it.
-        elsewhere: Seen instead of the nodes where ``around`` does not hold, of their shape; None: nowhere.
-        around: As said; None without ``elsewhere``.
-        mask: Where the nodes have a gradient; None: nowhere.
-        step: Pixels from node to node.
+        background: Background that the render was made with.
+        elsewhere: Nodes used instead where ``around`` is False, in the same shape; None to use none.
+        around: Where the sky's own nodes are used; None without ``elsewhere``.
+        mask: Where the nodes get a gradient; None for nowhere.
+        step: Node spacing, pixels.
     """
 
     background: tuple[float, float, float]
@@ -41,16 +41,16 @@ def laid_over_nodes(
     nodes: Float[Tensor, "rows columns 3"],
     behind: SkyLayer,
 ) -> Float[Tensor, "h w 3"]:
-    """A render over something else than its background: ``laid_over_nodes_reference``, by kernels for float32.
+    """Replace a render's background by the nodes: ``laid_over_nodes_reference``, with kernels for float32.
 
-    Those of the CPU give the same bits for any number of threads, and on any device nothing is added in another order.
-    The render and the nodes get gradients.
+    The CPU kernels are bit-identical for any number of threads, and sums have a fixed order on any device. The render
+    and the nodes get gradients.
 
     Args:
         colour: Rendered over ``behind.background``.
         alpha: Alpha of the render.
-        nodes: What is behind it.
-        behind: How.
+        nodes: Colours behind the render, at the nodes.
+        behind: How to composite them.
     """
     kernels = kernels_of(colour.device)
     fits = kernels is not None or colour.device.type == "cpu"
@@ -110,7 +110,7 @@ class _SkyComposite(torch.autograd.Function):
 
 
 def _contiguous(behind: SkyLayer) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """Nodes elsewhere, what is around and the mask, as kernels read them."""
+    """``elsewhere``, ``around`` and the mask in the form that kernels take."""
     elsewhere = None if behind.elsewhere is None else behind.elsewhere.detach().contiguous()
     around, mask = (
         None if mask is None else mask.contiguous().view(torch.uint8) for mask in (behind.around, behind.mask)
@@ -119,14 +119,14 @@ def _contiguous(behind: SkyLayer) -> tuple[Tensor | None, Tensor | None, Tensor 
 
 
 def _sky(alpha: Tensor, nodes: Tensor, behind: SkyLayer) -> tuple[Any, ...]:
-    """The argument of the CPU's kernels."""
+    """The argument of the CPU kernels."""
     return alpha, nodes, *_contiguous(behind), behind.step, behind.background
 
 
 def _cuda_sky(
     kernels: CudaKernels, colour: Tensor, alpha: Tensor, nodes: Tensor, behind: SkyLayer
 ) -> tuple[SplatSky, tuple[Tensor | None, ...]]:
-    """The argument of a device's kernels, and what has to live as long as it does."""
+    """The argument of the CUDA kernels, and the tensors that have to live as long."""
     elsewhere, around, mask = kept = _contiguous(behind)
     sky = SplatSky(
         width=colour.shape[1],

@@ -1,4 +1,4 @@
-"""Threads that change only how fast a stage is, never its answer."""
+"""Thread settings that change only a stage's speed, never its result."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from splatpipe.pipeline.raster import rasterizer
 
 @contextmanager
 def same_bits(threads: int) -> Iterator[None]:
-    """Give the native kernels their threads, and torch and OpenCV one: torch's sums depend on how many there are.
+    """Set the native kernels' threads, and one each for torch and OpenCV: torch's sums depend on the thread count.
 
     Args:
-        threads: Of the native kernels, at least 1; they keep them.
+        threads: Number of threads of the native kernels, at least 1; not restored afterwards.
     """
     before, before_cv2 = torch.get_num_threads(), cv2.getNumThreads()
     rasterizer.set_threads(threads)

@@ -1,10 +1,9 @@
-"""One surface a pixel: what a ray sees shall lie at one depth, not in layers that shine through each other.
+"""Distortion loss: everything along a ray should lie at one depth, not in translucent layers.
 
-The idea of the distortion loss of Barron et al., "Mip-NeRF 360" (CVPR 2022), as Huang et al., "2D Gaussian Splatting
-for Geometrically Accurate Radiance Fields" (SIGGRAPH 2024) have it for splats, there by the squared distances of all
-pairs along a ray: that sum is the variance of its depths, which two more pictures give (Σ z α T and Σ z² α T). Here
-what is less than a pixel on the ground is free, and what is much more counts no more than that: past a roof's edge a
-pixel rightly sees two depths.
+The idea is from Barron et al., "Mip-NeRF 360" (CVPR 2022), as adapted to splats by Huang et al., "2D Gaussian Splatting
+for Geometrically Accurate Radiance Fields" (SIGGRAPH 2024), there with the squared distances of all pairs along a ray:
+that sum is the variance of its depths, which two more images give (Σ z α T and Σ z² α T). Here a spread below the GSD
+is free, and the penalty saturates for a large one: past a roof's edge a pixel rightly sees two depths.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
-FIRST_SHARE = 0.2  # of a run from sparse points, without it: the surface has to be found first
-LEAST_ALPHA = 0.5  # below it a pixel shows more of the background than of a depth
-FREE_PX = 0.5  # standard deviation that costs nothing, pixels on the ground
-HALF_PX = 10.0  # beyond it at which half of the most is reached
-CENTRE_EVERY = 500  # iterations between looks for the model's centre on a device: by then it hardly moves
+FIRST_SHARE = 0.2  # of a run from sparse points, without this loss: the surface has to form first
+LEAST_ALPHA = 0.5  # below it a pixel shows more background than surface
+FREE_PX = 0.5  # standard deviation without penalty, in GSD
+HALF_PX = 10.0  # excess in GSD at which half of the maximum penalty is reached
+CENTRE_EVERY = 500  # iterations between updates of the model's centre on a device: it hardly moves
 
 
 class DistortionLoss(Technique):
@@ -35,8 +34,8 @@ class DistortionLoss(Technique):
 
     Args:
         weight: Weight in the loss.
-        after: Iterations of the schedule that pass without it.
-        about_median: As of ``spread_loss``.
+        after: Iterations of the schedule without this loss.
+        about_median: As for ``spread_loss``.
     """
 
     name = "distortion"
@@ -46,11 +45,11 @@ class DistortionLoss(Technique):
         self._centre = torch.full((3,), torch.nan, dtype=torch.float64)  # kept on the CPU
 
     def is_counted(self, place: int) -> bool:
-        """Whether it has a part in the loss at a place of the schedule, from 1."""
+        """Whether the loss is active at a place of the schedule, from 1."""
         return place > self._after
 
     def settings(self, settings: RenderOptions, model: Gaussians, camera: Camera, now: ScheduleStep) -> RenderOptions:
-        """With depths, measured from where float32 tells them best."""
+        """Turn on depths, with an origin at which float32 is most precise."""
         if not self.is_counted(now.place):
             return settings
         if self._is_worn(model, now):
@@ -58,22 +57,22 @@ class DistortionLoss(Technique):
         return replace(settings, depth=True, depth_origin=depth_along(self._centre, camera))
 
     def _is_worn(self, model: Gaussians, now: ScheduleStep) -> bool:
-        """Whether the model's centre has to be looked for again: on a device seldom, for that waits for it."""
+        """Whether to recompute the model's centre: rarely on a device, because that synchronizes."""
         if model.means.device.type == "cpu":
             return True
         return now.iteration % CENTRE_EVERY == 0 or bool(self._centre.isnan().any())
 
     def to_arrays(self) -> dict[str, Tensor]:
-        """The centre, by which depths are rounded."""
+        """The centre, which affects the rounding of depths."""
         return {"centre": self._centre}
 
     def load(self, arrays: Mapping[str, Tensor]) -> None:
-        """The inverse of ``to_arrays``; where there is no centre, it is looked for again."""
+        """The inverse of ``to_arrays``; a missing centre is recomputed."""
         if "centre" in arrays:
             self._centre = arrays["centre"].clone()
 
     def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
-        """The spread of the photo's rays, weighted."""
+        """The spread of depths along the photo's rays, weighted."""
         if not self.is_counted(shot.now.place):
             return None
         photo, origin = shot.photo, shot.settings.depth_origin
@@ -81,7 +80,7 @@ class DistortionLoss(Technique):
 
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:
-    """Where depths are measured from: that of the Gaussians' mean."""
+    """Origin of depths: the depth of the Gaussians' mean, world units."""
     return depth_along(means.detach().mean(dim=0).double(), camera)
 
 
@@ -99,15 +98,15 @@ def spread_loss(
     inside: tuple[slice, slice] = EVERYWHERE,
     about_median: bool = False,
 ) -> Float[Tensor, ""]:
-    """How far the depths along each ray are apart, 0 to 1, mean over the pixels that show a surface.
+    """Spread of the depths along each ray, 0 to 1; the mean over the pixels, 0 where no surface is shown.
 
     Args:
         rendered: With depths, squared from ``origin``.
         origin: World units along the view axis.
         camera: The photo's camera.
         inside: Rows and columns that count.
-        about_median: Depths are to lie at the ray's median, not at their mean, which what shines through from far
-            behind draws behind the surface.
+        about_median: Measure the spread about the ray's median depth, not the mean, which distant background shining
+            through pulls behind the surface.
     """
     seen = rendered.alpha.detach() >= LEAST_ALPHA
     alpha = torch.where(seen, rendered.alpha, 1.0)
@@ -118,6 +117,6 @@ def spread_loss(
         variance = torch.where(seen, square - 2.0 * middle * mean + middle.square(), 0.0)
     else:
         variance = square - torch.where(seen, mean, 0.0).square()
-    pixel = torch.where(seen, (mean.detach() + origin) / camera.fx, 1.0)  # on the ground, world units
+    pixel = torch.where(seen, (mean.detach() + origin) / camera.fx, 1.0)  # GSD, world units
     excess = torch.relu(variance / pixel.square() - FREE_PX**2)
     return torch.where(seen, excess / (excess + HALF_PX**2), 0.0)[inside].mean()

@@ -1,4 +1,4 @@
-"""Random dropping of Gaussians: a model from few photos shall not lean on any one Gaussian before a camera.
+"""Random dropping of Gaussians, so that a model from few photos does not rely on single Gaussians near a camera.
 
 The idea of Park, Ryu, Kim: "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR 2025.
 """
@@ -20,24 +20,24 @@ from splatpipe.pipeline.train.hooks import Technique
 from splatpipe.pipeline.train.schedule import Schedule, ScheduleStep
 
 DROPPED_LOGIT = -30.0  # an opacity of 1e-13: the projection culls it, so it costs nothing and learns nothing
-LARGEST_OPACITY = 0.999  # of the scaled ones, which a logit has to hold; the blending caps alpha at 0.99
+LARGEST_OPACITY = 0.999  # of scaled opacities, so that the logit stays finite; blending caps alpha at 0.99
 
 
 def share_at(schedule: Schedule, iteration: int) -> float:
-    """The share left out at an iteration (from 1): rises evenly to `dropout` at the schedule's end."""
+    """The share dropped at an iteration (from 1): rises linearly to `dropout` at the schedule's end."""
     return schedule.dropout * min(1.0, iteration / schedule.iterations)
 
 
 def dropped(gaussians: Gaussians, schedule: Schedule, iteration: int) -> Gaussians:
-    """The Gaussians as an iteration renders them; the same object where `dropout` is 0.
+    """The Gaussians as an iteration renders them; the same object if `dropout` is 0.
 
-    A random share has no opacity, the others have theirs over 1 - share: what a pixel lets through is the same on
-    average over the draws, as long as no scaled opacity exceeds 1.
+    A random share gets no opacity, and the opacity of the others is divided by 1 - share: the expected opacity stays
+    the same as long as no scaled opacity exceeds 1.
 
     Args:
         gaussians: The model.
         schedule: The training schedule.
-        iteration: From 1; with the seed and a Gaussian's row it names the random number.
+        iteration: From 1; with the seed and a Gaussian's row it selects the random number.
     """
     share = share_at(schedule, iteration)
     if share == 0.0:
@@ -60,7 +60,7 @@ class Dropout(Technique):
         self._schedule = schedule
 
     def before_render(self, model: Gaussians, now: ScheduleStep) -> Gaussians:
-        """The Gaussians without those left out."""
+        """The Gaussians without the dropped ones."""
         return dropped(model, self._schedule, now.place)
 
 
@@ -74,10 +74,10 @@ def _drawn(seed: int, iteration: int, gaussians: Gaussians) -> Float64[Tensor, "
 
 
 class _DropoutLogits(torch.autograd.Function):
-    """Logits of σ / (1 - share) for those kept.
+    """Logits of σ / (1 - share) for the Gaussians kept.
 
-    Where the cap holds, the gradient is that of the opacity below it: the cap binds in the Gaussian's middle, and its
-    flanks still tell how opaque it should be.
+    Where the cap applies, the gradient is that of the uncapped opacity: the cap only binds in the Gaussian's middle,
+    and its flanks still show how opaque it should be.
     """
 
     @staticmethod

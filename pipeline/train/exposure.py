@@ -1,9 +1,9 @@
-"""What exposure and white balance did to each photo, so that the splat need not explain it.
+"""Per-photo exposure and white balance, so that the splat does not have to explain them.
 
 An affine map of the colours for every training photo, trained beside the Gaussians, as in Kerbl et al., "A Hierarchical
 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets" (SIGGRAPH 2024), and before in Rematas et
-al., "Urban Radiance Fields" (CVPR 2022). Over the photos the maps' mean is the identity: the splat alone has the
-neutral appearance.
+al., "Urban Radiance Fields" (CVPR 2022). The mean of the maps over all photos is the identity, so the splat alone has
+the neutral appearance.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.side import SideModel
 
-FIRST_RATE = 1e-3  # of learning: a photo has some hundred visits, in which its exposure moves by a tenth at most
+FIRST_RATE = 1e-3  # learning rate: a photo has about a hundred visits, which change its exposure by at most a tenth
 LAST_RATE = 0.1  # of the first; exponential in between
-DECAY = 1e-3  # times the maps' deviation from the identity joins the loss's gradient: what no pixel tells stays there
+DECAY = 1e-3  # weight decay towards the identity: unconstrained coefficients stay there
 _NAME = "deviations"
 
 
@@ -35,7 +35,7 @@ class Exposure(SideModel, Technique):
     Args:
         names: Names of the photos trained on.
         first_rate: Learning rate at the start.
-        decay: How strongly the maps are drawn to the identity.
+        decay: Weight decay of the maps towards the identity.
     """
 
     name = "exposure"
@@ -46,7 +46,7 @@ class Exposure(SideModel, Technique):
         self._row = {name: row for row, name in enumerate(sorted(names))}
 
     def map_of(self, name: str) -> Float[Tensor, "3 4"]:
-        """What a photo's map is now: its colours are A c + b of the splat's, [A b]."""
+        """A photo's current map [A b]: its colours are A c + b for colours c of the splat."""
         deviations = self._deviations()
         return torch.eye(3, 4, device=deviations.device) + deviations[self._row[name]].view(3, 4)
 
@@ -55,15 +55,15 @@ class Exposure(SideModel, Technique):
         return self.applied(picture, shot.photo.camera.name)
 
     def applied(self, picture: Float[Tensor, "h w 3"], name: str) -> Float[Tensor, "h w 3"]:
-        """A picture through a photo's map; differentiable."""
+        """An image with a photo's map applied; differentiable."""
         return affine_colour(picture, self.map_of(name))
 
     @staticmethod
     def given(maps: Mapping[str, Sequence[Sequence[float]]]) -> Exposure:
-        """Maps as ``maps`` tells them, of which nothing is trained.
+        """Fixed maps, as returned by ``maps``; they are not trained.
 
         Raises:
-            ValueError: if one is no map.
+            ValueError: if one is not a map.
         """
         found = Exposure(tuple(maps))
         for name, rows in maps.items():
@@ -80,10 +80,10 @@ class Exposure(SideModel, Technique):
 
     @torch.no_grad()
     def step(self, name: str, share: float) -> None:
-        """Step a photo's map against its gradient, and let the photos' mean map be the identity again.
+        """Take an optimizer step on a photo's map, and restore the identity as the mean map.
 
         Args:
-            name: The photo's.
+            name: Name of the photo.
             share: Fraction of the schedule done, 0..1.
         """
         deviations, row = self._deviations(), self._row[name]
@@ -94,16 +94,16 @@ class Exposure(SideModel, Technique):
         self._centre()
 
     def _centre(self) -> None:
-        """Take out the maps' mean deviation."""
+        """Subtract the maps' mean deviation."""
         deviations = self._deviations()
         deviations -= deviations.mean(dim=0)
 
     def _deviations(self) -> Float[Tensor, "rows 12"]:
-        """What is trained: the maps less the identity."""
+        """The trained values: the maps less the identity."""
         return self.tensors[_NAME]
 
     def maps(self) -> dict[str, list[list[float]]]:
-        """Every photo's map, rows of A with b at their end, by name in order."""
+        """Every photo's map as rows [A b], by name, sorted."""
         with torch.no_grad():
             return {name: self.map_of(name).tolist() for name in self._row}
 
@@ -115,11 +115,11 @@ def exposures_json(exposure: Exposure | None) -> str:
 
 
 def read_exposures(path: Path, stage: str) -> dict[str, list[list[float]]]:
-    """The photos' maps, as ``Exposure.given`` takes them; none where exposure was not modelled.
+    """The photos' maps, as ``Exposure.given`` takes them; empty if exposure was not modelled.
 
     Args:
-        path: What ``exposures_json`` told.
-        stage: That left it.
+        path: File with the text of ``exposures_json``.
+        stage: The stage that wrote it.
 
     Raises:
         StageError: if it is not such a file.

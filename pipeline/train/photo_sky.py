@@ -1,4 +1,4 @@
-"""Where a training photo shows the sky, at the size that it is trained at."""
+"""The sky mask of a training photo, at its training size."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torch.nn import functional
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.sky_mask import SkyMask
 
-SURE = 0.9  # of a pixel, interpolated from the mask: the roof's edge stays out
-RIM_PX = 3  # around the sky, of ``WORK_MEGAPIXELS``: what the search may have left of it, and thin things before it
+SURE = 0.9  # minimum share of sky in a pixel, interpolated from the mask: keeps roof edges out
+RIM_PX = 3  # around the sky, at ``WORK_MEGAPIXELS``: sky missed by detection, and thin objects in front of it
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class PhotoSky:
     """A photo's sky.
 
     Attributes:
-        mask: Where it surely is.
-        around: The same and its surroundings.
+        mask: Pixels that are certainly sky.
+        around: The same, dilated by the rim.
     """
 
     mask: Bool[Tensor, "h w"]
@@ -39,7 +39,7 @@ class PhotoSkies:
         masks: Sky masks by photo name; photos without sky may be left out.
 
     Attributes:
-        masks: Those with sky.
+        masks: The masks that contain sky.
     """
 
     def __init__(self, masks: Mapping[str, SkyMask]) -> None:
@@ -47,18 +47,18 @@ class PhotoSkies:
         self._bits: dict[str, UInt8[Tensor, " n"]] = {}  # on a device, where photos are trained on one
 
     def __len__(self) -> int:
-        """In how many photos there is sky."""
+        """Number of photos that show sky."""
         return len(self.masks)
 
     def on(self, device: torch.device) -> PhotoSkies:
-        """The same for training on a device: the masks, an eighth of a byte a pixel, are kept there."""
+        """The same for training on a device: the masks are kept there, one bit per pixel."""
         moved = PhotoSkies(self.masks)
         if device.type != "cpu":
             moved._bits = {name: torch.from_numpy(mask.bits).to(device) for name, mask in self.masks.items()}
         return moved
 
     def seen(self, camera: Camera) -> PhotoSky | None:
-        """The sky of a photo at the size of ``camera``; None where it shows none."""
+        """The sky of a photo at the size of ``camera``; None if it shows none."""
         found = self.masks.get(camera.name)
         if found is None:
             return None
@@ -76,12 +76,12 @@ def photo_sky_on_cpu(found: SkyMask, camera: Camera) -> PhotoSky:
 
 
 def _widened(share: Bool[np.ndarray, "_ _"]) -> Bool[np.ndarray, "_ _"]:
-    """With the rim around."""
+    """The mask dilated by the rim."""
     return np.asarray(cv2.dilate(share.view(np.uint8), np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8))).view(bool)
 
 
 def _seen_in_window(share: Bool[np.ndarray, "_ _"], camera: Camera) -> PhotoSky:
-    """The same for a window of a photo larger than its mask: only what the window shows of the mask is looked at."""
+    """The same for a window of a photo larger than its mask: only the window's part of the mask is processed."""
     taken, places = [], []
     for old, (new, pixels) in zip(share.shape, _sides(camera), strict=True):
         step = old / new
@@ -105,7 +105,7 @@ def _seen_in_window(share: Bool[np.ndarray, "_ _"], camera: Camera) -> PhotoSky:
 
 
 def photo_sky_on_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camera: Camera) -> PhotoSky:
-    """The same from a mask's bits, made where they are; only rounding may differ.
+    """The same from a mask's bits, computed on their device; only rounding may differ.
 
     Args:
         bits: ``SkyMask.bits``.
@@ -122,7 +122,7 @@ def photo_sky_on_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camer
 
 
 def _sides(camera: Camera) -> tuple[tuple[int, slice], tuple[int, slice]]:
-    """The whole picture's height, and the rows that the camera has of it; its width, and the columns."""
+    """The whole image's height and the camera's rows of it; its width and the camera's columns."""
     whole, part = camera.whole(), camera.window
     top, left = (0, 0) if part is None else (part.top, part.left)
     return (whole.height, slice(top, top + camera.height)), (whole.width, slice(left, left + camera.width))
@@ -138,7 +138,7 @@ def _surely(sky: Bool[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]
 
 
 def _resizing(old: int, new: int, rows: slice, like: Tensor) -> Float[Tensor, "rows old"]:
-    """Weights of the old pixels for some new ones along a side: their overlap where it shrinks, else bilinear."""
+    """Weights of the old pixels for new ones along a side: by overlap when shrinking, otherwise bilinear."""
     step = old / new
     before = torch.arange(old, dtype=like.dtype, device=like.device)
     after = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)[:, None] * step

@@ -1,4 +1,4 @@
-"""The skies that were found in photos, in a file: finding them again for every block would take its time each time."""
+"""The photos' sky masks in a file, so that they do not have to be detected again for every block."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatpipe.pipeline.splat.sky_mask import SkyMask
 
 
 def write_skies(path: Path, masks: Mapping[str, SkyMask]) -> None:
-    """Write masks, by the photos' names; none is a file, too."""
+    """Write sky masks by photo name; an empty set also gives a file."""
     names = sorted(masks)
     bits = [masks[name].bits for name in names]
     with path.open("wb") as file:
@@ -27,7 +27,7 @@ def write_skies(path: Path, masks: Mapping[str, SkyMask]) -> None:
 
 
 def read_skies(path: Path, names: Container[str]) -> dict[str, SkyMask]:
-    """Read the masks of some photos back; those without sky have none.
+    """Read the masks of some photos back; photos without sky are not in the result.
 
     Raises:
         StageError: if it is not such a file.
