@@ -1,7 +1,7 @@
-"""The Gaussians of a GLB with `KHR_gaussian_splatting`: everything its scene draws of them, in the scene's frame.
+"""The Gaussians of a GLB with `KHR_gaussian_splatting`: all that its scene draws, in the scene's frame.
 
-Specifications: Khronos, "KHR_gaussian_splatting" (ratified), and "KHR_gaussian_splatting_compression_spz_2", of which
-CesiumJS takes the SPZ file's axes for the glTF's: so do we.
+Specifications: Khronos, "KHR_gaussian_splatting" (ratified), and "KHR_gaussian_splatting_compression_spz_2", for which
+we follow CesiumJS in taking the SPZ file's axes as the glTF's.
 """
 
 from __future__ import annotations
@@ -28,41 +28,41 @@ from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count, rgb_to_dc
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 RECORD = "splatpipe"
-"""In `asset.extras`: the record."""
+"""Key of the record in `asset.extras`."""
 KERNEL = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
     "projection": "perspective",
     "sortingMethod": "cameraDistance",
 }
-"""As 3D Gaussian splatting renders, on colours as displays take them."""
+"""The rendering of 3D Gaussian splatting, in display-referred colours."""
 ROWS_AT_ONCE = 1 << 16
 _KNOWN = (EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit")
 _LEAST_ROW_BYTES = 12
-"""The colour's: a file of so many bytes draws no more Gaussians, unless it draws them again and again."""
+"""Of a Gaussian's colour: bounds how many Gaussians a file can hold without drawing any of them repeatedly."""
 _INFINITY_LOGIT, _INFINITY_LOG_SCALE = 20.0, -20.0
-"""Stand for opacities of exactly 0 and 1, and for a scale of 0; float32 agrees, and ``splat.ply`` does the same."""
+"""Stand for opacities of exactly 0 and 1, and for a scale of 0; equal in float32, and the same as in ``splat.ply``."""
 _ROUNDING = 1e-3
-"""By which an opacity may be beyond 0..1."""
+"""Tolerance by which an opacity may lie outside 0..1."""
 _SIMILAR = 1e-4
-"""By which a node's axes may differ in length or from right angles."""
+"""Tolerance for equal lengths and right angles of a node's axes."""
 _HINT = "Give a splat: points with the attributes of KHR_gaussian_splatting."
 
 
 def harmonics_names(sh_degree: int) -> list[str]:
-    """The attributes of spherical harmonics, from degree 0, in the order of ``Gaussians.sh``."""
+    """Attribute names of the SH coefficients, from degree 0, in the order of ``Gaussians.sh``."""
     degrees = range(sh_degree + 1)
     return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
 
 
 def read_splats(container: Container) -> Gaussians:
-    """All Gaussians that the scene draws.
+    """Read all Gaussians that the scene draws, in the scene's frame.
 
     Args:
         container: The file.
 
     Raises:
-        SplatpipeError: if there are none, the file is damaged, or it asks for what is not read.
+        SplatpipeError: if there are none, the file is damaged, or it requires something unsupported.
     """
     required = container.document.get("extensionsRequired", [])
     unknown = [name for name in required if name not in _KNOWN] if isinstance(required, list) else [required]
@@ -81,7 +81,7 @@ def read_splats(container: Container) -> Gaussians:
 
 
 def _of_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same with harmonics of zero up to a degree."""
+    """The same Gaussians with SH padded with zeros up to a degree."""
     sh = torch.zeros(len(gaussians), coefficient_count(degree), 3)
     sh[:, : gaussians.sh.shape[1]] = gaussians.sh
     return replace(gaussians, sh=sh)
@@ -89,11 +89,11 @@ def _of_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 
 @dataclass(frozen=True)
 class _SpzSplat:
-    """A primitive whose Gaussians are an SPZ file inside the file.
+    """A primitive whose Gaussians are an embedded SPZ file.
 
     Attributes:
-        start: Of that, from the file's beginning, bytes.
-        length: Of it.
+        start: Offset of the SPZ file from the beginning of the GLB, bytes.
+        length: Its length, bytes.
     """
 
     start: int
@@ -104,7 +104,7 @@ class _SpzSplat:
         return self.length
 
     def read(self, container: Container) -> Gaussians:
-        """Its Gaussians, by the reader of such files, which takes a file."""
+        """Read its Gaussians through the SPZ reader, which needs a file."""
         reader = next((each for each in SPLAT_FORMATS if each.name == "spz" and each.reads), None)
         if reader is None:
             raise SplatpipeError(f"{container.path} holds an SPZ file, which is not read.", hint=_HINT)
@@ -122,11 +122,11 @@ class _SpzSplat:
 
 @dataclass(frozen=True)
 class _Splat:
-    """A primitive whose attributes are known to lie inside the file.
+    """A primitive whose attributes are checked to lie inside the file.
 
     Attributes:
-        columns: Its attributes, by their short names; the harmonics' from degree 0 as they come.
-        harmonics: From degree 0; empty where there are none, not even a constant.
+        columns: Its attributes other than SH, by short names.
+        harmonics: SH coefficients from degree 0; empty if there are none, not even a constant.
     """
 
     columns: Mapping[str, Accessor]
@@ -137,7 +137,7 @@ class _Splat:
         return _LEAST_ROW_BYTES * self.columns["position"].count
 
     def read(self, container: Container) -> Gaussians:
-        """Its Gaussians, in its own frame."""
+        """Read its Gaussians, in its own frame."""
         count = self.columns["position"].count
         gaussians = Gaussians.empty(count, max(math.isqrt(len(self.harmonics)) - 1, 0))
         for start in range(0, count, ROWS_AT_ONCE):
@@ -169,10 +169,10 @@ class _Splat:
 
 
 def _splat(container: Container, primitive: Mapping[str, Any]) -> _Splat | _SpzSplat:
-    """A primitive's attributes, found and checked.
+    """Locate and check a primitive's attributes.
 
     Raises:
-        SplatpipeError: if one is missing, of another length, or outside of the file.
+        SplatpipeError: if one is missing, has another length, or lies outside of the file.
     """
     extension, names = primitive["extensions"][EXTENSION], primitive.get("attributes")
     if not isinstance(names, dict):
@@ -207,7 +207,7 @@ def _splat(container: Container, primitive: Mapping[str, Any]) -> _Splat | _SpzS
 
 
 def _harmonics(container: Container, names: Mapping[str, Any]) -> list[str]:
-    """The attributes of whole degrees, from 0; none where the colour is told by COLOR_0."""
+    """SH attribute names of complete degrees, from 0; none if the colour is in COLOR_0."""
     told = {name for name in names if name.startswith(f"{EXTENSION}:SH_DEGREE_")}
     for degree in range(MAX_DEGREE, -1, -1):
         wanted = harmonics_names(degree)
@@ -219,10 +219,10 @@ def _harmonics(container: Container, names: Mapping[str, Any]) -> list[str]:
 
 
 def _placed(container: Container, gaussians: Gaussians, matrix: Float64[np.ndarray, "4 4"]) -> Gaussians:
-    """In the scene's frame.
+    """The Gaussians transformed to the scene's frame.
 
     Raises:
-        SplatpipeError: if the matrix stretches, shears or mirrors: Gaussians would be none.
+        SplatpipeError: if the matrix scales unevenly, shears or mirrors.
     """
     if np.array_equal(matrix, np.eye(4)):
         return gaussians

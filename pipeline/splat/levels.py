@@ -1,4 +1,4 @@
-"""Levels of detail: a tree of parts of space, each of which stands for those below it until one comes near."""
+"""Levels of detail (LOD): a tree over space in which each node replaces its children at a distance."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from splatpipe.pipeline.splat.reduction import Reduction, reduce_further
 
 MOST_PER_NODE = 60_000
 CHILDREN = 4
-"""Of a node, at most: a surface twice as coarse has a quarter as many Gaussians. The root has one more."""
+"""Maximum per node: a surface twice as coarse has a quarter as many Gaussians. The root may have one more."""
 BOX_SIGMAS = 3.0
 ERROR_PER_SPREAD = 40.0
-"""World units of a node's error for each of the spread of its merged Gaussians: at an error of 16 pixels the spread is
-0.4 pixels, and models of unlike captures are within 32 dB there (`benchmarks/levels.py`). From farther away a node is
-nearer still to what the full model is, but not to what is drawn of it, which leaves out what is fainter than an 8-bit
-step: most of a pixel's many Gaussians."""
+"""A node's error per spread of its merged Gaussians, both in world units: at an error of 16 pixels the spread is 0.4
+pixels, where models of different captures are within 32 dB of the full model (`benchmarks/levels.py`). From farther
+away a node is even closer to the full model, but not to its rendering, which omits contributions below an 8-bit step:
+most of a pixel's many Gaussians."""
 LARGE_POWER = 0.5
-"""In place of ``reduction.LARGE_POWER``: all of a node is seen from about one distance, and what is large is large in
-the picture."""
+"""Replaces ``reduction.LARGE_POWER``: all of a node is seen from about the same distance, so what is large in the world
+is large in the image."""
 FIRST_POWER = 0.3
-"""For the root, which is seen first, and then from the photos' places: what is small is near them. With less, what is
-enormous, far around, becomes thin."""
-_SPREAD_QUANTILE = 0.9  # the coarsest tenth may lie beyond
-_ERROR_STEP = 1.01  # that a node's error is at least above its children's
-_FAR_SIDES = 2.0  # what lies so many sides of the middle 80 % beyond them is far: sky, floaters
-_LARGE_SIDES = 0.05  # a Gaussian with such a standard deviation is large: it would be most of a leaf's box
-_MIDDLE_PERCENT = (10.0, 90.0)  # even a fifth of all Gaussians in a sky around leaves these to the scene
+"""For the root, which is seen first, and from the photos' positions, near which Gaussians are small. With a smaller
+power, enormous Gaussians far around the scene become thin."""
+_SPREAD_QUANTILE = 0.9  # the coarsest tenth may exceed it
+_ERROR_STEP = 1.01  # least ratio of a node's error to its children's
+_FAR_SIDES = 2.0  # Gaussians more than this many box sides outside the middle 80 % are far: sky, floaters
+_LARGE_SIDES = 0.05  # a Gaussian with a standard deviation above this many box sides would fill most of a leaf's box
+_MIDDLE_PERCENT = (10.0, 90.0)  # lies in the scene even if a fifth of all Gaussians form a sky around it
 _EXTENT_PERCENT = (5.0, 95.0)
 
 
@@ -42,11 +42,11 @@ class LevelNode:
     """A part of the scene at one level of detail.
 
     Attributes:
-        box: Lowest and highest corner of the centres ± 3 standard deviations of what it and all below it hold, scene
+        box: Lowest and highest corner of the centres ± 3 standard deviations of all Gaussians in it and below, scene
             frame.
-        error: How far it stands from the full model, world units; 0 where it is that. Above its children's.
-        gaussians: Stands for everything below.
-        children: Together they replace it; none at the full model.
+        error: Geometric error against the full model, world units; 0 for a leaf, otherwise above its children's.
+        gaussians: Represent everything below.
+        children: Together they replace the node; empty for a leaf.
     """
 
     box: Float64[np.ndarray, "2 3"]
@@ -55,26 +55,26 @@ class LevelNode:
     children: tuple[LevelNode, ...]
 
     def nodes(self) -> Iterator[LevelNode]:
-        """This one and all below it, each before its children."""
+        """This node and all below it, each before its children."""
         yield self
         for child in self.children:
             yield from child.nodes()
 
 
 def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> LevelNode:
-    """Divide Gaussians in space into leaves, and merge those of a node's children until they fit one node.
+    """Partition Gaussians into leaves, and merge those of a node's children until they fit into one node.
 
-    What lies far outside, as a sky does, and what is enormous have a branch of their own: the others' boxes stay small.
+    Gaussians far outside, such as a sky, and enormous ones get a branch of their own, so that other boxes stay small.
 
     Args:
         gaussians: On the CPU, in any frame; at least one.
-        most_per_node: Gaussians in a node, at most.
+        most_per_node: Maximum number of Gaussians per node.
 
     Returns:
-        The root. Every Gaussian is in one leaf, to the bit.
+        The root. Every Gaussian is in exactly one leaf, bit for bit.
 
     Raises:
-        ValueError: if there are no Gaussians, or nodes may not hold any.
+        ValueError: if there are no Gaussians, or ``most_per_node`` is below 1.
     """
     if not len(gaussians) or most_per_node < 1:
         raise ValueError(f"levels of {len(gaussians)} Gaussians, at most {most_per_node} in a node")
@@ -92,13 +92,13 @@ def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> Le
 def select_nodes(
     root: LevelNode, camera_centre: Float64[np.ndarray, " 3"], focal_px: float, most_error_px: float = 16.0
 ) -> list[LevelNode]:
-    """The nodes that show the scene from a place: as few as are needed for no error to be larger there than allowed.
+    """Select the fewest nodes that show the scene from a viewpoint within an error limit.
 
     Args:
-        root: Of the levels.
+        root: Root of the tree.
         camera_centre: World frame.
-        focal_px: Pixels.
-        most_error_px: Largest error on the screen, at the nearest point of a node's box.
+        focal_px: Focal length, pixels.
+        most_error_px: Largest screen-space error, at the nearest point of a node's box.
     """
     if not root.children or root.error * focal_px <= most_error_px * box_distance(root.box, camera_centre):
         return [root]
@@ -106,13 +106,13 @@ def select_nodes(
 
 
 def box_distance(box: Float64[np.ndarray, "2 3"], point: Float64[np.ndarray, " 3"]) -> float:
-    """From a point to the nearest of a box; 0 inside."""
+    """Distance from a point to a box; 0 inside."""
     return float(np.linalg.norm(np.maximum(np.maximum(box[0] - point, point - box[1]), 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Branch:
-    """A node, and what its Gaussians stand for."""
+    """A node with the reduction that produced its Gaussians."""
 
     node: LevelNode
     held: Reduction
@@ -121,7 +121,7 @@ class _Branch:
 def _branch(
     gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], part: Int64[np.ndarray, " m"], most: int
 ) -> _Branch:
-    """The tree of a part, its leaves alike in number."""
+    """The tree of a part, with leaves of about equal size."""
     if len(part) > most:
         return _joined(_branches(gaussians, means, part, most), most, LARGE_POWER)
     own = gaussians.select(torch.from_numpy(np.sort(part)))
@@ -131,7 +131,7 @@ def _branch(
 def _branches(
     gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], part: Int64[np.ndarray, " m"], most: int
 ) -> list[_Branch]:
-    """A part divided into the trees of its children: as low as nodes of this size allow."""
+    """The trees of a part's children, of the smallest height that the node size allows."""
     height = 1
     while most * CHILDREN**height < len(part):
         height += 1
@@ -140,7 +140,7 @@ def _branches(
 
 
 def _joined(branches: Sequence[_Branch], most: int, large_power: float) -> _Branch:
-    """The node over some: what they hold, merged until it fits."""
+    """The parent of some branches: their Gaussians, merged until they fit into a node."""
     children = tuple(branch.node for branch in branches)
     reduced = reduce_further(Reduction.joined([branch.held for branch in branches]), most, large_power)
     boxes = np.stack([child.box for child in children])
@@ -150,9 +150,9 @@ def _joined(branches: Sequence[_Branch], most: int, large_power: float) -> _Bran
 
 
 def _spread(reduced: Reduction) -> float:
-    """Upper quantile, by the numbers that they stand for, of how far Gaussians stand from those.
+    """Upper quantile of the spreads of merged Gaussians, weighted by the number of Gaussians merged into each.
 
-    Not by mass: a model's few enormous Gaussians, far from every camera, would outweigh all that is looked at.
+    Not by mass: a model's few enormous Gaussians, far from every camera, would outweigh everything in view.
     """
     order = np.argsort(reduced.spreads, kind="stable")
     below = np.cumsum(reduced.counts[order])
@@ -162,7 +162,7 @@ def _spread(reduced: Reduction) -> float:
 def _cells(
     means: Float64[np.ndarray, "n 3"], part: Int64[np.ndarray, " m"], count: int
 ) -> list[Int64[np.ndarray, " k"]]:
-    """Divide a part in space into so many, alike in number, across the longest side each time."""
+    """Split a part into ``count`` cells of about equal size, across the longest side each time."""
     if count == 1:
         return [part]
     first = count // 2
@@ -174,7 +174,7 @@ def _cells(
 
 
 def _outside(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Which lie far outside the middle of all, or are so large that a box around them says nothing of the others."""
+    """Which Gaussians lie far outside the middle of the scene, or are so large that they would dominate any box."""
     low, high = np.percentile(means, _MIDDLE_PERCENT, axis=0)
     side = float((high - low).max())
     far = ((means < low - _FAR_SIDES * side) | (means > high + _FAR_SIDES * side)).any(1)
@@ -183,7 +183,7 @@ def _outside(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Bool[np
 
 
 def _box(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
-    """Around centres and so many standard deviations along each axis of the frame."""
+    """The box around the centres ± ``BOX_SIGMAS`` standard deviations along each axis of the frame."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for piece in gaussians.pieces():
         moments = moments_of(piece)

@@ -1,4 +1,4 @@
-"""Pairs without conflict: of all edges the cheapest, then the cheapest that shares no end with it, and so on."""
+"""Greedy matching: the cheapest edge, then the cheapest one that shares no end with it, and so on."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from jaxtyping import Float64, Int64
 def match_cheapest(
     edges: Int64[np.ndarray, "e 2"], costs: Float64[np.ndarray, " e"], count: int
 ) -> Int64[np.ndarray, " m"]:
-    """A greedy matching, found without a loop over the edges.
+    """Compute a greedy matching without a loop over the edges.
 
-    An edge that is the cheapest at both of its ends is one that the greedy choice takes; with those and all that
-    touch them gone, others are (R. Preis, "Linear Time 1/2-Approximation Algorithm for Maximum Weighted Matching in
-    General Graphs", 1999). Of equal costs the earlier edge counts as the cheaper one.
+    The greedy choice takes every edge that is the cheapest at both of its ends; once these and all edges that touch
+    them are removed, others become cheapest (R. Preis, "Linear Time 1/2-Approximation Algorithm for Maximum Weighted
+    Matching in General Graphs", 1999). Of equal costs the earlier edge counts as cheaper.
 
     Args:
         edges: Two different ends each.
-        costs: What each costs, not NaN.
-        count: Of what there is to be matched: ends are below it.
+        costs: Cost of each edge, not NaN.
+        count: Number of vertices; all ends are below it.
 
     Returns:
-        The edges of the matching, cheapest first.
+        Indices of the matching's edges, cheapest first.
     """
     order = np.argsort(costs, kind="stable")
     left = np.arange(len(order))  # by rank

@@ -1,4 +1,4 @@
-"""How much two Gaussians differ from the one that would stand for both."""
+"""The cost of merging two Gaussians: how much they differ from the merged one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from jaxtyping import Float32, Float64, Int64
 from splatpipe.pipeline.splat.moments import Moments, joint_covariances, shares
 
 COLOUR_WEIGHT = 4.0
-"""Of the variance of a pair's colours against the divergence of its shapes: measured on the demo's model."""
-_ROWS_AT_ONCE = 1 << 15  # what one step needs stays in the cache
+"""Weight of a pair's colour variance against the divergence of its shapes: tuned on the demo's model."""
+_ROWS_AT_ONCE = 1 << 15  # one step's data fit into the cache
 
 
 def merge_costs(
@@ -18,19 +18,19 @@ def merge_costs(
     pairs: Int64[np.ndarray, "e 2"],
     least_variance: float,
 ) -> Float64[np.ndarray, " e"]:
-    """What merging pairs costs, each by itself: of shape and of colour, without a unit, whatever the pair's size.
+    """Costs of merging pairs, each independent of the others: shape plus colour, dimensionless and scale-invariant.
 
-    Of shape: a bound on the Kullback-Leibler divergence of the pair from the Gaussian with its moments, ½ (log|P| −
+    Shape: a bound on the Kullback-Leibler divergence of the pair from the Gaussian with its moments, ½ (log|P| −
     s log|P₁| − (1 − s) log|P₂|) of the joint covariance and the pair's own, with s the first's share of the mass (A. R.
     Runnalls, "Kullback-Leibler Approach to Gaussian Mixture Reduction", IEEE Transactions on Aerospace and Electronic
-    Systems 43(3), 2007). What would make a wall thick or a pole wide costs much. Of colour: the variance by mass of the
-    coefficients of spherical harmonics, which are orthonormal: all directions count alike.
+    Systems 43(3), 2007). Merges that would thicken a wall or widen a pole cost much. Colour: the mass-weighted variance
+    of the SH coefficients, which are orthonormal, so all directions count equally.
 
     Args:
-        moments: Of all Gaussians.
-        colours: All their coefficients of spherical harmonics.
-        pairs: Which two.
-        least_variance: Added along every axis, world units squared, > 0: how flat counts as flat.
+        moments: Moments of all Gaussians.
+        colours: All their SH coefficients.
+        pairs: Indices of each pair.
+        least_variance: Added along every axis, world units squared, > 0: flatter Gaussians count as equally flat.
     """
     costs = np.empty(len(pairs))
     volumes = _log_volumes(moments.covariances, least_variance)
@@ -47,7 +47,7 @@ def merge_costs(
 
 
 def _log_volumes(covariances: Float64[np.ndarray, "n 6"], least_variance: float) -> Float64[np.ndarray, " n"]:
-    """Logarithms of determinants, of the Cholesky factors' diagonals: those of flat Gaussians do not cancel."""
+    """Log determinants from the Cholesky factors' diagonals, which avoids cancellation for flat Gaussians."""
     xx, xy, xz, yy, yz, zz = covariances.T
     first = xx + least_variance
     second = np.maximum(yy + least_variance - xy * xy / first, least_variance)

@@ -1,8 +1,8 @@
-"""How alike a render and its photo are, by measures that need no learned weights.
+"""Similarity metrics between a render and its photo that need no learned weights.
 
-Every measure takes images (h, w, 3) in [0, 1] and an optional mask (h, w), True where a pixel counts; masked pixels of
-the render are replaced by the photo's before anything looks at a neighbourhood, so that they neither help nor
-harm. Everything is float64, and every sum is taken in a fixed order: the same bits for any number of threads.
+Every metric takes images (h, w, 3) in [0, 1] and an optional mask (h, w), True where a pixel counts. Pixels that do not
+count are replaced by the photo's before any neighbourhood is evaluated, so they neither help nor harm. Everything is
+float64, and every sum has a fixed order: bit-identical for any number of threads.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _GMSD_C = 170.0 / 255.0**2
 """170 for values of 0 to 255 in the authors' code, 0.0026 in the paper for values of 0 to 1."""
 _LUMA = (0.299, 0.587, 0.114)
-"""ITU-R BT.601 luma from gamma-coded RGB, as the authors' rgb2gray."""
+"""ITU-R BT.601 luma from gamma-coded RGB, as in the authors' rgb2gray."""
 _EDGE_SHARE = 0.1
-_FIELDS = 32  # of the chessboard along a picture's longer side: 51 pixels each at 2 megapixels, 19 at 0.27
-_STRIP_ROWS = 64  # rows whose windows are compared at a time: they stay in a core's cache
+_FIELDS = 32  # chessboard fields along an image's longer side: 51 pixels each at 2 megapixels, 19 at 0.27
+_STRIP_ROWS = 64  # rows whose windows are compared at a time: they fit into a core's cache
 _SHARPNESS_FLOOR = 1.0 / 255.0
-"""A gradient of one grey level a pixel, below which a photo shows nothing to be sharp about."""
+"""A gradient of one grey level per pixel: a photo with less has no edges to compare."""
 
 
 def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
@@ -43,7 +43,7 @@ def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
         Decibels; infinite for equal images.
 
     Raises:
-        ValueError: if the shapes differ, a value is not finite, or the mask leaves no pixel (so of every measure here).
+        ValueError: if the shapes differ, a value is not finite, or no pixel counts (likewise for every metric here).
     """
     x, y, counts = _prepare(render, photo, mask)
     errors = (_sum((a - b).square_(), counts) for a, b in zip(x, y, strict=True))
@@ -52,17 +52,17 @@ def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
 
 
 def psnr_cc(render: Image, photo: Image, mask: Mask | None = None) -> float:
-    """PSNR after an affine colour map (3 × 4) of the render, fitted by least squares on the other half of the picture.
+    """PSNR after an affine colour map (3 × 4) of the render, fitted by least squares on the other half of the image.
 
-    It forgives exposure and white balance that differ between photos. A map is fitted on each half and scored on the
-    other, so that no pixel is judged by colours that were fitted to it; all pixels' errors are one mean. Halves of one
-    edge would be lit differently, and shaded differently by the lens: what a map of one side misses on the other would
-    be their difference. So they are the fields of a chessboard, `_FIELDS` along the longer side: of any brightness,
-    colour or distance from the centre, both have as much, and a field is far larger than what neighbouring pixels share
-    by blur. The corrected render is clamped to [0, 1].
+    It ignores differences in exposure and white balance between photos. A map is fitted on each half and scored on the
+    other, so no pixel is scored with a map that was fitted to it; the errors of all pixels are averaged. If the image
+    were split along one line, lighting and vignetting would differ between the halves and count as error. So the halves
+    are the fields of a chessboard, `_FIELDS` along the longer side: both contain every brightness, colour and distance
+    from the centre equally, and a field is much larger than the blur between neighbouring pixels. The corrected render
+    is clamped to [0, 1].
 
     Raises:
-        ValueError: also if the mask leaves one half no pixel.
+        ValueError: also if one half has no pixel that counts.
     """
     x, y, counts = _prepare(render, photo, mask)
     board = _chessboard(counts.shape[0], counts.shape[1])
@@ -84,7 +84,7 @@ def _chessboard(height: int, width: int) -> Bool[Tensor, "h w"]:
 
 
 def _colour_maps(x: Tensor, y: Tensor, halves: tuple[Tensor, Tensor]) -> list[Float[Tensor, "4 3"]]:
-    """The map from ``x`` to ``y`` that fits each half best; the last row is added."""
+    """The least-squares map from ``x`` to ``y`` for each half; the last row is the offset."""
     for half in halves:
         _require_pixels(half)
     source = [*x, torch.ones_like(x[0])]
@@ -98,7 +98,7 @@ def _colour_maps(x: Tensor, y: Tensor, halves: tuple[Tensor, Tensor]) -> list[Fl
                     normal[k, i, j] = normal[k, j, i] = value
                 else:
                     right[k, i, j - i - 1] = value
-    # gelsd takes the smallest of many solutions: a render of one colour leaves the map undetermined
+    # gelsd returns the minimum-norm solution: a render of one colour leaves the map undetermined
     return [torch.linalg.lstsq(normal[k], right[k], driver="gelsd").solution for k in range(2)]
 
 
@@ -106,10 +106,10 @@ def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
     """Mean structural similarity: ``kornia.metrics.ssim`` with window 11 and "same" padding, to rounding.
 
     Wang, Bovik, Sheikh, Simoncelli: Image Quality Assessment: From Error Visibility to Structural Similarity, IEEE TIP
-    13(4), 2004: a Gaussian window of 11 × 11 and σ 1.5, K1 = 0.01, K2 = 0.03, a channel at a time.
+    13(4), 2004: a Gaussian window of 11 × 11 and σ 1.5, K1 = 0.01, K2 = 0.03, per channel.
 
     Raises:
-        ValueError: also if a side is under 6 pixels, which cannot be reflected by half a window.
+        ValueError: also if a side is under 6 pixels, which is too short to reflect by half a window.
     """
     x, y, counts = _prepare(render, photo, mask)
     radius = SSIM_WINDOW // 2
@@ -127,8 +127,8 @@ def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
 
     Wang, Simoncelli, Bovik: Multi-scale Structural Similarity for Image Quality Assessment, Asilomar 2003: five
     scales, halved by 2 × 2 means, whole windows only; contrast and structure of each scale and luminance of the
-    coarsest, to the published powers. A channel at a time, then their mean. Where the image (or what the mask leaves
-    of it) is smaller than a window at a scale, the scales before take over, their powers made to add up to one.
+    coarsest, to the published powers. Computed per channel, then averaged. If at some scale no window with a counting
+    centre fits into the image, only the finer scales are used, with powers normalised to a sum of one.
 
     Raises:
         ValueError: also if not even one window fits.
@@ -178,10 +178,10 @@ def gmsd(render: Image, photo: Image, mask: Mask | None = None) -> float:
 
 
 def sharpness(render: Image, photo: Image, mask: Mask | None = None) -> float:
-    """How sharp the photo's edges are in the render: 1 as in the photo, below blurred, above overshooting.
+    """Sharpness of the photo's edges in the render: 1 as in the photo, less if blurred, more if overshooting.
 
-    The ratio of the root mean square Sobel gradients (Tenengrad: Krotkov, Focusing, IJCV 1, 1987) of the luma, over the
-    tenth of the counting pixels where the photo's gradient is largest.
+    The ratio of the RMS Sobel gradients (Tenengrad: Krotkov, Focusing, IJCV 1, 1987) of the luma, over the tenth of the
+    counting pixels where the photo's gradient is largest.
     """
     x, y, counts = _prepare(render, photo, mask)
     lumas = (_luma(x), _luma(y))
@@ -202,18 +202,18 @@ METRICS: dict[str, Callable[..., float]] = {
     "gmsd": gmsd,
     "sharpness": sharpness,
 }
-"""Every measure by the name it has in metrics.json."""
+"""Every metric by its name in metrics.json."""
 
 
 def ssim_window(dtype: torch.dtype = torch.float64) -> Float[Tensor, " 11"]:
-    """The taps of SSIM's Gaussian window, which add up to one."""
+    """The taps of SSIM's Gaussian window, which sum to one."""
     offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     taps = torch.exp(-0.5 * (offset / SSIM_SIGMA).square())
     return (taps / taps.sum()).to(dtype)
 
 
 def _prepare(render: Tensor, photo: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Render (masked pixels from the photo) and photo as (3, h, w) in float64, and which pixels count."""
+    """Render (masked pixels taken from the photo) and photo as (3, h, w) in float64, and which pixels count."""
     if render.shape != photo.shape or render.ndim != 3 or render.shape[2] != 3:
         raise ValueError(f"render {tuple(render.shape)} and photo {tuple(photo.shape)} are not both (h, w, 3)")
     counts = torch.ones(render.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
@@ -230,7 +230,7 @@ def _prepare(render: Tensor, photo: Tensor, mask: Tensor | None) -> tuple[Tensor
 
 
 def _planes(image: Tensor) -> Float[Tensor, "3 h w"]:
-    """The channels one after the other, in float64, a channel at a time: pictures of megapixels are large in it."""
+    """The channels as float64 planes, converted one at a time, because large images take much memory in float64."""
     planes = torch.empty((3, *image.shape[:2]), dtype=torch.float64)
     for plane, channel in zip(planes, image.unbind(2), strict=True):
         plane.copy_(channel)
@@ -255,7 +255,7 @@ def _mean(values: Float[Tensor, "c h w"], counts: Bool[Tensor, "h w"]) -> float:
 def _window_sums(
     x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counts: Bool[Tensor, "h-10 w-10"]
 ) -> tuple[float, float]:
-    """Sums, over the counting ones of all whole windows, of SSIM and of its contrast · structure factor."""
+    """Sums of SSIM and of its contrast · structure factor over the whole windows whose centres count."""
     rows: tuple[list[float], list[float]] = ([], [])
     for top in range(0, counts.shape[0], _STRIP_ROWS):
         strip = slice(top, top + _STRIP_ROWS + SSIM_WINDOW - 1)
@@ -266,7 +266,7 @@ def _window_sums(
 
 
 def _blur(image: Float[Tensor, "h w"]) -> Tensor:
-    """Windowed means of whole windows (h - 10, w - 10), tap by tap: elementwise, so the same in any thread."""
+    """Means of whole windows (h - 10, w - 10), tap by tap: elementwise, so independent of the threads."""
     for dim in (1, 0):
         length = image.shape[dim] - SSIM_WINDOW + 1
         parts = (tap * image.narrow(dim, i, length) for i, tap in enumerate(ssim_window().tolist()))
@@ -291,14 +291,14 @@ def _luma(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
 
 
 def _halved(counts: Bool[Tensor, "h w"]) -> Tensor:
-    """Which 2 × 2 blocks (h // 2, w // 2) count whole."""
+    """The 2 × 2 blocks (h // 2, w // 2) all of whose pixels count."""
     h, w = counts.shape[0] // 2 * 2, counts.shape[1] // 2 * 2
     block = counts[:h, :w]
     return block[::2, ::2] & block[1::2, ::2] & block[::2, 1::2] & block[1::2, 1::2]
 
 
 def _gradient(image: Float[Tensor, "h w"], across: tuple[float, float, float]) -> Float[Tensor, "h w"]:
-    """Magnitude of the 3 × 3 gradient smoothed by ``across`` (its sum made 1), zeros beyond the border."""
+    """Magnitude of the 3 × 3 gradient smoothed by ``across`` (normalised to sum 1), with zero padding."""
     around = pad(image, [1] * 4)
     weights = [weight / sum(across) for weight in across]
     dx = around[:, 2:] - around[:, :-2]  # (h + 2, w)

@@ -1,4 +1,4 @@
-"""Gaussians by their moments: mass, mean and covariance, and the one Gaussian that has those of two."""
+"""Moments of Gaussians (mass, mean, covariance), and merging a pair into the Gaussian with the same moments."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from scipy.special import expit, logit
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-_LOG_SCALE_MOST = 40.0  # the square of the square of e^40 is a float64 still, and no scene is so large
-_OPACITY_LEAST, _OPACITY_MOST = 1e-7, 1.0 - 1e-6  # of a merged Gaussian: their logits are float32s, and finite
+_LOG_SCALE_MOST = 40.0  # the fourth power of e^40 still fits a float64, and no scene is this large
+_OPACITY_LEAST, _OPACITY_MOST = 1e-7, 1.0 - 1e-6  # of a merged Gaussian: their logits are finite in float32
 _AREA_POWER = 1.6075
-"""Exponent of Knud Thomsen's formula for an ellipsoid's surface (2004), within 1.061 %."""
+"""Exponent of Knud Thomsen's formula for an ellipsoid's surface area (2004), accurate to 1.061 %."""
 GROWTH = 0.45
-"""Power of the excess over opaque by which a merged Gaussian's area grows. At 0 surfaces whose Gaussians overlap become
-thin, at 1 their edges spread."""
+"""Power of the excess opacity by which a merged Gaussian's area grows. At 0, surfaces of overlapping Gaussians become
+thin; at 1, their edges spread."""
 _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """What n Gaussians are, apart from their colours.
+    """Moments of n Gaussians, without their colours.
 
     Attributes:
         means: Centres, world units.
         covariances: xx, xy, xz, yy, yz, zz; world units squared.
         opacities: 0..1.
-        areas: Surfaces of the ellipsoids of one standard deviation. A quarter of it is a convex body's mean shadow
-            (Cauchy), so that opacity times area stands for what a Gaussian covers, seen from anywhere: its mass.
+        areas: Surface areas of the one-sigma ellipsoids, world units squared. A convex body's mean projected area is a
+            quarter of its surface area (Cauchy), so opacity times area measures what a Gaussian covers on average over
+            all directions: its mass.
     """
 
     means: Float64[np.ndarray, "n 3"]
@@ -43,16 +44,16 @@ class Moments:
         return len(self.means)
 
     def masses(self) -> Float64[np.ndarray, " n"]:
-        """Opacity times area."""
+        """Masses: opacity times area, world units squared."""
         return np.asarray(self.opacities * self.areas)
 
     def select(self, index: Int64[np.ndarray, " m"]) -> Moments:
-        """Those of an index, copied."""
+        """The moments at the given indices, copied."""
         return Moments(self.means[index], self.covariances[index], self.opacities[index], self.areas[index])
 
 
 def moments_of(gaussians: Gaussians) -> Moments:
-    """Their moments, in float64; a scale beyond e^±40 counts as that."""
+    """Moments of Gaussians in float64; scales are clamped to e^±40."""
     means, log_scales, quats, logits = (
         tensor.detach().cpu().numpy().astype(np.float64)
         for tensor in (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits)
@@ -64,24 +65,24 @@ def moments_of(gaussians: Gaussians) -> Moments:
 
 
 def ellipsoid_areas(scales: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """Surfaces of ellipsoids by their half axes (Thomsen's approximation)."""
+    """Surface areas of ellipsoids from their semi-axes (Thomsen's approximation)."""
     x, y, z = np.power(scales, _AREA_POWER).T
     return np.asarray(4.0 * np.pi * np.power((x * y + x * z + y * z) / 3.0, 1.0 / _AREA_POWER))
 
 
 def shares(one: Moments, other: Moments) -> Float64[np.ndarray, " n"]:
-    """What part of each pair's mass its first has; half where both have none."""
+    """Each pair's share of mass in its first Gaussian; a half where both have no mass."""
     first, both = one.masses(), one.masses() + other.masses()
     return np.asarray(np.divide(first, both, out=np.full(len(first), 0.5), where=both > 0.0))
 
 
 def joint_covariances(one: Moments, other: Moments, share: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
-    """Covariances of pairs taken together, each about its common mean (law of total variance).
+    """Joint covariances of pairs about their common means (law of total variance), world units squared.
 
     Args:
-        one: The pairs' first.
-        other: Their second.
-        share: The first's part of the mass.
+        one: First Gaussian of each pair.
+        other: Second Gaussian of each pair.
+        share: The first's share of the mass.
     """
     apart = other.means - one.means
     between = np.stack([apart[:, a] * apart[:, b] for a, b in _upper()], axis=1)
@@ -90,15 +91,15 @@ def joint_covariances(one: Moments, other: Moments, share: Float64[np.ndarray, "
 
 
 def merge_pairs(one: Gaussians, other: Gaussians) -> Gaussians:
-    """One Gaussian for each pair, with the pair's mean and covariance, weighted by mass, and with its mass.
+    """Merge each pair into one Gaussian with the pair's mass and its mass-weighted mean and covariance.
 
     The weights are those of Kerbl et al., "A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very
-    Large Datasets" (2024): opacity times surface. An opacity that would exceed 1 is held there, since files and viewers
-    know no more, and the Gaussian grows by a part of what is lost (``GROWTH``).
+    Large Datasets" (2024): opacity times surface area. An opacity that would exceed 1 is clamped, since files and
+    viewers allow no more, and the Gaussian grows by part of the loss (``GROWTH``).
 
     Args:
-        one: The pairs' first.
-        other: Their second; of the same SH degree.
+        one: First Gaussian of each pair.
+        other: Second Gaussian of each pair; of the same SH degree.
     """
     ours, theirs = moments_of(one), moments_of(other)
     share = shares(ours, theirs)
@@ -128,7 +129,7 @@ def _upper() -> tuple[tuple[int, int], ...]:
 
 
 def _rotations(quats: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Matrices of quaternions (w, x, y, z) of any length; the identity for none."""
+    """Rotation matrices of quaternions (w, x, y, z) of any length; the identity for length zero."""
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     units = np.divide(quats, lengths, out=np.tile([1.0, 0.0, 0.0, 0.0], (len(quats), 1)), where=lengths > 0.0)
     return np.asarray(Rotation.from_quat(units[:, [1, 2, 3, 0]]).as_matrix()) if len(quats) else np.empty((0, 3, 3))

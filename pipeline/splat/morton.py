@@ -1,4 +1,4 @@
-"""Places along a Morton curve: what is near in space is near on it."""
+"""Morton codes: points close on the curve are close in space."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-BITS = 21  # an axis: three of them and the sign fill 64
-_SPREAD = (  # how far bits are moved, and those that stay: two zeros between each two in the end
+BITS = 21  # per axis: three times 21 and the sign make 64
+_SPREAD = (  # shifts and masks that insert two zeros between bits
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
     (8, 0x100F00F00F00F00F),
@@ -19,12 +19,12 @@ _SPREAD = (  # how far bits are moved, and those that stay: two zeros between ea
 def morton_keys(
     means: Float[Tensor, "n 3"], lowest: Float[Tensor, " 3"], size: Float[Tensor, " 3"]
 ) -> Int64[Tensor, " n"]:
-    """Places along a Morton curve through a box; the first axis has the lowest bit.
+    """Morton codes of points in a box; the first axis has the lowest bit.
 
     Args:
-        means: Points, world frame and units; one that is no number lies at the lowest end.
-        lowest: The box's corner.
-        size: Of its sides; along one of no length all points are at one place.
+        means: Points, world frame and units; NaN coordinates count as 0 after scaling, the lowest end.
+        lowest: Lowest corner of the box.
+        size: Side lengths of the box; along a side of length zero all points coincide.
     """
     cells = torch.where(size > 0.0, (1 << BITS) / size, 0.0)
     places = ((means - lowest) * cells).nan_to_num_(0.0).clamp_(0.0, (1 << BITS) - 1)

@@ -1,4 +1,4 @@
-"""An order of Gaussians in which each run of some hundreds lies in a small box: what files code in runs gets finer."""
+"""Order Gaussians so that each run of a few hundred lies in a small box, for finer quantization per run."""
 
 from __future__ import annotations
 
@@ -16,25 +16,26 @@ _INDEX_BITS = 32
 def in_neighbourhoods(
     means: Float[torch.Tensor, "n 3"], run: int, weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> Int64[torch.Tensor, " n"]:
-    """Split the points at the median of the longest side of their box, and each half again, down to runs.
+    """Order points by splitting them at the median of their box's longest side, recursively, down to runs.
 
     A k-d tree (J. L. Bentley, "Multidimensional binary search trees used for associative searching", 1975) whose halves
-    hold whole runs. Unlike a curve through the whole box it does not mind points far outside, and no run leaps.
+    hold whole runs. Unlike a space-filling curve through the whole box, it is robust to points far outside, and no run
+    has jumps.
 
     Args:
         means: Points, finite.
-        run: Points in a run, but for the last one.
-        weights: How much longer than it is a side counts, where its axis is coded coarser.
+        run: Points per run, except for the last one.
+        weights: Factors on the side lengths, larger for axes that are quantized more coarsely.
 
     Returns:
-        The points' indices in that order; within a run as they were. The same for the same points.
+        Indices of the points in that order; within a run the original order is kept. Deterministic.
 
     Raises:
         ValueError: if there are 2³² points or more.
     """
     if len(means) >= 1 << _INDEX_BITS:
         raise ValueError("too many points for an index of 32 bits")
-    columns = np.ascontiguousarray(means.detach().numpy().astype(np.float32).T)  # in the order so far
+    columns = np.ascontiguousarray(means.detach().numpy().astype(np.float32).T)  # in the current order
     factors = np.asarray(weights)
     order = np.arange(columns.shape[1], dtype=np.int64)
     todo = [(0, len(order))]
@@ -62,12 +63,12 @@ def reordered(
     rows: int,
     turn: Float64[torch.Tensor, "3 3"] | None = None,
 ) -> Iterator[Gaussians]:
-    """The Gaussians in an order, so many at a time.
+    """Iterate over the Gaussians in an order, in pieces.
 
     Args:
-        gaussians: Of which pieces are copied.
-        order: Their indices.
-        rows: Of a piece, but for the last one.
+        gaussians: All Gaussians; the pieces are copies.
+        order: Their indices in order.
+        rows: Gaussians per piece, except for the last one.
         turn: Rotation to another frame, if any.
     """
     nowhere = torch.zeros(3, dtype=torch.float64)
@@ -79,7 +80,7 @@ def reordered(
 
 
 def _sortable(values: Float32[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
-    """Numbers in the values' order, their places in the lower bits, so that no two are alike."""
+    """Unique integers that sort like the values; the lower bits hold the index."""
     bits = values.view(np.int32)
     ordered = np.where(bits < 0, ~bits, bits ^ np.int32(-(1 << 31))).view(np.uint32)
     return np.asarray(ordered.astype(np.uint64) << np.uint64(_INDEX_BITS) | np.arange(len(values), dtype=np.uint64))

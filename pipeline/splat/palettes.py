@@ -1,9 +1,9 @@
-"""Palettes of vectors: up to 65,536 of them that stand for a million, and the nearest one to each vector.
+"""Vector palettes: up to 65,536 entries that stand for a million vectors, and the nearest entry to each vector.
 
-k-means (S. Lloyd, "Least squares quantization in PCM", 1982) with the search of inverted files (H. Jégou, M. Douze,
-C. Schmid, "Product quantization for nearest neighbor search", 2011): the palette is divided into cells, and a vector is
-compared with the entries of the cells about its own, instead of with all of them, which would be 6e12 operations a
-million vectors. Matrix products are done on one thread: on more they may round differently.
+k-means (S. Lloyd, "Least squares quantization in PCM", 1982) with inverted-file search (H. Jégou, M. Douze, C. Schmid,
+"Product quantization for nearest neighbor search", 2011): the palette is divided into cells, and a vector is compared
+with the entries of the cells around its own instead of all, which would take 6e12 operations per million vectors.
+Matrix products run on one thread: on more they may round differently.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-ITERATIONS = 3  # more makes the error smaller by less than a hundredth each
+ITERATIONS = 3  # each further one reduces the error by less than 1 %
 _CELL_ITERATIONS = 6
 _ENTRIES_A_CELL = 128
 _CANDIDATES = 1024  # entries that a vector is compared with, at least
-_BLOCK = 1 << 20  # numbers in a block of distances: 4 MB, which stay in the cache
+_BLOCK = 1 << 20  # numbers in a block of distances: 4 MB, which fit into the cache
 _ROWS_AT_ONCE = 1 << 16
-_LEAST_SHARE = 1e-6  # of the mean error: of rows without any error, too, a start is made
-_HALVINGS = 100  # of a factor's range, which may be wide
-_MOST_FITTED = 1 << 20  # vectors that a palette is fitted to: of more, evenly spaced ones
+_LEAST_SHARE = 1e-6  # of the mean error: lets rows without error be chosen, too
+_HALVINGS = 100  # bisections of a factor's range, which may be wide
+_MOST_FITTED = 1 << 20  # vectors that a palette is fitted to: an evenly spaced subset of more
 
 
 def fit_palette(
     rows: Float[Tensor, "n d"], size: int, weights: Float[Tensor, " n"] | None = None, iterations: int = ITERATIONS
 ) -> tuple[Float[Tensor, "k d"], Int64[Tensor, " n"]]:
-    """Vectors whose squares of distances to all rows sum up to little.
+    """Fit a palette with a small sum of squared distances to all rows.
 
     Args:
-        rows: Finite, float32 on the CPU.
-        size: Most vectors in the palette, > 0; as many where there are as many different rows.
-        weights: Of each row, positive; alike without.
+        rows: Vectors, finite, float32 on the CPU.
+        size: Maximum number of palette entries, > 0; reached if there are as many different rows.
+        weights: Positive weight of each row; None for equal weights.
         iterations: Rounds of k-means.
 
     Returns:
-        The palette, and which of its vectors is nearest to each row, or nearly.
+        The palette, and the index of the (approximately) nearest entry to each row.
     """
     with one_thread():
         step = max(-(-len(rows) // _MOST_FITTED), 1)
@@ -60,16 +60,16 @@ def fit_palette(
 def nearest_entries(
     rows: Float[Tensor, "n d"], palette: Float[Tensor, "k d"], before: Int64[Tensor, " n"]
 ) -> Int64[Tensor, " n"]:
-    """Which of a palette's vectors is nearest to each row, or nearly; `before` where none is found that is nearer."""
+    """Index of the (approximately) nearest palette entry to each row; `before` where none nearer is found."""
     with one_thread():
         return CellIndex.of(palette).nearest(rows, before)
 
 
 def _start(rows: Float[Tensor, "n d"], weights: Float[Tensor, " n"], size: int) -> Int64[Tensor, " k"]:
-    """Which rows to begin with: the more of them, the more error there would be without, and none of them twice.
+    """Distinct rows to start with, their density proportional to the rows' squared distance from the mean.
 
-    In many dimensions the best number of entries in a region is nearly proportional to that (P. L. Zador, "Asymptotic
-    quantization error of continuous signals and the quantization dimension", 1982).
+    In many dimensions the optimal number of entries in a region is nearly proportional to that error (P. L. Zador,
+    "Asymptotic quantization error of continuous signals and the quantization dimension", 1982).
     """
     if len(rows) <= size:
         return torch.arange(len(rows))
@@ -86,13 +86,13 @@ def _start(rows: Float[Tensor, "n d"], weights: Float[Tensor, " n"], size: int) 
 
 @dataclass(frozen=True, eq=False)
 class CellIndex:
-    """A palette's entries in cells of what is near one another.
+    """A palette's entries, grouped into cells of nearby entries.
 
     Attributes:
-        entries: Of the palette, cell after cell.
-        places: Of each entry in the palette that was given.
-        centres: Of the cells.
-        bounds: Where each cell's entries begin, and the end.
+        entries: Palette entries, cell by cell.
+        places: Index of each entry in the original palette.
+        centres: Centres of the cells.
+        bounds: Start of each cell's entries, and the end.
     """
 
     entries: Float[Tensor, "k d"]
@@ -102,7 +102,7 @@ class CellIndex:
 
     @classmethod
     def of(cls, palette: Float[Tensor, "k d"]) -> CellIndex:
-        """Divide a palette."""
+        """Build the index of a palette."""
         count = max(len(palette) // _ENTRIES_A_CELL, 1)
         centres = palette[torch.arange(count) * len(palette) // count].clone()
         ones = torch.ones(len(palette))
@@ -114,10 +114,10 @@ class CellIndex:
         return cls(palette[places], places, centres, bounds)
 
     def nearest(self, rows: Float[Tensor, "n d"], before: Int64[Tensor, " n"] | None = None) -> Int64[Tensor, " n"]:
-        """Which of the palette is nearest to each row, among the cells about its own and the one that was before.
+        """Index of the palette entry nearest to each row, among the cells around its own and the previous entry.
 
-        That one is what makes every round of k-means better than the last: an entry that stands for one row alone moves
-        off it a little, into a cell that may not be looked into.
+        Including the previous entry makes every round of k-means at least as good as the last: an entry that stands for
+        a single row may move slightly, into a cell that is not searched.
         """
         cells = _nearest(rows, self.centres)
         order = torch.argsort(cells, stable=True)
@@ -135,12 +135,12 @@ class CellIndex:
     def _nearer(
         self, rows: Float[Tensor, "n d"], one: Int64[Tensor, " n"], other: Int64[Tensor, " n"]
     ) -> Int64[Tensor, " n"]:
-        """Of two entries a row."""
+        """The nearer of two entries for each row."""
         distances = (((rows - self.entries[each]) ** 2).sum(1) for each in (one, other))
         return torch.where(next(distances) <= next(distances), one, other)
 
     def _candidates(self, cell: int) -> Int64[Tensor, " m"]:
-        """Entries of the nearest cells, as many as needed."""
+        """Entries of as many of the nearest cells as needed."""
         near = torch.argsort(((self.centres - self.centres[cell]) ** 2).sum(1), stable=True)
         reach = torch.cumsum((self.bounds[1:] - self.bounds[:-1])[near], 0)
         cells = near[: int(torch.searchsorted(reach, _CANDIDATES)) + 1].tolist()
@@ -148,7 +148,7 @@ class CellIndex:
 
 
 def _nearest(rows: Float[Tensor, "n d"], entries: Float[Tensor, "m d"]) -> Int64[Tensor, " n"]:
-    """By |e|² / 2 − r · e, which is half the square of the distance but for what is the row's own."""
+    """Index of the nearest entry by |e|² / 2 − r · e, half the squared distance up to a term of the row alone."""
     halves, columns = (entries * entries).sum(1) / 2, entries.T.contiguous()
     found = torch.empty(len(rows), dtype=torch.int64)
     step = max(_BLOCK // len(entries), 1)
@@ -161,7 +161,7 @@ def _nearest(rows: Float[Tensor, "n d"], entries: Float[Tensor, "m d"]) -> Int64
 def _means(
     rows: Float[Tensor, "n d"], weights: Float[Tensor, " n"], labels: Int64[Tensor, " n"], before: Float[Tensor, "k d"]
 ) -> Float[Tensor, "k d"]:
-    """Weighted means of the rows of each label; as before where there are none."""
+    """Weighted means of the rows of each label; unchanged for labels without rows."""
     mass, sums = (torch.zeros(shape, dtype=torch.float64) for shape in ((len(before), 1), before.shape))
     for start in range(0, len(rows), _ROWS_AT_ONCE):
         part = slice(start, start + _ROWS_AT_ONCE)
@@ -173,7 +173,7 @@ def _means(
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Matrix products on one thread: the same bits for any number."""
+    """Run torch on one thread: bit-identical for any number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""What is behind a scene, by viewing direction alone: a small panorama, and how a render is laid over it."""
+"""The backdrop of a scene by viewing direction alone: a small panorama, and compositing a render over it."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from splatpipe.pipeline.splat.archives import read_archive
 from splatpipe.pipeline.splat.sky_mask import directions, horizontal_axes
 from splatpipe.pipeline.splat.upload import rgb_beside, upload
 
-ROWS = 32  # from straight down to straight up, cells of 5.6°: gradients and large clouds, no building
+ROWS = 32  # from straight down to straight up, cells of 5.6°: gradients and large clouds, no buildings
 COLUMNS = 2 * ROWS
-FULL_FROM_DEG = -2.0  # over the horizon: there the panorama covers all, as the search for the sky allows
-NOTHING_UP_TO_DEG = -6.0  # below, it covers nothing: holes in the ground stay holes
-STEP_PX = 8  # a picture's directions are looked up so far apart and interpolated: a cell is wider than that
+FULL_FROM_DEG = -2.0  # elevation from which the panorama covers fully, the lowest that the sky search allows
+NOTHING_UP_TO_DEG = -6.0  # elevation up to which it covers nothing: holes in the ground stay holes
+STEP_PX = 8  # spacing of the nodes at which directions are looked up; a cell is wider than that
 LARGEST_FILE_BYTES = 1 << 20
 
 
 @dataclass
 class Panorama:
-    """Colours by elevation and azimuth; bilinear between the cells' centres.
+    """Colours by elevation and azimuth, interpolated bilinearly between the cells' centres.
 
     Attributes:
         up: The panorama's pole, a unit vector in the model's frame.
-        colours: Of the cells, row by row from straight down, 0..1; a leaf of autograd while it is trained.
+        colours: RGB of the cells, row by row from straight down, 0..1; an autograd leaf while it is trained.
     """
 
     up: Float64[np.ndarray, " 3"]
     colours: Float[Tensor, "cells 3"]
 
     def behind(self, camera: Camera, background: tuple[float, float, float]) -> Float[Tensor, "h w 3"]:
-        """What a camera sees where nothing is: the panorama, and below the horizon the background.
+        """What a camera sees behind the scene: the panorama, and below the horizon the background.
 
         Args:
             camera: The camera.
@@ -48,23 +48,23 @@ class Panorama:
         return self.look(camera).behind(self.colours, background)
 
     def look(self, camera: Camera) -> PanoramaView:
-        """Where a camera's nodes look, for colours of this panorama's cells."""
+        """The lookup of a camera's nodes in this panorama."""
         if self.colours.device.type == "cpu":
             return gather_view(camera, self.up, self.colours)
         return matrix_view(camera, self.up, self.colours)
 
     def at(self, rays: Float64[np.ndarray, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
-        """The colours in some directions of any length."""
+        """The colours along some directions, of any length."""
         return GatherLookup.of_rays(rays, self.up, self.colours).mixed(self.colours).reshape(rays.shape)
 
     def to(self, device: torch.device) -> Panorama:
-        """The same with its colours on a device; no leaf of autograd any more where they have to move."""
+        """The panorama with its colours on a device; they are no longer an autograd leaf if they had to be moved."""
         return Panorama(self.up, self.colours.to(device))
 
 
 @runtime_checkable
 class Lookup(Protocol):
-    """The cells that some directions mix, whatever the cells' colours are."""
+    """The cells and weights that some directions interpolate, independent of the cells' colours."""
 
     def mixed(self, colours: Float[Tensor, "cells 3"]) -> Float[Tensor, "n 3"]:
         """The directions' colours."""
@@ -72,12 +72,12 @@ class Lookup(Protocol):
 
 @dataclass(frozen=True)
 class PanoramaView:
-    """Where a camera's nodes look.
+    """The directions of a camera's nodes as a lookup in a panorama.
 
     Attributes:
         camera: The camera.
-        share: How much of what is behind is the panorama, (rows, columns, 1).
-        cells: What the nodes mix, row by row.
+        share: The panorama's share of the backdrop, (rows, columns, 1).
+        cells: The cells that the nodes interpolate, row by row.
     """
 
     camera: Camera
@@ -87,7 +87,7 @@ class PanoramaView:
     def behind(
         self, colours: Float[Tensor, "cells 3"], background: tuple[float, float, float]
     ) -> Float[Tensor, "h w 3"]:
-        """What the camera sees of some cells' colours, and below the horizon of the background."""
+        """What the camera sees behind the scene for given cell colours, with the background below the horizon."""
         return between_nodes(self.at_nodes(colours, background), self.camera.height, self.camera.width)
 
     def at_nodes(
@@ -101,18 +101,18 @@ class PanoramaView:
     def flat_at_nodes(
         self, colour: tuple[float, float, float], background: tuple[float, float, float]
     ) -> Float[Tensor, "rows columns 3"]:
-        """The same of cells of one colour."""
+        """The same for cells of a single colour."""
         everywhere, below = (rgb_beside(rgb, self.share) for rgb in (colour, background))
         return self.share * everywhere + (1.0 - self.share) * below
 
 
 @dataclass(frozen=True)
 class GatherLookup:
-    """Four cells a direction, fetched by their numbers: little work, for a CPU.
+    """Lookup of four cells per direction by index: little work, for a CPU.
 
     Attributes:
-        cells: (n, 4) numbers.
-        weights: (n, 4, 1).
+        cells: (n, 4) cell indices.
+        weights: (n, 4, 1) bilinear weights.
     """
 
     cells: Int64[Tensor, "n 4"]
@@ -120,7 +120,7 @@ class GatherLookup:
 
     @staticmethod
     def of_rays(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"], like: Tensor) -> GatherLookup:
-        """Those around some directions; weights in another tensor's type and on its device."""
+        """The lookup for some directions, with another tensor's dtype and device."""
         cells, weights = (torch.from_numpy(array).to(like.device) for array in cells_of(rays.reshape(-1, 3), up))
         return GatherLookup(cells, weights.to(like.dtype)[:, :, None])
 
@@ -131,8 +131,10 @@ class GatherLookup:
 
 @dataclass(frozen=True)
 class MatrixLookup:
-    """All cells with weights that are mostly zero, by products of matrices: their backward pass adds in a fixed order
-    on a GPU, too, where numbers that fetch would add in any or be sorted first.
+    """Lookup by matrix products over all cells, with mostly zero weights.
+
+    The backward pass of matrix products sums in a fixed order on a GPU as well; that of an index lookup sums in any
+    order, or has to sort first.
 
     Attributes:
         by_row: (n, ROWS) weights.
@@ -150,14 +152,14 @@ class MatrixLookup:
 
 
 def gather_view(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> PanoramaView:
-    """A camera's look at a panorama with that pole, in another tensor's type."""
+    """A camera's view of a panorama with the given pole, with another tensor's dtype."""
     nodes = directions(camera, STEP_PX)
     share = torch.from_numpy(cover(nodes, up)).to(like.dtype)[:, :, None]
     return PanoramaView(camera, share, GatherLookup.of_rays(nodes, up, like))
 
 
 def matrix_view(camera: Camera, up: Float64[np.ndarray, " 3"], like: Tensor) -> PanoramaView:
-    """The same, all of it made on the other tensor's device: the host does nothing that grows with the photo."""
+    """The same, computed on the other tensor's device: the host's work does not grow with the photo's size."""
     device, dtype = like.device, like.dtype
     east, north = horizontal_axes(up)
     axes = upload(torch.from_numpy(camera.cam_from_world[:3, :3] @ np.stack([east, north, up], axis=1)), device)
@@ -183,13 +185,13 @@ def composite_over(
     background: tuple[float, float, float],
     behind: Float[Tensor, "h w 3"],
 ) -> Float[Tensor, "h w 3"]:
-    """A render with something else behind it; differentiable by all tensors.
+    """Replace a render's background; differentiable with respect to all tensors.
 
     Args:
-        colour: Rendered over ``background``.
-        alpha: The render's.
-        background: What it has behind it.
-        behind: What takes its place.
+        colour: The render over ``background``.
+        alpha: The render's opacity.
+        background: The render's background colour.
+        behind: What replaces it.
     """
     return colour + (1.0 - alpha)[:, :, None] * (behind - rgb_beside(background, behind))
 
@@ -200,10 +202,10 @@ def between_nodes(
     """Interpolate bilinearly from nodes to every pixel.
 
     Args:
-        values: Of the nodes: one at every ``step``-th pixel of every ``step``-th row, from the first on.
-        height: Of the picture.
-        width: Of the picture.
-        step: Pixels from node to node.
+        values: Values at the nodes: every ``step``-th pixel of every ``step``-th row, from the first on.
+        height: Image height, pixels.
+        width: Image width, pixels.
+        step: Spacing of the nodes, pixels.
     """
     down, right = (
         _between(size, count, step, values) for size, count in ((height, values.shape[0]), (width, values.shape[1]))
@@ -214,7 +216,7 @@ def between_nodes(
 
 
 def cover(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"]) -> Float32[np.ndarray, "*shape"]:
-    """How much of what is behind a scene is the panorama: 1 above the horizon, 0 well below."""
+    """The panorama's share of the backdrop by direction: 1 above the horizon, 0 well below."""
     sine = rays @ up / np.linalg.norm(rays, axis=-1)
     elevation = np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
     share = (elevation - NOTHING_UP_TO_DEG) / (FULL_FROM_DEG - NOTHING_UP_TO_DEG)
@@ -224,7 +226,7 @@ def cover(rays: Float64[np.ndarray, "*shape 3"], up: Float64[np.ndarray, " 3"]) 
 def cells_of(
     rays: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"]
 ) -> tuple[Int64[np.ndarray, "n 4"], Float32[np.ndarray, "n 4"]]:
-    """The four cells around each direction, and their bilinear weights; around the poles there is one row only."""
+    """The four cells around each direction, and their bilinear weights; near the poles only one row."""
     east, north = horizontal_axes(up)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     row = (np.arcsin(np.clip(rays @ up, -1.0, 1.0)) / math.pi + 0.5) * ROWS - 0.5
@@ -249,7 +251,7 @@ def write_panorama(path: Path, panorama: Panorama | None) -> None:
 
 
 def read_panorama(path: Path) -> Panorama | None:
-    """Read ``write_panorama``'s file back; None where it says that there is none.
+    """Read a file of ``write_panorama``; None if it says that there is no panorama.
 
     Raises:
         StageError: if it is not such a file.
@@ -272,7 +274,7 @@ def panorama_of(up: np.ndarray, colours: np.ndarray) -> Panorama:
     """A panorama from a file's arrays.
 
     Raises:
-        ValueError: if they are not one's.
+        ValueError: if the arrays are not a panorama's.
     """
     if up.shape != (3,) or up.dtype != np.float64 or not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError("its pole is no direction")
@@ -282,7 +284,7 @@ def panorama_of(up: np.ndarray, colours: np.ndarray) -> Panorama:
 
 
 def nodes_along(size: int) -> int:
-    """How many nodes a side of a picture has: the last one is at its last pixel or a little outside."""
+    """Number of nodes along a side of an image: the last one is at its last pixel or slightly outside."""
     return -((1 - size) // STEP_PX) + 1
 
 

@@ -1,4 +1,4 @@
-"""Splats as PLY files in the layout of 3D Gaussian splatting, read from anybody and trusted from nobody.
+"""Splats as PLY files in the layout of 3D Gaussian splatting; input is never trusted.
 
 Layout: the reference implementation of "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (Kerbl et al.,
 SIGGRAPH 2023), which every trainer and viewer follows; PLY itself: G. Turk, "The PLY Polygon File Format" (1994).
@@ -26,9 +26,9 @@ MIP_COMMENT = "SplatRenderMode: mip"
 _CHUNK_ROWS = 65_536
 """Rows converted at a time: 16 MB of a degree 3 splat, so that a large file is not in memory twice."""
 _INFINITY_LOGIT = 20.0
-"""Stands for an opacity of exactly 1 (or 0), which some converters store as an infinite logit; float32 agrees."""
+"""Stands for an opacity of exactly 1 (or 0), which some converters store as an infinite logit; equal in float32."""
 _INFINITY_LOG_SCALE = -20.0
-"""Stands for a scale of exactly 0, which flat splats are stored with: 2e-9 units."""
+"""Stands for a scale of exactly 0, as stored in flat splats: 2e-9 units."""
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -40,7 +40,7 @@ _REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROTATION)
 
 @dataclass(frozen=True)
 class SplatHeader:
-    """What a splat PLY says about itself.
+    """The header of a splat PLY.
 
     Attributes:
         count: Number of Gaussians.
@@ -61,9 +61,9 @@ def write_splat(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) 
     """Write the exact 3DGS layout: binary little-endian float32, normals of zero, f_rest channel-major.
 
     Args:
-        path: The file; replaced if it is there.
-        gaussians: What to write, parameters as they are (logits, logarithms, (w, x, y, z)).
-        comments: Header comments, one line each; what is not ASCII is escaped.
+        path: The file; replaced if it exists.
+        gaussians: Gaussians to write, as raw parameters (logits, logarithms, (w, x, y, z)).
+        comments: Header comments, one line each; non-ASCII characters are escaped.
 
     Raises:
         ValueError: if a value is not finite, or a comment has a line break.
@@ -79,17 +79,17 @@ def write_splat(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) 
 def write_splat_parts(
     path: Path, parts: Iterable[Gaussians], count: int, sh_degree: int, comments: Sequence[str] = ()
 ) -> None:
-    """Write the bytes that ``write_splat`` writes of all parts one after another, of which none is kept.
+    """Write the same bytes as ``write_splat`` for the concatenated parts, without keeping any of them in memory.
 
     Args:
-        path: The file; replaced if it is there, and no splat where this fails.
-        parts: Asked for one by one.
-        count: Gaussians in all of them.
-        sh_degree: Of all of them.
-        comments: As of ``write_splat``.
+        path: The file; replaced if it exists, and not a valid splat if this fails.
+        parts: Consumed one by one.
+        count: Number of Gaussians in all parts.
+        sh_degree: SH degree of all parts.
+        comments: As for ``write_splat``.
 
     Raises:
-        ValueError: as ``write_splat``, or if the parts are not of this count or degree.
+        ValueError: as ``write_splat``, or if the parts do not have this count or degree.
         OSError: if the file cannot be written.
     """
     left = count
@@ -140,7 +140,7 @@ def property_names(sh_degree: int) -> list[str]:
 def read_splat(path: Path) -> Gaussians:
     """Read a splat by property name: any order, either byte order, float or double, with or without normals.
 
-    Infinite opacity logits and scales of zero, which converters write, become large finite ones.
+    Infinite opacity logits and log scales (scales of zero), which some converters write, become large finite values.
 
     Args:
         path: A binary PLY of SH degree 0..3.
@@ -149,7 +149,7 @@ def read_splat(path: Path) -> Gaussians:
         float32 Gaussians on the CPU.
 
     Raises:
-        SplatpipeError: if the file is missing, cut off, no splat, or has values that are not numbers.
+        SplatpipeError: if the file is missing, truncated, not a splat, or has values that are not numbers.
     """
     with open_file(path) as file:
         header = _read_header(path, file)
@@ -163,17 +163,17 @@ def read_splat(path: Path) -> Gaussians:
 
 
 def read_splat_header(path: Path) -> SplatHeader:
-    """Read and check only the header of a splat PLY, against the file's size too.
+    """Read only the header of a splat PLY, and check it, also against the file's size.
 
     Raises:
-        SplatpipeError: as ``read_splat``, but for the values.
+        SplatpipeError: as ``read_splat``, except for the values.
     """
     with open_file(path) as file:
         return _read_header(path, file)
 
 
 def _read_header(path: Path, file: BinaryIO) -> SplatHeader:
-    """Parse the header; leaves the file wherever it is."""
+    """Parse the header; the file position afterwards is unspecified."""
     header = read_ply_header(path, file)
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
@@ -184,7 +184,7 @@ def _read_header(path: Path, file: BinaryIO) -> SplatHeader:
 
 
 def _check_vertex(path: Path, vertex: PlyElement, has_chunks: bool) -> int:
-    """SH degree of a vertex element that is a splat's."""
+    """Check that a vertex element is a splat's; returns its SH degree."""
     kinds = dict(vertex.fields)
     if has_chunks and "packed_position" in kinds:
         raise SplatpipeError(

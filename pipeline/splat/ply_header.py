@@ -1,4 +1,4 @@
-"""The header of a PLY file: what elements it has and where, checked against the file's size.
+"""The header of a PLY file: its elements and their offsets, checked against the file's size.
 
 G. Turk, "The PLY Polygon File Format" (1994).
 """
@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 
 PLY_HINT = "Give a splat as trainers write it: a binary PLY with x, f_dc_0, opacity, scale_0, rot_0 and so on."
 _MAX_HEADER_BYTES = 65_536
-"""A degree 3 splat's header has 1.5 kB, and a record of ours less than 60,000: more is no header of a splat."""
+"""A degree 3 splat's header has 1.5 kB, and a record of ours less than 60,000 bytes: no splat's header has more."""
 _TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -36,7 +36,7 @@ _TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
-_NAMES = {"u1": "uchar", "u4": "uint", "f4": "float"}  # that we write
+_NAMES = {"u1": "uchar", "u4": "uint", "f4": "float"}  # the types that we write
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -46,9 +46,9 @@ class PlyElement:
 
     Attributes:
         name: ``vertex`` and so on.
-        count: Its rows.
-        fields: Names and numpy types of its properties, but for lists.
-        has_list: Whether one is a list, so that its rows are of no fixed length.
+        count: Number of rows.
+        fields: Names and numpy types of its properties, except lists.
+        has_list: Whether a property is a list, so that rows have no fixed length.
     """
 
     name: str
@@ -59,14 +59,14 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says it holds.
+    """The header of a PLY file.
 
     Attributes:
-        byte_order: As numpy writes it.
+        byte_order: In numpy's notation.
         comments: The comment lines' texts, in order.
-        elements: In the file's order, no name twice.
-        offset_bytes: Where the first one begins.
-        size_bytes: The file's.
+        elements: In the file's order, with unique names.
+        offset_bytes: Offset of the first element.
+        size_bytes: Size of the file.
     """
 
     byte_order: str
@@ -80,14 +80,14 @@ class PlyHeader:
         return np.dtype([(name, self.byte_order + kind) for name, kind in element.fields])
 
     def offset_of(self, path: Path, element: PlyElement) -> int:
-        """Where an element begins, all rows of which are there.
+        """Offset of an element in bytes, checked that all its rows are in the file.
 
         Args:
-            path: The file, for the error.
-            element: One of the header's, without lists.
+            path: The file, for the error message.
+            element: One of the header's elements, without lists.
 
         Raises:
-            SplatpipeError: if the file is too short, or has lists before it.
+            SplatpipeError: if the file is too short, or has lists before the element.
         """
         offset = self.offset_bytes
         for each in self.elements[: self.elements.index(element)]:
@@ -109,8 +109,8 @@ def ply_header_bytes(elements: Sequence[PlyElement], comments: Sequence[str]) ->
     """The header of a binary little-endian file.
 
     Args:
-        elements: In order; of bytes, 32-bit unsigned numbers and floats.
-        comments: One line each; what is not ASCII is escaped.
+        elements: In order, with uint8, uint32 and float32 properties.
+        comments: One line each; non-ASCII characters are escaped.
 
     Raises:
         ValueError: if a comment has a line break.
@@ -127,10 +127,10 @@ def ply_header_bytes(elements: Sequence[PlyElement], comments: Sequence[str]) ->
 
 
 def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
-    """Parse the header; leaves the file wherever it is.
+    """Parse the header; the file position afterwards is unspecified.
 
     Raises:
-        SplatpipeError: if it is no PLY's, or a text PLY's.
+        SplatpipeError: if the file is not a PLY, or a text PLY.
     """
     lines, offset = _header_lines(path, file)
     byte_order, comments, elements = _parse_lines(path, lines)
@@ -141,7 +141,7 @@ def _header_lines(path: Path, file: BinaryIO) -> tuple[list[str], int]:
     """The header's lines without its first and last, and the offset of the data."""
     try:
         start = file.read(_MAX_HEADER_BYTES)
-    except OSError as error:  # a folder opens on some systems and fails here
+    except OSError as error:  # on some systems a folder can be opened and fails here
         raise SplatpipeError(f"Cannot read {path}: {error.strerror}.", hint="Check the path.") from error
     if not re.match(rb"ply[ \t]*\r?\n", start):
         raise SplatpipeError(f"{path} is not a PLY file.", hint=PLY_HINT)

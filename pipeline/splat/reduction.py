@@ -1,4 +1,4 @@
-"""Fewer Gaussians that look the same: neighbours are merged, those most alike first."""
+"""Reduce the number of Gaussians by merging neighbours, the most similar first."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from splatpipe.pipeline.splat.moments import merge_pairs, moments_of, shares
 from splatpipe.pipeline.splat.morton import morton_keys
 
 NEIGHBOURS = 16
-"""Of each Gaussian that it may merge with: with 8, levels from where they are shown are 0.5 dB worse."""
+"""Merge candidates per Gaussian: with 8, levels of detail at their display distance are 0.5 dB worse."""
 ROUND_SHARE = 0.3
-"""Of the Gaussians, at most so many vanish in a round: the less, the nearer to always taking the very cheapest."""
+"""Largest share of the Gaussians removed per round: the smaller, the closer to always merging the cheapest pair."""
 LARGE_POWER = 0.1
-"""Power of the area, beside the median's, by which merging a large Gaussian costs more: a scene's few enormous ones
-fill whole pictures, and the many that are large only because they are far away are to merge nearly as others do."""
+"""Power of the area relative to the median's by which merging a large Gaussian costs more: a scene's few enormous ones
+fill whole images, while the many that are only large because they are far away should merge nearly like others."""
 PIECE = 200_000
-"""Gaussians looked at together: bounds the memory."""
+"""Gaussians processed together: bounds the memory."""
 _ROWS_AT_ONCE = 1 << 15
-_CROWD = 1e-9  # of the extent: keeps points at one place apart in the tree, which is slow of many of them else
+_CROWD = 1e-9  # of the extent: separates coincident points in the k-d tree, which would be slow with many
 _CROWD_SEED = 1
 _FLAT = 1e-3  # standard deviation of what is flat, as a share of the median of the largest ones
 _LOG_SCALE_LEAST = -30.0
@@ -36,13 +36,13 @@ _LOG_SCALE_LEAST = -30.0
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """What is left of Gaussians, and how far it stands from them.
+    """Reduced Gaussians, and how far the originals lie from them.
 
     Attributes:
-        gaussians: Those left, in the order of the first of what each stands for.
-        spreads: How far what each stands for lies from its centre, root mean square by mass, world units; 0 for one
-            that stands for itself.
-        counts: How many each stands for.
+        gaussians: The remaining Gaussians, each in the position of the first of those merged into it.
+        spreads: Mass-weighted RMS distance of the originals' centres from each one's centre, world units; 0 for an
+            unmerged Gaussian.
+        counts: How many originals each represents.
     """
 
     gaussians: Gaussians
@@ -51,12 +51,12 @@ class Reduction:
 
     @classmethod
     def none_yet(cls, gaussians: Gaussians) -> Reduction:
-        """All of them, each for itself."""
+        """All Gaussians, unmerged."""
         return cls(gaussians, np.zeros(len(gaussians)), np.ones(len(gaussians), dtype=np.int64))
 
     @classmethod
     def joined(cls, parts: Sequence[Reduction]) -> Reduction:
-        """One after another; all of one SH degree, at least one."""
+        """Concatenate at least one reduction, all of the same SH degree."""
         return cls(
             Gaussians.concat([part.gaussians for part in parts]),
             np.concatenate([part.spreads for part in parts]),
@@ -65,14 +65,14 @@ class Reduction:
 
 
 def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
-    """Merge neighbours until so many are left; each merge keeps mass, mean and covariance (``moments.merge_pairs``).
+    """Merge neighbours down to a count; each merge keeps mass, mean and covariance (``moments.merge_pairs``).
 
     Args:
-        gaussians: On the CPU. One with a NaN, or at infinity, is drawn by nobody: it goes first.
-        count: How many are to be left, at least 1.
+        gaussians: On the CPU. Those with a NaN, or at infinity, cannot be drawn and are removed first.
+        count: Number of Gaussians to keep, at least 1.
 
     Returns:
-        So many, or fewer where fewer can be drawn; the argument itself where it has no more.
+        ``count`` Gaussians, or fewer if fewer can be drawn; the argument itself if it has no more than ``count``.
 
     Raises:
         ValueError: if the count is less than 1.
@@ -83,11 +83,11 @@ def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
 
 
 def reduce_further(start: Reduction, count: int, large_power: float = LARGE_POWER) -> Reduction:
-    """``reduce_to`` of what stands for others already, without a copy.
+    """Like ``reduce_to`` for already reduced Gaussians, without a copy.
 
     Args:
-        start: Taken over where it has more: merged Gaussians take their place in it.
-        count: How many are to be left, at least 1.
+        start: Overwritten with merged Gaussians if it has more than ``count``.
+        count: Number of Gaussians to keep, at least 1.
         large_power: See ``LARGE_POWER``.
 
     Raises:
@@ -113,7 +113,7 @@ def reduce_further(start: Reduction, count: int, large_power: float = LARGE_POWE
 
 
 def _least_variance(gaussians: Gaussians, alive: Int64[np.ndarray, " n"]) -> float:
-    """Of what is flat, beside the median size of all; world units squared."""
+    """The variance below which an axis counts as flat, from the median size of all, world units squared."""
     if not len(alive):
         return 1.0
     largest = gaussians.log_scales[torch.from_numpy(alive)].amax(1).to(torch.float64)
@@ -121,7 +121,7 @@ def _least_variance(gaussians: Gaussians, alive: Int64[np.ndarray, " n"]) -> flo
 
 
 def _drawn(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
-    """Which are drawn: opacities of 0 and 1 and scales of 0 have infinite parameters, and are."""
+    """Which Gaussians can be drawn; infinite parameters for opacities of 0 and 1 and scales of 0 are valid."""
     fine = torch.ones(len(gaussians), dtype=torch.bool)
     for name in PARAMETERS:
         for first in range(0, len(gaussians), _ROWS_AT_ONCE):
@@ -144,7 +144,7 @@ def _cheapest_pairs(
     least_variance: float,
     large_power: float,
 ) -> Int64[np.ndarray, "m 2"]:
-    """Pairs without conflict, the cheapest of all pieces; at least one."""
+    """The cheapest disjoint pairs over all pieces; at least one."""
     found, costs = [], []
     for piece in _pieces(work.gaussians, alive, turn):
         part = work.gaussians.select(torch.from_numpy(piece))
@@ -156,7 +156,7 @@ def _cheapest_pairs(
 
 
 def _pieces(work: Gaussians, alive: Int64[np.ndarray, " n"], turn: int) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Parts of space with so many Gaussians each, cut elsewhere every other turn."""
+    """Parts of space with at most ``PIECE`` Gaussians, with different borders every other turn."""
     if len(alive) <= PIECE:
         yield alive
         return
@@ -165,7 +165,7 @@ def _pieces(work: Gaussians, alive: Int64[np.ndarray, " n"], turn: int) -> Itera
 
 
 def _along_a_curve(means: Float[Tensor, "n 3"], alive: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
-    """In the order of a Morton curve through nearly all of them."""
+    """Indices sorted along a Morton curve through nearly all Gaussians."""
     some = means[torch.from_numpy(alive[:: max(1, len(alive) // PIECE)])].to(torch.float64)
     low, high = (torch.from_numpy(corner) for corner in np.percentile(some.numpy(), [1.0, 99.0], axis=0))
     keys = np.empty(len(alive), np.int64)
@@ -179,7 +179,7 @@ def _along_a_curve(means: Float[Tensor, "n 3"], alive: Int64[np.ndarray, " m"]) 
 def _piece_pairs(
     piece: Gaussians, counts: Int64[np.ndarray, " n"], least_variance: float, large_power: float
 ) -> tuple[Int64[np.ndarray, "m 2"], Float64[np.ndarray, " m"]]:
-    """A matching of neighbours, and what each pair costs all that it stands for."""
+    """A matching of neighbours, and each pair's cost times the number of originals that it represents."""
     moments = moments_of(piece)
     edges = _neighbours(moments.means)
     colours = piece.sh.to(torch.float32).reshape(len(piece), -1).numpy()
@@ -191,7 +191,7 @@ def _piece_pairs(
 
 
 def _neighbours(means: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "e 2"]:
-    """Pairs of neighbours, the lower index first, in order; and a chain through all, which always has a matching."""
+    """Sorted pairs of neighbours, lower index first; includes a chain through all, so a matching always exists."""
     count = len(means)
     extent = float(np.ptp(means, axis=0).max()) or 1.0
     noise = np.random.default_rng(_CROWD_SEED).uniform(-1.0, 1.0, means.shape)
@@ -208,7 +208,7 @@ def _neighbours(means: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "e 2"]:
 
 
 def _merge_into_first(work: Reduction, pairs: Int64[np.ndarray, "m 2"]) -> None:
-    """Put each pair's merged Gaussian in its first one's place."""
+    """Replace each pair's first Gaussian with the merged one."""
     gaussians, spreads = work.gaussians, work.spreads
     for start in range(0, len(pairs), _ROWS_AT_ONCE):
         i, j = pairs[start : start + _ROWS_AT_ONCE].T
