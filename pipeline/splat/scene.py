@@ -1,4 +1,4 @@
-"""A splat as a file holds it: the Gaussians, which way is up, where it lies on the earth, and what was done to it."""
+"""The contents of a splat file: Gaussians, axes, position on the earth, and edit history."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torch import Tensor
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 Axes = Literal["z up", "y up", "y down"]
-"""``z up``: east, north, up (a survey's). ``y up``: east, up, south (glTF, SPZ). ``y down``: east, down, north, which
-viewers take a 3DGS PLY for (a COLMAP camera's habit)."""
+"""``z up``: east, north, up (surveying). ``y up``: east, up, south (glTF, SPZ). ``y down``: east, down, north, which
+viewers assume for a 3DGS PLY (a COLMAP camera's axes)."""
 
 FORMAT = 1
 MOST_RECORD_BYTES = 60_000  # of the record in a file: gzip's extra field holds 65,535
@@ -31,15 +31,15 @@ _Z_UP_FROM: Mapping[Axes, tuple[tuple[float, ...], ...]] = {
 
 @dataclass(frozen=True)
 class SplatOrigin:
-    """Where a splat's zero lies on the earth; its axes, turned to z up, are east, north, up there.
+    """Position of a splat's origin on the earth; its axes, turned to z up, are east, north, up there.
 
     Attributes:
         latitude: Degrees, WGS 84.
-        longitude: The same.
+        longitude: Degrees, WGS 84.
         height_m: In the vertical datum, metres.
         vertical_datum: ``ellipsoidal``, ``EPSG:n``, or ``unknown``.
-        crs: That coordinates are read out in, as ``survey.crs.parse_crs`` takes it; empty for the UTM zone.
-        approximate_crs: The user accepts it though a grid of it is missing.
+        crs: CRS for displayed coordinates, as accepted by ``survey.crs.parse_crs``; empty for the UTM zone.
+        approximate_crs: Whether the user accepts the CRS although one of its grids is missing.
     """
 
     latitude: float
@@ -52,14 +52,14 @@ class SplatOrigin:
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What a file says of its Gaussians.
+    """Metadata of a splat file.
 
     Attributes:
         axes: Which way is up.
-        antialias: Whether opacities allow for the blur on screen (Mip-Splatting).
+        antialias: Whether opacities account for the screen-space blur (Mip-Splatting).
         metres: Whether a unit is a metre.
-        place: Where it lies on the earth; None where nobody knows.
-        edits: What was done to it since it was trained, in order, each as JSON.
+        place: Position on the earth; None if unknown.
+        edits: Edits since training, in order, each as JSON.
     """
 
     axes: Axes = "z up"
@@ -69,10 +69,10 @@ class SceneFacts:
     edits: tuple[Mapping[str, Any], ...] = ()
 
     def record(self) -> str:
-        """One line of ASCII JSON, which files carry under the name ``splatpipe`` and ``facts_of_record`` reads.
+        """One line of ASCII JSON, stored in files under the name ``splatpipe``; ``facts_of_record`` reads it.
 
         Raises:
-            ValueError: if it is larger than a file may carry.
+            ValueError: if it is longer than ``MOST_RECORD_BYTES``.
         """
         text = json.dumps({"format": FORMAT, **asdict(self)}, separators=(",", ":"), allow_nan=False)
         if len(text) > MOST_RECORD_BYTES:
@@ -81,11 +81,11 @@ class SceneFacts:
 
 
 def facts_of_record(text: str | bytes | None, otherwise: SceneFacts) -> SceneFacts:
-    """What a file's record says; ``otherwise`` where there is none, or it is not one of ours: files come from anybody.
+    """Parse a file's record; returns ``otherwise`` if there is none or it is not a valid record of ours.
 
     Args:
-        text: The record.
-        otherwise: What the format means by itself.
+        text: The record, untrusted.
+        otherwise: The format's defaults.
     """
     if text is None or len(text) > MOST_RECORD_BYTES:
         return otherwise
@@ -103,7 +103,7 @@ def _facts(value: Mapping[str, Any]) -> SceneFacts:
         raise ValueError("edits")
     place = None if value["place"] is None else _place(value["place"])
     facts = SceneFacts(value["axes"], value["antialias"] is True, value["metres"] is True, place, tuple(edits))
-    facts.record()  # fails where it could not be written again: JSON reads 1e400 as infinity
+    facts.record()  # raises if it could not be written again: JSON reads 1e400 as infinity
     return facts
 
 
@@ -117,18 +117,18 @@ def _place(value: Mapping[str, Any]) -> SplatOrigin:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a splat file holds.
+    """The contents of a splat file.
 
     Attributes:
-        gaussians: On the CPU, float32, in the frame that ``facts.axes`` names.
-        facts: What it says of them.
+        gaussians: On the CPU, float32, in the frame given by ``facts.axes``.
+        facts: Metadata.
     """
 
     gaussians: Gaussians
     facts: SceneFacts = field(default_factory=SceneFacts)
 
     def turned(self, axes: Axes) -> Scene:
-        """The same with other axes; itself, to the bit, where they are these."""
+        """The scene turned to other axes; the scene itself if it has these already."""
         if axes == self.facts.axes:
             return self
         turn, nowhere = turn_of(axes, self.facts.axes), torch.zeros(3, dtype=torch.float64)
@@ -137,6 +137,6 @@ class Scene:
 
 
 def turn_of(axes: Axes, from_axes: Axes) -> Float64[Tensor, "3 3"]:
-    """Rotation to axes from other ones."""
+    """Rotation to ``axes`` from ``from_axes``."""
     matrices = {name: torch.tensor(rows, dtype=torch.float64) for name, rows in _Z_UP_FROM.items()}
     return matrices[axes].T @ matrices[from_axes]

@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, with the signs and the order of 3D Gaussian splatting.
+"""Real spherical harmonics (SH) up to degree 3, with the signs and the order of 3D Gaussian splatting.
 
 The basis is the one of "Efficient Spherical Harmonic Evaluation" (P.-P. Sloan, JCGT 2(2), 2013), its Condon-Shortley
 phase included, ordered by degree l, then m = -l..l: the order in which a splat PLY stores its coefficients.
@@ -30,18 +30,18 @@ _C3 = (
     math.sqrt(105.0 / (16.0 * math.pi)),
 )
 _OFFSET = 0.5
-"""3DGS stores colours about mid-grey."""
+"""3DGS stores colours relative to mid-grey."""
 _ROTATION_TOLERANCE = 1e-4
-"""What a rotation matrix rounded to float32 and multiplied a few times is still within."""
+"""Covers a rotation matrix rounded to float32 and multiplied a few times."""
 _ROUNDING = 1e-13
-"""What a weight of nothing may come out as."""
+"""Weights below this are zero up to rounding."""
 
 _CHUNK_ROWS = 8192
-"""Rows multiplied at a time: what one product needs stays in the cache."""
+"""Rows multiplied at a time: one product's data fit into the cache."""
 
 
 def coefficient_count(degree: int) -> int:
-    """Number of coefficients a channel up to and including a degree.
+    """Number of coefficients per channel up to and including a degree.
 
     Raises:
         ValueError: if the degree is not in 0..3.
@@ -92,11 +92,11 @@ def sh_basis(degree: int, dirs: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
 
 
 def eval_sh(degree: int, sh: Float[Tensor, "n k 3"], dirs: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Colour that each Gaussian shows along its direction, about zero: add 0.5 (and clamp at 0) for a colour.
+    """Evaluate each Gaussian's SH along its direction; add 0.5 (and clamp at 0) for a colour.
 
     Args:
-        degree: Bands up to this degree count; at most what ``sh`` holds.
-        sh: Coefficients; the first (degree + 1)² of the k are read.
+        degree: Highest degree to evaluate, at most that of ``sh``.
+        sh: Coefficients; the first (degree + 1)² of the k are used.
         dirs: Unit directions from the camera's centre to the Gaussians, world frame.
 
     Returns:
@@ -127,7 +127,7 @@ def rotate_sh(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Flo
         Rotated coefficients, in the dtype and on the device of ``sh``.
 
     Raises:
-        ValueError: if k is no (degree + 1)² of a degree in 0..3, or ``rotation`` is not a rotation.
+        ValueError: if k is not (degree + 1)² for a degree in 0..3, or ``rotation`` is not a rotation.
     """
     degree = math.isqrt(sh.shape[1]) - 1
     if coefficient_count(degree) != sh.shape[1]:
@@ -140,16 +140,16 @@ def rotate_sh(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Flo
     for band in range(1, degree + 1):
         columns = slice(band**2, (band + 1) ** 2)
         new_from_old = _least_squares(basis[:, columns], basis_back[:, columns])
-        new_from_old[new_from_old.abs() < _ROUNDING] = 0.0  # of quarter turns most are nothing, and not multiplied
+        new_from_old[new_from_old.abs() < _ROUNDING] = 0.0  # for quarter turns most weights are zero and are skipped
         result[:, columns] = multiply_rows(new_from_old, sh[:, columns])
     return result
 
 
 def _least_squares(a: Float[Tensor, "m k"], b: Float[Tensor, "m k"]) -> Float[Tensor, "k k"]:
-    """x that brings a @ x closest to b, by the normal equations and Gauss-Jordan elimination.
+    """Least-squares solution x of a @ x = b, by the normal equations and Gauss-Jordan elimination.
 
-    In Python's own arithmetic: MKL's solvers round differently with the alignment of their memory, and a weight of
-    ±1e-17 instead of nothing changes the sign of a zero in the file. The samples make the equations well conditioned.
+    Computed in plain Python: MKL's solvers round differently with memory alignment, and a weight of ±1e-17 instead of
+    zero changes the sign of a zero in the file. The samples make the equations well conditioned.
     """
     rows, targets = a.tolist(), b.tolist()
     count = a.shape[1]
@@ -168,7 +168,7 @@ def _least_squares(a: Float[Tensor, "m k"], b: Float[Tensor, "m k"]) -> Float[Te
 
 
 def multiply_rows(matrix: Float[Tensor, "i j"], rows: Float[Tensor, "n j ..."]) -> Float[Tensor, "n i ..."]:
-    """The matrix times every row, in the rows' dtype; the same bits for any number of threads, unlike a matmul."""
+    """The matrix times every row, in the rows' dtype; bit-identical for any number of threads, unlike a matmul."""
     result = rows.new_empty((rows.shape[0], matrix.shape[0], *rows.shape[2:]))
     for start in range(0, rows.shape[0], _CHUNK_ROWS):
         part = slice(start, start + _CHUNK_ROWS)
@@ -183,7 +183,7 @@ def multiply_rows(matrix: Float[Tensor, "i j"], rows: Float[Tensor, "n j ..."]) 
 
 
 def check_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """The rotation in float64 on the CPU.
+    """Check a rotation; returns it in float64 on the CPU.
 
     Raises:
         ValueError: if it is not orthonormal with determinant +1.
@@ -196,7 +196,7 @@ def check_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 
 
 def rgb_to_dc(rgb: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
-    """Constant-band coefficients that show a colour (0..1) from everywhere."""
+    """Constant-band coefficients of a view-independent colour (0..1)."""
     return (rgb - _OFFSET) / C0
 
 

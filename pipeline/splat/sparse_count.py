@@ -1,4 +1,4 @@
-"""How many of a start's Gaussians are those of sparse points: a line in its file's header, for they come first."""
+"""The number of initial Gaussians from sparse points, which come first in the file: a header comment."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ _NAME = "SparsePoints"
 
 
 def sparse_comment(count: int) -> str:
-    """The header comment that tells it.
+    """The header comment with the count.
 
     Args:
-        count: Gaussians of sparse points.
+        count: Number of Gaussians from sparse points.
     """
     return f"{_NAME}: {count}"
 
 
 def sparse_count(comments: Sequence[str], gaussians: int) -> int:
-    """How many the comments tell; all of them where they tell none: there is no telling them apart.
+    """Read the count from the comments; without one, all Gaussians count, as they cannot be told apart.
 
     Args:
-        comments: Of a splat's header.
-        gaussians: In the file.
+        comments: Comments of a splat's header.
+        gaussians: Number of Gaussians in the file.
     """
     told = [re.fullmatch(rf"{_NAME}: ([0-9]{{1,15}})", comment, re.ASCII) for comment in comments]
     counts = [int(match[1]) for match in told if match is not None]

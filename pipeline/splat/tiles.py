@@ -1,10 +1,10 @@
-"""3D Tiles 1.1 of a splat on the globe: a tileset of levels of detail, each tile glTF with SPZ inside, for CesiumJS.
+"""3D Tiles 1.1 of a georeferenced splat for CesiumJS: a tileset of LOD levels whose tiles are glTF with embedded SPZ.
 
 Specifications: OGC 22-025r4, "3D Tiles 1.1"; Khronos, "KHR_gaussian_splatting" and its
 "KHR_gaussian_splatting_compression_spz_2"; Esri's extension `ESRI_crs` (github.com/Esri/3D-tiles). What they leave open
-is as CesiumJS 1.145 takes it: the tileset names both glTF extensions as required, or its tiles are drawn as points; the
-scene's first node holds the splat and a matrix; the SPZ file's axes are the glTF's, y up, and no others; there is an
-attribute for each term of the harmonics but the constant one, which is COLOR_0, and none for opacities.
+follows CesiumJS 1.145: the tileset lists both glTF extensions as required, or its tiles are drawn as points; the
+scene's first node holds the splat and a matrix; the SPZ file must use the glTF's axes, y up; there is an attribute for
+each SH coefficient except the constant one, which is COLOR_0, and none for opacities.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ TILESET = "tileset.json"
 TILES = "tiles"
 GLTF_CONTENT = "3DTILES_content_gltf"
 ESRI_CRS = "ESRI_crs"
-_STEP_M = 0.001  # that boxes are rounded outwards to
-_LEAST_HALF_M = 0.001  # of a box's side: one of nothing has no inverse
-_TILE = re.compile(r"[0-9]+\.glb", re.ASCII)  # as they are called
+_STEP_M = 0.001  # to which boxes are rounded outwards
+_LEAST_HALF_M = 0.001  # half side of a box: a zero one has no inverse
+_TILE = re.compile(r"[0-9]+\.glb", re.ASCII)  # names of tiles
 _EXTENSIONS = [EXTENSION, SPZ_EXTENSION]
 
 
 @dataclass(frozen=True, eq=False)
 class EsriCrs:
-    """A projected CRS that programs of Esri show the tiles in, instead of on the globe.
+    """A projected CRS in which Esri software shows the tiles instead of on the globe.
 
     Attributes:
-        wkid: Well-known number: EPSG's, which Esri takes; None where it has none.
-        wkt: Its definition (WKT 2) where it has no number; else empty.
-        vertical_wkid: Of its heights; None where nobody knows, which Esri takes for heights above some geoid.
-        crs_from_local: From local metres, z up, to its units: the best affine map.
+        wkid: Well-known ID, the EPSG code that Esri accepts; None if there is none.
+        wkt: The definition (WKT 2) if there is no ID; else empty.
+        vertical_wkid: ID of the vertical CRS; None if unknown, which Esri interprets as heights above some geoid.
+        crs_from_local: Best-fitting affine map from local metres, z up, to the CRS's units.
     """
 
     wkid: int | None
@@ -62,20 +62,20 @@ def write_tiles(
     ecef_from_local: Float64[np.ndarray, "4 4"],
     esri_crs: EsriCrs | None = None,
 ) -> None:
-    """Write `tileset.json` and a tile for each node; the same bytes for the same levels.
+    """Write `tileset.json` and a tile for each node; deterministic.
 
-    Every tile has an origin of its own, so that SPZ's positions of 24 bits are within a millimetre in a site that is
+    Every tile has its own origin, so that SPZ's 24-bit positions are accurate to a millimetre in a site that is
     kilometres across.
 
     Args:
-        folder: Made if it is not there; tiles of an earlier one are replaced or taken away, its other files stay.
-        scene: What the levels are of; its facts go into the tileset.
-        root: Of its levels, in its frame.
-        ecef_from_local: Places the scene, turned to z up, on the earth (EPSG:4978), metres; rigid.
-        esri_crs: What the tiles are shown in by programs of Esri; None for the globe alone.
+        folder: Created if missing; tiles of an earlier tileset are replaced or deleted, other files stay.
+        scene: The scene of the levels; its metadata goes into the tileset.
+        root: Root of its levels of detail, in its frame.
+        ecef_from_local: Rigid transform of the scene, turned to z up, to earth-centred coordinates (EPSG:4978), metres.
+        esri_crs: CRS for Esri software; None for the globe only.
 
     Raises:
-        SplatpipeError: if the scene lies nowhere on the earth.
+        SplatpipeError: if the scene is not georeferenced.
         ValueError: if a value is not finite.
         OSError: if a file cannot be written.
     """
@@ -97,17 +97,17 @@ def write_tiles(
 
 
 def _drop_earlier(folder: Path, named: Set[str]) -> None:
-    """Take away tiles that no tileset names any more."""
+    """Delete tiles that the tileset no longer references."""
     for path in sorted((folder / TILES).iterdir()):
         if _TILE.fullmatch(path.name) and f"{TILES}/{path.name}" not in named:
             path.unlink()
 
 
 def refuse_nowhere(facts: SceneFacts) -> None:
-    """Tiles lie on the globe.
+    """Check that a scene is georeferenced, as tiles require.
 
     Raises:
-        SplatpipeError: if a scene lies nowhere on the earth.
+        SplatpipeError: if it is not.
     """
     if facts.place is None:
         raise SplatpipeError(
@@ -121,7 +121,7 @@ def box_z_up(box: Float64[np.ndarray, "2 3"], axes: Axes) -> Float64[np.ndarray,
 
     Args:
         box: Lowest and highest corner.
-        axes: Of the scene's frame.
+        axes: Axes of the scene's frame.
     """
     corners = box @ turn_of("z up", axes).numpy().T
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
@@ -145,7 +145,7 @@ def _tileset(tile: Mapping[str, Any], root: LevelNode, facts: SceneFacts, esri_c
 
 
 def _tile(node: LevelNode, names: Mapping[int, str], axes: Axes, esri_crs: EsriCrs | None) -> dict[str, Any]:
-    """A node and all below it, as the tileset states them: z up, whatever their glTF is."""
+    """The tileset's entry for a node and all below it: z up, unlike their glTF."""
     volume = {"box": _box(box_z_up(node.box, axes))}
     tile: dict[str, Any] = {"boundingVolume": volume, "geometricError": float(node.error), "refine": "REPLACE"}
     if id(node) in names:
@@ -158,7 +158,7 @@ def _tile(node: LevelNode, names: Mapping[int, str], axes: Axes, esri_crs: EsriC
 
 
 def _box(box: Float64[np.ndarray, "2 3"]) -> list[float]:
-    """Centre and half axes, the box rounded outwards."""
+    """Centre and half axes of the box, rounded outwards."""
     steps = np.stack([np.floor(box[0] / _STEP_M), np.ceil(box[1] / _STEP_M)])
     centre = np.round(steps.mean(axis=0) * _STEP_M, 6)
     half = np.round(np.maximum((steps[1] - steps[0]) * (_STEP_M / 2.0), _LEAST_HALF_M), 6)
@@ -170,7 +170,7 @@ def _column_major(matrix: Float64[np.ndarray, "4 4"]) -> list[float]:
 
 
 def _write_tile(path: Path, gaussians: Gaussians, facts: SceneFacts) -> None:
-    """Write glTF, y up, about its own origin, whose only data are an SPZ file of version 2."""
+    """Write a tile: glTF, y up, about its own origin, whose only data are an SPZ file of version 2."""
     turn = turn_of("y up", facts.axes)
     origin = np.rint((gaussians.means.amin(dim=0) + gaussians.means.amax(dim=0)).double().numpy() / 2.0)
     means = (gaussians.means.double() - torch.from_numpy(origin)).float()
@@ -188,7 +188,7 @@ def _write_tile(path: Path, gaussians: Gaussians, facts: SceneFacts) -> None:
 def _document(
     gaussians: Gaussians, matrix: Float64[np.ndarray, "4 4"], bounds: Float64[np.ndarray, "2 3"], spz_size: int
 ) -> dict[str, Any]:
-    """glTF's JSON: accessors without data, which the SPZ file fills."""
+    """The glTF JSON: accessors without data, which comes from the SPZ file."""
     kinds = {
         "POSITION": {"componentType": FLOAT, "type": "VEC3", "min": bounds[0].tolist(), "max": bounds[1].tolist()},
         "COLOR_0": {"componentType": UNSIGNED_BYTE, "type": "VEC4", "normalized": True},
