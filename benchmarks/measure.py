@@ -1,4 +1,4 @@
-"""What the benchmarks share: datasets of a size, cases in processes of their own, clocks of an iteration's parts."""
+"""Shared by the benchmarks: datasets of a given size, cases in their own processes, timers of an iteration's parts."""
 
 from __future__ import annotations
 
@@ -49,28 +49,28 @@ from splatpipe.pipeline.train.techniques import make_techniques
 from splatpipe.pipeline.train.windows import TrainingSize
 from splatpipe.stages import initialize
 
-PUBLISHED_ITERATIONS = 30_000  # the rates of a long run, so that the measured iterations hardly change the model
+PUBLISHED_ITERATIONS = 30_000  # learning rates of a long run, so the measured iterations hardly change the model
 PARTS = ("forward", "loss", "backward", "adam")
 
 
 @dataclass(frozen=True)
 class InitialSettings:
-    """How the points of a dataset become Gaussians.
+    """How the points of a dataset become initial Gaussians.
 
     Attributes:
-        options: Of `initialize`.
-        held_out: Names of photos that have no say in it.
+        options: Options of `initialize`.
+        held_out: Names of photos that must not influence it.
     """
 
     options: InitializeConfig
     held_out: tuple[str, ...] = ()
 
 
-DEFAULT_START = InitialSettings(InitializeConfig(dense=False))  # the sparse points alone fix the work
+DEFAULT_START = InitialSettings(InitializeConfig(dense=False))  # sparse points alone keep the workload fixed
 
 
 class SilentReporter:
-    """A stage's Reporter that tells nothing."""
+    """A stage's Reporter that discards everything."""
 
     def progress(self, done: float, total: float, what: str, unit: str = "") -> None: ...
     def metric(self, name: str, value: float, step: int | None = None) -> None: ...
@@ -80,17 +80,17 @@ class SilentReporter:
 
 @dataclass(frozen=True)
 class TimingCase:
-    """Training iterations to be timed, in a process of their own.
+    """Training iterations to be timed in a process of their own.
 
     Attributes:
         dataset: Folder with photos of the right size and their cameras.
-        splat: The Gaussians to start with.
-        threads: That compute.
-        repeats: Iterations that count.
+        splat: The initial Gaussians.
+        threads: Compute threads.
+        repeats: Number of measured iterations.
         warmup: Iterations before them; at least an epoch, so that every photo is decoded.
-        sh_degree: Of the Gaussians' colours, all of it from the first iteration that counts.
-        seed: Of the order of photos.
-        statistics: Collect what density control ranks by, as the first half of a training does.
+        sh_degree: SH degree, active in full from the first measured iteration.
+        seed: Seed of the order of photos.
+        statistics: Collect the statistics of density control, as the first half of a training does.
     """
 
     dataset: str
@@ -105,18 +105,18 @@ class TimingCase:
 
 @dataclass
 class IterationParts:
-    """Seconds that each part of an iteration took, one value an iteration.
+    """Seconds that each part of an iteration took, one value per iteration.
 
     Attributes:
-        wall_s: By the wall clock.
-        cpu_s: Of all threads.
+        wall_s: Wall-clock seconds.
+        cpu_s: CPU seconds of all threads.
     """
 
     wall_s: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in (*PARTS, "iteration")})
     cpu_s: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in (*PARTS, "iteration")})
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, its time kept under a name."""
+        """Return the function wrapped with a timer that records under a name."""
 
         @functools.wraps(function)
         def run(*arguments: Any, **options: Any) -> Any:
@@ -129,7 +129,7 @@ class IterationParts:
         return run
 
     def row(self) -> Row:
-        """Medians and shortest times; ``rest`` is what the parts leave of an iteration."""
+        """Return medians and minima; ``rest`` is the part of an iteration that no timer covers."""
         row: Row = {}
         for kind, times in (("wall", self.wall_s), ("cpu", self.cpu_s)):
             row[f"{kind}_s"] = statistics.median(times["iteration"])
@@ -143,7 +143,7 @@ class IterationParts:
 
 @contextlib.contextmanager
 def timed_parts(parts: IterationParts) -> Iterator[None]:
-    """Put a clock around the functions that ``iterate`` calls; they stay what they are."""
+    """Time the functions that ``iterate`` calls while the context lasts."""
     places = ((rasterizer, "render"), (iteration, "photo_loss"), (torch.Tensor, "backward"), (TrainState, "step"))
     with contextlib.ExitStack() as undo:
         for part, (owner, name) in zip(PARTS, places, strict=True):
@@ -154,9 +154,9 @@ def timed_parts(parts: IterationParts) -> Iterator[None]:
 
 
 def time_case(case: TimingCase) -> Row:
-    """Train a few iterations by training's own code, the number of Gaussians fixed, and take their times.
+    """Train a few iterations with training's own code at a fixed number of Gaussians, and return their times.
 
-    Memory is what the process takes at most above what it took with its libraries imported, which this call finds.
+    Memory is the process's peak above what it had with its libraries imported, as measured by this call.
     """
     before = restart_peak()
     config = TrainConfig(
@@ -213,20 +213,20 @@ def time_case(case: TimingCase) -> Row:
 
 
 def camera_of(views: Sequence[View], seed: int, number: int) -> Camera:
-    """Which view's turn it is in an iteration (from 1)."""
+    """Return the camera of the view used in an iteration (from 1)."""
     epoch, place = divmod(number - 1, len(views))
     return views[int(permutation(seed, epoch, len(views))[place])].camera
 
 
 def restart_peak() -> int:
-    """Let the kernel's record of this process's peak memory start anew, and return what it takes now, bytes."""
+    """Reset the kernel's record of this process's peak memory, and return its current memory, bytes."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     return peak_memory_bytes()
 
 
 def point_sets(data: Path) -> list[Path]:
-    """The sparse models of a dataset folder, each a folder with `0` in it: `sparse`, and others named after it."""
+    """List a dataset's sparse models, each a folder that contains `0`: `sparse`, and others named after it."""
     found = sorted(path.parent for path in data.glob("sparse*/0") if path.is_dir())
     if not found:
         raise SystemExit(f"{data} has no sparse/0.")
@@ -241,17 +241,17 @@ def prepare(
     photos: int | None = None,
     start: InitialSettings = DEFAULT_START,
 ) -> Path:
-    """Write a dataset's photos and cameras in another size, lossless, as training reads them.
+    """Write a dataset's photos and cameras at another size, lossless, in training's input format.
 
     Args:
         data: The dataset, undistorted.
-        points: Which of its sparse models, by the folder's name.
-        factor: On both sides of every photo.
-        folder: Where.
-        photos: Only so many, the first in name order; None for all.
+        points: Folder name of the sparse model to use.
+        factor: Scale factor of both sides of every photo.
+        folder: Output folder.
+        photos: Number of photos, the first in name order; None for all.
         start: How the points become Gaussians.
     """
-    whole = folder / "whole"  # the same under the names that the line has
+    whole = folder / "whole"  # the same under the pipeline's names
     whole.mkdir(parents=True)
     for link, target in ((IMAGES, IMAGES), ("masks", "masks"), ("sparse", points)):
         if (data / target).is_dir():
@@ -282,20 +282,20 @@ def prepare(
 
 
 def _write_png(path: Path, pixels: Any) -> None:
-    """Under whatever name: readers look at the content."""
+    """Write a PNG, whatever the file's name: readers go by content."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(".png", np.ascontiguousarray(pixels, np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     path.write_bytes(data.tobytes())
 
 
 def size_factor(data: Path, megapixels: float) -> float:
-    """What to multiply the sides of a dataset's first photo by for a size."""
+    """Return the scale factor of the sides that gives a dataset's first photo a size."""
     camera = load_views(data)[0].camera
     return float((1e6 * megapixels / (camera.width * camera.height)) ** 0.5)
 
 
 def parser(text: str | None) -> argparse.ArgumentParser:
-    """The options that all benchmarks have."""
+    """Return a parser with the options that all benchmarks share."""
     options = argparse.ArgumentParser(description=text)
     options.add_argument("--data", type=Path, help="a folder with images/ and sparse/0, undistorted (PINHOLE)")
     options.add_argument("--threads", type=int, default=os.cpu_count() or 1)
@@ -305,10 +305,10 @@ def parser(text: str | None) -> argparse.ArgumentParser:
 
 
 def parse(options: argparse.ArgumentParser) -> argparse.Namespace:
-    """Read the command line.
+    """Parse the command line.
 
     Raises:
-        SystemExit: if it makes no sense.
+        SystemExit: if it is invalid.
     """
     arguments = options.parse_args()
     if arguments.case is None and (arguments.data is None or not arguments.data.is_dir()):
@@ -323,10 +323,10 @@ def run_apart(command: Sequence[str], case: TimingCase) -> Row:
 
     Args:
         command: The script and its options.
-        case: Handed to it.
+        case: The case to pass.
 
     Raises:
-        SystemExit: if it fails; it has told why.
+        SystemExit: if it fails; the script has reported why.
     """
     text = json.dumps(asdict(case))
     done = subprocess.run([sys.executable, *command, "--case", text], stdout=subprocess.PIPE, text=True, check=False)
@@ -338,7 +338,7 @@ def run_apart(command: Sequence[str], case: TimingCase) -> Row:
 
 @contextlib.contextmanager
 def scratch() -> Iterator[Path]:
-    """A folder for the run's datasets."""
+    """Yield a folder for the run's datasets."""
     folder = Path(tempfile.mkdtemp(prefix="splatpipe-bench-"))
     try:
         yield folder
@@ -347,7 +347,7 @@ def scratch() -> Iterator[Path]:
 
 
 def machine(threads: int) -> Row:
-    """What the figures were measured on, with its ceilings."""
+    """Describe the machine that the figures were measured on, with its ceilings."""
     facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": rasterizer.isa_name(), "isas": _native.isas()}
     facts |= {"system": f"{platform.system()} {platform.release()}", "versions": versions()}
     facts["load_average"] = os.getloadavg()[0]  # of the minute before: well above 0, the machine was not idle
@@ -355,7 +355,7 @@ def machine(threads: int) -> Row:
 
 
 def cpu_model() -> str:
-    """The processor's name, as far as the system tells it."""
+    """Return the processor's name, if the system reports it."""
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -363,21 +363,21 @@ def cpu_model() -> str:
 
 
 def report(name: str, facts: Row, rows: Sequence[Row], columns: Mapping[str, str], path: Path | None) -> None:
-    """Print a table of the rows and write them all.
+    """Print a table of the rows and write all figures.
 
     Args:
-        name: Of the benchmark.
-        facts: Of the machine and the run.
+        name: Name of the benchmark.
+        facts: Facts about the machine and the run.
         rows: The figures.
         columns: As ``print_table`` takes them.
-        path: Of the JSON; None for none.
+        path: Path of the JSON; None for none.
     """
     print_table(name, rows, columns)
     write_figures(name, facts, rows, path)
 
 
 def write_figures(name: str, facts: Row, rows: Sequence[Row], path: Path | None) -> None:
-    """Print the facts that are one value, and write all of them and the rows where there is a path."""
+    """Print the facts that are single values; write all facts and rows if there is a path."""
     for fact, value in facts.items():
         if isinstance(value, str | int | float):
             console().print(f"{fact}: {value}", highlight=False)

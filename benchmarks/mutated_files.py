@@ -1,8 +1,9 @@
-"""Damaged files through every reader: ``mutated_files.py [--count 5000] [--formats spz,sog] [--samples FOLDER]``.
+"""Feed damaged files to every reader: ``mutated_files.py [--count 5000] [--formats spz,sog] [--samples FOLDER]``.
 
-Each file is made of a whole one by a seed; each is read in a process with little memory. Asked: no crash, none over 5 s
-or 500 MB, and no error but ours. What fails is told with its seed, and ``--save FOLDER`` keeps it. Further whole files,
-by others' writers, may lie in a folder: files or folders named ``FORMAT-anything``.
+Each file is derived from a valid one with a seed, and read in a process with limited memory. Required: no crash, none
+over 5 s or 500 MB, and no error but ours. Failures are reported with their seed; ``--save FOLDER`` keeps the files.
+``--samples`` names a folder with further valid files from third-party writers: files or folders named
+``FORMAT-anything``.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 
-SLOW_S = 5.0  # of the CPU
+SLOW_S = 5.0  # of CPU time
 WORKER = Path(__file__).with_name("read_worker.py")
-HANG_S = 60.0  # on the clock, of a machine that others use, too
+HANG_S = 60.0  # wall-clock time, on a shared machine
 MOST_BYTES = 500_000_000
-LARGEST_SAMPLE = 8 << 20  # a file that is larger is no sample: reading thousands of it takes hours
-BY_CONTENT = 4  # every so many-th file is to be recognised first
+LARGEST_SAMPLE = 8 << 20  # a larger file is not used as a sample: reading thousands of it takes hours
+BY_CONTENT = 4  # every n-th file must first be recognised by its content
 ENDS = ("read", "refused", "crashed", "unsound", "slow", "memory")
 COLUMNS = {
     "format": "format:",
@@ -49,12 +50,12 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Sample:
-    """A whole splat file, with what lies beside it.
+    """A valid splat file, with its accompanying files.
 
     Attributes:
-        splat_format: Of the registry.
-        main: What is given to the reader, below the folder; empty for the folder itself.
-        files: All that is there, by path below the folder.
+        splat_format: Format in the registry.
+        main: Path given to the reader, relative to the folder; empty for the folder itself.
+        files: All files, by path relative to the folder.
     """
 
     splat_format: SplatFormat
@@ -62,7 +63,7 @@ class Sample:
     files: dict[str, bytes]
 
     def write(self, folder: Path) -> Path:
-        """Put it into an empty folder; what to read."""
+        """Write it into an empty folder; return the path to read."""
         for name, data in self.files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)
@@ -71,14 +72,14 @@ class Sample:
 
 @dataclass(frozen=True)
 class Failure:
-    """A file that a reader did not bear.
+    """A file that a reader did not handle safely.
 
     Attributes:
-        splat_format: Its name.
-        seed: That makes the file again.
+        splat_format: Name of the format.
+        seed: Seed that reproduces the file.
         what: The damage.
         end: One of ``ENDS``.
-        detail: How it showed.
+        detail: How the reader failed.
     """
 
     splat_format: str
@@ -89,7 +90,7 @@ class Failure:
 
 
 def small_scene(count: int, degree: int) -> Scene:
-    """Random Gaussians with facts of every kind."""
+    """Return random Gaussians with metadata of every kind."""
     generator = torch.Generator().manual_seed(count)
     gaussians = Gaussians.empty(count, degree)
     gaussians.means = 10.0 * torch.randn(count, 3, generator=generator)
@@ -102,7 +103,7 @@ def small_scene(count: int, degree: int) -> Scene:
 
 
 def own_samples(splat_format: SplatFormat) -> list[Sample]:
-    """What our writer makes of small scenes."""
+    """Return our writer's output for small scenes."""
     found = []
     for count, degree in ((300, 3), (40, 1), (1, 0)):
         with tempfile.TemporaryDirectory() as folder:
@@ -114,7 +115,7 @@ def own_samples(splat_format: SplatFormat) -> list[Sample]:
 
 
 def foreign_samples(splat_format: SplatFormat, folder: Path) -> list[Sample]:
-    """Those of a folder that are named after a format."""
+    """Return the samples in a folder that are named after a format."""
     found = []
     for path in sorted(folder.glob(f"{splat_format.name}-*")):
         if path.is_dir():
@@ -131,7 +132,7 @@ def _sample(splat_format: SplatFormat, folder: Path, main: str) -> Sample:
 
 
 def damaged(samples: Sequence[Sample], seed: int) -> tuple[str, Sample]:
-    """What is done to one of a format's samples, and what becomes of it; the same for the same seed."""
+    """Return the damage done to one of a format's samples, and the result; the same for the same seed."""
     generator = np.random.default_rng([seed, zlib.crc32(samples[0].splat_format.name.encode())])
     sample = samples[generator.integers(len(samples))]
     others = samples[generator.integers(len(samples))].files
@@ -147,11 +148,11 @@ def damaged(samples: Sequence[Sample], seed: int) -> tuple[str, Sample]:
 
 
 class ReadProcess:
-    """A process that reads, started anew whenever one ends.
+    """A reading process, restarted whenever one ends.
 
     Args:
-        worker: Its script.
-        patience_s: On the clock, for an answer.
+        worker: Script of the process.
+        patience_s: Wall-clock seconds to wait for an answer.
     """
 
     def __init__(self, worker: Path = WORKER, patience_s: float = HANG_S) -> None:
@@ -159,7 +160,7 @@ class ReadProcess:
         self._process: subprocess.Popen[str] | None = None
 
     def read(self, splat_format: str, path: Path) -> dict[str, Any]:
-        """How reading a file ended; see ``read_worker``."""
+        """Return how reading a file ended; see ``read_worker``."""
         process = self._process or self._started()
         self._process = process
         assert process.stdin is not None and process.stdout is not None
@@ -179,7 +180,7 @@ class ReadProcess:
         return {"outcome": "crashed", "detail": detail, "cpu_s": 0.0, "peak_bytes": 0}
 
     def close(self) -> None:
-        """End it."""
+        """Terminate the process."""
         if self._process is not None:
             assert self._process.stdin is not None and self._process.stdout is not None
             self._process.kill()
@@ -198,7 +199,7 @@ class ReadProcess:
 
 
 def end_of(answer: dict[str, Any]) -> str:
-    """One of ``ENDS``."""
+    """Classify an answer as one of ``ENDS``."""
     if answer["outcome"] == "read" and answer["detail"]:
         return "unsound"
     if answer["outcome"] in ("read", "refused"):
@@ -213,10 +214,10 @@ def attack(samples: Sequence[Sample], seeds: Sequence[int], process: ReadProcess
     """Read a format's damaged files.
 
     Args:
-        samples: Whole files of one format, at least one.
-        seeds: A file each.
-        process: That reads.
-        save: A folder that keeps what fails; None to keep nothing.
+        samples: Valid files of one format, at least one.
+        seeds: One file is made from each.
+        process: The reading process.
+        save: Folder for the files that fail; None to keep nothing.
     """
     name = samples[0].splat_format.name
     found = Attack(name, Counter(), [], 0.0, 0)
@@ -238,14 +239,14 @@ def attack(samples: Sequence[Sample], seeds: Sequence[int], process: ReadProcess
 
 @dataclass
 class Attack:
-    """What a format's reader bore.
+    """Result of attacking a format's reader.
 
     Attributes:
-        splat_format: Its name.
-        ends: How many files ended how.
-        failures: Those that it did not bear.
-        longest_s: CPU seconds of the longest.
-        most_bytes: Taken over what was taken before.
+        splat_format: Name of the format.
+        ends: Number of files by how reading them ended.
+        failures: Files that the reader did not handle safely.
+        longest_s: CPU seconds of the slowest file.
+        most_bytes: Largest rise in memory.
     """
 
     splat_format: str
@@ -255,14 +256,14 @@ class Attack:
     most_bytes: int
 
     def row(self) -> Row:
-        """For the table."""
+        """Return a row for the table."""
         figures: Row = {"format": self.splat_format, "files": self.ends.total(), "longest_s": self.longest_s}
         figures |= {end: self.ends[end] for end in ENDS} | {"most_bytes": self.most_bytes}
         return figures | {"bars": "missed" if self.failures else "met"}
 
 
 def readable() -> Iterator[SplatFormat]:
-    """The formats that there are readers for."""
+    """Yield the formats that have a reader."""
     return (splat_format for splat_format in SPLAT_FORMATS if splat_format.reads)
 
 

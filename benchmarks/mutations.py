@@ -1,4 +1,4 @@
-"""Damage to files, each kind as it happens to them or as somebody would do it who means harm."""
+"""Damage to files, both accidental and malicious."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ ABSURD_JSON: tuple[Any, ...] = (
     *(0, -1, 2**31, 2**63, 10**30, 1e308, float("nan"), float("inf"), 0.5, None, True, "", "x" * 5000),
     *([], {}, [[]], [None] * 3, ["../../etc/passwd"], "../up.webp", "/dev/zero", "\0", {"a": {"b": []}}),
 )
-HEADER_BYTES = 96  # counts and lengths stand there
-TAIL_BYTES = 96  # a ZIP's directory ends there
-DEEPER = 0.75  # chance to open a container rather than to damage it from outside
-BOMBS = 0.006  # of all: unpacking one takes seconds
-TEXT_BYTES = 4096  # where a text header is looked for
+HEADER_BYTES = 96  # location of counts and lengths
+TAIL_BYTES = 96  # location of a ZIP's directory
+DEEPER = 0.75  # probability of damaging a container's content rather than its bytes
+BOMBS = 0.006  # share of all: unpacking one takes seconds
+TEXT_BYTES = 4096  # where text headers are searched
 
 Damage = Callable[[bytes, bytes, np.random.Generator], bytes]
 
@@ -56,7 +56,7 @@ def _splice(data: bytes, other: bytes, generator: np.random.Generator) -> bytes:
 
 
 def _put_number(data: bytes, _: bytes, generator: np.random.Generator) -> bytes:
-    """Absurd binary numbers, mostly where headers are; up to four of them."""
+    """Write up to four absurd binary numbers, mostly into headers."""
     found = bytearray(data)
     for _number in range(int(generator.integers(1, 5))):
         value = _absurd_bytes(generator)
@@ -84,7 +84,7 @@ def _absurd_bytes(generator: np.random.Generator) -> bytes:
 
 
 def _put_text_number(data: bytes, _: bytes, generator: np.random.Generator) -> bytes:
-    """Absurd numbers in a text header, or in JSON as text."""
+    """Write absurd numbers into a text header, or into JSON as text."""
     places = list(re.finditer(rb"-?[0-9][0-9.eE+-]*", data[:TEXT_BYTES]))
     if not places:
         return _put_number(data, b"", generator)
@@ -101,7 +101,7 @@ def _drop_or_double_line(data: bytes, _: bytes, generator: np.random.Generator) 
 
 
 def _change_json(data: bytes, _: bytes, generator: np.random.Generator) -> bytes:
-    """One to three nodes become absurd, disappear, or appear twice."""
+    """Make one to three nodes absurd, drop them, or duplicate them."""
     try:
         value = json.loads(data.rstrip(b"\0 "))
     except ValueError:
@@ -146,12 +146,12 @@ JSON: dict[str, Damage] = {"json changed": _change_json, "absurd text": _put_tex
 
 
 def mutated(data: bytes, other: bytes, generator: np.random.Generator) -> tuple[str, bytes]:
-    """A damaged copy of a file, and what was done to it.
+    """Return a damaged copy of a file, and a description of the damage.
 
     Args:
-        data: The whole file.
-        other: Another one, for splices.
-        generator: Decides everything: the same state, the same damage.
+        data: The complete file.
+        other: Another file, for splices.
+        generator: Decides everything: the same state gives the same damage.
     """
     if generator.random() < BOMBS:
         bomb = bomb_like(data, generator)

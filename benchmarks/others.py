@@ -1,4 +1,4 @@
-"""Others' programs that read and write splats, run by node: what `npm ci` in `benchmarks/readers` fetches."""
+"""Third-party programs that read and write splats, run by node and installed by `npm ci` in `benchmarks/readers`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts
 
 READERS = Path(__file__).resolve().parent / "readers"
 THEIR_AXES: Axes = "y down"
-"""What splat-transform takes a PLY for; SPZ and glTF, which are y up, it turns to that and back."""
+"""Axes that splat-transform assumes for a PLY; SPZ and glTF, which are y up, it converts to these and back."""
 _ENDINGS = {"compressed-ply": ".compressed.ply", "spz": ".spz", "sog": ".sog", "glb": ".glb", "ply": ".ply"}
 _OPTIONS = {"spz": ("--spz-version", "3"), "sog": ("-g", "cpu"), "streamed-sog": ("-g", "cpu")}
 
@@ -25,10 +25,10 @@ class ProgramEnd:
     """How a program ended.
 
     Attributes:
-        code: Its exit code.
-        said: On both outputs, together.
-        cpu_s: CPU seconds of it and its threads.
-        peak_bytes: Of its memory.
+        code: Exit code.
+        said: Standard output and error, together.
+        cpu_s: CPU seconds of the process and its threads.
+        peak_bytes: Peak memory.
     """
 
     code: int
@@ -39,22 +39,22 @@ class ProgramEnd:
 
 @dataclass(frozen=True)
 class OtherPrograms:
-    """Their programs.
+    """Installed third-party programs.
 
     Attributes:
-        folder: That has their `node_modules`.
-        node: 22 or newer.
+        folder: Folder with their `node_modules`.
+        node: Path of node, 22 or newer.
     """
 
     folder: Path = READERS
     node: Path = Path("node")
 
     def run(self, *arguments: str | Path, cwd: Path | None = None) -> ProgramEnd:
-        """Run node on a script with its arguments, in their folder or another."""
+        """Run node on a script with arguments, in the programs' folder or another."""
         return run_measured([self.node, *arguments], self.folder if cwd is None else cwd)
 
     def convert(self, source: Path, target: Path, *options: str) -> ProgramEnd:
-        """Convert by splat-transform.
+        """Convert with splat-transform.
 
         Raises:
             MachineError: if it fails.
@@ -74,21 +74,21 @@ class OtherPrograms:
         return name in (*_ENDINGS, "spz2", "model", "viewer-ply", "streamed-sog") and name != "glb"
 
     def write(self, name: str, source: Path, folder: Path) -> tuple[Path, ProgramEnd]:
-        """A PLY as splat-transform writes it in a format of ours.
+        """Convert a PLY with splat-transform to a format of ours.
 
         Args:
-            name: Of the format.
+            name: Name of the format.
             source: A PLY in their axes.
-            folder: Where to.
+            folder: Output folder.
         """
         target = folder / f"theirs{_ENDINGS[name]}"
         return target, self.convert(source, target, *_OPTIONS.get(name, ()))
 
     def read(self, path: Path) -> Scene:
-        """What splat-transform reads of a file; in the axes that it takes for its own.
+        """Read a file with splat-transform; the scene is in its axes.
 
         Raises:
-            SplatpipeError: if it cannot.
+            SplatpipeError: if it fails.
         """
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "read.ply"
@@ -97,10 +97,10 @@ class OtherPrograms:
 
 
 def find_others(folder: Path = READERS) -> OtherPrograms:
-    """The programs of a folder.
+    """Find the programs in a folder.
 
     Raises:
-        MachineError: if they, or node, are not there.
+        MachineError: if they, or node, are missing.
     """
     node = os.environ.get("NODE") or shutil.which("node") or _wheels_node()
     if not (folder / "node_modules/@playcanvas/splat-transform").is_dir() or node is None:
@@ -120,7 +120,7 @@ def _wheels_node() -> str | None:
 
 
 def run_measured(command: list[str | Path], cwd: Path) -> ProgramEnd:
-    """Run a command and count what it and its threads took."""
+    """Run a command and measure its CPU time and memory."""
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen([str(part) for part in command], cwd=cwd, stdout=said, stderr=said)
         _, status, used = os.wait4(process.pid, 0)

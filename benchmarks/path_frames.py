@@ -1,13 +1,15 @@
-"""Frames along a smooth path between a run's photos, to look at: ``path_frames.py OUT --frames 120 --save FOLDER``.
+"""Render frames along a smooth path between a run's photos: ``path_frames.py OUT --frames 120 --save FOLDER``.
 
-Rendered as `evaluate` does it, level, at the size of training, with the first photo's intrinsics. Leaves PNG frames,
-a contact sheet, and:
+Frames are rendered as `evaluate` does, level, at training size, with the first photo's intrinsics. Writes PNG frames, a
+contact sheet, and:
 
-- each frame's mean luminance and the step from the frame before, in 8-bit steps as all here;
-- the same places in consecutive frames, found through the median depths of both: the median difference of their colours
-  (with that of resampling), and of their luminance with its sign, in which texture cancels: a change of exposure;
-- the share of a frame that is nearer than half the depth of the nearest sparse points of the two photos around, as the
-  frame would see them: something hangs before the camera. And the frame's median depth over those photos' smaller one.
+- each frame's mean luminance and its change from the previous frame, in 8-bit steps like all colours here;
+    - for the same places in consecutive frames, matched by the median depths of both: the median colour difference
+    (including that of resampling), and the signed median luminance difference, in which texture cancels: a change of
+    exposure;
+    - the share of a frame nearer than half the depth of the nearest sparse points of the two neighbouring photos, as
+    seen from the frame: something floats in front of the camera; and the frame's median depth over the smaller one of
+    those photos.
 """
 
 from __future__ import annotations
@@ -46,11 +48,11 @@ from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.consistency import AGREEMENT
 
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, of coded values
-EVERY_PX = 3  # places of a frame that are followed into the next, both ways
+EVERY_PX = 3  # spacing of the pixels that are followed into the next frame, both ways
 NEAREST = 0.02  # quantile of the sparse points' depths: a few points are wrong
-IN_THE_AIR = 0.5  # of the nearest points' depth: the sparse cloud has holes, but not so deep
-LARGEST_IN_THE_AIR = 0.01  # of a frame: more of it counts as a floater that crosses
-MUCH_NEARER = 0.7  # of the smaller median depth of the two photos around
+IN_THE_AIR = 0.5  # of the nearest points' depth: the sparse cloud has holes, but none so deep
+LARGEST_IN_THE_AIR = 0.01  # share of a frame: more counts as a crossing floater
+MUCH_NEARER = 0.7  # times the smaller median depth of the two neighbouring photos
 SHEET_COLUMNS, SHEET_FRAMES, SHEET_WIDTH = 6, 48, 300
 FPS = 25
 SHOWN = 8  # frames in the table; all are in the JSON
@@ -73,7 +75,7 @@ Depth = Float[np.ndarray, "h w"]
 
 @dataclass(frozen=True, eq=False)
 class PathFrame:
-    """A camera, its render, and the median depth of that."""
+    """A camera, its render, and the render's median depth."""
 
     camera: Camera
     pixels: Pixels
@@ -83,7 +85,7 @@ class PathFrame:
 def same_places(
     camera: Camera, depth: Depth, following: Camera, following_depth: Depth
 ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
-    """Pixels of a frame and of the next that show the same places, by the median depths of both."""
+    """Return pixels of a frame and of the next that show the same places, by the median depths of both."""
     rows, columns = (part.ravel() for part in np.mgrid[1 : camera.height : EVERY_PX, 1 : camera.width : EVERY_PX])
     z = depth[rows, columns].astype(np.float64)
     here = np.stack([columns + 0.5, rows + 0.5], axis=1)[z > 0.0]
@@ -100,13 +102,13 @@ def same_places(
 
 
 def change(frame: PathFrame, following: PathFrame) -> Row:
-    """What changes from a frame to the next in the places that both show; 8-bit steps."""
+    """Return the changes between two frames in the places that both show; 8-bit steps."""
     here, there = same_places(frame.camera, frame.depth, following.camera, following.depth)
     if len(here) == 0:
         return {"places": 0}
     column, row = here.astype(np.int64).T
     x, y = (part.astype(np.float32) - np.float32(0.5) for part in there.T)
-    shape = (-(-len(x) // 1024), 1024)  # OpenCV takes maps of fewer than 32,768 rows
+    shape = (-(-len(x) // 1024), 1024)  # OpenCV accepts maps of fewer than 32,768 rows
     sampled = cv2.remap(following.pixels, np.resize(x, shape), np.resize(y, shape), cv2.INTER_LINEAR)
     colours = sampled.reshape(-1, 3)[: len(x)]
     step = colours.astype(np.float64) - frame.pixels[row, column]
@@ -118,7 +120,7 @@ def change(frame: PathFrame, following: PathFrame) -> Row:
 
 
 class SceneClearance:
-    """What the photos say of how near things are."""
+    """Distances to the nearest scene content, according to the photos."""
 
     def __init__(self, run: OpenedRun, cameras: Sequence[Camera]) -> None:
         points, tracks = load_points_and_tracks(run.parts["undistort.dataset"].path)
@@ -126,7 +128,7 @@ class SceneClearance:
         self.medians = [_median(run.median_depth(camera)) for camera in cameras]
 
     def look(self, frame: PathFrame, index: int) -> Row:
-        """How near a frame's things are, between photo ``index`` and the next."""
+        """Return how near a frame's content is, between photo ``index`` and the next."""
         points = np.vstack(self.seen[index : index + 2])
         _, _, z = frame.camera.in_view(points)
         limit = IN_THE_AIR * float(np.quantile(z, NEAREST)) if z.size else 0.0
@@ -144,15 +146,15 @@ def _median(depth: Depth) -> float | None:
 
 
 def path(capture: PhotoTrack, cameras: Sequence[Camera], frames: int) -> list[tuple[float, Camera]]:
-    """Cameras along a smooth way through all of some, level, with the first one's intrinsics.
+    """Return cameras along a smooth, level path through given cameras, with the first one's intrinsics.
 
     Args:
-        capture: That they are of.
-        cameras: In the order of the way, at least two, not all in one place.
+        capture: Capture that the cameras belong to.
+        cameras: Cameras in path order, at least two, not all in one place.
         frames: At least two.
 
     Returns:
-        How far along each is, in cameras from the first, and the camera.
+        Each frame's position along the path, counted in cameras from the first, and its camera.
     """
     distance = followed_photos(capture)[1]
     route = upright_route(cameras, capture.up)
@@ -167,7 +169,7 @@ def path(capture: PhotoTrack, cameras: Sequence[Camera], frames: int) -> list[tu
 
 
 def nearest_first(cameras: Sequence[Camera]) -> list[Camera]:
-    """From the first on, always to the nearest that is left."""
+    """Order cameras from the first, always continuing with the nearest remaining one."""
     ordered, left = [cameras[0]], list(cameras[1:])
     while left:
         here = ordered[-1].centre()
@@ -176,7 +178,7 @@ def nearest_first(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder: Path) -> list[Row]:
-    """Render and write the frames and their contact sheet; a row a frame."""
+    """Render and write the frames and their contact sheet; return a row per frame."""
     capture = open_scene({name: part.path for name, part in run.parts.items()}, 1, cpu()).capture
     surroundings = SceneClearance(run, cameras)
     rows: list[Row] = []
@@ -202,7 +204,7 @@ def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder:
 
 
 def summary(rows: Sequence[Row]) -> Row:
-    """What a path's rows come to."""
+    """Summarise a path's rows."""
     followed = [row for row in rows if row.get("places")]
     crossing = [
         row["frame"]
@@ -232,7 +234,7 @@ def main() -> None:
         options.error("a path has two frames at least")
     try:
         run = open_run(arguments.out)
-        cameras = [run.camera(view) for view in run.views]  # in name order: that of the flight
+        cameras = [run.camera(view) for view in run.views]  # in name order, i.e. flight order
         if arguments.order == "nearest":
             cameras = nearest_first(cameras)
         arguments.save.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Floaters planted into a run's model, and how many the cleaner finds: ``planted_floaters.py OUT [--seed 19]``.
+"""Plant floaters into a run's model, and count how many the cleaner finds: ``planted_floaters.py OUT [--seed 19]``.
 
-The rule of planting is `floater_planting.py`'s and not the cleaner's. Asked: 95 % found, of each kind; at most 0.5 % of
-the building lost, by count, where photos see a surface; and the trained model, cleaned, shows photos that were held out
-as before, to 0.05 dB of psnr_cc.
+The planting rule is that of `floater_planting.py`, not the cleaner's. Required: 95 % found, of each kind; at most 0.5 %
+of the building's Gaussians lost, where photos see a surface; and the cleaned trained model reproduces the held-out
+photos as before, within 0.05 dB of psnr_cc.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.metrics import psnr, psnr_cc
 
 ASKED_FOUND, MOST_LOST, MOST_WORSE_DB = 0.95, 0.005, 0.05
-DEPTH_MEGAPIXELS = 0.07  # of the pictures that say where surfaces are
+DEPTH_MEGAPIXELS = 0.07  # of the renders that locate surfaces
 
 KIND_COLUMNS = {"kind": "kind:", "planted": "planted:,", "found": "found:,", "share": "share:.4f", "bars": "bars:"}
 LOSS_COLUMNS = {
@@ -52,7 +52,7 @@ PICTURE_COLUMNS = {
 
 
 def photos_of(run: OpenedRun) -> TrainingPhotos:
-    """What the cleaner is told: the photos of the training, and none that was held out."""
+    """Return the photos passed to the cleaner: those of the training, none that was held out."""
     views = [view for view in run.views if view.camera.name not in run.held_out]
 
     def picture(index: int) -> tuple[Pixels, Mask | None]:
@@ -63,12 +63,12 @@ def photos_of(run: OpenedRun) -> TrainingPhotos:
 
 
 def kept_by_cleaner(model: Gaussians, photos: TrainingPhotos | None) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians the cleaner leaves."""
+    """Return which Gaussians the cleaner keeps."""
     return np.asarray(clean_scene(model, photos).keep.numpy())
 
 
 def kind_rows(planted: FloaterScene, kept: Bool[np.ndarray, " n"]) -> list[Row]:
-    """How many of each kind were taken away, and of all."""
+    """Return a row per kind and one for all: how many floaters were removed."""
     gone = ~kept[planted.trained :]
     rows = []
     for number, kind in enumerate((*KINDS, "all")):
@@ -80,7 +80,7 @@ def kind_rows(planted: FloaterScene, kept: Bool[np.ndarray, " n"]) -> list[Row]:
 
 
 def loss_row(planted: FloaterScene, kept: Bool[np.ndarray, " n"], model: str) -> Row:
-    """What was lost of the trained model."""
+    """Return how much of the trained model was lost."""
     gone = ~kept[: planted.trained]
     lost = float(gone[planted.building].mean())
     row: Row = {"model": model, "gaussians": planted.trained, "taken": int(gone.sum()), "lost": lost}
@@ -88,7 +88,7 @@ def loss_row(planted: FloaterScene, kept: Bool[np.ndarray, " n"], model: str) ->
 
 
 def picture_rows(run: OpenedRun, models: dict[str, Model]) -> list[Row]:
-    """Likeness of each held-out photo to renders of all models."""
+    """Compare each held-out photo with renders of all models."""
     rows = []
     for view in run.views:
         if view.camera.name not in run.held_out:

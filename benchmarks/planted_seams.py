@@ -1,4 +1,4 @@
-"""Seams as bad merges leave them, planted into a splat that has none: what a detector of seams is held against."""
+"""Plant seams, as left by bad merges, into a seamless splat, to test the seam detector."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import C0
 
-STRIP = 20.0  # of a doubled wall, in pixels: what two blocks overlap in when margins are kept
+STRIP = 20.0  # width of a doubled wall, pixels: the overlap of two blocks whose margins are kept
 
 
 def gap(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, width: float) -> Gaussians:
-    """Without the Gaussians whose centres lie near a border.
+    """Remove the Gaussians whose centres lie near a border.
 
     Args:
         gaussians: The splat.
-        plan: The ground's.
+        plan: The ground plan.
         line: The border.
-        width: Of what is empty, world units.
+        width: Width of the gap, world units.
     """
     return gaussians.select(torch.from_numpy(~_near(gaussians, plan, line, width / 2.0)))
 
 
 def doubled(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, rise: float, strip: float) -> Gaussians:
-    """With those near a border there twice, once of them higher.
+    """Duplicate the Gaussians near a border, the copies higher.
 
     Args:
         gaussians: The splat.
-        plan: The ground's.
+        plan: The ground plan.
         line: The border.
-        rise: Of the second surface above the first, world units.
-        strip: How wide that is, world units.
+        rise: Height of the second surface above the first, world units.
+        strip: Width of the strip, world units.
     """
     again = gaussians.select(torch.from_numpy(_near(gaussians, plan, line, strip / 2.0)))
     up = torch.from_numpy(rise * plan.up).to(again.means)
@@ -43,13 +43,13 @@ def doubled(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, rise: float,
 
 
 def colour_step(gaussians: Gaussians, plan: GroundPlan, line: PlanLine, step: float) -> Gaussians:
-    """With all on the left of a border, as far as it goes, brighter.
+    """Brighten all Gaussians to the left of a border, along its length.
 
     Args:
         gaussians: The splat.
-        plan: The ground's.
+        plan: The ground plan.
         line: The border.
-        step: Of the colour, 0 to 1.
+        step: Change of the colour, 0 to 1.
     """
     places = plan.places(gaussians.means.double().numpy())
     along = line.along(places)

@@ -1,8 +1,8 @@
-"""A Poisson surface of a cloud, to compare the mesh with: ``poisson_mesh.py cloud.laz OUT``; takes the extra ``mesh``.
+"""Build a cloud's Poisson surface, to compare meshes: ``poisson_mesh.py cloud.laz OUT``; needs the extra ``mesh``.
 
-Screened Poisson reconstruction (Kazhdan and Hoppe 2013) by open3d, of the cloud's own normals, about the cloud's
-middle; what lies far from any point is cut away, as everybody who uses it does. ``OUT/mesh.ply`` is in the truth's
-metres, so that ``surface_truth.py OUT`` measures it.
+Screened Poisson reconstruction (Kazhdan and Hoppe 2013) by open3d, from the cloud's own normals, relative to the
+cloud's centre; parts far from any point are trimmed, as is usual. ``OUT/mesh.ply`` is in the truth's metres, so
+``surface_truth.py OUT`` can measure it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from surface_truth import CRS
 from splatpipe.pipeline.surface.tsdf import open3d
 
 Points = Float64[np.ndarray, "n 3"]
-SPARSEST = 0.02  # of the vertices, those with the fewest points around: the skin that Poisson spans over holes
+SPARSEST = 0.02  # share of the vertices, those with the lowest density: the skin that Poisson spans over holes
 
 
 def poisson_mesh(points: Points, normals: Points, cell_m: float) -> tuple[Points, Int64[np.ndarray, "m 3"]]:
-    """Vertices and triangles.
+    """Return vertices and triangles of the Poisson surface.
 
     Args:
-        points: Any frame, metres.
-        normals: Of unit length.
+        points: Points in any frame, metres.
+        normals: Unit normals.
         cell_m: Side of the finest cells.
     """
     o3d = open3d()

@@ -1,11 +1,11 @@
-"""Positions that are poor, on the demo's cameras: ``poor_positions.py [--run OUT] [--seeds 50]``.
+"""Georeference the demo's cameras with poor positions: ``poor_positions.py [--run OUT] [--seeds 50]``.
 
-The true positions with errors of a known kind, drawn anew for each seed, go through georef as photos' positions of
-stated 3 m (5 m in height); the frame that comes out is held against the truth. For offset (of the cameras' middle),
-north, up (angle between the two verticals) and scale: in how many of the placed seeds the truth lies within the stated
-95 %, and the median of the stated standard deviations over the root mean square of the errors. Refused are frames whose
-scale is known worse than 20 % or a direction worse than 15°. With a run of the demo its sparse model is used, else the
-true cameras.
+The true positions with errors of a known kind, drawn anew for each seed, go through georef as photo positions with a
+stated accuracy of 3 m (5 m in height); the resulting frame is compared with the truth. For offset (of the cameras'
+centroid), north, up (angle between the two verticals) and scale: in how many of the georeferenced seeds the truth lies
+within the stated 95 % interval, and the median of the stated standard deviations over the RMS error. Frames whose scale
+is known worse than 20 % or a direction worse than 15° are rejected. With a run of the demo its sparse model is used,
+otherwise the true cameras.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ class PositionError:
     """A kind of error.
 
     Attributes:
-        name: In the table.
-        noise_m: Standard deviations of east, north, up.
-        correlation: Of a position's error with the one's before.
-        common_m: Standard deviations of what all positions are off together.
-        wrong: How many are off by 500 m besides.
-        gimbal_deg: What the gimbal's angles are off by about each axis; None for photos without angles.
-        photos: From and to which, in name order.
+        name: Name in the table.
+        noise_m: Standard deviations in east, north, up.
+        correlation: Correlation of consecutive positions' errors.
+        common_m: Standard deviations of the error common to all positions.
+        wrong: Number of positions with an additional error of 500 m.
+        gimbal_deg: Error of the gimbal angles about each axis; None for photos without angles.
+        photos: First and last photo, in name order.
     """
 
     name: str
@@ -82,7 +82,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class SimulatedCameras:
-    """The cameras: in the model, and truly."""
+    """The cameras: poses in the model, and true poses."""
 
     model: SparseModel
     world_from_model: Similarity
@@ -91,7 +91,7 @@ class SimulatedCameras:
 
 
 def true_scene(run: Path | None) -> SimulatedCameras:
-    """The demo's cameras, from a run's sparse model or their truth."""
+    """Load the demo's cameras, from a run's sparse model or from their truth."""
     truth = {photo["name"]: photo for photo in TRUTH["photos"]}
     centres = np.array([photo["centre_m"] for photo in truth.values()])
     turns = np.array([np.array(photo["cam_from_world"])[:3, :3] for photo in truth.values()])
@@ -111,7 +111,7 @@ def true_scene(run: Path | None) -> SimulatedCameras:
 
 
 def only(scene: SimulatedCameras, between: tuple[int, int]) -> SimulatedCameras:
-    """Some of the cameras."""
+    """Select some of the cameras."""
     model, photos = scene.model, slice(*between)
     part = SparseModel(
         model.names[photos],
@@ -125,7 +125,7 @@ def only(scene: SimulatedCameras, between: tuple[int, int]) -> SimulatedCameras:
 
 
 def stated(scene: SimulatedCameras, case: PositionError, seed: int) -> tuple[Positions, list[str]]:
-    """Positions with errors, and which of them are wrong."""
+    """Return positions with errors, and the names of the grossly wrong ones."""
     rng = np.random.default_rng(seed)
     count = len(scene.centres)
     errors = rng.normal(size=(count, 3))
@@ -148,7 +148,7 @@ def stated(scene: SimulatedCameras, case: PositionError, seed: int) -> tuple[Pos
 
 
 def gimbal_angles(enu_from_cam: Float64[np.ndarray, "3 3"]) -> dict[str, float]:
-    """Yaw, pitch and roll of a camera."""
+    """Return a camera's yaw, pitch and roll."""
     right, _, forward = enu_from_cam.T
     pitch = math.asin(float(np.clip(forward[2], -1.0, 1.0)))
     yaw = math.atan2(forward[0], forward[1])
@@ -158,7 +158,7 @@ def gimbal_angles(enu_from_cam: Float64[np.ndarray, "3 3"]) -> dict[str, float]:
 
 
 def errors_of(frame: Frame, scene: SimulatedCameras) -> Float64[np.ndarray, " 6"]:
-    """East, north, height of the cameras' middle; heading and up in degrees; scale in per cent."""
+    """Return the errors: east, north, height of the cameras' centroid; heading and up in degrees; scale in per cent."""
     assert frame.origin is not None
     placed = PLACE.enu_from_geodetic(frame.origin.geodetic_from_enu(frame.world_from_model.apply(scene.model.centres)))
     off = placed.mean(axis=0) - scene.centres.mean(axis=0)
@@ -170,7 +170,7 @@ def errors_of(frame: Frame, scene: SimulatedCameras) -> Float64[np.ndarray, " 6"
 
 
 def row_of(scene: SimulatedCameras, case: PositionError, seeds: int) -> Row:
-    """A case: how many were placed, how often the truth lies within what was stated, and how right the sigmas are."""
+    """Return a case's row: number georeferenced, coverage of the stated intervals, and accuracy of the sigmas."""
     part = only(scene, case.photos)
     photos: dict[str, Photo] = {}
     errors, sigmas, within, named = [], [], [], 0

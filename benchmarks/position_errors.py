@@ -1,4 +1,4 @@
-"""How far a format moves Gaussians, beside the step that it stores positions in."""
+"""Measure how far a format moves Gaussians, relative to its quantization step."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.scene import Scene
 
 SITE_M = 3000.0
-MOST_POINTS = 30_000  # of which each is looked for
-BESIDE = 20.0  # steps: what is farther was brought in by the format, or is another Gaussian
-HALF = 0.5 + 1e-3  # of a step: rounding to the nearest, and that of float32 along the way
+MOST_POINTS = 30_000  # number that are matched
+BESIDE = 20.0  # steps: a larger distance means another Gaussian, or an error of the format
+HALF = 0.5 + 1e-3  # of a step: rounding to nearest, plus float32 along the way
 
 Points = Float64[np.ndarray, "n 3"]
 
 
 def site_of(scene: Scene) -> Scene:
-    """The same Gaussians, as many as are looked for, over a site 3 km across, each as large as it was."""
+    """Spread the Gaussians that are matched over a site of 3 km, with unchanged sizes."""
     found = scene.gaussians
     index = torch.linspace(0, len(found) - 1, min(len(found), MOST_POINTS)).long()
     part = found.select(index)
@@ -38,13 +38,13 @@ def site_of(scene: Scene) -> Scene:
 
 
 def position_row(original: Scene, read: Scene, path: Path, name: str) -> Row:
-    """Figures of a format: errors in millimetres and in its steps, per coordinate.
+    """Return a format's position errors in millimetres and in steps, per coordinate.
 
     Args:
         original: What was written.
         read: What was read.
-        path: The file, whose head tells its steps.
-        name: Of the format.
+        path: The file, whose header states its steps.
+        name: Name of the format.
     """
     truth, found = original.turned("z up").gaussians, read.turned("z up").gaussians
     index, partner = _partners(truth, found)
@@ -65,9 +65,10 @@ def position_row(original: Scene, read: Scene, path: Path, name: str) -> Row:
 
 
 def _partners(truth: Gaussians, found: Gaussians) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Which Gaussians are looked for, and which ones they became: formats change the order.
+    """Match the sampled Gaussians with those read: formats change the order.
 
-    By colour, opacity and scales as well as by position, all of which are kept well enough to tell neighbours apart.
+    Matching uses colour, opacity and scales as well as position; these are kept precisely enough to tell neighbours
+    apart.
     """
     index = np.linspace(0, len(truth) - 1, min(len(truth), MOST_POINTS)).astype(np.int64)
 
@@ -85,10 +86,10 @@ def _partners(truth: Gaussians, found: Gaussians) -> tuple[Int64[np.ndarray, " m
 
 
 def steps_m(name: str, path: Path, in_file: Points) -> Points:
-    """What a format rounds each coordinate to, metres; those of float32 where it keeps that.
+    """Return a format's quantization step of each coordinate, metres; float32's if it stores that.
 
     Args:
-        name: Of the format.
+        name: Name of the format.
         path: The file.
         in_file: Coordinates in its axes.
     """
@@ -109,7 +110,7 @@ def _float_steps(points: Points) -> Points:
 
 
 def _compressed_steps(path: Path, in_file: Points) -> Points:
-    """Of the chunk that a point lies in: the smallest that has it, 11, 10 and 11 bits a side."""
+    """Return the steps of the smallest chunk that contains a point: 11, 10 and 11 bits per axis."""
     boxes = _chunks(path)
     steps = (boxes[:, 3:] - boxes[:, :3]) / np.array([2047.0, 1023.0, 2047.0])
     found = np.full(in_file.shape, np.inf)
@@ -121,7 +122,7 @@ def _compressed_steps(path: Path, in_file: Points) -> Points:
 
 
 def _chunks(path: Path) -> Float64[np.ndarray, "chunks 6"]:
-    """Lowest and highest corners, from the file's first element."""
+    """Return the chunks' lowest and highest corners, from the file's first element."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     lines = data[:end].decode("ascii", "replace").split("\n")

@@ -1,4 +1,4 @@
-"""The rasterizer by itself, as training's iterations use it: the pairs that it blends and its speed."""
+"""Measure the rasterizer alone, as used in training: its speed and the pairs that it blends."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from splatpipe.pipeline.train.iteration import render_options
 from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.state import TrainState
 
-WARMUP = 3  # renders that do not count
+WARMUP = 3  # renders that are not measured
 
 
 def raster_alone(state: TrainState, plan: TrainingPlan, cameras: Sequence[Camera]) -> dict[str, Any]:
-    """Forward and backward pass of the rasterizer one after the other, with nothing of training between them.
+    """Time the rasterizer's forward and backward pass in sequence, without the rest of training.
 
     Args:
-        state: Its Gaussians are rendered and stay as they are.
-        plan: The training's.
-        cameras: To be rendered, in turn.
+        state: Provides the Gaussians, which stay unchanged.
+        plan: The training's plan.
+        cameras: Cameras to render, in turn.
 
     Returns:
-        Median wall seconds of a view, and pairs a second and core (CPU seconds of all threads, over all views).
+        Median wall seconds per view, and pairs per second and core (CPU seconds of all threads, over all views).
     """
     options = render_options(plan, plan.schedule.at(max(1, state.iteration)), False)
     pairs, wall, cpu = 0, [], 0.0
@@ -51,13 +51,13 @@ def raster_alone(state: TrainState, plan: TrainingPlan, cameras: Sequence[Camera
 
 
 def contributing_pairs(gaussians: Gaussians, camera: Camera, plan: TrainingPlan, iteration: int) -> int:
-    """Pixel-Gaussian pairs that training's render in an iteration blends: alpha ≥ 1/255, before the pixel's end.
+    """Count the pixel-Gaussian pairs blended by a training iteration's render: alpha ≥ 1/255, before a pixel saturates.
 
     Args:
-        gaussians: As they are before the iteration.
-        camera: The iteration's.
-        plan: The training's.
-        iteration: From 1.
+        gaussians: The Gaussians before the iteration.
+        camera: The iteration's camera.
+        plan: The training's plan.
+        iteration: Iteration, from 1.
     """
     now = plan.schedule.at(iteration)
     n, h, w = len(gaussians), camera.height, camera.width

@@ -1,7 +1,7 @@
-"""Reads splat files one after another in a process of its own, and says how each ended and what it took.
+"""Read splat files one after another in a separate process; report how each ended and what it took.
 
-A line of JSON in (``format``, empty to find it by content, and ``path``), a line out (``outcome``, ``detail``,
-``cpu_s``, ``peak_bytes``). Linux.
+One line of JSON in (``format``, empty to detect it by content, and ``path``), one line out (``outcome``, ``detail``,
+``cpu_s``, ``peak_bytes``). Linux only.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.scene import Scene
 
-SPARE_BYTES = 2 << 30  # of address space over what is taken: what is asked for and not used does not count, to a limit
+SPARE_BYTES = 2 << 30  # of address space above current use: reserved but unused memory does not count, up to a limit
 STATUS = Path("/proc/self/status")
 
 Reader = Callable[[Path], Scene]
 
 
 def main() -> None:
-    """Read until the input ends."""
+    """Process requests until the input ends."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # what readers print is no answer
+    os.dup2(2, 1)  # what readers print is not an answer
     torch.set_num_threads(1)
-    warnings.simplefilter("error")  # what is only warned of is wrong
+    warnings.simplefilter("error")  # a mere warning is a fault here
     readers = {each.name: each.read for each in SPLAT_FORMATS if each.reads} | {"": read_scene}
-    for reader in readers.values():  # the modules are loaded before memory is counted
+    for reader in readers.values():  # load the modules before memory is counted
         _read(reader, Path(os.devnull))
     limit = _kilobytes("VmSize") * 1024 + SPARE_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def _measured(reader: Reader, path: Path) -> dict[str, Any]:
-    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew: proc(5)
+    Path("/proc/self/clear_refs").write_text("5")  # reset the peak: proc(5)
     before, start = _kilobytes("VmRSS"), time.process_time()
     outcome, detail = _read(reader, path)
     cpu_s, peak = time.process_time() - start, _kilobytes("VmHWM") - before
@@ -73,7 +73,7 @@ def _read(reader: Reader, path: Path) -> tuple[str, str]:
 
 
 def _fault(scene: Scene) -> str:
-    """What is wrong with a scene that was read; empty where it is sound."""
+    """Return what is wrong with a scene that was read; empty if it is sound."""
     found = scene.gaussians
     if not all(bool(piece.finite().all()) for piece in found.pieces()):
         return "values that are not finite"
