@@ -1,1 +1,1 @@
-"""What surveyors are handed besides the splat: surface model, orthophoto, contours, clouds, and their files."""
+"""Survey products besides the splat: surface model, orthophoto, contours, point clouds, and their files."""

@@ -1,4 +1,4 @@
-"""The surface model as files: `dsm.tif`, `dsm_confidence.tif`, and contours."""
+"""The digital surface model (DSM) as files: `dsm.tif`, `dsm_confidence.tif`, and contours."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from splatpipe.pipeline.surface.site_extent import SiteExtent
 from splatpipe.pipeline.surface.sources import LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 
-HELD_BYTES = 512 << 20  # of depths in memory
+HELD_BYTES = 512 << 20  # limit for depths in memory
 MILLIMETRES = 1000.0
 MOST_MILLIMETRES = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True, eq=False)
 class DsmTask:
-    """What a surface model is made from.
+    """Inputs of a surface model.
 
     Attributes:
         surface: The run's photos and depths.
-        site: What they show.
-        cell_m: Side of a cell on the ground.
-        threads: Tiles at a time.
+        site: The area that they cover.
+        cell_m: Cell size on the ground, metres.
+        threads: Tiles in parallel.
     """
 
     surface: RunSurface
@@ -48,7 +48,7 @@ class DsmTask:
 
 
 def height_range(site: SiteExtent, grid: Grid) -> tuple[float, float]:
-    """Between which heights a site lies, the CRS's unit."""
+    """Lowest and highest height of a site, in the CRS's unit."""
     mapped = grid.crs_from_local(
         np.array([[e, n, up] for e in site.box[:, 0] for n in site.box[:, 1] for up in site.box[:, 2]])
     )
@@ -56,16 +56,16 @@ def height_range(site: SiteExtent, grid: Grid) -> tuple[float, float]:
 
 
 def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
-    """Write the surface model; a killed one goes on from its last finished sheet.
+    """Write the surface model; a killed run resumes after its last finished sheet.
 
     Args:
-        task: What it is made from.
-        work: Folder of what is kept meanwhile.
-        out: Where the files go.
-        report: Told of progress.
+        task: Inputs.
+        work: Folder for intermediate files.
+        out: Output folder.
+        report: Receives progress.
 
     Returns:
-        Figures for people: cells, their side, what share of the covered area has a height, expected accuracy.
+        Statistics: number and size of cells, share of the covered area with heights, expected accuracy, and so on.
 
     Raises:
         SplatpipeError: if the grid would be absurdly large.
@@ -104,14 +104,14 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
 
 
 def _seen(site: SiteExtent, sheet: GridSheet, tile: Tile) -> bool:
-    """Whether enough photos see any of a tile."""
+    """Whether enough photos see any part of a tile."""
     corners = sheet.sheet.lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
     local = sheet.sheet.local(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
     return site.sees(np.stack([local.min(axis=0), local.max(axis=0)]))
 
 
 def _write_rasters(making: SheetWork, out: Path, grid: Grid) -> Int64[np.ndarray, " 65536"]:
-    """Write both rasters; how many cells have an expected deviation of so many millimetres, none of 0."""
+    """Write both rasters; returns a histogram of the cells' expected deviations in millimetres, with 0 left empty."""
     with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
         for part, arrays in making.finished():
             file.write(part, arrays["height"])
@@ -120,7 +120,7 @@ def _write_rasters(making: SheetWork, out: Path, grid: Grid) -> Int64[np.ndarray
         for part, arrays in making.finished():
             file.write(part, np.moveaxis(arrays["confidence"], -1, 0))
             sigmas += np.bincount(arrays["confidence"][..., 1].ravel(), minlength=len(sigmas))
-    sigmas[0] = 0  # where there is no height
+    sigmas[0] = 0  # cells without a height
     return sigmas
 
 

@@ -1,4 +1,4 @@
-"""The orthophoto as a file: `ortho.tif`, drawn sheet by sheet on the surface model."""
+"""The true orthophoto as a file: `ortho.tif`, computed sheet by sheet on the surface model."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from splatpipe.pipeline.surface.site_extent import SiteExtent
 from splatpipe.pipeline.surface.sources import LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 
-PIXEL_BYTES = 1 << 30  # of decoded photos in memory; all together lie on the disk where they are more
-AROUND = 3  # cells of the surface model more than the pixels drawn need: heights between cells
+PIXEL_BYTES = 1 << 30  # limit for decoded photos in memory; beyond it, all are kept on disk
+AROUND = 3  # margin in cells of the surface model around the pixels, for interpolation
 
 
 @dataclass(frozen=True, eq=False)
 class OrthoTask:
-    """What an orthophoto is made from.
+    """Inputs of an orthophoto.
 
     Attributes:
         surface: The run's photos and depths.
-        site: What they show.
-        dsm: `dsm.tif`.
-        dsm_cell_m: Side of its cells on the ground.
-        gsd_m: Side of a pixel on the ground.
-        threads: Tiles at a time.
+        site: The area that they cover.
+        dsm: Path of `dsm.tif`.
+        dsm_cell_m: Cell size of the DSM on the ground, metres.
+        gsd_m: Ground sampling distance (GSD), metres per pixel.
+        threads: Tiles in parallel.
     """
 
     surface: RunSurface
@@ -58,19 +58,19 @@ class OrthoTask:
 
 
 def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
-    """Write the orthophoto; a killed one goes on from its last finished sheet.
+    """Write the orthophoto; a killed run resumes after its last finished sheet.
 
     Args:
-        task: What it is made from.
-        work: Folder of what is kept meanwhile.
-        out: Where the file goes.
-        report: Told of progress.
+        task: Inputs.
+        work: Folder for intermediate files.
+        out: Output folder.
+        report: Receives progress.
 
     Returns:
-        Figures for people: pixels, their side, by how much photos' exposures were levelled.
+        Statistics: number and size of pixels, range of the exposure corrections in stops, and so on.
 
     Raises:
-        SplatpipeError: if the grid would be absurdly large, or a photo is no longer what it was.
+        SplatpipeError: if the grid would be absurdly large, or a photo has changed.
         MachineError: if the disk is full.
     """
     grid = make_grid(task.surface.frame, task.site.box, task.gsd_m)
@@ -100,7 +100,7 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """Photos whose pixels are at hand, as ``OrthoInput`` takes them."""
+    """Photos with access to their pixels, as needed for ``OrthoInput``."""
 
     sources: Sequence[PhotoSource]
     levels: PhotoGains
@@ -123,19 +123,19 @@ def _colours(
 
 
 def _has_heights(known: KnownCells, heights: Grid, sheet: GridSheet, tile: Tile) -> bool:
-    """Whether pixels of a sheet's tile may lie on a height."""
+    """Whether any pixels of a sheet's tile may have a height."""
     part = Tile(sheet.part.row + tile.row, sheet.part.column + tile.column, tile.height, tile.width)
     return known.any_in(_cells_under(sheet.grid, part, heights, AROUND * heights.cell))
 
 
 def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
-    """The surface model's cells that lie under pixels, or next to them; some may be outside of the model.
+    """The surface model's cells under or next to pixels; some may be outside of the model.
 
     Args:
-        grid: The pixels'.
-        part: Which of them.
-        heights: The surface model's, in the same CRS.
-        margin: How far around, the CRS's unit.
+        grid: Grid of the pixels.
+        part: The pixels.
+        heights: Grid of the surface model, in the same CRS.
+        margin: Margin around the pixels, in the CRS's unit.
     """
     west, north = (grid.left + part.column) * grid.cell - margin, (grid.top - part.row) * grid.cell + margin
     east, south = west + part.width * grid.cell + 2.0 * margin, north - part.height * grid.cell - 2.0 * margin
@@ -145,7 +145,7 @@ def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
 
 
 def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
-    """The heights that a sheet's pixels lie on, over the sheet."""
+    """The heights under a sheet's pixels, relative to the sheet."""
     margin = (MARGIN + SPREAD) * sheet.grid.cell + AROUND * heights.cell
     part = _cells_under(sheet.grid, sheet.part, heights, margin)
     rows = np.clip([part.row, part.row + part.height], 0, heights.height)
@@ -156,7 +156,7 @@ def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
 
 
 def _read(dsm: Path, part: Tile) -> Float64[np.ndarray, "h w"]:
-    """Heights of cells, nan where there are none."""
+    """Heights of the DSM's cells, NaN where there are none."""
     with gdal(dsm.parent), rasterio.open(dsm) as raster:
         window = Window(part.column, part.row, part.width, part.height)
         found = raster.read(1, window=window, masked=True, boundless=False)
@@ -164,7 +164,7 @@ def _read(dsm: Path, part: Tile) -> Float64[np.ndarray, "h w"]:
 
 
 def _places(dsm: Path, heights: Grid) -> Float64[np.ndarray, "m 3"]:
-    """Some of the surface's cells, evenly, local metres."""
+    """Evenly spaced cells of the surface, local metres."""
     rows, columns = (
         max(1, round((COMPARED_AT * a / b) ** 0.5))
         for a, b in ((heights.height, heights.width), (heights.width, heights.height))

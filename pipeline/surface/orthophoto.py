@@ -1,4 +1,4 @@
-"""The true orthophoto: every cell coloured by the best photo that sees the topmost surface there."""
+"""The true orthophoto: every cell is coloured from the best photo that sees the topmost surface there."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from splatpipe.pipeline.surface.point_visibility import Points, contiguous, sigh
 from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PosedDepthMap, photos_seeing
 from splatpipe.pipeline.surface.tiles import Tile
 
-TILE = 384  # cells a side
-SPREAD = 24  # cells that colours are spread to where no photo sees; further off there is none
-MOST_RATED = 24_000_000  # cells times photos at once: 70 MB of costs, and colours of a few
-LEAST_CELLS = 1 << 14  # of a tile that is not made in parts: margins would be the most of it
+TILE = 384  # cells per side
+SPREAD = 24  # cells over which colours are extended into areas that no photo sees; farther away there is none
+MOST_RATED = 24_000_000  # cells times photos at once: 70 MB of costs, and colours of a few photos
+LEAST_CELLS = 1 << 14  # smaller tiles are not split: they would be mostly margin
 
 
 @dataclass(frozen=True, eq=False)
 class Orthophoto:
-    """The orthophoto in a tile.
+    """A tile of the orthophoto.
 
     Attributes:
-        tile: Which.
+        tile: The tile.
         colour: RGB, 8 bits; black where there is none.
-        photos: How many photos see each cell; 0 where colours were spread from around, or are none.
-        label: Number of the photo that colours it; -1 where none sees it.
+        photos: How many photos see each cell; 0 where colours were extended from nearby or are missing.
+        label: Index of the photo that colours each cell; -1 where none sees it.
         known: Where there is a colour.
     """
 
@@ -46,16 +46,16 @@ class Orthophoto:
 
 @dataclass(frozen=True, eq=False)
 class OrthoInput:
-    """All that an orthophoto is made from.
+    """Inputs of the orthophoto's tiles.
 
     Attributes:
         sources: Photos, always in the same order.
-        surface: Heights.
-        lattice: Whose cells get colours; may be finer than the heights'.
-        relief: Between which heights the surface lies.
-        levels: By how much photos' light is multiplied.
-        pixels: Holds a few photos.
-        depths: Holds a few of their depths.
+        surface: Heights of the surface.
+        lattice: Cells to colour; may be finer than those of the heights.
+        relief: Lowest and highest height of the surface.
+        levels: Exposure gains of the photos.
+        pixels: Cache of a few photos' pixels.
+        depths: Cache of a few photos' depths.
     """
 
     sources: Sequence[PhotoSource]
@@ -68,12 +68,12 @@ class OrthoInput:
 
 
 def orthophotos(album: OrthoInput, tiles: Sequence[Tile], threads: int) -> Iterator[Orthophoto]:
-    """Tiles of the orthophoto, in their order: the same bits for any number of threads, and however cells are tiled.
+    """Compute tiles of the orthophoto in order; bit-identical for any number of threads and any tiling.
 
     Args:
         album: Photos, surface and cells.
-        tiles: Which to make.
-        threads: Tiles at a time.
+        tiles: Tiles to compute.
+        threads: Tiles in parallel.
 
     Raises:
         ValueError: if pixels or depths do not fit their camera.
@@ -82,12 +82,12 @@ def orthophotos(album: OrthoInput, tiles: Sequence[Tile], threads: int) -> Itera
 
 
 def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MOST_RATED) -> Orthophoto:
-    """One tile of the orthophoto.
+    """Compute one tile of the orthophoto.
 
     Args:
         album: Photos, surface and cells.
-        tile: Which.
-        most: Cells times photos at once; larger ones are made in parts.
+        tile: The tile.
+        most: Limit on cells times photos; tiles above it are computed in parts.
     """
     wide = tile.grown(MARGIN + SPREAD)
     windows = photos_seeing([source.camera for source in album.sources], album.lattice, wide, album.relief)
@@ -114,9 +114,9 @@ def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MOST_RATED) -> Or
 def _rated(
     album: OrthoInput, numbers: Sequence[int], points: Points
 ) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, "n h w"], UInt16[np.ndarray, "n h w"]]:
-    """Numbers of the photos that see any of the points, where they see them, and what it costs to be coloured by them.
+    """Indices of the photos that see any of the points, where they see them, and the cost of colouring from each.
 
-    Costs are told beside what is seen, too, for what lies around a cell counts.
+    Costs are also given where a photo does not see a point, because a cell's surroundings count.
     """
     shape = (len(numbers), *points[2].shape)
     seen, cost = np.empty(shape, np.bool_), np.empty(shape, np.uint16)
@@ -134,7 +134,7 @@ def _rated(
 
 
 def _joined(tile: Tile, halves: Sequence[Orthophoto]) -> Orthophoto:
-    """Of what a tile's halves are."""
+    """Join the halves of a tile."""
     axis = 0 if halves[0].tile.width == tile.width else 1
     columns = zip(*((half.colour, half.photos, half.label, half.known) for half in halves), strict=True)
     return Orthophoto(tile, *(np.concatenate(column, axis=axis) for column in columns))
