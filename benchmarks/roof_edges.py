@@ -1,7 +1,7 @@
-"""How far the edges of roofs in an orthophoto are from the true ones.
+"""Measure how far the edges of roofs in an orthophoto are from the true ones.
 
-Along the true outline of the roofs, where the true picture has its strongest edge across it there, too, the strongest
-edge of the orthophoto is looked for along the same line. Walls that lean, roofs that are shown twice or torn move it.
+At places along the true roof outline where the true image has its strongest edge on the outline, the orthophoto's
+strongest edge is searched along the same normal. Leaning walls, and roofs that are doubled or torn, move it.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from tables import Row
 
 REACH_PX = 12  # to each side of the true edge
 STEPS_A_PX = 4
-SMOOTH_PX = 0.7  # sigma, of what edges are looked for in: a pixel's own noise is none
+SMOOTH_PX = 0.7  # sigma of the blur before edges are searched: suppresses the noise of single pixels
 ALONG_PX = 2.0  # between places on the outline
-TRUE_WITHIN_PX = 0.75  # of the outline, the true picture's strongest edge
-LEAST_STEP = 12.0  # grey levels a pixel: a roof that looks like what is beside it has no edge to be found
-LEAST_SHARE = 0.3  # of the true edge's strength: less is no edge, and is missing
-OUTSTANDING = 1.5  # times the strongest other true edge along the line that is not the same one
-SAME_PX = 2.5  # so near, it is the same edge
+TRUE_WITHIN_PX = 0.75  # largest distance of the true image's strongest edge from the outline
+LEAST_STEP = 12.0  # grey levels per pixel: a roof that looks like its surroundings has no measurable edge
+LEAST_SHARE = 0.3  # of the true edge's strength: anything weaker counts as missing
+OUTSTANDING = 1.5  # times the strongest other true edge along the line
+SAME_PX = 2.5  # within this distance it is the same edge
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-OUTLINE_SIGMA_PX = 2.0  # that the mask's border is softened by, for its direction and its place between pixels
+OUTLINE_SIGMA_PX = 2.0  # of the mask's blur, from which the border's direction and subpixel position are computed
 
 
 def outline(roofs: Bool[np.ndarray, "h w"]) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
-    """Places on the border of a mask (column, row; the first pixel's centre is (0, 0)), and unit normals outwards."""
+    """Return places on a mask's border (column, row; the first pixel's centre is (0, 0)), and unit normals outwards."""
     soft = cv2.GaussianBlur(roofs.astype(np.float32), (0, 0), OUTLINE_SIGMA_PX)
     down, across = np.gradient(soft)
     found, normals = [], []
@@ -37,7 +37,7 @@ def outline(roofs: Bool[np.ndarray, "h w"]) -> tuple[Float64[np.ndarray, "n 2"],
         length = np.linalg.norm(slope, axis=1)
         good = length > 1e-3
         normal = -slope[good] / length[good, None]
-        to_edge = (soft[row, column][good] - 0.5) / length[good]  # a step of Newton to the border between pixels
+        to_edge = (soft[row, column][good] - 0.5) / length[good]  # a Newton step to the border between pixels
         found.append(places[good] + normal * np.clip(to_edge, -1.0, 1.0)[:, None])
         normals.append(normal)
     if not found:
@@ -48,7 +48,7 @@ def outline(roofs: Bool[np.ndarray, "h w"]) -> tuple[Float64[np.ndarray, "n 2"],
 def strengths(
     picture: UInt8[np.ndarray, "h w 3"], places: Float64[np.ndarray, "n 2"], normals: Float64[np.ndarray, "n 2"]
 ) -> Float32[np.ndarray, "n k"]:
-    """How steep the brightness is across the outline, along a line through each place; grey levels a pixel."""
+    """Return the brightness gradient across the outline, along a line through each place; grey levels per pixel."""
     grey = cv2.GaussianBlur(picture.astype(np.float32) @ LUMA, (0, 0), SMOOTH_PX)
     offsets = _offsets()
     lines = (places[:, None] + normals[:, None] * offsets[:, None]).astype(np.float32)
@@ -61,7 +61,7 @@ def _offsets() -> Float64[np.ndarray, " k"]:
 
 
 def visible_edges(strength: Float32[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
-    """Places where the true picture has one edge that stands out, and has it on the outline."""
+    """Return the places where the true image has a single prominent edge, on the outline."""
     offsets = _offsets()
     best = strength.argmax(axis=1)
     peak = strength.max(axis=1)
@@ -76,13 +76,13 @@ def edge_distances(
     roofs: Bool[np.ndarray, "h w"],
     counts: Bool[np.ndarray, "h w"],
 ) -> Float64[np.ndarray, " n"]:
-    """Pixels from the true edge to the orthophoto's, infinite where it has none, of each place that has one to show.
+    """Return the pixels from true edges to the orthophoto's, infinite where it has none, at each measurable place.
 
     Args:
         picture: The orthophoto, black where it has nothing.
         truth: The true picture on the same grid.
-        roofs: True.
-        counts: Where places of the outline count.
+        roofs: Mask of the true roofs.
+        counts: Mask of the places that count.
     """
     places, normals = outline(roofs)
     height, width = roofs.shape
@@ -94,14 +94,14 @@ def edge_distances(
     visible = visible_edges(true)
     found = strengths(picture, places[visible], normals[visible])
     offsets = _offsets()
-    shift = offsets[true[visible].argmax(axis=1)]  # the true picture's own edge, a quarter pixel beside the outline
+    shift = offsets[true[visible].argmax(axis=1)]  # the true image's own edge, to a quarter pixel
     apart = np.abs(offsets[found.argmax(axis=1)] - shift)
     lost = found.max(axis=1) < LEAST_SHARE * true[visible].max(axis=1)
     return np.asarray(np.where(lost, np.inf, apart))
 
 
 def edge_figures(distances_px: Float64[np.ndarray, " n"]) -> Row:
-    """``edges`` (places), ``median`` and ``p95`` of the distances, and the share ``lost``."""
+    """Return ``edges`` (places), ``median`` and ``p95`` of the distances, and the share ``lost``."""
     row: Row = {"edges": int(distances_px.size)}
     if distances_px.size == 0:
         return row

@@ -1,9 +1,9 @@
-"""Every format written, read back by us and by splat-transform, and rendered: ``round_trips.py OUT [OUT …]``.
+"""Write every format, read it with our reader and splat-transform, and render it: ``round_trips.py OUT [OUT …]``.
 
-A table a run: likeness to the original of what held-out photos' cameras see, by our reader, by splat-transform's, and
-of splat-transform's own file of the same splat; bytes; how far positions move, in the run and over 3 km. Asked: PLY and
-model folder the same, GLB 70 dB; SPZ 3, SOG, compressed PLY 38 dB, not 0.3 dB below splat-transform's nor 5 % larger.
-Times are `format_speed.py`'s. Before, once: npm ci --prefix benchmarks/readers.
+One table per run: similarity to the original in the held-out views, by our reader, by splat-transform's, and of
+splat-transform's own file of the same splat; bytes; displacement of positions, in the run and over a 3 km site.
+Required: PLY and model folder identical, GLB 70 dB; SPZ 3, SOG, compressed PLY 38 dB, no more than 0.3 dB below
+splat-transform's nor 5 % larger. For times see `format_speed.py`. Set up once: npm ci --prefix benchmarks/readers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from splatpipe.pipeline.splat.scene import Scene
 ASKED_DB = {"ply": math.inf, "model": math.inf, "glb": 70.0, "spz": 38.0, "sog": 38.0, "compressed-ply": 38.0}
 MOST_BELOW_DB = 0.3  # splat-transform's
 MOST_LARGER = 1.05  # times splat-transform's
-LIKE = {"model": "ply"}  # formats whose positions are another's
+LIKE = {"model": "ply"}  # formats that store positions as another one does
 
 COLUMNS = {
     "format": "format:",
@@ -63,11 +63,11 @@ POSITION_COLUMNS = {
 
 @dataclass(frozen=True)
 class TripFolder:
-    """Where files go, and who else reads them.
+    """Output folder and third-party readers.
 
     Attributes:
-        folder: Of files; what splat-transform wrote is taken again, where it is of the same splat.
-        others: Their programs.
+        folder: Folder for files; splat-transform's output is reused for the same splat.
+        others: Third-party programs.
         slow: Formats that splat-transform is not asked to write.
     """
 
@@ -76,7 +76,7 @@ class TripFolder:
     slow: frozenset[str] = field(default_factory=frozenset)
 
     def theirs(self, name: str, scene: Scene) -> Path | None:
-        """What splat-transform writes of a splat; None where it does not write the format."""
+        """Return splat-transform's file of a splat; None if it does not write the format."""
         if not self.others.writes(name) or name in self.slow:
             return None
         source = self.folder / "theirs_from.ply"
@@ -92,7 +92,7 @@ class TripFolder:
 
 
 def round_trip(capture: CaptureRun, originals: Sequence[Picture], kind: SplatFormat, work: TripFolder) -> Row:
-    """A format's row."""
+    """Return a format's row."""
     path = written(capture.scene, kind, work.folder / capture.name)
     row: Row = {"format": kind.name, "bytes": bytes_of(path)}
     missed = []
@@ -131,7 +131,7 @@ def _by_them(capture: CaptureRun, originals: Sequence[Picture], path: Path, work
 def _their_file(
     capture: CaptureRun, originals: Sequence[Picture], kind: SplatFormat, path: Path, work: TripFolder
 ) -> Row:
-    """Likeness of splat-transform's own file, read by it and by us."""
+    """Measure the similarity of splat-transform's own file, read by it and by us."""
     row: Row = {}
     if work.others.reads(kind.name):
         row["theirs_db"] = decibels(capture.pictures(work.others.read(path)), originals)
@@ -142,14 +142,14 @@ def _their_file(
 
 
 def positions(scene: Scene, over: str, kind: SplatFormat, folder: Path) -> Row:
-    """A format's row of errors."""
+    """Return a format's row of position errors."""
     path = written(scene, kind, folder / f"positions_{over}".replace(" ", "_"))
     row = position_row(scene, kind.read(path), splat_file(path), LIKE.get(kind.name, kind.name))
     return {"format": kind.name, "over": over, "bars": "met" if row["within"] else "missed"} | row
 
 
 def written(scene: Scene, kind: SplatFormat, folder: Path) -> Path:
-    """Where a splat is written, in place of what may be there."""
+    """Write a splat, replacing an existing file; return its path."""
     path = folder / kind.file
     if path.is_dir():
         shutil.rmtree(path)
@@ -158,7 +158,7 @@ def written(scene: Scene, kind: SplatFormat, folder: Path) -> Path:
 
 
 def same(a: Scene, b: Scene) -> bool:
-    """Whether two splats have the same values, whatever way their quaternions are long."""
+    """Whether two splats have the same values, regardless of their quaternions' lengths."""
     one, other = a.gaussians, b.gaussians
     if len(one) != len(other) or one.sh_degree != other.sh_degree:
         return False
@@ -169,13 +169,13 @@ def same(a: Scene, b: Scene) -> bool:
 
 
 def splat_file(path: Path) -> Path:
-    """The file with the Gaussians: itself, or the PLY of a model folder."""
+    """Return the file with the Gaussians: the path itself, or the PLY of a model folder."""
     found = sorted(path.glob("point_cloud/iteration_*/point_cloud.ply")) if path.is_dir() else []
     return found[-1] if found else path
 
 
 def bytes_of(path: Path) -> int:
-    """Of a file, or of all in a folder."""
+    """Return the bytes of a file, or of all files in a folder."""
     return (
         sum(each.stat().st_size for each in path.rglob("*") if each.is_file()) if path.is_dir() else path.stat().st_size
     )
@@ -183,7 +183,7 @@ def bytes_of(path: Path) -> int:
 
 @contextmanager
 def working_folder(kept: Path | None) -> Iterator[Path]:
-    """The folder that was given, or one that disappears."""
+    """Yield the given folder, or a temporary one."""
     if kept is not None:
         kept.mkdir(parents=True, exist_ok=True)
         yield kept
@@ -193,7 +193,7 @@ def working_folder(kept: Path | None) -> Iterator[Path]:
 
 
 def measure(out: Path, kinds: Sequence[SplatFormat], work: TripFolder, views: int) -> tuple[list[Row], list[Row]]:
-    """Tables of a run: likeness and bytes, positions."""
+    """Return a run's tables: similarity and bytes, positions."""
     capture = open_capture(out, views)
     originals = capture.pictures(capture.scene)
     rows, errors = [], []

@@ -1,12 +1,12 @@
-"""How training's cost grows: ``scaling.py --data DATASET --threads N --json FILE``.
+"""Measure how training's cost grows: ``scaling.py --data DATASET --threads N --json FILE``.
 
 Three series around one case: Gaussians, megapixels, threads. The Gaussians are the dataset's points, thinned or copied
-with jitter, and sized so that as many of them contribute to a pixel in every case: only their number changes. Every
-case runs training's own code in a process of its own. ``ratio_to_linear`` is the time over what the first row of the
-series makes it by proportion: at most 1 where cost grows no faster than linearly.
+with jitter, and sized so that equally many contribute to a pixel in every case: only their number changes. Every case
+runs training's own code in a process of its own. ``ratio_to_linear`` is the time divided by a proportional
+extrapolation from the series' first row: at most 1 if the cost grows no faster than linearly.
 
 ``--memory`` adds a series of whole training stages, with a step of density control that grows to the cap and with
-checkpoints, for their peak memory; their times are of the whole stage, shared out among its four iterations.
+checkpoints, for their peak memory; their times cover the whole stage, divided by its four iterations.
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ COLUMNS = {
     "to linear": "ratio_to_linear:.2f",
     "peak MB": "peak_bytes:MB",
 }
-CALIBRATED = 0.02  # of the wanted pairs a pixel, either way
-CALIBRATIONS = 8  # looks at most: the blur keeps a million Gaussians from covering less of a small picture
+CALIBRATED = 0.02  # tolerance, relative to the wanted pairs per pixel
+CALIBRATIONS = 8  # iterations at most: the blur prevents a million Gaussians from covering less of a small image
 LONGEST_STEP = 1.5
-MEMORY_START = 0.9  # of the cap: what density control then grows to it
+MEMORY_START = 0.9  # of the cap: density control then grows to it
 MEMORY_ITERATIONS = 4
 
 
 def scattered(base: Gaussians, count: int) -> Gaussians:
-    """As many Gaussians as asked for: thinned evenly, or copies moved about by their own size."""
+    """Return ``count`` Gaussians: thinned evenly, or copies jittered by their own size."""
     index = torch.arange(count) * len(base) // count
     made = base.select(index)
     generator = torch.Generator().manual_seed(0)
@@ -83,26 +83,26 @@ def scattered(base: Gaussians, count: int) -> Gaussians:
 
 
 def sized(gaussians: Gaussians, cameras: Sequence[Camera], plan: TrainingPlan, wanted: float) -> Gaussians:
-    """The Gaussians, larger or smaller all alike, so that ``wanted`` of them contribute to the mean pixel.
+    """Scale all Gaussians equally until ``wanted`` of them contribute to the mean pixel.
 
     Args:
-        gaussians: Changed in place.
-        cameras: Whose pixels.
+        gaussians: The Gaussians, changed in place.
+        cameras: Cameras whose pixels are counted.
         plan: How they are rendered.
-        wanted: Pairs a pixel.
+        wanted: Pairs per pixel.
     """
     pixels = sum(camera.width * camera.height for camera in cameras)
     for _ in range(CALIBRATIONS):
         found = sum(contributing_pairs(gaussians, camera, plan, 1) for camera in cameras) / pixels
         if abs(found / wanted - 1.0) < CALIBRATED:
             break
-        # Its area goes with the square of its size; no step so long that the next one has nothing to go by.
+        # The area grows with the square of the size; steps are limited so that the next one still has pairs to measure.
         gaussians.log_scales += max(-LONGEST_STEP, min(LONGEST_STEP, 0.5 * math.log(wanted / max(found, 1e-3))))
     return gaussians
 
 
 def write_start(dataset: Path, count: int, wanted: float, threads: int) -> Path:
-    """Write the Gaussians of a case beside its dataset."""
+    """Write the initial Gaussians of a case beside its dataset."""
     views = load_views(dataset)
     path = dataset / f"{count}.ply"
     with same_bits(threads):
@@ -113,7 +113,7 @@ def write_start(dataset: Path, count: int, wanted: float, threads: int) -> Path:
 
 
 def grown_in_the_middle(config: TrainConfig, footage: PhotoSizes = UNKNOWN) -> Schedule:
-    """A schedule with one step of density control, in which everything that was seen grows: the cap decides."""
+    """Return a schedule with one step of density control in which every visible Gaussian grows, up to the cap."""
     schedule = resolve_schedule(config, footage)
     middle = schedule.iterations // 2
     density = replace(schedule.density, first=middle, last=middle, every=middle, gradient=1e-12)
@@ -121,7 +121,7 @@ def grown_in_the_middle(config: TrainConfig, footage: PhotoSizes = UNKNOWN) -> S
 
 
 def stage_case(case: TimingCase) -> Row:
-    """The whole training stage of a few iterations, with density control up to the cap and checkpoints."""
+    """Run the whole training stage for a few iterations, with density control up to the cap and checkpoints."""
     before = restart_peak()
     start = Path(case.splat)
     cap = round(read_splat_header(start).count / MEMORY_START)
@@ -151,7 +151,7 @@ def stage_case(case: TimingCase) -> Row:
 
 
 def series(arguments: argparse.Namespace) -> Iterator[tuple[str, list[tuple[int, float, int]]]]:
-    """Name of each series, and its cases: Gaussians, megapixels, threads."""
+    """Yield each series' name and its cases: Gaussians, megapixels, threads."""
     count, megapixels, threads = arguments.at_gaussians, arguments.at_megapixels, arguments.threads
     yield "gaussians", [(each, megapixels, threads) for each in arguments.gaussians]
     yield "megapixels", [(count, each, threads) for each in arguments.megapixels]
@@ -162,7 +162,7 @@ def series(arguments: argparse.Namespace) -> Iterator[tuple[str, list[tuple[int,
 
 
 def with_ratio(rows: list[Row]) -> list[Row]:
-    """The rows of a series, each with its time over what the first one makes it by proportion."""
+    """Return a series' rows, each with its time divided by the first row's, extrapolated proportionally."""
     first = rows[0]
     for row in rows:
         quantity = row["series"] if row["series"] in first else "gaussians"
@@ -204,7 +204,7 @@ def main() -> None:
 def run_case(
     arguments: argparse.Namespace, folder: Path, memory: bool, count: int, megapixels: float, threads: int
 ) -> Row:
-    """One case in a process of its own; the datasets, a size each, are kept for the others."""
+    """Run one case in a process of its own; the datasets, one per size, are kept for the other cases."""
     dataset = folder / f"{megapixels}"
     if not dataset.exists():
         prepare(arguments.data, "sparse", size_factor(arguments.data, megapixels), dataset, arguments.photos)

@@ -1,10 +1,10 @@
-"""Whether borders of blocks show in a splat: ``seams.py OUT COARSE.ply [--merged MERGED.ply] [--partition FILE]``.
+"""Detect visible block borders in a splat: ``seams.py OUT COARSE.ply [--merged MERGED.ply] [--partition FILE]``.
 
-OUT is a run; its splat, or MERGED in its place, is looked at along the borders of a partition (its JSON as
-``Partition.facts`` gives it; without, OUT's site is cut into ``--blocks`` cells), against COARSE, a splat of the same
-frame without blocks. With ``--plant`` the splat is taken to be without seams: gaps, doubled surfaces and steps of
-colour of graded strength are put on its longest borders, and the table says which are found. Sizes are in pixels as a
-camera over the border has them, colours 0 to 1.
+OUT is a run; its splat, or MERGED in its place, is examined along the borders of a partition (JSON as written by
+``Partition.facts``; without it, OUT's site is cut into ``--blocks`` cells) against COARSE, a splat in the same frame
+without blocks. With ``--plant`` the splat is assumed to be seamless: gaps, doubled surfaces and colour steps of graded
+strength are planted on its longest borders, and the table shows which are found. Sizes are in pixels of a camera above
+the border, colours 0 to 1.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class SeamScene:
-    """What borders are looked at in.
+    """Context in which borders are examined.
 
     Attributes:
         run: The run.
-        partition: Its cells.
-        cameras: Of its photos, at the size of training.
+        partition: The run's cells.
+        cameras: Cameras of its photos, at training size.
         coarse: The model without blocks.
-        metres: A unit of the model's frame.
+        metres: Metres per unit of the model's frame.
     """
 
     run: OpenedRun
@@ -71,11 +71,11 @@ class SeamScene:
     metres: float
 
     def seams(self, splat: Gaussians, line: PlanLine) -> list[Seam]:
-        """What shows of a border of a splat."""
+        """Return the visible seams on a border of a splat."""
         return find_seams((splat, self.coarse), self.partition.plan, line, self.cameras, self.run.options)
 
     def pixel(self, splat: Gaussians, line: PlanLine) -> float:
-        """Of the cameras over a border, on the surface below them, world units."""
+        """Return a pixel's size on the surface below the cameras above a border, world units."""
         cameras, height = border_cameras(splat, self.partition.plan, line, self.cameras, self.run.options)
         return height / cameras[0].fx
 
@@ -84,7 +84,7 @@ def open_site(arguments: argparse.Namespace) -> SeamScene:
     """Read what the command line names.
 
     Raises:
-        SplatpipeError: if something is not there, or broken.
+        SplatpipeError: if something is missing or broken.
     """
     run = open_run(arguments.out)
     frame = load_frame(run.parts["georef.frame"].path).world_from_model
@@ -103,7 +103,7 @@ def open_site(arguments: argparse.Namespace) -> SeamScene:
 
 
 def judged(place: SeamScene, splat: Gaussians, border: Border) -> Iterator[Row]:
-    """A row for each seam of a border, or one that says that there is none."""
+    """Yield a row for each seam on a border, or one stating that there is none."""
     facts: Row = {"border": f"{border.blocks[0]}–{border.blocks[1]}", "length": border.line.length * place.metres}
     seams = place.seams(splat, border.line)
     for seam in seams:
@@ -123,7 +123,7 @@ def judged(place: SeamScene, splat: Gaussians, border: Border) -> Iterator[Row]:
 
 
 def planted(place: SeamScene, splat: Gaussians, border: Border) -> Iterator[Row]:
-    """Rows of each seam that was put on a border: what was found of its kind, or the first of what else was."""
+    """Yield a row for each seam planted on a border: the detection of its kind, or else the first other one."""
     plan, line = place.partition.plan, border.line
     pixel = place.pixel(splat, line)
     plants: dict[str, Callable[[float], Gaussians]] = {

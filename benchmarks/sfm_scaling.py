@@ -1,12 +1,12 @@
-"""How mapping's cost grows with the photos: ``sfm_scaling.py --photos 250 500 1000 2000 --json FILE``.
+"""Measure how mapping's cost grows with the photos: ``sfm_scaling.py --photos 250 500 1000 2000 --json FILE``.
 
-For each number a flight is made whose cameras are known (`flight_scene`), mapped in a process of its own on one thread,
-and held against the truth: camera centres after a similarity fit, in GSD, and over what the adjustment of the true
-tracks from the true cameras leaves of the same noise. Plain COLMAP runs beside it up to ``--plain-up-to`` photos. The
-choice of pairs is measured apart, with descriptors that are drawn when they are asked for.
+For each number of photos a synthetic flight (`flight_scene`) is mapped in a process of its own on one thread and
+compared with the truth: camera centres after a similarity fit, in GSD, and relative to the error that the adjustment of
+the true tracks from the true cameras leaves for the same noise. Plain COLMAP runs beside it up to ``--plain-up-to``
+photos. Pair selection is measured separately, with descriptors generated on demand.
 
-``--captures DATABASE …`` maps real ones instead: databases of the stage `matches`, or folders of runs. The exponent is
-that of a line through the logarithms of the CPU seconds over those of the photos.
+``--captures DATABASE …`` maps real captures instead: databases of the stage `matches`, or folders of runs. The exponent
+is the slope of a line through log CPU seconds over log photos.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PAIRS = {
 
 
 def fly(count: int, seed: int, hows: Sequence[str], folder: Path) -> list[Row]:
-    """Make a flight and map it in each of the ways, the noise's own error beside them."""
+    """Generate a flight and map it in each of the ways, with the noise's own error for comparison."""
     flight = make_flight(count, seed)
     database = folder / "database.db"
     write_database(flight, database, seed)
@@ -61,7 +61,7 @@ def fly(count: int, seed: int, hows: Sequence[str], folder: Path) -> list[Row]:
 
 
 def exponent(rows: Sequence[Row]) -> float | None:
-    """Of the CPU seconds over the photos; None of a single size."""
+    """Return the exponent of the CPU seconds over the photos; None for a single size."""
     photos = np.log([row["photos"] for row in rows])
     if len(set(photos.tolist())) < 2:
         return None

@@ -1,8 +1,8 @@
-"""Mapping as it was, COLMAP's own and ours on the same matches: ``sfm_speed.py DATABASE …``.
+"""Compare the former mapping, COLMAP's own and ours on the same matches: ``sfm_speed.py DATABASE …``.
 
-Each runs in a process of its own, on one thread, in turn. A database is what the stage `matches`
-left; a run's folder does for it. With ``--truth truth.json`` of the demo, the distances of its camera centres after a
-similarity fit are told, too.
+Each runs in a process of its own, on one thread, in turn. A database is the output of the stage `matches`; a run's
+folder is accepted, too. With the demo's ``--truth truth.json``, the distances of its camera centres after a similarity
+fit are reported as well.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ONES = {**COLUMNS, "centres mm": "centres_mm:.2f"}
 
 
 def database_of(path: Path) -> Path:
-    """A database, or the one that a run's newest matches left."""
+    """Return the path itself if it is a database, or that of a run's newest matches."""
     if path.is_file():
         return path
     found = sorted(path.glob("stages/matches-*/database.db"), key=lambda each: each.stat().st_mtime)
@@ -32,13 +32,13 @@ def database_of(path: Path) -> Path:
 
 
 def true_centres(path: Path) -> dict[str, list[float]]:
-    """Metres, by the photo's name."""
+    """Return the true camera centres in metres, by photo name."""
     photos = json.loads(path.read_text(encoding="utf-8"))["photos"]
     return {photo["name"]: photo["centre_m"] for photo in photos}
 
 
 def measure(path: Path, how: str, truth: dict[str, list[float]]) -> Row:
-    """One mapping's figures."""
+    """Return one mapping's figures."""
     database = database_of(path)
     with pycolmap.Database.open(database) as opened:
         total = opened.num_images()

@@ -1,9 +1,9 @@
-"""Held-out quality over training's CPU time, at several sizes: ``sizes.py PHOTOS --work FOLDER 0.5:7000 4:12000 …``.
+"""Compare held-out quality and CPU time at several sizes: ``sizes.py PHOTOS --work FOLDER 0.5:7000 4:12000 …``.
 
-Each SIZE:ITERATIONS is a training of its own (schedules follow from the length) on photos of at most SIZE megapixels,
-by the line itself, on the same cameras, photos and start; all are judged at the same size, min(photo, 2 MP). The stages
-before training run once. Runs that are in FOLDER already are not run again; their OUT stays there, for pictures and for
-`texture_contrast.py`. CPU time is of the training alone.
+Each SIZE:ITERATIONS is a separate training (schedules follow from the length) by the pipeline itself on photos of at
+most SIZE megapixels, with the same cameras, photos and start; all are evaluated at the same size, min(photo, 2 MP). The
+stages before training run once. Runs already in FOLDER are not repeated; their OUT stays there, for images and for
+`texture_contrast.py`. CPU time is that of training alone.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ COLUMNS = {
 
 
 def prepared(photos: Path, work: Path, given: list[str]) -> Path:
-    """The OUT that all trainings begin with: everything up to `initialize`.
+    """Return the OUT that all trainings start from: everything up to `initialize`.
 
     Raises:
-        SystemExit: if that fails.
+        SystemExit: if a stage fails.
     """
     base = work / "base"
     command = splatpipe("base", ["run", str(photos), str(base), "--until", "initialize", *given], work / "base.log")
@@ -51,10 +51,10 @@ def prepared(photos: Path, work: Path, given: list[str]) -> Path:
 
 
 def train(base: Path, photos: Path, arm: str, given: list[str]) -> Row:
-    """One training, judged.
+    """Run one training and evaluate it.
 
     Args:
-        base: Of ``prepared``.
+        base: OUT from ``prepared``.
         photos: The capture.
         arm: SIZE:ITERATIONS.
         given: Options of all runs.
@@ -75,7 +75,7 @@ def train(base: Path, photos: Path, arm: str, given: list[str]) -> Row:
 
 
 def judged(out: Path) -> Row:
-    """What a run's training took, and how good it is."""
+    """Return what a run's training took, and its quality."""
     folder = open_run_folder(out, LINE)
     metrics = json.loads(folder.lineage(EVALUATE, EVALUATE)["evaluate.metrics"].path.read_text(encoding="utf-8"))
     manifest = json.loads(

@@ -1,4 +1,4 @@
-"""Each product of a run against the demo's truth: rows of figures."""
+"""Compare each product of a run with the demo's truth: rows of figures."""
 
 from __future__ import annotations
 
@@ -23,22 +23,24 @@ from splatpipe.demo.relief import relief_in
 from splatpipe.demo.visibility import FEWEST, photos_that_see
 from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
 
-TOLERANCE_GSD = 2.0  # of clouds and meshes
-SAMPLES = 100_000  # of the true surface and of a product: a share's deviation is below 0.002
-SPACING_M = 0.05  # between places on the true surface
+TOLERANCE_GSD = 2.0  # for clouds and meshes
+SAMPLES = 100_000  # of the true surface and of a product: the standard deviation of a share is below 0.002
+SPACING_M = 0.05  # between samples on the true surface
 SEED = 18
-TARGET_REACH_PX = 32  # of the crop that a target is looked for in; a target is some 18 px
-FOUND_PX = 12.0  # farther off, it is another one, or nonsense
-SEEN_M = 0.05  # a target that lies deeper than what is seen from above is hidden
-WALL_M = 0.5  # before or behind a wall's plane, what belongs to it: reveals, sills, frames, steps of the roof's edge
-SAME_NORMAL = 0.9  # cosine, of a façade and the wall that it is of
-SAME_WALL_M = 2.0  # between their planes, at most
+TARGET_REACH_PX = 32  # half-size of the search window; a target is some 18 px
+FOUND_PX = 12.0  # a detection farther off is another target, or false
+SEEN_M = 0.05  # a target this far below the visible surface is hidden
+WALL_M = (
+    0.5  # in front of or behind a wall's plane, what belongs to it: reveals, sills, frames, steps at the roof's edge
+)
+SAME_NORMAL = 0.9  # cosine between a façade's normal and its wall's
+SAME_WALL_M = 2.0  # largest distance between their planes
 WALL_PARTS = (HOUSE, PLAIN, BRICKS)
-MAIN_ROOF_M = 4.3  # its eaves' height, less a little; the annex and the canopy are lower
+MAIN_ROOF_M = 4.3  # height of its eaves, less a little; the annex and the canopy are lower
 
 
 def measure_dsm(site: TruthGrid, raster: Raster) -> list[Row]:
-    """A row for what counts, each class of it, and what is counted apart."""
+    """Return a row for all cells that count, one per class, and those counted separately."""
     found = site.cut(np.where(raster.there, raster.bands[0].astype(np.float64), np.nan), np.nan)
     errors = relief_errors(found, site.relief.height, site.relief.cosine)
     clear = site.below & ~site.steps
@@ -59,9 +61,9 @@ def measure_dsm(site: TruthGrid, raster: Raster) -> list[Row]:
 def target_differences(
     site: TruthGrid, picture: UInt8[np.ndarray, "h w 3"], cell_m: float
 ) -> dict[str, Float64[np.ndarray, " 2"]]:
-    """Metres east and south from each target's true place to where the orthophoto shows it; NaN where it does not.
+    """Return metres east and south from each target's true place to the orthophoto's; NaN where it is not found.
 
-    Targets that are truly to be seen from above, by three photos.
+    Only targets that are truly visible from above, and in three photos.
     """
     points = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["points"]
     apart = {}
@@ -79,7 +81,7 @@ def target_differences(
 def target_difference(
     picture: UInt8[np.ndarray, "h w 3"], place: Float64[np.ndarray, " 2"]
 ) -> Float64[np.ndarray, " 2"]:
-    """Pixels from a place to the quadrant target that is found there; NaN where there is none."""
+    """Return the pixels from a place to the quadrant target detected there; NaN if there is none."""
     left, top = np.maximum(place.astype(int) - TARGET_REACH_PX, 0)
     crop = picture[top : top + 2 * TARGET_REACH_PX, left : left + 2 * TARGET_REACH_PX]
     found = [np.array([t.x + left, t.y + top]) - place for t in find_quadrant_targets(np.ascontiguousarray(crop))]
@@ -88,12 +90,12 @@ def target_difference(
 
 
 def measure_ortho(site: TruthGrid, raster: Raster, true: Path | None) -> tuple[Row, list[Row]]:
-    """Its figures, and a row of contrasts of each texture; without the true picture only the targets.
+    """Return the orthophoto's figures, and a row of contrasts per texture; without the true image only the targets.
 
     Args:
-        site: The truth on its grid.
+        site: The truth on the orthophoto's grid.
         raster: The orthophoto.
-        true: The true picture from above.
+        true: Path of the true image from above.
     """
     picture, there = site.cut(colours(raster), 0), site.cut(raster.there, False)
     apart = target_differences(site, picture, raster.cell)
@@ -119,7 +121,7 @@ def _contrasts(
     truth: UInt8[np.ndarray, "h w 3"],
     counts: Bool[np.ndarray, "h w"],
 ) -> list[Row]:
-    from texture_contrast import EDGE_PX  # here, for it loads torch
+    from texture_contrast import EDGE_PX  # imported here, since it loads torch
     from texture_contrast import figures as contrast_figures
 
     rows = []
@@ -131,7 +133,7 @@ def _contrasts(
 
 
 def matching(facades: list[Facade], name: str) -> Facade | None:
-    """The elevation of a wall of the house; None where there is none."""
+    """Return the elevation of a wall of the house; None if there is none."""
     wall, span, high = wall_planes()[name]
     middle = wall.point(span / 2.0, high / 2.0)
     near = []
@@ -144,7 +146,7 @@ def matching(facades: list[Facade], name: str) -> Facade | None:
 
 
 def facade_errors(facade: Facade, points: Points, normals: Points) -> Float64[np.ndarray, " n"]:
-    """Distances normal to the true surface at places on it, positive outside; NaN where the elevation has no depth."""
+    """Return distances along the true normal at points of the true surface, positive outside; NaN without a depth."""
     right, down, normal = facade.axes()
     axes = np.stack([right / (right @ right), down / (down @ down), normal])
     column, row, depth = ((points - facade.corners[0]) @ axes.T).T
@@ -155,7 +157,7 @@ def facade_errors(facade: Facade, points: Points, normals: Points) -> Float64[np
 
 
 def measure_facades(truth: SceneTruth, facades: list[Facade]) -> list[Row]:
-    """A row a wall, then all of them and the plain ones; a wall that no elevation is of is missing altogether."""
+    """Return a row per wall, one for all and one for the plain walls; a wall without an elevation counts as missing."""
     rows, every, plain = [], [], []
     for name, (wall, span, _high) in wall_planes().items():
         view = facade_view(name, GSD_M)
@@ -185,7 +187,7 @@ def measure_facades(truth: SceneTruth, facades: list[Facade]) -> list[Row]:
 
 
 def corner_distance(facade: Facade, left: Float64[np.ndarray, " 3"], right: Float64[np.ndarray, " 3"]) -> float:
-    """The farthest, in plan, of an elevation's four corners from the wall's own, metres."""
+    """Return the largest plan distance between an elevation's four corners and the wall's, metres."""
     pairs = zip(facade.corners[:, :2], np.stack([left, right, right, left])[:, :2], strict=True)
     return max(float(np.linalg.norm(found - true)) for found, true in pairs)
 
@@ -193,13 +195,13 @@ def corner_distance(facade: Facade, left: Float64[np.ndarray, " 3"], right: Floa
 def measure_points(
     truth: SceneTruth, surface: Surface, points: Points, distances_to: Callable[[Points], Float64[np.ndarray, " n"]]
 ) -> Row:
-    """Precision, recall and F1 at 2 GSD of a cloud, or of places spread over a mesh.
+    """Return precision, recall and F1 at 2 GSD of a cloud, or of points sampled on a mesh.
 
     Args:
         truth: The scene.
         surface: Its triangles below the flight.
-        points: Of the product, the truth's metres.
-        distances_to: From places of the true surface to the product.
+        points: Points of the product, in the truth's metres.
+        distances_to: Distances from points of the true surface to the product.
     """
     rng = np.random.default_rng(SEED)
     own = thinned(points[truth.flown_over(points)], GSD_M)
@@ -213,7 +215,7 @@ def measure_points(
 
 
 def near_triangles(truth: SceneTruth) -> Bool[np.ndarray, " m"]:
-    """Triangles of which some part may lie below the flight."""
+    """Return the triangles that may lie partly below the flight."""
     (west, south), (east, north) = truth.flown_box
     x, y = truth.triangles[..., 0], truth.triangles[..., 1]
     return np.asarray(
@@ -222,7 +224,7 @@ def near_triangles(truth: SceneTruth) -> Bool[np.ndarray, " m"]:
 
 
 def seen_places(truth: SceneTruth, rng: np.random.Generator) -> Points:
-    """Places of the true surface below the flight that at least three photos see, as many a square metre everywhere."""
+    """Sample the true surface below the flight where at least three photos see it, at a uniform density."""
     rows = np.flatnonzero(near_triangles(truth))
     places, of = spread(truth.triangles[rows], 3 * SAMPLES, rng)
     below = truth.flown_over(places)
@@ -231,10 +233,10 @@ def seen_places(truth: SceneTruth, rng: np.random.Generator) -> Points:
 
 
 def true_surface_of(truth: SceneTruth) -> Surface:
-    """What precision is measured to."""
+    """Return the surface that precision is measured against."""
     return surface_of(truth.triangles[near_triangles(truth)], SPACING_M, np.random.default_rng(SEED))
 
 
 def ortho_site(truth: SceneTruth, raster: Raster, crs_from_true: Callable[[Points], Points]) -> TruthGrid:
-    """The truth on an orthophoto's grid: whether photos see it is told for 4 × 4 pixels at a time."""
+    """Return the truth on an orthophoto's grid; visibility in the photos is computed per block of 4 × 4 pixels."""
     return site_of(truth, raster, crs_from_true, every=4)
