@@ -1,8 +1,8 @@
-"""Depths of many photos as one cloud: each place of the surface once, by the photo that sees it best.
+"""Fusion of depth maps into one point cloud: each part of the surface once, from the photo that sees it best.
 
-A pixel becomes a point unless a photo that sees the place more finely has it, too. It then moves along its normal to
-where all photos that see it have it, on average, and is dropped where as many look through it. (Merrell et al.,
-"Real-Time Visibility-Based Fusion of Depth Maps", ICCV 2007, weigh these two against each other, too.)
+A pixel becomes a point unless a photo with a smaller footprint there has it, too. The point then moves along its normal
+to the average over all photos that see it, and is dropped if as many photos see through it. (Merrell et al., "Real-Time
+Visibility-Based Fusion of Depth Maps", ICCV 2007, also weigh these two against each other.)
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from splatpipe.pipeline.surface.photo_set import DepthPart, SurfacePieces, Surfa
 from splatpipe.pipeline.surface.sources import HeightRange
 from splatpipe.pipeline.surface.tiles import Tile
 
-FINER = 0.9  # of a point's footprint: a photo with less than that has the place instead; beyond it both may
-LEAST_PHOTOS = 3  # that have to see a point, its own among them
-REACH = 2.5  # deviations of the mean within which a photo counts (Tukey's biweight; Beaton and Tukey 1974)
-SIGMA_PX = 0.7  # of a depth, in pixels' lengths on the surface
+FINER = 0.9  # of a point's footprint: a photo with a smaller one takes over the point; otherwise both may keep it
+LEAST_PHOTOS = 3  # photos that have to see a point, including its own
+REACH = 2.5  # standard deviations from the mean within which a photo counts (Tukey's biweight; Beaton and Tukey 1974)
+SIGMA_PX = 0.7  # standard deviation of a depth, in pixel footprints on the surface
 ROUNDS = 3  # of the robust mean
-STALE = 0.3  # of points that are lost, which it is time to leave behind
-BATCH = 1 << 14  # points at a time: what each photo says of them is held, 16 bytes a point and photo
+STALE = 0.3  # share of discarded points at which the arrays are compacted
+BATCH = 1 << 14  # points at a time: takes 16 bytes per point and photo
 MOST = np.iinfo(np.uint8).max
 
 
 @dataclass(frozen=True, eq=False)
 class FusedPoints:
-    """A cloud.
+    """A fused point cloud.
 
     Attributes:
-        pieces: Where its points are, and which way they face.
-        footprint: How long a pixel of the best photo is on each, metres.
-        confidence: How many photos besides that one see it.
+        pieces: Positions and normals of the points.
+        footprint: Size of the best photo's pixel on the surface at each point, metres.
+        confidence: How many other photos see each point.
     """
 
     pieces: SurfacePieces
@@ -47,18 +47,18 @@ class FusedPoints:
         return len(self.footprint)
 
     def select(self, rows: np.ndarray) -> FusedPoints:
-        """Those of them."""
+        """The points of these rows."""
         return FusedPoints(self.pieces.select(rows), self.footprint[rows], self.confidence[rows])
 
 
 def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: HeightRange) -> FusedPoints:
-    """The cloud of a tile, photo by photo; its points may have left the tile by a little.
+    """Fuse the depths in a tile, photo by photo; points may lie slightly outside of the tile.
 
     Args:
-        parts: Of all photos' depths, wherever the tile may lie in them.
-        lattice: Whose cells are meant.
-        tile: Which of them.
-        relief: Points outside of these heights are noise.
+        parts: The parts of all photos' depths that may show the tile.
+        lattice: The lattice of the tile.
+        tile: The tile.
+        relief: Height range; points outside of it are noise.
     """
     if not parts:
         return joined([])
@@ -80,7 +80,7 @@ def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: Heig
 def finest_of_cubes(
     xyz: Float64[np.ndarray, "3 n"], footprint: Float64[np.ndarray, " n"], lattice: Lattice, tile: Tile
 ) -> Int64[np.ndarray, " k"]:
-    """Rows of the finest point in each cube of a cell's side, by cell and height; none of what is outside of a tile."""
+    """Rows of the finest point in each cube of cell size, by cell and height; those outside of the tile are dropped."""
     cell = lattice.cells(tile, xyz[0], xyz[1])
     kept = np.flatnonzero(cell >= 0)
     layer = np.floor(xyz[2, kept] / lattice.cell_m).astype(np.int64)
@@ -93,7 +93,7 @@ def finest_of_cubes(
 
 
 def joined(found: Sequence[FusedPoints]) -> FusedPoints:
-    """Several clouds one after the other."""
+    """Concatenate clouds."""
     none = FusedPoints(SurfacePieces(np.zeros((3, 0)), np.zeros((3, 0))), np.zeros(0), np.zeros(0, np.uint8))
     every = [none, *found]
     xyz, normal = (np.concatenate([getattr(each.pieces, name) for each in every], axis=1) for name in ("xyz", "normal"))
@@ -102,7 +102,7 @@ def joined(found: Sequence[FusedPoints]) -> FusedPoints:
 
 
 def _by_distance(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile) -> list[DepthPart]:
-    """The nearest photos first: they are likely to have a place more finely, and most points need no others."""
+    """Parts sorted by distance: near photos are likely to be finer, so most points need no others."""
     middle = lattice.centres(tile)[tile.height // 2, tile.width // 2]
     away = [float(np.hypot(*(part.camera.centre()[:2] - middle))) for part in parts]
     return [parts[k] for k in np.argsort(away, kind="stable")]
@@ -127,11 +127,11 @@ def _finest(points: DepthPoints, others: Sequence[DepthPart]) -> DepthPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Opinion:
-    """What the photos say about points, a row a photo that sees some.
+    """Where other photos place the points; one row per photo that sees any.
 
     Attributes:
-        offset: From a point to the photo's place of it, metres: (photos, 3, n).
-        weight: How much it counts; 0 where it does not see it.
+        offset: From a point to the photo's position of it, metres: (photos, 3, n).
+        weight: Weight of the photo; 0 where it does not see the point.
     """
 
     offset: Float32[np.ndarray, "m 3 n"]
@@ -139,7 +139,7 @@ class _Opinion:
 
 
 def _agreed(points: DepthPoints, parts: Sequence[DepthPart]) -> FusedPoints:
-    """Points where the photos that see them have them, without those that few see or many look through."""
+    """Points moved to the average of the photos that see them, without those that few see or many see through."""
     opinion, normal, balance = _heard(points, parts)
     count = 1 + (opinion.weight > 0.0).sum(axis=0)
     kept = np.flatnonzero((count >= LEAST_PHOTOS) & (balance > 0))
@@ -156,7 +156,7 @@ def _agreed(points: DepthPoints, parts: Sequence[DepthPart]) -> FusedPoints:
 def _heard(
     points: DepthPoints, parts: Sequence[DepthPart]
 ) -> tuple[_Opinion, Float64[np.ndarray, "3 n"], Int64[np.ndarray, " n"]]:
-    """What the other photos say; the sum of all normals; and how many more see a point than look through it."""
+    """The other photos' positions; the sum of all normals; and how many more photos see a point than see through it."""
     size = len(points.footprint)
     normal, balance = points.pieces.normal.copy(), np.ones(size, np.int64)
     offsets, weights = [np.zeros((0, 3, size), np.float32)], [np.zeros((0, size), np.float32)]
@@ -184,9 +184,9 @@ def _heard(
 def _place_and_normal(
     pieces: SurfacePieces, part: DepthPart, look: SurfaceView, seen: Bool[np.ndarray, " n"]
 ) -> tuple[Float64[np.ndarray, "3 k"], Float64[np.ndarray, "3 k"]]:
-    """From points to the pixels that show them in another photo, and these pixels' normals; zero where unknown.
+    """Offsets from points to the surface at their pixels in another photo, and the normals there; zero where unknown.
 
-    A pixel's centre lies beside the point, but on its plane: along the normal it is as far off as the plane.
+    A pixel's centre lies beside the point, but on the surface's plane, so along the normal the offset is the plane's.
     """
     row, column = look.place.row[seen].astype(np.int64), look.place.column[seen].astype(np.int64)
     offset = place_of(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64)) - pieces.xyz[:, seen]
@@ -197,7 +197,7 @@ def _place_and_normal(
 def _robust_mean(
     along: Float64[np.ndarray, "m n"], weight: Float64[np.ndarray, "m n"], footprint: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
-    """How far points move along their normals: the biweight mean, the own place among what is averaged."""
+    """Shifts of points along their normals: the biweight mean, which includes the point's own position."""
     mean = np.zeros(len(footprint))
     reach = REACH * SIGMA_PX * footprint
     for _ in range(ROUNDS):

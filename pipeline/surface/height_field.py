@@ -1,4 +1,4 @@
-"""A finished surface model to ask for heights between its cells."""
+"""A finished surface model with interpolation of heights between its cells."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from jaxtyping import Float32, Float64
 
 from splatpipe.pipeline.surface.lattice import Lattice
 
-STEEPEST = 2.0  # rise over run between neighbouring cells; more is a step, which stays one
+STEEPEST = 2.0  # rise over run between neighbouring cells; anything steeper is a step and not interpolated
 
 
 @dataclass(frozen=True, eq=False)
 class HeightField:
-    """Heights of all cells; they may lie in a mapped file.
+    """Heights of all cells, possibly memory-mapped.
 
     Attributes:
-        lattice: Where the cells are.
-        height: Local metres at their centres, nan where there is none.
+        lattice: The cells' positions.
+        height: Local metres at the cells' centres, NaN where there is none.
     """
 
     lattice: Lattice
     height: Float32[np.ndarray, "h w"]
 
     def at(self, east: Float64[np.ndarray, " *n"], north: Float64[np.ndarray, " *n"]) -> Float64[np.ndarray, " *n"]:
-        """Heights of places: between smooth cells in a straight line, at a step the nearest cell's; nan outside."""
+        """Heights of places: bilinear between smooth cells, the nearest cell's at a step; NaN outside."""
         across, down = self.lattice.places(east, north)
         nearest = self._cell(np.floor(down).astype(np.int64), np.floor(across).astype(np.int64))
         left, top = np.floor(across - 0.5), np.floor(down - 0.5)

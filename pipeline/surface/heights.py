@@ -17,29 +17,30 @@ from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCach
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import HALF, HeightVotes, Layer, undecided
 
-TILE = 256  # cells a side
-LEAST_PHOTOS = 3  # that see a place
-NEAR = 4  # cells: smaller holes are filled from around,
-FAR = 16  # cells: larger ones where photos may see what is filled in,
-FAR_ON_WALLS = 28  # and still larger ones on walls, which are plain where no depths are found, and flat
-BEHIND = 8  # photos that see a surface are worth one that looks through it: depths make what is near too wide
-FEW = 2  # photos that agree on a height, which counts where a third one may see it
+TILE = 256  # cells per side
+LEAST_PHOTOS = 3  # photos that have to see a cell
+NEAR = 4  # cells: holes up to this size are filled from their surroundings,
+FAR = 16  # larger ones up to this if photos may see the filled surface,
+FAR_ON_WALLS = 28  # and still larger ones on walls, which are flat and textureless where depths are missing
+BEHIND = 8  # one photo that sees through a surface outweighs this many that see it: depths widen foreground objects
+FEW = 2  # photos that agree on a height suffice where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
 MOST_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
-LEAST_CELLS = 1 << 12  # of a tile that is not made in parts: margins would be the most of it
+LEAST_CELLS = 1 << 12  # smaller tiles are not split: they would be mostly margin
 MOST = np.iinfo(np.uint8).max
 
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """The surface model in a tile.
+    """A tile of the surface model.
 
     Attributes:
-        tile: Which.
-        height: Of the topmost surface at the cells' centres, local metres; nan where fewer than three photos see.
-        sigma: Expected deviation of each, metres; nan where there is none.
-        photos: How many photos agree on each; 2 where a third one may see it, 1 where it was filled from around, 0
-            where there is none.
+        tile: The tile.
+        height: Height of the topmost surface at the cells' centres, local metres; NaN where fewer than three photos see
+            it.
+        sigma: Expected deviation of each height, metres; NaN where there is none.
+        photos: How many photos agree on each height; 2 where a third one may see it, 1 where it was filled from its
+            surroundings, 0 where there is none.
     """
 
     tile: Tile
@@ -50,14 +51,14 @@ class Heights:
 
 @dataclass(frozen=True, eq=False)
 class HeightInput:
-    """All that the surface model is made from.
+    """Inputs of the surface model.
 
     Attributes:
         sources: Depths of the photos, always in the same order.
-        lattice: Whose cells get heights.
-        relief: Between which heights.
-        shelf: Holds a few depths.
-        upright: Whether the lattice is a wall's, and not the ground's.
+        lattice: Cells that get heights.
+        relief: Lowest and highest height to consider.
+        shelf: Cache of a few depth maps.
+        upright: Whether the lattice is a wall's instead of the ground's.
     """
 
     sources: Sequence[DepthSource]
@@ -68,26 +69,26 @@ class HeightInput:
 
     @property
     def far(self) -> int:
-        """How far larger holes look around, cells."""
+        """Size limit of the larger holes to fill, cells."""
         return FAR_ON_WALLS if self.upright else FAR
 
     @property
     def margin(self) -> int:
-        """Cells around a tile that its holes look at."""
+        """Margin around a tile that filling its holes needs, cells."""
         return NEAR + self.far + 1
 
     def depths(self, number: int) -> PosedDepthMap:
-        """A photo's depths, loaded if they are not at hand."""
+        """A photo's depths, loaded if they are not cached."""
         return self.shelf.get(number, self.sources[number].loaded)
 
 
 def surface_heights(capture: HeightInput, tiles: Sequence[Tile], threads: int) -> Iterator[Heights]:
-    """Heights of tiles, in their order: the same bits for any number of threads, and however cells are tiled.
+    """Compute heights of tiles in order; bit-identical for any number of threads and any tiling.
 
     Args:
         capture: Photos and cells.
-        tiles: Which to make.
-        threads: Tiles at a time.
+        tiles: Tiles to compute.
+        threads: Tiles in parallel.
 
     Raises:
         ValueError: if depths do not fit their camera.
@@ -96,12 +97,12 @@ def surface_heights(capture: HeightInput, tiles: Sequence[Tile], threads: int) -
 
 
 def tile_heights(capture: HeightInput, tile: Tile, most: int = MOST_VOTES) -> Heights:
-    """Heights of one tile.
+    """Compute the heights of one tile.
 
     Args:
         capture: Photos and cells.
-        tile: Which.
-        most: Cells times photos at once; larger ones are made in parts.
+        tile: The tile.
+        most: Limit on cells times photos; tiles above it are computed in parts.
     """
     wide = tile.grown(capture.margin)
     seen = photos_seeing([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
@@ -137,7 +138,7 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MOST_VOTES) -> He
 def _filled(
     capture: HeightInput, tile: Tile, height: Float64[np.ndarray, " c"], numbers: Sequence[int]
 ) -> tuple[Float64[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
-    """A tile's heights with small holes filled, and larger ones where enough photos may see that; and which are new."""
+    """Fill a tile's small holes, and larger ones where enough photos may see the result; also returns which are new."""
     shape, cell_m = (tile.height, tile.width), capture.lattice.cell_m
     near, _ = filled(height.reshape(shape), cell_m, NEAR, capture.upright)
     far, new = filled(near, cell_m, capture.far, capture.upright)
@@ -154,7 +155,7 @@ def _may_see(
     height: Float64[np.ndarray, " a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, " a"]:
-    """How many photos see places, or look there and have no depth."""
+    """How many photos see each place, or view it without having a depth there."""
     count = np.zeros(len(asked), np.int64)
     for _, view in _views(capture, tile, asked, height[None], numbers):
         count += view.seen | view.unknown
@@ -168,16 +169,16 @@ def _views(
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Iterator[tuple[int, PointVisibility]]:
-    """What each photo says of places in some of a tile's cells, layer by layer, with the layer's number."""
+    """Visibility of places in some of a tile's cells in each photo, layer by layer, with the layer's index."""
     east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
-    for number in reversed(numbers) if asked.size else ():  # the last ones are still at hand
+    for number in reversed(numbers) if asked.size else ():  # the last ones are still cached
         found = capture.depths(number)
         for layer, height in enumerate(heights):
             yield layer, sight(found, (east, north, height), capture.lattice.cell_m)
 
 
 def _joined(tile: Tile, halves: Sequence[Heights]) -> Heights:
-    """Of what a tile's halves are."""
+    """Join the halves of a tile."""
     axis = 0 if halves[0].tile.width == tile.width else 1
     columns = zip(*((half.height, half.sigma, half.photos) for half in halves), strict=True)
     return Heights(tile, *(np.concatenate(column, axis=axis) for column in columns))
@@ -191,9 +192,9 @@ def _empty(tile: Tile) -> Heights:
 def _chosen(
     capture: HeightInput, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]
 ) -> Float64[np.ndarray, " c"]:
-    """Of the surfaces in each cell the highest that too few photos look through; nan where none is.
+    """The highest surface in each cell that not too many photos see through; NaN where there is none.
 
-    Where there are several, one that covers half of the cell at least comes before others.
+    Surfaces that cover at least half of the cell take precedence.
     """
     asked = np.flatnonzero(undecided(found, LEAST_PHOTOS))
     heights = np.stack([layer.height[asked] for layer in found])
@@ -214,7 +215,7 @@ def _balance(
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
-    """How many more photos see a surface than ``BEHIND`` times those that look through it."""
+    """Number of photos that see a surface, minus ``BEHIND`` times those that see through it."""
     balance = np.zeros(heights.shape, np.int64)
     for layer, view in _views(capture, tile, asked, heights, numbers):  # whole numbers add up in any order
         balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)

@@ -1,7 +1,7 @@
-"""A surface from depths by a truncated signed distance function (Curless and Levoy, SIGGRAPH 1996), by open3d.
+"""A mesh from depths by a truncated signed distance function (TSDF; Curless and Levoy, SIGGRAPH 1996), with open3d.
 
-Every voxel near the surface has the mean of how far before it or behind it photos see the surface, along their view
-axes. A photo that looks through a voxel counts, too: so what one photo imagines, others clear away.
+Every voxel near the surface stores the mean signed distance to the surface along the photos' optical axes. Photos that
+see through a voxel count as well, so they clear away the false surfaces of a single photo.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from splatpipe.pipeline.surface.blocks import BAND, LEAST_PHOTOS, SIDE, Blocks, 
 from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.triangles import TriangleMesh, in_order
 
-FARTHEST_M = 1e4  # open3d asks for a limit of depths
-WIDER = 1.01  # times a block's half diagonal: what a view's sides touch is in it, however it is rounded
+FARTHEST_M = 1e4  # open3d requires a depth limit
+WIDER = 1.01  # times a block's half diagonal: includes blocks that touch the view's sides, despite rounding
 
 
 def open3d() -> Any:
-    """The module.
+    """Import open3d.
 
     Raises:
-        MachineError: if it is not installed, or a system's library that it needs is not.
+        MachineError: if it, or a system library that it needs, is not installed.
     """
     try:
         return importlib.import_module("open3d")
@@ -48,17 +48,17 @@ def open3d() -> Any:
 
 
 def tsdf_mesh(photos: PhotoSet, box: Box, blocks: Blocks, threads: int, report: Reporter) -> TriangleMesh:
-    """The surface that photos see, in one order whatever the number of threads.
+    """Mesh the surface that photos see, in an order that is independent of the number of threads.
 
     Args:
-        photos: With their depths.
-        box: What of the world counts.
-        blocks: Where the surface is.
-        threads: Photos at a time where depths are read.
-        report: Told of progress.
+        photos: Photos with their depths.
+        box: The part of the world to mesh.
+        blocks: Voxel blocks near the surface.
+        threads: Photos whose depths are read in parallel.
+        report: Receives progress.
 
     Raises:
-        MachineError: if open3d is not there.
+        MachineError: if open3d is not installed.
     """
     o3d = open3d()
     size = blocks.places.shape[1]
@@ -95,14 +95,14 @@ def _depths_of(photos: PhotoSet, box: Box, number: int) -> tuple[Camera, Float32
 
 
 def _pose(camera: Camera, blocks: Blocks) -> np.ndarray:
-    """Camera from the blocks' own metres: near zero, where float32 is fine enough."""
+    """Camera pose relative to the blocks' corner: coordinates near zero, where float32 is precise enough."""
     pose = camera.cam_from_world.copy()
     pose[:3, 3] += pose[:3, :3] @ blocks.low
     return pose
 
 
 def _in_view(camera: Camera, blocks: Blocks) -> Bool[np.ndarray, " n"]:
-    """Blocks of which a part may lie in a camera's picture."""
+    """Blocks that may be partly inside a camera's view."""
     reach = WIDER * SIDE * blocks.voxel_m * np.sqrt(3.0) / 2.0
     pose = camera.cam_from_world
     x, y, depth = pose[:3, :3] @ blocks.centres() + pose[:3, 3:]

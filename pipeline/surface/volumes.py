@@ -1,10 +1,10 @@
-"""Volumes between a surface model and a base inside a polygon, with how far they may be off.
+"""Volumes between a surface model and a base inside a polygon, with their uncertainty.
 
-The uncertainty has three parts, which are taken for independent. A cell's noise: neighbours share it, as depths of
-neighbouring pixels do, so a sum's variance is the cells' own times the number of cells that one counts for. The base's:
-a plane through the rim is as uncertain as its fit, whose residuals, shared along the rim likewise, hold the rim's noise
-and its roughness both. And where heights are stated, what the whole surface may be too high or too low by; a rim that
-is too high as well takes that out again.
+The uncertainty has three parts, assumed independent. First, the noise of cells: it is correlated between neighbours,
+like the depths of neighbouring pixels, so the variance of a sum is that of the cells times the number of cells that
+share an error. Second, the base: a plane through the rim is as uncertain as its fit, whose residuals, correlated along
+the rim, contain both the rim's noise and its roughness. Third, if the base's height is stated, a systematic height
+error of the whole surface; with a base through the rim, which is off by the same amount, it cancels.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.surface_file import SurfaceFile
 from splatpipe.pipeline.surface.tiles import Tile, tiled
 
-WINDOW = 1024  # cells a side
-PARTS = 5  # of a cell's side: how much of a cell that the outline crosses lies inside
-SHARED_CELLS = 1.0  # two cells' noise goes together by exp(-d² / 4 s²), d their distance and s this: 3.5 along a line
+WINDOW = 1024  # cells per side
+PARTS = 5  # subdivisions of a cell's side, for the share inside of a cell that the outline crosses
+SHARED_CELLS = 1.0  # s of the noise correlation exp(-d² / 4 s²) of two cells at distance d, in cells: 3.5 along a line
 SHARED_ALONG = 2.0 * math.sqrt(math.pi) * SHARED_CELLS  # that sum over a line of cells,
 SHARED_AROUND = 4.0 * math.pi * SHARED_CELLS**2  # and over an area
-RIM_CELLS = 1.0  # between places on the rim
-MOST_RIM = 1_000_000  # such places: 20 km at 2 cm, more is a wrong coordinate
-LEAST_RIM = 12  # places with heights that a plane is laid through
-LEAST_RIM_SHARE = 0.5  # of the rim that has heights: of less, nobody knows how the base goes on
-LOWEST_OF = 5  # neighbouring places whose median is one height: a single cell may be a hole's
-UNTOLD_SIGMA_CELLS = 0.5  # expected deviation where none is told, in cells
+RIM_CELLS = 1.0  # spacing of samples on the rim, in cells
+MOST_RIM = 1_000_000  # samples: 20 km at 2 cm; a longer rim means a wrong coordinate
+LEAST_RIM = 12  # samples with heights needed to fit a plane
+LEAST_RIM_SHARE = 0.5  # of the rim that needs heights: with less, the base is unreliable
+LOWEST_OF = 5  # neighbouring samples in the median filter: a single cell may be in a hole
+UNTOLD_SIGMA_CELLS = 0.5  # assumed deviation where none is stated, in cells
 ROUNDS, HUBER = 5, 1.5  # of the plane's robust fit, and deviations beyond which a place counts less
 
 Kind = Literal["rim", "lowest", "stated"]
@@ -42,14 +42,14 @@ Kind = Literal["rim", "lowest", "stated"]
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A plane: height = terms · (1, east, north), metres on the ground from a place in the middle.
+    """A plane: height = terms · (1, east, north), with ground metres from a point in the middle.
 
     Attributes:
-        kind: ``rim``: through the outline's heights. ``lowest``: level, at the lowest of them. ``stated``: level.
-        middle: Easting and northing that it counts from, the CRS's unit.
-        terms: Height in the middle, rise towards east, rise towards north.
-        covariance: Of the terms.
-        misfit_m: Root mean square of the rim about it; None of a level one.
+        kind: ``rim``: fitted to the outline's heights. ``lowest``: level, at the lowest of them. ``stated``: level.
+        middle: Easting and northing of that point, in the CRS's unit.
+        terms: Height in the middle, slope towards east, slope towards north.
+        covariance: Covariance of the terms.
+        misfit_m: RMS distance of the rim from the plane, metres; None for a level base.
     """
 
     kind: Kind
@@ -74,15 +74,15 @@ class Amount:
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """What lies above and below a base.
+    """Volumes above and below a base.
 
     Attributes:
         base: The plane.
-        area_m2: Of the polygon, on the ground.
-        known_m2: Of it, where there are heights: volumes are of that alone.
-        cut: Above the base: what would be taken away.
-        fill: Below it: what would be brought.
-        net: Cut less fill.
+        area_m2: Ground area of the polygon.
+        known_m2: The part of it with heights, to which the volumes refer.
+        cut: Volume above the base, to be removed.
+        fill: Volume below it, to be filled.
+        net: Cut minus fill.
     """
 
     base: Base
@@ -98,10 +98,10 @@ class _Ground:
     """A surface inside an outline, metres in plan and height.
 
     Attributes:
-        surface: The model, in the CRS's units.
+        surface: The surface model, in the CRS's units.
         area: The outline in the CRS's unit.
-        plan_m: Metres on the ground in a unit of the plan.
-        height_m: Metres in a unit of heights.
+        plan_m: Ground metres per unit in plan.
+        height_m: Metres per unit of height.
     """
 
     surface: SurfaceFile
@@ -120,14 +120,14 @@ class _Ground:
 def measure_volume(
     surface: SurfaceFile, area: PlanArea, crs: MapCrs, base: Kind | float, datum_sigma_m: float = 0.0
 ) -> Volume:
-    """The volume between a surface model and a base.
+    """Compute the volumes between a surface model and a base.
 
     Args:
-        surface: The model.
-        area: East and north, local metres.
-        crs: The model's.
+        surface: The surface model.
+        area: The polygon; east and north, local metres.
+        crs: CRS of the surface model.
         base: ``rim``, ``lowest``, or a height in the CRS's unit.
-        datum_sigma_m: Expected deviation of all heights together: counts where a height is stated.
+        datum_sigma_m: Standard deviation of a height error common to the whole surface; used for a stated height.
 
     Raises:
         SplatpipeError: if the outline is absurdly long, lies outside of the surface, or too little of it has heights
@@ -176,7 +176,7 @@ def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
 
 
 def _along(ring: Ring, step: float) -> Float64[np.ndarray, "n 2"]:
-    """Places on a closed outline, evenly."""
+    """Evenly spaced points on a closed outline."""
     closed, way = np.concatenate([ring, ring[:1]]), _lengths(ring)
     count = max(LEAST_RIM, round(way[-1] / step))
     at = np.arange(count) / count * way[-1]
@@ -184,7 +184,7 @@ def _along(ring: Ring, step: float) -> Float64[np.ndarray, "n 2"]:
 
 
 def _lengths(ring: Ring) -> Float64[np.ndarray, " n"]:
-    """How long a closed outline is up to each of its vertices, and as a whole."""
+    """Cumulative length of a closed outline at each vertex, and its total length."""
     closed = np.concatenate([ring, ring[:1]])
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
 
@@ -207,7 +207,7 @@ def _fitted(
     up: Float64[np.ndarray, " n"],
     sigma: Float64[np.ndarray, " n"],
 ) -> Base:
-    """The plane through the rim, robust (Huber's weights), with the covariance of shared noise."""
+    """Robust fit of the plane through the rim (Huber weights), with a covariance that allows for correlated noise."""
     weight = np.ones(len(up))
     terms = np.zeros(3)
     spread = 0.0
@@ -226,7 +226,7 @@ def _fitted(
 
 
 def _windows(ground: _Ground) -> Iterator[Tile]:
-    """Parts of the raster that the outline lies in."""
+    """Parts of the raster that the outline's bounding box covers."""
     vertices = np.concatenate(ground.rings())
     column, row = ground.surface.lattice.places(vertices[:, 0], vertices[:, 1])
     lattice = ground.surface.lattice
@@ -238,13 +238,13 @@ def _windows(ground: _Ground) -> Iterator[Tile]:
 
 @dataclass(frozen=True, eq=False)
 class _CutFillSums:
-    """Sums over cells, of cut and fill each.
+    """Sums over cells, for cut and fill each.
 
     Attributes:
         known_m2: Area with heights.
         m3: Volumes.
-        noise: Variance by the cells' own noise.
-        lever: By how much cut falls and fill grows with the base's terms: so the net falls by their sum.
+        noise: Variance from the cells' own noise.
+        lever: Derivatives with respect to the base's terms: cut falls and fill grows by these, net falls by their sum.
     """
 
     known_m2: float
@@ -284,7 +284,7 @@ def _part(ground: _Ground, base: Base, part: Tile) -> _CutFillSums:
 
 
 def _shares(ground: _Ground, part: Tile) -> Float64[np.ndarray, "h w"]:
-    """How much of each cell lies inside."""
+    """The share of each cell that lies inside."""
     lattice = ground.surface.lattice
     centres = lattice.centres(part)
     shape = centres.shape[:2]
@@ -292,7 +292,7 @@ def _shares(ground: _Ground, part: Tile) -> Float64[np.ndarray, "h w"]:
     crossed = np.zeros(shape, np.bool_)
     for ring in ground.rings():
         column, row = lattice.places(*_along(ring, lattice.cell_m / PARTS).T)
-        for down in (-1, 0, 1):  # a sample's neighbours: an outline may cut a corner between two samples
+        for down in (-1, 0, 1):  # also a sample's neighbours: an outline may cut a corner between two samples
             for right in (-1, 0, 1):
                 j = np.floor(column).astype(np.int64) - part.column + right
                 i = np.floor(row).astype(np.int64) - part.row + down
