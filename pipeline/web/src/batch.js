@@ -1,9 +1,9 @@
-// A batch's page while the batch runs: says how old it is, loads itself again, and tells when nobody writes it any more.
-// Without scripts a refresh of the browser's own does the loading.
+// A batch's page while the batch is running: shows its age, reloads itself, and warns if it is no longer updated.
+// Without scripts, the browser's own refresh reloads it.
 
 const body = document.body;
 const written = Number(body.dataset.written) * 1000; // milliseconds
-const silence = Number(body.dataset.silence) * 1000; // so long without a word is too long
+const silence = Number(body.dataset.silence) * 1000; // longest time without an update
 const every = Number(body.dataset.refresh) * 1000;
 const opened = Date.now();
 const age = document.querySelector("[data-age]");
@@ -12,7 +12,7 @@ const pause = document.querySelector("[data-pause]");
 let paused = false;
 let leaving = false;
 
-/** A time in words, to the second or the minute. */
+/** A duration in words, to the second or the minute. */
 function words(milliseconds) {
   const seconds = Math.round(milliseconds / 1000);
   if (seconds < 60) return `${seconds} s`;
@@ -20,7 +20,7 @@ function words(milliseconds) {
   return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
-/** Whether loading again would take something away: a reader's selection, or the place of the keyboard. */
+/** Whether reloading would lose the reader's text selection or keyboard focus. */
 function busy() {
   return document.querySelector("main :focus-visible") !== null || !document.getSelection().isCollapsed;
 }

@@ -1,6 +1,6 @@
-// A training as it runs: asks the server every other second, while anybody looks.
+// The live view of training: polls the server every two seconds while the page is visible.
 //
-// For scripts: window.splatpipe.live.state() is what the server said last, and updates how many times that was new.
+// For scripts: window.splatpipe.live.state() is the server's last answer, and updates the number of changed answers.
 
 import uPlot from "uplot";
 
@@ -17,7 +17,7 @@ const MODELS = {
 
 let told = null;
 let updates = 0;
-let view = null; // name of the photo that is shown
+let view = null; // name of the photo shown
 let pictured = { address: "" };
 const plots = {};
 
@@ -118,7 +118,7 @@ function tellModel(model) {
   return `${model.block ? `block ${model.block}, ` : ""}${MODELS[model.kind]}${count}`;
 }
 
-// The picture before stays until the new one is there; one at a time.
+// The previous image stays until the new one has loaded; one at a time.
 async function picture(stamp, number) {
   const address = `/live/${stamp}/${number}`;
   if (pictured.address === address) return;
@@ -134,7 +134,7 @@ async function picture(stamp, number) {
       $(what).hidden = false;
     }
   } catch {
-    if (pictured === mine) pictured = { address: "" }; // the model went on meanwhile: the next answer names it
+    if (pictured === mine) pictured = { address: "" }; // the model has changed: the next answer has the new stamp
   }
 }
 

@@ -1,7 +1,7 @@
-// Marking control points: one point, one photo, one click; the next photo comes by itself.
+// Marking control points: one point, one photo, one click; the next photo follows automatically.
 //
-// For scripts: window.splatpipe.mark has ready (a promise), state(), goTo(pointName, photoName), screenAt([x, y]) in the
-// window's pixels of a place in the photo, and settled(), a promise that all is on the disk and shown.
+// For scripts: window.splatpipe.mark has ready (a promise), state(), goTo(pointName, photoName), screenAt([x, y]), the
+// window pixel of a photo pixel, and settled(), a promise that everything is saved on disk and shown.
 
 import { element, isLeft, showEstimate, showPhotos, showPoints } from "./mark/panels.js";
 import { paintOver } from "./mark/crosses.js";
@@ -9,7 +9,7 @@ import { Photos, Picture } from "./mark/picture.js";
 import { Outbox, fetchJson, post } from "./mark/server.js";
 
 const $ = (id) => document.getElementById(id);
-const CLOSE_ZOOM = 4; // screen pixels a photo's pixel, where the place is known well
+const CLOSE_ZOOM = 4; // screen pixels per photo pixel, if the position is well known
 const ROOM = 2.8; // radii of uncertainty that the view shows
 const KEYS = [
   ["Click", "mark the point; click again to correct it"],
@@ -53,7 +53,7 @@ function numbers({ point, photo }) {
 
 const needsMore = (point) => point.marks < state.wanted && point.left > 0;
 
-// What the server says: taken over unless changes of ours are still on their way.
+// The server's answer: applied unless changes of ours are still pending.
 function hear({ answer, refused }) {
   if (refused) hint(refused, true);
   if (answer && outbox.count === 0) take(answer);
@@ -66,7 +66,7 @@ function take(answer) {
   showAll();
 }
 
-// The order of a point's photos stays as it was when one came to it: nothing moves under the hand.
+// The order of a point's photos stays fixed while the point is open, so that nothing moves under the pointer.
 function setDetail(detail) {
   const known = state.order.get(detail.name);
   if (known) detail.photos.sort((a, b) => known.indexOf(a.photo) - known.indexOf(b.photo));
@@ -74,7 +74,7 @@ function setDetail(detail) {
   state.detail = detail;
 }
 
-// Until the point's photos are known, and then until its photo is there, all that is clicked is for what is shown.
+// Until the point's photos are known and its photo is loaded, clicks apply to what is shown.
 async function choosePoint(number, photo) {
   state.asked = number;
   const detail = await fetchJson(`/api/mark/${number}`);
@@ -94,7 +94,7 @@ async function choosePhoto(number) {
   state.moved = null;
   hint("");
   const size = state.told.photos[number];
-  picture.show(null, size); // where nothing is shown, nothing can be clicked
+  picture.show(null, size); // without a photo, nothing can be clicked
   showAll();
   try {
     const bitmap = await photos.get(number, size);
@@ -117,7 +117,7 @@ function home() {
   picture.look(at[0], at[1], Math.min(CLOSE_ZOOM, inside ? room : room / 2));
 }
 
-// The next photo that remains, after the one that is shown.
+// The next remaining photo after the one shown.
 function nextLeft() {
   const rows = state.detail.photos;
   const at = rows.findIndex((each) => each.photo === state.photo);
@@ -144,7 +144,7 @@ function mark([x, y], nudge) {
 function nudge(dx, dy) {
   const at = place() ?? [picture.x, picture.y];
   const to = [at[0] + dx, at[1] + dy];
-  if (row().mark) mark(to, !row().found); // a found one that is moved is somebody's from here on
+  if (row().mark) mark(to, !row().found); // a detected target that is moved becomes the user's mark
   else state.moved = to;
   picture.keepInSight(to);
   picture.draw();
@@ -160,7 +160,7 @@ async function accept() {
   await onward();
 }
 
-// To the next photo of the point while it wants more, then to the next point that does.
+// To the next photo of the point while it needs more marks, then to the next point that does.
 async function onward() {
   const next = nextLeft();
   if (next && state.detail.photos.filter((each) => each.mark).length < state.wanted) return choosePhoto(next.photo);
@@ -176,7 +176,7 @@ async function onward() {
 function remove() {
   const here = row();
   if (!here.mark) return;
-  const { found } = here; // the next georeferencing would find it again: the file has to say no
+  const { found } = here; // the next georeferencing would detect it again: the file has to rule it out
   Object.assign(here, { mark: null, found: false, hidden: found, residual_px: null });
   send({ action: found ? "hide" : "unmark" });
   showAll();
@@ -306,7 +306,7 @@ function run(act) {
   state.acting = state.acting.then(act).catch((error) => hint(error.message, true));
 }
 
-// What is chosen from a list waits for nothing, but what comes next waits for it.
+// Choosing from a list does not wait, but later actions wait for it.
 function atOnce(act) {
   const done = act().catch((error) => hint(error.message, true));
   state.acting = Promise.all([state.acting, done]);

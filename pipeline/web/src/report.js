@@ -1,7 +1,7 @@
-// The held-out photos of a report: photo and render become one picture with a slider between them.
-// Without scripts, and in print, they stand side by side.
+// The held-out photos of a report: photo and render become one image with a slider between them.
+// Without scripts, and in print, they are side by side.
 
-/** Makes one view's pictures a comparison. */
+/** Turns one view's images into a comparison. */
 function compare(view) {
   const pictures = view.querySelector(".pictures");
   const photo = pictures.querySelector(".photo");

@@ -1,10 +1,10 @@
-// Brings in a site's viewer, packed: a third of the bytes where the host compresses nothing on the way. Then it asks for
-// the first of the splat, which arrives while the browser reads the viewer. site.py writes the addresses.
+// Loads a site's viewer, compressed: a third of the bytes if the host does not compress. It then requests the first
+// part of the splat, which arrives while the browser parses the viewer. site.py writes the addresses.
 
 const { script, packed, first } = document.currentScript.dataset;
 const GZIP = [0x1f, 0x8b];
 
-/** Where the viewer is, unpacked. */
+/** URL of the unpacked viewer. */
 async function unpack() {
   const answer = await fetch(packed);
   if (!answer.ok) throw new Error(`${answer.status}`);
@@ -12,7 +12,7 @@ async function unpack() {
   const hint = Object.assign(document.createElement("link"), { rel: "preload", as: "fetch", crossOrigin: "", href: first });
   document.head.append(hint);
   let stream = new Blob([bytes]).stream();
-  if (GZIP.every((byte, i) => bytes[i] === byte)) stream = stream.pipeThrough(new DecompressionStream("gzip")); // some hosts have the browser do it
+  if (GZIP.every((byte, i) => bytes[i] === byte)) stream = stream.pipeThrough(new DecompressionStream("gzip")); // some hosts have the browser unpack it
   const text = await new Response(stream).arrayBuffer();
   return URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
 }
@@ -25,7 +25,7 @@ function run(src) {
 }
 
 const ready = unpack()
-  .catch(() => script) // an old browser, or a page that was opened from a disk
+  .catch(() => script) // an old browser, or a page opened from disk
   .then(run)
   .catch(() => {
     document.getElementById("message").textContent = "The viewer cannot be loaded.";
@@ -33,5 +33,5 @@ const ready = unpack()
     throw new Error("the viewer cannot be loaded");
   })
   .then(() => window.splatpipe.ready); // the viewer's own, see viewer.js
-ready.catch(() => null); // the page tells it
+ready.catch(() => null); // the page reports it
 window.splatpipe = { ready };

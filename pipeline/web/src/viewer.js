@@ -1,22 +1,22 @@
-// viewer.html: the splat in any browser, without a network; and a site's index.html, which loads it in levels of detail.
-// viewer.py and site.py write the pages; the parts are in viewer/.
+// viewer.html shows the splat in any browser, offline; a site's index.html loads it in levels of detail. viewer.py and
+// site.py write the pages; the modules are in viewer/.
 //
 // For scripts and tests there is `window.splatpipe`:
-//   ready                 a promise: the first whole picture is on the screen (rejected where loading failed); on a site
-//                         all else is there only then
-//   complete()            a promise: a complete frame of the present view, as fine as it gets, is on the screen
+//   ready                 a promise: the first complete frame is on the screen (rejected if loading failed); on a site,
+//                         the rest of this API exists only then
+//   complete()            a promise: a complete frame of the current view, in full detail, is on the screen
 //   cameraState()         {position, yaw, pitch, roll, fx, fy, cx, cy, width, height, photo}: world units, radians, CSS px
 //   setCamera({position, target} or {position, yaw, pitch, roll})   look from there, at once
-//   goToCamera(name, atOnce = true)   the view of a photo; false where there is none of that name
-//   project([x, y, z])    {x, y, depth}: where a world point is in the window, CSS px
-//   pick(x, y)            [x, y, z]: the world point under a place in the window, or null
-//   crsOf([x, y, z])      its coordinates in the run's CRS, or null where there is none
+//   goToCamera(name, atOnce = true)   the view of a photo; false if there is none of that name
+//   project([x, y, z])    {x, y, depth}: window position of a world point, CSS px
+//   pick(x, y)            [x, y, z]: the world point at a window position, or null
+//   crsOf([x, y, z])      its coordinates in the run's CRS, or null if there is none
 //   measure(from, to, kind = "distance")   {distance, horizontal, height}, drawn like one made by hand
 //   showPoints(on), showCameras(on), showInterface(on)
-//   picture()             a promise: the present view as a PNG data URL
-//   shown()               {gaussians, files}: what is drawn; files of the levels of detail, where it is in such
-//   limit(count)          on a site: so many Gaussians at most are seen in full; the page has its own limit by the device
-//   facts                 what the page was made with
+//   picture()             a promise: the current view as a PNG data URL
+//   shown()               {gaussians, files}: what is drawn; files of the levels of detail, if any
+//   limit(count)          on a site: most Gaussians in view; by default the page sets a limit for the device
+//   facts                 the facts the page was made with
 
 import { Box3, Vector3 } from "three";
 import { fillStrip, Frusta, frustumDepth } from "./viewer/cameras.js";
@@ -37,9 +37,9 @@ import { Stage } from "./viewer/stage.js";
 import { LevelStream } from "./viewer/stream.js";
 import { View } from "./viewer/view.js";
 
-const FAR_PER_SIZE = 1e4; // of the scene: what is behind everything else must not be cut off
+const FAR_PER_SIZE = 1e4; // of the scene's size: the far plane must not clip the background
 const HOVER_MS = 60;
-const FILLED = 0.85; // of the free part of the window, by what one goes to
+const FILLED = 0.85; // of the free part of the window, by the target of a move
 
 const $ = (id) => document.getElementById(id);
 const array = (vector) => [vector.x, vector.y, vector.z];
@@ -51,15 +51,15 @@ class Viewer {
     this.photos = facts.cameras;
     this.view = new View({ near: facts.near, far: facts.size * FAR_PER_SIZE });
     this.centre = vector(facts.centre);
-    this.photo = null; // whose view it is
-    this.last = null; // chosen last: where the next and the one before count from
+    this.photo = null; // the photo whose view this is
+    this.last = null; // the last one chosen, from which next and previous count
     this.tool = null;
   }
 
   async start() {
     const { facts, view } = this;
     const levels = facts.levels && this.fetchLevels(facts.levels);
-    levels?.catch(() => null); // told where it is waited for
+    levels?.catch(() => null); // reported where it is awaited
     this.stage = new Stage($("canvas"), facts);
     view.changed = () => {
       this.photo = null;
@@ -84,7 +84,7 @@ class Viewer {
       return this.show(await readSplat(facts, progress));
     }
     await this.stream(...(await levels));
-    this.addSmallParts(); // files of their own: nobody waits for them
+    this.addSmallParts(); // in separate files that nothing waits for
   }
 
   async addSmallParts() {
@@ -93,7 +93,7 @@ class Viewer {
     this.stage.invalidate();
   }
 
-  /** Sections and volumes; null where none were measured. */
+  /** Sections and volumes; null if none were measured. */
   makeResults() {
     const measured = readMeasurements();
     for (const element of document.querySelectorAll(".for-results")) element.hidden = !measured;
@@ -106,7 +106,7 @@ class Viewer {
     return results;
   }
 
-  /** Show a splat, all of it. */
+  /** Show a complete splat. */
   async show(bytes) {
     this.part = await readPart(bytes);
     this.stage.show([this.part]);
@@ -114,12 +114,12 @@ class Viewer {
     loaded();
   }
 
-  /** The tree and its root, asked for before WebGL holds up the page. */
+  /** Request the tree and its root, before setting up WebGL blocks the page. */
   fetchLevels({ tree, root, bytes }) {
     return Promise.all([readLevels(tree), fetchPatiently(root, async (file) => file, { progress, total: bytes })]);
   }
 
-  /** Show a splat in levels of detail: all of it, coarse, then finer where one looks. */
+  /** Show a splat in levels of detail: first all of it, coarse, then refined where the view is. */
   async stream(nodes, bytes) {
     const stream = new LevelStream(nodes, this.stage, (error) => note(`Some of the model stays coarse: ${error.message} Reload to try again.`));
     await stream.begin(bytes);
@@ -129,7 +129,7 @@ class Viewer {
     loaded();
   }
 
-  /** Resolves when the present view is on the screen, as fine as it gets. */
+  /** Resolves when the current view is on the screen in full detail. */
   async complete() {
     do {
       await this.stage.complete();
@@ -205,19 +205,19 @@ class Viewer {
     return true;
   }
 
-  /** Where to turn to from here: with a photo's lens. */
+  /** The current pose, with the photo's lens. */
   pose() {
     return this.view.poseOf(this.view.lens.rotation ? this.view.lens : this.photos[this.facts.start]);
   }
 
   /**
-   * Go to where all of some places are seen.
+   * Move to a view of all the given places.
    *
    * @param {Vector3[]} places
-   * @param {Vector3 | null} forward Level; null: as one looks now.
+   * @param {Vector3 | null} forward Horizontal; null for the current direction.
    * @param {number} pitch Radians.
-   * @param {{x: number, y: number, width: number, height: number}} free The part of the window that they are to fill, by
-   *   its middle and its size, CSS pixels.
+   * @param {{x: number, y: number, width: number, height: number}} free The part of the window to fill, given by its
+   *   centre and size, CSS pixels.
    */
   lookAt(places, forward, pitch, free) {
     const to = this.pose();
@@ -246,7 +246,7 @@ class Viewer {
     return meet(this.parts().map((part) => part.caster), view.position, view.ray(x, y), forward, limits);
   }
 
-  /** What is drawn of the splat. */
+  /** The parts of the splat that are drawn. */
   parts() {
     return this.levels ? this.levels.parts() : this.part ? [this.part] : [];
   }

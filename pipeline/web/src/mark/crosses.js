@@ -1,7 +1,7 @@
-// What is drawn over a photo: where the point is expected, where it is marked or was found, and where the pointer is.
+// The overlay on a photo: the expected position of the point, its mark or detected target, and the pointer.
 
 const INK = { expected: "#ffb000", marked: "#3ddc68", found: "#d08cff", moved: "#4cc2ff", wrong: "#ff5a5f" };
-const GAP = 4; // screen pixels left free at the place itself
+const GAP = 4; // screen pixels left free around the position itself
 const ARM = 16;
 
 export function paintOver(context, picture, row, moved) {
@@ -28,7 +28,7 @@ function stroke(context, colour, path) {
   context.stroke();
 }
 
-// Lines of one device pixel over the whole photo, with the place itself left free.
+// Cross hairs one device pixel wide over the whole photo, with a gap at the position itself.
 function lines(context, picture) {
   const [x, y] = picture.pointer;
   context.save();
@@ -65,7 +65,7 @@ function circle(context, picture, place, radius) {
   context.restore();
 }
 
-// Where the ray of the point's only mark runs through this photo: the point lies on it.
+// The epipolar curve of the point's only mark in this photo: the point lies on it.
 function path(context, picture, line) {
   context.save();
   context.globalAlpha = 0.8;

@@ -1,4 +1,4 @@
-// The lists beside the photo: points with what the marks tell of them, and the photos of a point.
+// The lists beside the photo: points with their estimates from the marks, and the photos of a point.
 
 export const element = (tag, attributes = {}, ...children) => {
   const made = document.createElement(tag);

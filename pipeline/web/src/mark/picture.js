@@ -1,10 +1,10 @@
-// A photo on a canvas, zoomed so that a pixel can be pointed at: sharp, drawn when something changed and only then.
+// A photo on a canvas that can be zoomed to single pixels: sharp, and redrawn only when something has changed.
 
-const MOST_PIXELS = 150e6; // of photos kept decoded, 4 bytes each
+const MOST_PIXELS = 150e6; // of decoded photos in memory, 4 bytes each
 const LARGEST_ZOOM = 40;
-const SHARP_FROM = 1.5; // device pixels a pixel, from which on they are drawn as squares
-const SMALL_WIDTH = 1600; // of the copy that is drawn while the view is far away: a large photo is slow to reduce
-const DRAG_PX = 4; // less is a click
+const SHARP_FROM = 1.5; // device pixels per photo pixel from which pixels are drawn as squares
+const SMALL_WIDTH = 1600; // of the copy drawn when zoomed out: reducing a large photo is slow
+const DRAG_PX = 4; // a shorter movement is a click
 const TAP_MS = 600;
 
 export class Photos {
@@ -39,7 +39,7 @@ async function load(number) {
 }
 
 export class Picture {
-  // `on.click([x, y])` with photo pixels, the first one's corner at (0, 0); `on.paint(drawing)` draws over the photo.
+  // `on.click([x, y])` gets photo pixels, with the first one's corner at (0, 0); `on.paint(drawing)` draws the overlay.
   constructor(canvas, overall, on) {
     Object.assign(this, { canvas, overall, on, bitmap: null, size: null, x: 0, y: 0, zoom: 1, pointer: null });
     this.touches = new Map();
@@ -98,7 +98,7 @@ export class Picture {
     return [this.x + (x - this.width / 2) / this.zoom, this.y + (y - this.height / 2) / this.zoom];
   }
 
-  // Moves the view where a place would be out of sight, and no more.
+  // Moves the view only if a position would be out of sight.
   keepInSight(place) {
     const [x, y] = this.screenAt(place);
     const margin = 40;
@@ -169,7 +169,7 @@ export class Picture {
     this.canvas.setPointerCapture(event.pointerId);
     this.touches.set(event.pointerId, this.place(event));
     if (this.touches.size === 1) this.drag = { start: this.place(event), moved: false, at: event.timeStamp };
-    else this.drag = null; // a pinch is no click
+    else this.drag = null; // a pinch is not a click
   }
 
   pointermove(event) {

@@ -1,5 +1,5 @@
-// What the page asks of the server. A change that did not reach the disk stays in the browser's storage and is sent
-// again, also by the page that is opened next: no mark is lost when the server, or the machine, goes down.
+// The page's requests to the server. A change that was not saved on disk stays in the browser's storage and is sent
+// again, also by the next page opened: no mark is lost if the server or the machine goes down.
 
 const RETRY_MS = 2000;
 const token = document.querySelector("meta[name=splatpipe-token]").content;
@@ -30,7 +30,7 @@ export async function post(path, body) {
 }
 
 export class Outbox {
-  // Changes on their way to the disk, in order; `hear` is told of answers and of trouble.
+  // Pending changes, in order; `hear` is called with answers and errors.
   constructor(key, numbers, hear) {
     this.key = `splatpipe.marks:${key}`;
     this.numbers = numbers;
@@ -67,12 +67,12 @@ export class Outbox {
       if (this.waiting.length) localStorage.setItem(this.key, JSON.stringify(this.waiting));
       else localStorage.removeItem(this.key);
     } catch {
-      // A browser without storage: the page itself still has them.
+      // A browser without storage: the page itself still holds them.
     }
     this.hear({});
   }
 
-  // Resolves when nothing waits any more, or when something has to wait.
+  // Resolves when nothing is pending any more, or when something has to be sent later.
   send() {
     this.sending ??= this.sendAll().finally(() => (this.sending = null));
     return this.sending;
@@ -91,7 +91,7 @@ export class Outbox {
         this.hear({ answer });
       } catch (error) {
         if (error.status === 400) {
-          this.waiting.shift(); // it will never be right
+          this.waiting.shift(); // it will never be accepted
           this.keep();
           this.hear({ refused: `${change.point} in ${change.photo}: ${error.message}` });
           continue;

@@ -1,15 +1,15 @@
-// Spark draws one instance a splat. That costs a software renderer some 6 µs each, whatever is drawn (a million: 28 s),
-// and wastes most of a GPU's vertex lanes. Here an instance is a batch of many splats: the same pictures, in 3 s.
-// In WebGL 2 the highest index always means a primitive's restart (OpenGL ES 3.0, 2.8.1).
+// Spark draws one instance per splat. This costs a software renderer about 6 µs each, whatever is drawn (a million:
+// 28 s), and wastes most of a GPU's vertex lanes. Here an instance is a batch of many splats: the same images, in 3 s.
+// In WebGL 2 the highest index always means primitive restart (OpenGL ES 3.0, 2.8.1).
 
 import { BufferAttribute } from "three";
 
-const BATCH = 16383; // splats an instance: their corners are what 16-bit indices reach below 65535, which is no corner
+const BATCH = 16383; // splats per instance: four vertices each, by 16-bit indices below 65535, the restart index
 const CORNERS = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0];
 const TRIANGLES = [0, 1, 2, 0, 2, 3];
 
-// What is replaced in spark's vertex shader, once each. The last one draws no pixel of a splat that is sure to be
-// discarded for being fainter than minAlpha, and makes the splats of a draft larger, as there are fewer of them.
+// Replacements in spark's vertex shader, once each. The last one skips pixels that would certainly be discarded for
+// being fainter than minAlpha, and enlarges the splats of a draft, since there are fewer of them.
 const REPLACEMENTS = [
   ["void main() {", `uniform int drawnSplats;\nuniform int splatStride;\nvoid main() {\nint place = (gl_InstanceID * ${BATCH} + (gl_VertexID >> 2)) * splatStride;`],
   [
@@ -22,8 +22,8 @@ const REPLACEMENTS = [
 ];
 
 /**
- * Make a SparkRenderer draw batches.
- * @returns {(stride: number) => void} Sets that only every stride-th splat is drawn, larger: a draft.
+ * Make a SparkRenderer draw in batches.
+ * @returns {(stride: number) => void} Sets the draft mode: only every stride-th splat is drawn, larger.
  */
 export function drawInBatches(spark) {
   let shader = spark.material.vertexShader;

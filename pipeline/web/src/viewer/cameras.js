@@ -1,4 +1,4 @@
-// The photos' cameras as frusta with their pictures, and as a strip of pictures; both jump to the photo's view.
+// The photos' cameras as frusta with images, and as a strip of thumbnails; both go to the photo's view on a click.
 
 import { BufferAttribute, BufferGeometry, DoubleSide, Group, LineBasicMaterial, LineSegments, Mesh, MeshBasicMaterial, Texture, Vector3 } from "three";
 
@@ -6,9 +6,9 @@ const COLOUR = 0xff9f1c;
 const HELD_OUT = 0x2ec4ff;
 const CORNERS = [[0, 0], [1, 0], [1, 1], [0, 1]];
 const EDGES = [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]];
-const OWN_VIEW = 0.5; // of a frustum's depth: from there the frustum itself would cover the view
+const OWN_VIEW = 0.5; // of a frustum's depth: from closer, the frustum itself would cover the view
 
-/** Centre and the picture's corners in the world, of a frustum that is `depth` long. */
+/** World coordinates of the centre and the image's corners of a frustum of length `depth`. */
 function corners(photo, depth) {
   const r = photo.rotation;
   return CORNERS.map(([right, down]) => {
@@ -49,7 +49,7 @@ export class Frusta {
     return { photo, centre, four, lines, picture };
   }
 
-  /** Lay the photos into the frusta: once they are to be seen. */
+  /** Texture the frusta with the photos, once they are visible. */
   async paint() {
     if (this.painted) return;
     this.painted = true;
@@ -69,7 +69,7 @@ export class Frusta {
     this.changed();
   }
 
-  /** Hide the frusta that one looks out of. */
+  /** Hide the frusta that the viewpoint is in. */
   update(view) {
     for (const { centre, lines, picture } of this.items) {
       const away = view.position.distanceTo(centre) > OWN_VIEW * this.depth;
@@ -77,7 +77,7 @@ export class Frusta {
     }
   }
 
-  /** The photo whose frustum's picture is at a place in the window; the foremost. */
+  /** The photo whose frustum's image is at a window position; the foremost one. */
   at(view, x, y) {
     let [found, nearest] = [null, Infinity];
     if (!this.group.visible) return null;
@@ -91,7 +91,7 @@ export class Frusta {
     return found?.photo ?? null;
   }
 
-  /** Draw one stronger; whether that changed anything. */
+  /** Highlight one; returns whether anything changed. */
   mark(photo) {
     if (this.marked === photo) return false;
     this.marked = photo;
@@ -120,8 +120,8 @@ export function frustumDepth(photos) {
 }
 
 /**
- * The strip of pictures.
- * @returns {{choose: (photo: object | null) => void, paint: () => void}} Marks one; loads the pictures.
+ * The strip of thumbnails.
+ * @returns {{choose: (photo: object | null) => void, paint: () => void}} Highlights one; loads the thumbnails.
  */
 export function fillStrip(strip, photos, go) {
   const buttons = photos.map((photo) => {
@@ -133,7 +133,7 @@ export function fillStrip(strip, photos, go) {
       const image = document.createElement("img");
       image.alt = photo.name;
       image.loading = "lazy";
-      image.style.aspectRatio = `${photo.width} / ${photo.height}`; // its place is known before it is loaded
+      image.style.aspectRatio = `${photo.width} / ${photo.height}`; // reserves its space before it is loaded
       button.append(image);
     } else {
       button.textContent = photo.name;

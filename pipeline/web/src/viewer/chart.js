@@ -1,12 +1,12 @@
-// A section as a chart: distance to the right, heights up, both in metres; what is under the pointer is told.
+// A section as a chart: distance to the right, height up, both in metres; shows the values under the pointer.
 
 const SIZE = { width: 340, height: 176 };
 const FRAME = { left: 46, right: 8, top: 8, bottom: 20 };
 const STEPS = [1, 2, 5];
 const MOST_TICKS = { across: 5, up: 4 };
-const LEAST_RANGE_M = 0.1; // of heights: a floor's noise is no mountain range
+const LEAST_RANGE_M = 0.1; // of heights, so that the noise of a flat floor is not exaggerated
 
-/** A step of 1, 2 or 5 times a power of ten that divides a range into few parts. */
+/** A step of 1, 2 or 5 times a power of ten that divides a range into at most `most` parts. */
 function stepOf(range, most) {
   for (let power = Math.floor(Math.log10(range / most)); ; power++) {
     const step = STEPS.map((base) => base * 10 ** power).find((each) => range / each <= most);
@@ -32,7 +32,7 @@ function svg(name, values, text) {
 export class Chart {
   /**
    * @param {SVGElement} drawing Filled here.
-   * @param {(index: number | null) => void} pointed Told which place is under the pointer.
+   * @param {(index: number | null) => void} pointed Called with the index of the place under the pointer.
    */
   constructor(drawing, pointed) {
     Object.assign(this, { drawing, pointed, trace: null });
@@ -61,7 +61,7 @@ export class Chart {
     this.mark(null);
   }
 
-  /** How many times heights are drawn larger than distances. */
+  /** Vertical exaggeration of the chart. */
   get enlarged() {
     const wide = (SIZE.width - FRAME.left - FRAME.right) / (this.across[1] - this.across[0]);
     return (SIZE.height - FRAME.top - FRAME.bottom) / (this.up[1] - this.up[0]) / wide;

@@ -1,4 +1,4 @@
-// Files from beside the page: one, or many that are fetched a few at a time, the most wanted first.
+// Fetches files beside the page: one, or many of which a few at a time are fetched, most important first.
 
 import { LoadError } from "./error.js";
 
@@ -36,11 +36,11 @@ export async function fetchBytes(address, { total = 0, progress = () => {}, sign
 }
 
 /**
- * What is made of a file's bytes, tried a few times.
+ * Fetch and process a file, with a few retries.
  * @template T
  * @param {string} address
- * @param {(bytes: Uint8Array) => Promise<T>} use Rejects where the file is damaged.
- * @param {object} how As `fetchBytes`.
+ * @param {(bytes: Uint8Array) => Promise<T>} use Processes the bytes; rejects if the file is damaged.
+ * @param {object} how As for `fetchBytes`.
  * @returns {Promise<T>}
  */
 export async function fetchPatiently(address, use, how = {}) {
@@ -56,17 +56,17 @@ export async function fetchPatiently(address, use, how = {}) {
 
 export class FileQueue {
   /**
-   * @param {number} atOnce How many requests.
-   * @param {(address: string, bytes: Uint8Array) => Promise<void>} use Takes a file; rejects where it is damaged.
-   * @param {(address: string, error: Error) => void} failed Told once no further attempt is made.
+   * @param {number} atOnce Number of concurrent requests.
+   * @param {(address: string, bytes: Uint8Array) => Promise<void>} use Processes a file; rejects if it is damaged.
+   * @param {(address: string, error: Error) => void} failed Called once there are no more retries.
    */
   constructor(atOnce, use, failed) {
     Object.assign(this, { atOnce, use, failed });
-    this.pending = new Set(); // in the order in which they are wanted
-    this.running = new Map(); // what ends each of them, by address
+    this.pending = new Set(); // in order of importance
+    this.running = new Map(); // abort controllers by address
   }
 
-  /** These and no others, in this order: what is under way and not among them is ended. */
+  /** Set the files to fetch, in order; other requests in progress are aborted. */
   want(addresses) {
     this.pending = new Set(addresses);
     for (const [address, controller] of this.running) {

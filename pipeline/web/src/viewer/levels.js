@@ -1,15 +1,15 @@
-// A site's levels of detail: which nodes of the tree a view wants. site.py writes the tree, levels.json.
+// A site's levels of detail: selects the nodes of the tree for a view. site.py writes the tree, levels.json.
 
 import { Vector3 } from "three";
 import { fetchPatiently } from "./files.js";
 import { LoadError } from "./error.js";
 
-const KEPT_FROM = 0.5; // of the pixels at which a node is refined: a refined one stays so down to here
-const MARGIN = 1.2; // of a core's size: what is just outside the window is refined as well
-const UNSEEN = 0.25; // of a Gaussian that is drawn is what one costs that is out of sight: it is sorted, no more
+const KEPT_FROM = 0.5; // of the error at which a node is refined: hysteresis, a refined node stays refined down to this
+const MARGIN = 1.2; // of a core's size: nodes just outside the window are refined too
+const UNSEEN = 0.25; // cost of a Gaussian out of sight relative to one drawn: it is only sorted
 
 /**
- * The tree's nodes, the root first.
+ * Read the tree's nodes, root first.
  * @returns {Promise<{file: string, core: number[][], origin: number[], error: number, count: number, children: object[]}[]>}
  */
 export async function readLevels(address) {
@@ -29,12 +29,12 @@ export async function readLevels(address) {
     }
     if (nodes[0].file) return nodes;
   } catch {
-    // told below
+    // reported below
   }
   throw new LoadError("levels.json is damaged.", "Copy the folder again, or export it again: splatpipe export.");
 }
 
-/** How large what a node leaves out is in the window, pixels, and whether any of it is in the window. */
+/** Computes a node's error in the window, pixels, and whether any of the node is in view. */
 class Eye {
   constructor(view, ratio) {
     const { fx, fy, cx, cy } = view.intrinsics();
@@ -52,7 +52,7 @@ class Eye {
     return (error * this.scale) / Math.max(distance, this.near);
   }
 
-  /** Whether its box is before all sides of what is seen: what is farthest out of it is. */
+  /** Whether its box reaches inside every plane of the view frustum. */
   sees({ core: [least, most] }) {
     const middle = new Vector3(...least).add(new Vector3(...most)).multiplyScalar(0.5);
     const half = new Vector3(...most).sub(middle).multiplyScalar(MARGIN);
@@ -63,13 +63,13 @@ class Eye {
     });
   }
 
-  /** What drawing a node costs, in Gaussians that are seen. */
+  /** The cost of drawing a node, in Gaussians in view. */
   cost(node) {
     return node.count * (this.sees(node) ? 1 : UNSEEN);
   }
 }
 
-/** Nodes by how large their error is in the window, the largest first. */
+/** Nodes sorted by their error in the window, largest first. */
 class Ranking {
   constructor() {
     this.items = [];
@@ -91,15 +91,15 @@ class Ranking {
 }
 
 /**
- * What a view wants of the tree.
+ * Select the nodes for a view.
  *
  * @param {object} root
  * @param {import("./view.js").View} view
- * @param {{pixels: number, most: number, held: number, ratio: number, refined: Set<object>}} limits Errors up to which a
- *   node will do, in the screen's pixels; Gaussians that are seen, and all that are shown, at most; the screen's pixels a
- *   CSS pixel; nodes whose descendants are shown.
- * @returns {{inner: Set<object>, order: object[]}} Nodes that their children are to stand for, and all that have to be
- *   loaded for that, the most important first.
+ * @param {{pixels: number, most: number, held: number, ratio: number, refined: Set<object>}} limits Acceptable error of
+ *   a node, screen pixels; most Gaussians in view and in total; screen pixels per CSS pixel; nodes whose descendants are
+ *   shown.
+ * @returns {{inner: Set<object>, order: object[]}} Nodes to be replaced by their children, and all nodes to be loaded
+ *   for that, most important first.
  */
 export function wantedLevels(root, view, { pixels, most, held, ratio, refined }) {
   const eye = new Eye(view, ratio);

@@ -1,4 +1,4 @@
-// Distances and heights between two clicked points: lines and labels over the picture.
+// Distances and heights between two clicked points: lines and labels over the image.
 
 import { Vector3 } from "three";
 
@@ -19,7 +19,7 @@ export class Measuring {
     this.rubber = null; // from the first point to the cursor
   }
 
-  /** Begin with a tool, or end with null. */
+  /** Start a tool, or stop with null. */
   use(kind) {
     this.kind = kind;
     this.first = null;
@@ -35,7 +35,7 @@ export class Measuring {
     return element;
   }
 
-  /** A clicked point: the first, or the second, which makes a measurement. */
+  /** Handle a clicked point: the first, or the second, which completes a measurement. */
   click(point) {
     this.hover(null);
     if (!this.first) {
@@ -48,7 +48,7 @@ export class Measuring {
     return result;
   }
 
-  /** The point under the cursor, or null: what a click would measure is shown. */
+  /** Handle the point under the cursor, or null: shows what a click would measure. */
   hover(point) {
     if (this.rubber) this.remove(this.rubber);
     this.rubber = this.first && point ? this.make(this.kind, this.first, point) : null;
@@ -92,7 +92,7 @@ export class Measuring {
     for (const element of [label, ...ends]) element.remove();
   }
 
-  /** Move everything to where its points are in the window. */
+  /** Move everything to its points' window positions. */
   update(view) {
     this.view = view;
     this.show();
@@ -121,7 +121,7 @@ export class Measuring {
     this.drawing.replaceChildren(...this.segments.flatMap((segment) => [svgLine(segment, HALO), svgLine(segment, LINE)]));
   }
 
-  /** Draw it all into a picture. */
+  /** Draw all measurements into an image. */
   draw(canvas, scale) {
     const context = canvas.getContext("2d");
     context.scale(scale, scale);
@@ -149,7 +149,7 @@ export class Measuring {
   }
 }
 
-/** A world segment on the screen, cut at the near plane; null where all of it is behind. */
+/** A world segment on the screen, clipped at the near plane; null if all of it is behind. */
 function onScreen(view, a, b) {
   const { near } = view.planes;
   const [pa, pb] = [view.project(a), view.project(b)];

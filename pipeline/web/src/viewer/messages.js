@@ -1,4 +1,4 @@
-// What the page says of its loading: a bar, a message in the middle of the page, a note at its edge.
+// Loading status of the page: a bar, a message in the middle of the page, a note at its edge.
 
 const $ = (id) => document.getElementById(id);
 
@@ -7,7 +7,7 @@ export function progress(share) {
   $("bar").style.width = `${Math.round(100 * share)}%`;
 }
 
-/** A message in the middle of the page: there is nothing else to see. */
+/** Show a message in the middle of the page, while there is nothing else to see. */
 export function tell(message, hint, choose = false) {
   $("loading").hidden = false;
   $("loading").classList.add("failed");
@@ -16,20 +16,20 @@ export function tell(message, hint, choose = false) {
   $("choose").hidden = !choose;
 }
 
-/** The model is there. */
+/** Hide the loading status: the model is shown. */
 export function loaded() {
   document.body.classList.add("ready");
   $("loading").hidden = true;
 }
 
-/** A sentence at the page's edge: what is there can be seen. */
+/** Show a sentence at the page's edge, without hiding the model. */
 export function note(text) {
   $("notice").textContent = text;
   $("notice").hidden = false;
 }
 
 /**
- * A splat that is dropped on the page or chosen, where the page cannot read it itself.
+ * Accept a splat file dropped on the page or chosen, if the page cannot load it itself.
  * @param {(bytes: Uint8Array) => Promise<void>} show
  */
 export function acceptFile(show) {

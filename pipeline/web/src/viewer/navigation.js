@@ -1,10 +1,10 @@
-// Mouse, touch and keys: they turn, shift and approach; a click without a movement is passed on.
+// Mouse, touch and keys: rotate, pan and zoom; a click without movement is passed on.
 
 import { Vector3 } from "three";
 
 const TURN_PER_PX = 0.005; // radians
 const CLICK_PX = { mouse: 4, pen: 8, touch: 12 };
-const APPROACH = 0.0012; // share of the distance a wheel step of 1 px takes away, logarithmic
+const APPROACH = 0.0012; // logarithmic share of the distance per wheel step of 1 px
 const FLY_PER_SECOND = 0.25; // of the scene's size
 const FLY_TURN_PER_SECOND = 0.9; // radians
 const FAST = 4; // with shift
@@ -38,7 +38,7 @@ export class Navigation {
     this.begun = { x: event.offsetX, y: event.offsetY, moved: this.pointers.size > 1 };
   }
 
-  /** What the fingers hold on to: the model where it is met, else something as far away as the scene. */
+  /** The point to hold: on the model under the pointer, else at the scene's distance. */
   grab(event) {
     const { x, y } = this.middle() ?? { x: event.offsetX, y: event.offsetY };
     this.held = this.scene.pick(x, y) ?? this.scene.centre();
@@ -78,7 +78,7 @@ export class Navigation {
     if (this.pointers.size) this.grab(event);
   }
 
-  /** Shift so that what is held stays under the pointer. */
+  /** Pan so that the held point stays under the pointer. */
   pan(right, down) {
     const { fx, fy } = this.view.intrinsics();
     const { right: x, up: y, forward } = this.view.axes();
@@ -86,7 +86,7 @@ export class Navigation {
     this.view.shift(new Vector3().addScaledVector(x, (-right * depth) / fx).addScaledVector(y, (down * depth) / fy));
   }
 
-  /** Towards a point: `amount` 1 leaves 1/e of the distance. */
+  /** Move towards a point: `amount` 1 reduces the distance to 1/e. */
   approach(amount, point) {
     const offset = new Vector3().subVectors(point, this.view.position);
     const least = 2 * this.view.planes.near;

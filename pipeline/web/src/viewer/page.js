@@ -1,21 +1,21 @@
-// What the page carries: the facts of the scene and, in most pages, the splat itself; or where it lies.
+// The page's embedded data: the facts of the scene and, in most pages, the splat itself, or else its URL.
 
 import { LoadError } from "./error.js";
 import { fetchBytes } from "./files.js";
 
-const CHUNK = 1 << 22; // letters decoded at a time where the browser has no decoder of its own; a multiple of 4
+const CHUNK = 1 << 22; // characters decoded at a time in browsers without a native decoder; a multiple of 4
 
 /** The facts that viewer.py wrote; see ViewerScene there. */
 export function readFacts() {
   return JSON.parse(document.getElementById("scene").textContent);
 }
 
-/** What measured_viewer.py put into the page; null where nothing was measured. */
+/** The measurements that measured_viewer.py put into the page; null if there are none. */
 export function readMeasurements() {
   return JSON.parse(document.getElementById("measurements").textContent);
 }
 
-/** Bytes of base64 text, without holding up the page for long. */
+/** Decode base64 text without blocking the page for long. */
 export async function bytesOf(text, progress = () => {}) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
   const parts = [];
@@ -27,7 +27,7 @@ export async function bytesOf(text, progress = () => {}) {
   return new Uint8Array(await new Blob(parts).arrayBuffer());
 }
 
-/** The splat's file: out of the page, or from the address beside it. */
+/** Bytes of the splat's file, from the page or from its URL beside it. */
 export async function readSplat(facts, progress) {
   const inlined = document.getElementById("splat");
   if (inlined) {
@@ -49,7 +49,7 @@ export async function readSplat(facts, progress) {
   return await fetchBytes(facts.splat.address, { progress });
 }
 
-/** The sparse points: out of the page, or from beside it, where those that cannot be had are none. */
+/** The sparse points, from the page or from a file beside it; empty if that cannot be loaded. */
 export async function readPoints({ xyz, rgb, address, count }) {
   if (!address) {
     const [places, colours] = [await bytesOf(xyz), await bytesOf(rgb)];

@@ -1,4 +1,4 @@
-// Splats out of one SPZ file, as they are drawn and as rays meet them.
+// The splats of one SPZ file, for rendering and for ray casting.
 
 import { ExtSplats, SplatMesh } from "@sparkjsdev/spark";
 import { LoadError } from "./error.js";
@@ -7,7 +7,7 @@ import { RayCaster } from "./ray.js";
 const SH_TEXTURES = { sh1: "sh1Texture", sh2: "sh2Texture", sh3a: "sh3TextureA", sh3b: "sh3TextureB" }; // spark's names
 
 export class SplatPart {
-  /** @param {ExtSplats} splats @param {number[]} origin Their zero in the world. */
+  /** @param {ExtSplats} splats @param {number[]} origin Their origin in the world. */
   constructor(splats, origin) {
     this.splats = splats;
     this.count = splats.numSplats;
@@ -19,16 +19,16 @@ export class SplatPart {
     this.forget();
   }
 
-  /** Once the GPU has the harmonics, nobody else needs them: two thirds of a splat's bytes. */
+  /** Free the spherical harmonics once the GPU has them: two thirds of a splat's bytes. */
   forget() {
     const { extra } = this.splats;
-    this.splats.ensureShTextures(); // spark makes them when it first draws
+    this.splats.ensureShTextures(); // spark would create them on first draw
     for (const [name, its] of Object.entries(SH_TEXTURES)) {
       const texture = extra[its]?.value;
       if (!texture) continue; // a lower degree has none
       texture.onUpdate = () => {
         texture.image.data = null;
-        extra[name] = true; // that it is there, spark asks still
+        extra[name] = true; // spark still checks that it exists
       };
     }
   }
@@ -40,9 +40,9 @@ export class SplatPart {
   }
 }
 
-/** Decode an SPZ file (y up), whose zero is at `origin` in the world. */
+/** Decode an SPZ file (y up) whose origin is at `origin` in the world. */
 export async function readPart(bytes, origin = [0, 0, 0]) {
-  const splats = new ExtSplats({ fileBytes: bytes, fileType: "spz" }); // float32 centres: half floats are cm apart
+  const splats = new ExtSplats({ fileBytes: bytes, fileType: "spz" }); // float32 centres: half floats have steps of centimetres
   try {
     await splats.initialized;
   } catch {

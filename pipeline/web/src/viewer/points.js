@@ -5,7 +5,7 @@ import { BufferAttribute, BufferGeometry, Points, ShaderMaterial, Vector3 } from
 const SIZE_PX = 3.5;
 const REACH_PX = 10; // from a click
 
-/** None at first, and not shown. */
+/** Make an empty, hidden point cloud. */
 export function makePoints() {
   const geometry = new BufferGeometry();
   const material = new ShaderMaterial({
@@ -19,7 +19,7 @@ void main() {
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
   gl_PointSize = size;
 }`,
-    fragmentShader: "varying vec3 colour;\nvoid main() { gl_FragColor = vec4(colour, 1.0); }", // as they are: sRGB
+    fragmentShader: "varying vec3 colour;\nvoid main() { gl_FragColor = vec4(colour, 1.0); }", // unchanged: sRGB
   });
   const points = new Points(geometry, material);
   points.frustumCulled = false;
@@ -28,20 +28,20 @@ void main() {
   return points;
 }
 
-/** Put points into their place. @param {{xyz: Float32Array, rgb: Uint8Array}} found */
+/** Fill in the points. @param {{xyz: Float32Array, rgb: Uint8Array}} found */
 export function fillPoints(points, { xyz, rgb }) {
   points.geometry.setAttribute("position", new BufferAttribute(xyz, 3));
   points.geometry.setAttribute("rgb", new BufferAttribute(rgb, 3, true));
 }
 
-/** The foremost point near a place in the window; null where none is. */
+/** The foremost point near a window position, or null. */
 export function nearestPoint(points, view, x, y) {
   const xyz = points.geometry.getAttribute("position")?.array ?? [];
   const { fx, fy, cx, cy } = view.intrinsics();
   const { right, up, forward } = view.axes();
   const eye = view.position;
   let [best, least] = [-1, Infinity];
-  for (let i = 0; i < xyz.length; i += 3) { // as view.project, which for each of 150,000 makes vectors anew
+  for (let i = 0; i < xyz.length; i += 3) { // view.project inlined, without its vectors for each of 150,000 points
     const [x0, y0, z0] = [xyz[i] - eye.x, xyz[i + 1] - eye.y, xyz[i + 2] - eye.z];
     const depth = x0 * forward.x + y0 * forward.y + z0 * forward.z;
     const across = cx + (fx * (x0 * right.x + y0 * right.y + z0 * right.z)) / depth;

@@ -1,15 +1,15 @@
-// What a ray meets: the median depth of the Gaussians along it, as our rasterizer measures (RenderOptions.for_depths).
+// Ray casting: the median depth of the Gaussians along a ray, as in our rasterizer (RenderOptions.for_depths).
 
 import { Vector3 } from "three";
 
 const ALPHA_MIN = 1 / 255;
 const ALPHA_MAX = 0.99;
 const BLUR_PX2 = 0.3;
-const MEDIAN = 0.5; // of the light is left: there the surface is
-const SHIFT_MAX = 0.5; // share of its centre's depth by which a Gaussian's depth on the ray may differ from it
+const MEDIAN = 0.5; // transmittance at which the surface is
+const SHIFT_MAX = 0.5; // largest difference of a Gaussian's depth on the ray from its centre's, a share of the latter
 const SIGMAS2 = 2 * Math.log(255);
 
-let halves = null; // value of every half float
+let halves = null; // lookup table of all half floats
 
 function halfValues() {
   const values = new Float32Array(65536);
@@ -24,10 +24,10 @@ function halfValues() {
 }
 
 /**
- * @param {RayCaster[]} casters Of all the splats.
+ * @param {RayCaster[]} casters Casters of all splats.
  * @param {Vector3} origin @param {Vector3} direction Unit, world.
- * @param {Vector3} forward The view's axis: Gaussians are passed in the order of their depth along it.
- * @param {{near: number, pixel: number}} limits Nearest depth, and a pixel's angle.
+ * @param {Vector3} forward The view's axis: Gaussians are sorted by depth along it.
+ * @param {{near: number, pixel: number}} limits Near plane, and a pixel's angle.
  * @returns {Vector3 | null} The point in the world.
  */
 export function meet(casters, origin, direction, forward, limits) {
@@ -43,14 +43,14 @@ export function meet(casters, origin, direction, forward, limits) {
 }
 
 export class RayCaster {
-  /** @param splats Spark's ExtSplats; their frame is the world's turned to y up (x, z, -y). @param {number[]} zero Theirs, in the world. */
+  /** @param splats Spark's ExtSplats; their frame is the world's rotated to y up (x, z, -y). @param {number[]} zero Their origin in the world. */
   constructor(splats, zero) {
     this.splats = splats;
     this.zero = zero;
     this.reach2 = null;
   }
 
-  /** Centres and squared reach, and a sphere about them all, read once: the search goes through nothing else. */
+  /** Precompute centres, squared reaches and a bounding sphere, which are all that the search uses. */
   prepare() {
     halves ??= halfValues();
     const count = this.splats.numSplats;
@@ -73,7 +73,7 @@ export class RayCaster {
     this.sphere = { centre: low.clone().add(high).multiplyScalar(0.5), radius: low.distanceTo(high) / 2 };
   }
 
-  /** Whether a ray may meet any of them; the arguments in their frame. */
+  /** Whether a ray may hit any of them; arguments in their frame. */
   passes(origin, direction, blur2) {
     const offset = this.sphere.centre.clone().sub(origin);
     const away = offset.length();
@@ -83,7 +83,7 @@ export class RayCaster {
     return Math.sqrt(Math.max(0, away * away - along * along)) <= this.sphere.radius + farthest * Math.sqrt(SIGMAS2 * blur2);
   }
 
-  /** What a ray meets of them: alphas with their depths, see `meet`. */
+  /** The ray's hits: alphas with their depths, see `meet`. */
   hits(origin, direction, forward, { near, pixel }) {
     if (!this.reach2) this.prepare();
     const [ox, oy, oz] = [origin.x - this.zero[0], origin.z - this.zero[2], this.zero[1] - origin.y];
@@ -109,12 +109,12 @@ export class RayCaster {
     return met;
   }
 
-  /** A Gaussian's alpha on a ray, and where along it it is largest. */
+  /** A Gaussian's largest alpha on a ray, and its position along the ray. */
   response(i, [x, y, z], [dx, dy, dz], blur2) {
     const { scales, quaternion, opacity } = this.splats.getSplat(i);
-    const place = new Vector3(x, y, z).applyQuaternion(quaternion.conjugate()); // in the Gaussian's own axes
+    const place = new Vector3(x, y, z).applyQuaternion(quaternion.conjugate()); // in the Gaussian's axes
     const ray = new Vector3(dx, dy, dz).applyQuaternion(quaternion);
-    let [aa, ab, bb] = [0, 0, 0]; // of the place and the ray, over the sigmas
+    let [aa, ab, bb] = [0, 0, 0]; // dot products of position and ray, divided by the sigmas
     for (const axis of ["x", "y", "z"]) {
       const weight = 1 / (scales[axis] * scales[axis] + blur2);
       aa += weight * place[axis] * place[axis];

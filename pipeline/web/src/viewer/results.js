@@ -1,17 +1,17 @@
-// What was measured on the surface model: sections and volumes as a list, as lines in place, and a section as a chart.
-// measured_viewer.py puts it into the page.
+// Measurements on the surface model: sections and volumes as a list and as lines in 3D, and a section as a chart.
+// measured_viewer.py puts them into the page.
 
 import { Vector3 } from "three";
 import { Chart } from "./chart.js";
 import { placesOf, Traces } from "./traces.js";
 
-const SECTION_PITCH_RAD = -0.45; // a section is seen from aside, a volume from rather above
+const SECTION_PITCH_RAD = -0.45; // sections are viewed from the side, volumes more from above
 const VOLUME_PITCH_RAD = -0.9;
-const NARROW = "(max-width: 640px), (max-height: 520px)"; // as in viewer.css: there the list waits folded
+const NARROW = "(max-width: 640px), (max-height: 520px)"; // as in viewer.css: the list is collapsed there
 
 const $ = (id) => document.getElementById(id);
 
-/** A figure with as many digits as its deviation has a meaning in: that one's first two. */
+/** Format a value with its standard deviation, rounded to the latter's first two digits. */
 function withSigma(value, sigma) {
   const digits = sigma > 0 ? Math.min(3, Math.max(0, 1 - Math.floor(Math.log10(sigma)))) : 1;
   return `${value.toFixed(digits)} ± ${sigma.toFixed(digits)}`;
@@ -32,7 +32,7 @@ function volumeLines(facts) {
   return [`net ${told("net")}`, `cut ${told("cut")}, fill ${told("fill")}`, `${facts.area_m2.toFixed(1)} m², over ${base ?? "a base"}`];
 }
 
-/** What of the window the list and the photos leave free, CSS pixels. */
+/** The part of the window not covered by the list and the photos, CSS pixels. */
 function freeWindow() {
   const [list, photos, tools] = ["results", "bottom", "tools"].map((id) => $(id).getBoundingClientRect());
   const aside = list.right < innerWidth / 2;
@@ -85,7 +85,7 @@ export class Results {
     return { button, item };
   }
 
-  /** Go there, and show its chart if it has one; null: nothing is chosen any more. */
+  /** Go to an item and show its chart, if any; null clears the selection. */
   choose(index) {
     this.chosen = index;
     this.traces.choose(index);
@@ -105,7 +105,7 @@ export class Results {
     this.buttons[index].item.scrollIntoView({ block: "nearest" });
   }
 
-  /** Tell of a place of the chosen section. */
+  /** Show the values at a place of the chosen section. */
   point(index) {
     const trace = this.items[this.chosen]?.trace;
     const reading = $("reading");
@@ -129,7 +129,7 @@ export class Results {
     return this.traces.group.visible;
   }
 
-  /** The lines and the list, or neither. */
+  /** Show or hide the lines and the list. */
   show(shown) {
     if (!this.items.length) return;
     this.traces.show(shown);

@@ -1,4 +1,4 @@
-// The sky that training found: colours by direction, behind everything; below the horizon the background shows.
+// The trained sky: colours by direction, behind everything; below the horizon the background colour shows.
 
 import { BufferAttribute, BufferGeometry, ClampToEdgeWrapping, DataTexture, LinearFilter, Matrix3, Mesh, RepeatWrapping, RGBAFormat, ShaderMaterial, Vector3 } from "three";
 
@@ -24,7 +24,7 @@ void main() {
 }`;
 
 /**
- * @param {Uint8Array} colours Red, green, blue of `rows` × 2 `rows` cells, from straight down, from west by south.
+ * @param {Uint8Array} colours RGB of `rows` × 2 `rows` cells, from straight down up, from west via south.
  * @param {{rows: number, nothing_up_to_deg: number, full_from_deg: number}} sky
  * @param {number[]} background
  */

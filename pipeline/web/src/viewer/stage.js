@@ -1,20 +1,20 @@
-// The canvas: draws when something has changed, one frame at a time, and says when a frame is whole.
+// The canvas: draws when something has changed, one frame at a time, and reports complete frames.
 
 import { Group, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { SparkRenderer } from "@sparkjsdev/spark";
 import { drawInBatches } from "./batches.js";
 import { LoadError } from "./error.js";
 
-const BLUR_PX2 = 0.3; // and the two below: what our rasterizer does, pipeline/raster/definitions.py
+const BLUR_PX2 = 0.3; // this and the two below are as in our rasterizer, pipeline/raster/definitions.py
 const ALPHA_MIN = 1 / 255;
 const SIGMAS = Math.sqrt(2 * Math.log(255)); // an opaque Gaussian is fainter than ALPHA_MIN beyond
-const REST_MS = 160; // without a movement: then the picture is drawn in full
+const REST_MS = 160; // without movement, after which the view is drawn in full
 const POLL_MS = 4;
-const SLOW_MS = 120; // a frame that takes longer is drawn as a draft while the view moves
-const DRAFT_MS = 150; // what a draft is to take, about
-const DRAFT_SPLATS = 150_000; // a software renderer takes 1 µs for each, however small
+const SLOW_MS = 120; // slower frames are drawn as drafts while the view moves
+const DRAFT_MS = 150; // target duration of a draft
+const DRAFT_SPLATS = 150_000; // a software renderer takes 1 µs each, however small
 const LEAST_RESOLUTION = 0.3; // of a draft
-const GLIMPSE_RESOLUTION = 0.5; // of a first picture: a quarter of the pixels, which take most of the time without a GPU
+const GLIMPSE_RESOLUTION = 0.5; // of the first frame: a quarter of the pixels, the slow part without a GPU
 const MOST_PIXEL_RATIO = 2;
 
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -31,7 +31,7 @@ export class Stage {
     }
     this.canvas = canvas;
     this.renderer = new WebGLRenderer({ canvas, context, antialias: false, alpha: false });
-    this.renderer.debug.checkShaderErrors = false; // asking holds up the page until the driver has compiled
+    this.renderer.debug.checkShaderErrors = false; // checking blocks the page until the driver has compiled
     this.renderer.setClearColor((facts.background[0] * 255 << 16) | (facts.background[1] * 255 << 8) | (facts.background[2] * 255), 1);
     this.scene = new Scene();
     this.camera = new PerspectiveCamera();
@@ -53,7 +53,7 @@ export class Stage {
     this.failed = () => {};
     this.splats = new Group();
     this.scene.add(this.splats);
-    this.begun = false; // there is nothing to draw before the first splats
+    this.begun = false; // nothing is drawn before the first splats
     this.wanted = 0;
     this.movedAt = -Infinity;
     this.fullMs = 0;
@@ -65,7 +65,7 @@ export class Stage {
   }
 
   /**
-   * Draw these splats, and no others.
+   * Set the splats to draw.
    * @param {import("./part.js").SplatPart[]} parts
    */
   show(parts) {
@@ -88,7 +88,7 @@ export class Stage {
     this.invalidate();
   }
 
-  /** Draw again; `moving`: a draft will do where drawing is slow. */
+  /** Request a redraw; `moving`: a draft suffices if drawing is slow. */
   invalidate(moving = false) {
     this.wanted++;
     this.whole = false;
@@ -96,12 +96,12 @@ export class Stage {
     this.schedule();
   }
 
-  /** Resolves when a frame of the present view is on the screen, sorted and in full. */
+  /** Resolves when a sorted, full frame of the current view is on the screen. */
   complete() {
     return this.whole ? Promise.resolve() : new Promise((resolve) => this.waiting.push(resolve));
   }
 
-  /** Resolves when what is shown is on the screen, coarser than it will be: the next frame is in full. */
+  /** Resolves when a first frame at reduced resolution is on the screen; the next one is full. */
   glimpse() {
     return new Promise((resolve) => (this.glimpsed = resolve));
   }
@@ -126,7 +126,7 @@ export class Stage {
     this.camera.updateMatrixWorld(true);
     const began = performance.now();
     if (this.splatsShown && this.splats.children.length) {
-      if (resting || slow || glimpsed) await this.sortNow(); // a first picture has to show something, even while one moves
+      if (resting || slow || glimpsed) await this.sortNow(); // the first frame must show something, even while moving
       else if (!this.spark.sorting) this.spark.update(this).then(() => this.invalidate(), this.failed);
     }
     this.setQuality(!resting && slow, glimpsed ? GLIMPSE_RESOLUTION : 1);
@@ -140,14 +140,14 @@ export class Stage {
     else setTimeout(() => this.schedule(), REST_MS);
   }
 
-  /** Colours and order of the splats for this very view. */
+  /** Update the splats' colours and order for the current view. */
   async sortNow() {
     while (this.spark.sorting) await pause(POLL_MS);
     await this.spark.update(this);
     while (this.spark.sorting || this.spark.sortDirty) await pause(POLL_MS);
   }
 
-  /** The screen's pixels a CSS pixel that are drawn at rest. */
+  /** Screen pixels per CSS pixel at rest. */
   get fullRatio() {
     return Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO);
   }
@@ -171,7 +171,7 @@ export class Stage {
     this.renderer.setSize(width, height, false);
   }
 
-  /** Wait until the GPU is done, without holding up the page: no frame is begun before. */
+  /** Wait until the GPU is done without blocking the page; no frame starts before. */
   async fence() {
     const gl = this.renderer.getContext();
     const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -187,7 +187,7 @@ export class Stage {
     for (const resolve of waiting) resolve();
   }
 
-  /** The present picture as a canvas of its own, in full. */
+  /** The current view, in full, as a new canvas. */
   async picture() {
     await this.complete();
     this.renderer.render(this.scene, this.camera);

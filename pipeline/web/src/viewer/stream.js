@@ -1,16 +1,16 @@
-// The splats of a site: the coarse whole first, then finer where one looks. A node stays until all of its children are
-// there to stand for it, so that there is never a hole.
+// Streams a site's splat: the whole at a coarse level first, then refined where the view is. A node stays until all of
+// its children are loaded to replace it, so that there is never a hole.
 
 import { FileQueue } from "./files.js";
 import { wantedLevels } from "./levels.js";
 import { readPart } from "./part.js";
 
-const PIXELS = 8; // of the screen: a smaller error is not refined; its Gaussians stand half a pixel from the truth
+const PIXELS = 8; // on the screen: smaller errors are not refined; Gaussians are then half a pixel off
 const NARROW = "(max-width: 640px), (max-height: 520px), (pointer: coarse)";
-const MOST = { wide: 3_000_000, narrow: 800_000 }; // Gaussians seen: what a computer, and what a phone does smoothly
-const HELD = 1.5; // times as many are in memory at most, those out of sight as well: each takes 200 bytes
-const LITTLE_MEMORY_GB = 4; // of the machine: then as on a phone
-const AT_ONCE = { wide: 4, narrow: 2 }; // files: each is decoded by a worker with memory of its own
+const MOST = { wide: 3_000_000, narrow: 800_000 }; // Gaussians in view that a computer and a phone can draw smoothly
+const HELD = 1.5; // times as many are in memory at most, including those out of sight: 200 bytes each
+const LITTLE_MEMORY_GB = 4; // with less memory, the phone's limits apply
+const AT_ONCE = { wide: 4, narrow: 2 }; // files: each is decoded by a worker with its own memory
 
 function size() {
   const small = matchMedia(NARROW).matches || (navigator.deviceMemory ?? Infinity) < LITTLE_MEMORY_GB;
@@ -19,9 +19,9 @@ function size() {
 
 export class LevelStream {
   /**
-   * @param {object[]} nodes As `readLevels` gives them.
+   * @param {object[]} nodes As returned by `readLevels`.
    * @param {import("./stage.js").Stage} stage
-   * @param {(error: Error) => void} failed Told of the first file that cannot be had.
+   * @param {(error: Error) => void} failed Called for the first file that cannot be loaded.
    */
   constructor(nodes, stage, failed) {
     this.root = nodes[0];
@@ -39,7 +39,7 @@ export class LevelStream {
     addEventListener("online", () => this.retry());
   }
 
-  /** How many Gaussians are seen at most, and with them how many are in memory. */
+  /** Set the limits of Gaussians in view and, in proportion, in memory. */
   limit(most) {
     this.most = most;
     this.held = HELD * most;
@@ -53,7 +53,7 @@ export class LevelStream {
     this.stage.show([this.root.part]);
   }
 
-  /** Ask for what a view wants, and show of it what is there. */
+  /** Request the nodes for a view, and show those that are loaded. */
   update(view) {
     this.time++;
     const ratio = this.stage.fullRatio;
@@ -76,7 +76,7 @@ export class LevelStream {
     this.settle();
   }
 
-  /** Loaded nodes that together stand for a node, as fine as wanted; null where there are none. */
+  /** Loaded nodes that together cover a node, as close to the wanted level as possible; null if there are none. */
   cover(node, inner) {
     if (node.part && !inner.has(node)) return [node];
     const parts = [];
@@ -88,7 +88,7 @@ export class LevelStream {
     return parts.length ? parts : null;
   }
 
-  /** Nodes that were let go of while their descendants were shown, which are finer than wanted. */
+  /** Nodes that were unloaded while their descendants, now finer than wanted, were shown. */
   lost(node, inner) {
     if (!inner.has(node)) return node.part ? [] : [node];
     return node.children.flatMap((child) => this.lost(child, inner));
@@ -110,13 +110,13 @@ export class LevelStream {
     this.stage.invalidate();
   }
 
-  /** The network is back. */
+  /** Retry after the network is back. */
   retry() {
     for (const node of this.nodes) node.failed = false;
     this.stage.invalidate();
   }
 
-  /** Let go of what has not been wanted for longest. */
+  /** Unload the nodes that have not been wanted for longest. */
   unload() {
     if (this.loaded <= this.held) return;
     const idle = this.nodes.filter((node) => node.part && node.touched !== this.time && node !== this.root);
@@ -128,7 +128,7 @@ export class LevelStream {
     }
   }
 
-  /** What is shown. */
+  /** The parts shown. */
   parts() {
     return this.shown.map((node) => node.part);
   }
@@ -138,7 +138,7 @@ export class LevelStream {
     for (const resolve of this.waiting.splice(0)) resolve();
   }
 
-  /** Resolves when nothing more is to come for the present view. */
+  /** Resolves when nothing more will be loaded for the current view. */
   settled() {
     return this.queue.pending.size ? new Promise((resolve) => this.waiting.push(resolve)) : Promise.resolve();
   }

@@ -1,4 +1,4 @@
-// Lines of sections and volumes over the model, with their names beside them.
+// Lines of sections and volumes over the model, with labels.
 
 import { Group, Vector3 } from "three";
 import { LineMaterial } from "three/examples/jsm/lines/LineMaterial.js";
@@ -8,10 +8,10 @@ import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeome
 const COLOURS = { section: 0x4dd6ff, volume: 0xffd23f };
 const HALO = { colour: 0x0a0e12, more: 3, opacity: 0.6 };
 const WIDTH = { plain: 2, chosen: 4 }; // CSS pixels
-const MOST_NAMES = 12; // of more, the chosen one's alone
+const MOST_NAMES = 12; // with more, only the chosen one is labelled
 const NAME_ABOVE_PX = 16;
 
-/** The places of a trace's columns, in pairs; none over a gap. */
+/** A trace's points as line segments, without those across gaps. */
 function segments({ x, y, z }) {
   const found = [];
   for (let i = 1; i < z.length; i++) {
@@ -52,7 +52,7 @@ export class Traces {
     };
     const lines = { halo: line(HALO.colour, HALO.opacity, 2), line: line(COLOURS[kind], 1, 3) };
     const at = placesOf(traces);
-    const named = kind === "section" ? at[0] : at.reduce((a, b) => (b.z > a.z ? b : a)); // a section's name is at its start
+    const named = kind === "section" ? at[0] : at.reduce((a, b) => (b.z > a.z ? b : a)); // a section is labelled at its start
     return { ...lines, named, label: this.label("named", name) };
   }
 
@@ -65,7 +65,7 @@ export class Traces {
     return element;
   }
 
-  /** Draw one stronger; null for none. */
+  /** Highlight one; null for none. */
   choose(index) {
     this.chosen = index;
     this.items.forEach(({ halo, line }, i) => {
@@ -76,7 +76,7 @@ export class Traces {
     this.changed();
   }
 
-  /** Put a dot onto a place; null for nowhere. */
+  /** Put a dot at a place; null removes it. */
   point(place) {
     this.here = place;
     if (this.view) this.update(this.view);
@@ -87,7 +87,7 @@ export class Traces {
     this.changed();
   }
 
-  /** Move names and the dot to where their places are in the window. */
+  /** Move labels and the dot to their window positions. */
   update(view) {
     this.view = view;
     const put = (element, place, above) => {

@@ -1,8 +1,8 @@
-// Where one looks from: place, direction and lens, in the world (z up).
+// The viewpoint: position, direction and lens, in the world (z up).
 
 import { Matrix4, Vector3 } from "three";
 
-const WIDEST_RAD = (80 * Math.PI) / 180; // a photo's lens in a window of another shape shows no wider angle than this
+const WIDEST_RAD = (80 * Math.PI) / 180; // largest angle shown with a photo's lens in a window of another aspect ratio
 const STEEPEST_RAD = (89.5 * Math.PI) / 180;
 const MOVE_MS = 700;
 
@@ -12,8 +12,8 @@ export class View {
     this.planes = planes;
     this.position = new Vector3();
     this.yaw = 0; // of the viewing direction, from east to north
-    this.pitch = 0; // over the horizon
-    this.roll = 0; // clockwise seen from behind
+    this.pitch = 0; // above the horizon
+    this.roll = 0; // clockwise as seen from behind
     this.lens = { width: 4, height: 3, fx: 3, fy: 3, cx: 2, cy: 1.5 };
     this.size = { width: 1, height: 1 };
     this.changed = () => {};
@@ -31,20 +31,20 @@ export class View {
     return { right, up, forward, back: forward.clone().negate() };
   }
 
-  /** Take a direction from a camera's axes. */
+  /** Set the direction from a camera's axes. */
   face(forward, right) {
     this.pitch = Math.asin(Math.max(-1, Math.min(1, forward.z)));
     if (Math.abs(forward.z) < 0.9999) {
       this.yaw = Math.atan2(forward.y, forward.x);
     } else {
-      this.yaw = Math.atan2(right.x, -right.y); // straight down or up: as if there were no roll
+      this.yaw = Math.atan2(right.x, -right.y); // straight down or up: assume no roll
     }
     this.roll = 0;
     const { right: level, up } = this.axes();
     this.roll = Math.atan2(-right.dot(up), right.dot(level));
   }
 
-  /** Exactly where a photo was taken, with its lens. */
+  /** The pose of a photo, with its lens. */
   poseOf(photo) {
     const to = new View(this.planes);
     const r = photo.rotation; // world from camera (x right, y down, z forward), row by row
@@ -60,7 +60,7 @@ export class View {
     this.changed();
   }
 
-  /** Move there over a moment, or at once, as for those who asked for less motion; then call `arrived`. */
+  /** Move there, animated or at once (also if the user prefers reduced motion); then call `arrived`. */
   travel(to, atOnce = false, arrived = () => {}) {
     this.journey = null;
     if (atOnce || matchMedia("(prefers-reduced-motion: reduce)").matches) {
@@ -93,7 +93,7 @@ export class View {
     step();
   }
 
-  /** Turn by angles; around a point, or on the spot. Being turned by hand, the view comes level. */
+  /** Rotate by angles around a point or on the spot. Manual rotation levels the view. */
   turn(yaw, pitch, pivot = null) {
     this.journey = null;
     const before = this.axes();
@@ -109,14 +109,14 @@ export class View {
     this.changed();
   }
 
-  /** Shift in the world. */
+  /** Translate in the world. */
   shift(offset) {
     this.journey = null;
     this.position.add(offset);
     this.changed();
   }
 
-  /** Focal lengths and principal point in the window's pixels: the photo's whole view where its shape allows it. */
+  /** Focal lengths and principal point in window pixels, showing the whole photo if the aspect ratio allows it. */
   intrinsics() {
     const { width, height, fx, fy, cx, cy } = this.lens;
     const [across, down] = [this.size.width / width, this.size.height / height];
@@ -131,14 +131,14 @@ export class View {
     };
   }
 
-  /** The ray through a place in the window, CSS pixels: unit direction in the world. */
+  /** The unit direction, in the world, of the ray through a window position in CSS pixels. */
   ray(x, y) {
     const { fx, fy, cx, cy } = this.intrinsics();
     const { right, up, forward } = this.axes();
     return forward.clone().addScaledVector(right, (x - cx) / fx).addScaledVector(up, (cy - y) / fy).normalize();
   }
 
-  /** Where a world point is in the window, CSS pixels, and its depth (≤ 0: behind). */
+  /** Window position of a world point, CSS pixels, and its depth (≤ 0: behind). */
   project(point) {
     const { fx, fy, cx, cy } = this.intrinsics();
     const { right, up, forward } = this.axes();
