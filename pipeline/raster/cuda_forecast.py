@@ -1,6 +1,6 @@
-"""How many pairs of a Gaussian and a tile the next frame has, from those before it: the host never waits for a count.
+"""Forecast of the next frame's Gaussian-tile pairs from earlier frames, so that the host never waits for a count.
 
-What a frame has more than was foreseen is rendered all the same, with the same bits, but slowly (see native/cuda).
+Pairs beyond the forecast are still rendered, with identical bits, but slowly (see native/cuda).
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda_api import SplatFrameFacts
 
-FIRST_PAIRS_A_GAUSSIAN = 8  # of a frame of which nothing is known; a trained Gaussian touches 3 to 10 tiles
-FIRST_PAIRS_A_TILE = 64  # and a start of few, large ones fills the tiles
-FIRST_PASSES = 8  # once, so that a wrong guess costs launches that find nothing, not one block's work on the rest
-MARGIN = 1.25  # over the most that was seen: between two looks views differ, and the model grows
-WINDOW = 512  # frames after which the most before them begins to be forgotten: more than most trainings have photos
-PAIR_BYTES = 64  # of the frame and its backward pass
-MEMORY_SHARE = 1 / 16  # of the device's for pairs: several chunks are binned twice, so one should do where it can
-FEWEST_PAIRS, MOST_PAIRS = 1 << 22, 1 << 28  # at a time: a small device's, which fill all of it; and 17 GB of them
-STEPS_AN_OCTAVE = 8  # capacities are rounded up to these, so that torch's allocator finds the last frame's memory again
-MOST_TILES = 1 << 16  # of a chunk, as in frame.h
+FIRST_PAIRS_A_GAUSSIAN = 8  # for a first frame; a trained Gaussian touches 3 to 10 tiles
+FIRST_PAIRS_A_TILE = 64  # for a start with few, large Gaussians, which fill the tiles
+FIRST_PASSES = 8  # once: a wrong guess then costs empty launches, not one block working off the rest alone
+MARGIN = 1.25  # over the recent maximum: views differ, and the model grows
+WINDOW = 512  # frames after which older maxima start to be forgotten: more than most trainings have photos
+PAIR_BYTES = 64  # per pair, in the frame and its backward pass
+MEMORY_SHARE = 1 / 16  # of the device's memory for pairs: several chunks are binned twice, so prefer a single one
+FEWEST_PAIRS, MOST_PAIRS = 1 << 22, 1 << 28  # at a time: for a small device, filling it; and 17 GB of them
+STEPS_AN_OCTAVE = 8  # sizes that capacities are rounded up to, so that torch's allocator reuses the last frame's memory
+MOST_TILES = 1 << 16  # per chunk, as in frame.h
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class FrameSize:
     """What is known of a frame before it is rendered.
 
     Attributes:
-        count: Gaussians.
-        tiles: Of the picture.
+        count: Number of Gaussians.
+        tiles: Number of tiles of the image.
     """
 
     count: int
@@ -41,11 +41,11 @@ class FrameSize:
 
 @dataclass(frozen=True)
 class FrameAllocation:
-    """What a frame gets.
+    """The allocation of a frame.
 
     Attributes:
-        capacity: Pairs that it holds at a time.
-        passes: Chunks that are worked off by the whole device.
+        capacity: Number of pairs that it holds at a time.
+        passes: Number of chunks that the whole device processes.
     """
 
     capacity: int
@@ -54,13 +54,13 @@ class FrameAllocation:
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """What a frame took.
+    """What a frame actually used.
 
     Attributes:
-        size: As it was asked for.
-        capacity: As it was given.
-        pairs: In all.
-        chunks: That they took at that capacity.
+        size: The requested size.
+        capacity: The allocated capacity.
+        pairs: Total number of pairs.
+        chunks: Number of chunks that they took at that capacity.
     """
 
     size: FrameSize
@@ -70,12 +70,12 @@ class FrameFacts:
 
 
 class PendingFacts:
-    """Facts on their way from the device.
+    """Facts being copied from the device.
 
     Args:
-        memory: A frame's, which begins with them; a frame is enqueued on the current stream.
-        size: Of the frame.
-        capacity: Of the frame.
+        memory: The frame's memory, which begins with the facts; the frame is enqueued on the current stream.
+        size: Size of the frame.
+        capacity: Capacity of the frame.
     """
 
     def __init__(self, memory: Tensor, size: FrameSize, capacity: int) -> None:
@@ -89,20 +89,21 @@ class PendingFacts:
             self._event.record()
 
     def arrived(self) -> bool:
-        """Whether the facts can be had without waiting."""
+        """Whether the facts can be read without waiting."""
         return self._event is None or bool(self._event.query())  # type: ignore[no-untyped-call]
 
     def facts(self) -> FrameFacts:
-        """What arrived."""
+        """The facts; call after ``arrived``."""
         pairs, _, chunks = self._numbers.tolist()
         return FrameFacts(self._size, self._capacity, pairs, chunks)
 
 
 class Forecast:
-    """The room that frames get: the most that was seen of late, with a margin, within a limit.
+    """Forecasts frame allocations: the recent maximum with a margin, within a limit.
 
     Args:
-        most_pairs: At a time, of which a frame's memory depends; a view of more is worked off in chunks.
+        most_pairs: Maximum number of pairs at a time, which determines a frame's memory; views with more are processed
+            in chunks.
     """
 
     def __init__(self, most_pairs: int = FEWEST_PAIRS) -> None:
@@ -116,7 +117,7 @@ class Forecast:
         self._lock = threading.Lock()  # pages of the viewer are rendered by several threads
 
     def room(self, size: FrameSize) -> FrameAllocation:
-        """What the next frame gets; never waits."""
+        """The allocation of the next frame; never waits."""
         with self._lock:
             return self._room(size)
 
@@ -139,7 +140,7 @@ class Forecast:
         return self._last
 
     def read_later(self, memory: Tensor, size: FrameSize, capacity: int) -> None:
-        """Learn from a frame that was enqueued, when its facts have arrived."""
+        """Learn from an enqueued frame once its facts have arrived."""
         self._readings.append(PendingFacts(memory, size, capacity))
 
     def learn(self, facts: FrameFacts) -> None:
@@ -151,7 +152,7 @@ class Forecast:
             self._recent = facts
 
     def shrink(self) -> bool:
-        """Halve the pairs that are held at a time, for memory is short; False if they are as few as they can be."""
+        """Halve the pairs held at a time, because memory is short; False if they are already at the minimum."""
         if self._last.capacity <= max(1, self._last_count):
             return False
         self.most_pairs = max(1, self._last_count, self._last.capacity // 2)
@@ -159,21 +160,21 @@ class Forecast:
 
     @staticmethod
     def _foreseen(facts: FrameFacts, size: FrameSize) -> int:
-        """Pairs by a frame of another size: as many more as it has more tiles and Gaussians, never fewer."""
+        """Pairs forecast from a frame of another size: scaled up with tiles and Gaussians, never down."""
         grown = max(1.0, size.tiles / max(1, facts.size.tiles)) * max(1.0, size.count / max(1, facts.size.count))
         return int(MARGIN * facts.pairs * grown)
 
 
 def most_pairs_of(memory_bytes: int) -> int:
-    """Pairs that a device holds at a time; where memory is short after all, they become fewer.
+    """Maximum pairs that a device holds at a time; reduced later if memory is short after all.
 
     Args:
-        memory_bytes: The device's.
+        memory_bytes: The device's memory.
     """
     return min(MOST_PAIRS, max(FEWEST_PAIRS, int(MEMORY_SHARE * memory_bytes) // PAIR_BYTES))
 
 
 def _rounded_up(pairs: int) -> int:
-    """To the next of a few sizes an octave."""
+    """Rounded up to the next of ``STEPS_AN_OCTAVE`` sizes per octave."""
     step = max(1, (1 << max(0, pairs.bit_length() - 1)) // STEPS_AN_OCTAVE)
     return -(-pairs // step) * step

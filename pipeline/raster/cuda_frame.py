@@ -1,4 +1,4 @@
-"""The CUDA rasterizer under torch's autograd, and what is left of its backward pass for the optimiser."""
+"""The CUDA rasterizer under torch's autograd, and the deferred end of its backward pass for the optimizer."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ TILE_PX = 16  # a tile's side
 
 @dataclass(frozen=True, eq=False)
 class CudaFrame:
-    """A frame on the device, with the memory that its backward pass wants.
+    """A frame on the device, with the memory that its backward pass needs.
 
     Attributes:
-        kernels: That rendered it.
-        shot: The camera and how.
-        parameters: What was rendered, in the order of ``PARAMETERS``.
-        memory: The frame's.
-        capacity: Pairs that it holds at a time.
-        passes: Chunks that the whole device works off.
+        kernels: The kernels that rendered it.
+        shot: The camera and render settings.
+        parameters: The rendered parameters, in the order of ``PARAMETERS``.
+        memory: The frame's memory.
+        capacity: Number of pairs that it holds at a time.
+        passes: Number of chunks that the whole device processes.
     """
 
     kernels: CudaKernels
@@ -62,14 +62,14 @@ class CudaFrame:
         """Render to colour, alpha, the three depths or None, radii and visible (uint8); all contiguous.
 
         Args:
-            kernels: That do it.
-            shot: The camera and how.
-            parameters: The model's, in the order of ``PARAMETERS``.
+            kernels: The kernels to use.
+            shot: The camera and render settings.
+            parameters: The model's parameters, in the order of ``PARAMETERS``.
             outputs: As above.
-            may_shrink: Whether chunks are made smaller here where memory is short; a training does that itself, told.
+            may_shrink: Whether to make chunks smaller if memory is short; a training does that itself, with a warning.
 
-        Raises:
-            torch.OutOfMemoryError: if memory is short, and that was not enough or may not be done.
+            Raises:
+                torch.OutOfMemoryError: if memory is short and smaller chunks did not help or are not allowed.
         """
         tiles = -(-shot.width // TILE_PX) * -(-shot.height // TILE_PX)
         size = FrameSize(len(parameters[0]), tiles)
@@ -94,7 +94,7 @@ class CudaFrame:
         return frame
 
     def blend_backward(self, pictures: Sequence[Tensor | None]) -> Tensor:
-        """From the gradients by colour, alpha, depth sum and sum of squares (None: zero) to those on the screen.
+        """From the gradients of colour, alpha, depth sum and sum of squares (None: zero) to screen-space gradients.
 
         Returns:
             Memory of the backward pass, which holds them.
@@ -108,7 +108,7 @@ class CudaFrame:
         return back
 
     def project_backward(self, back: Tensor) -> tuple[tuple[Tensor, ...], Float[Tensor, "n 2"]]:
-        """From there to the gradients of the parameters, and of the centres on the screen."""
+        """From screen-space gradients to those of the parameters and of the projected centres."""
         gradients = tuple(torch.empty_like(tensor) for tensor in self.parameters)
         means2d = torch.empty(len(self.parameters[0]), 2, device=self.kernels.device)
         rows, at = self.kernels.rows(gradients), self.kernels.at(means2d)
@@ -116,12 +116,12 @@ class CudaFrame:
         return gradients, means2d
 
     def step(self, back: Tensor, step: SplatStep, means2d: Float[Tensor, "n 2"] | None) -> None:
-        """The same, and at once a step of Adam."""
+        """The same, fused with a step of Adam."""
         shot, _, frame = self._said(back)
         self.kernels.call("splat_step", shot, frame, ctypes.byref(step), self.kernels.at(means2d))
 
     def _said(self, back: Tensor | None) -> tuple[object, object, object]:
-        """The shot, the parameters and the frame, as the library takes them."""
+        """The shot, the parameters and the frame in the form that the library takes."""
         frame = SplatFrame(
             memory=self.kernels.at(self.memory),
             bytes=self.memory.numel(),
@@ -139,13 +139,13 @@ class UnfinishedBackward:
     """A backward pass that stopped at the screen.
 
     Attributes:
-        frame: That was rendered.
-        back: What each Gaussian has on the screen.
-        visible: The Gaussians that it showed.
+        frame: The rendered frame.
+        back: The screen-space gradients of each Gaussian.
+        visible: The visible Gaussians.
         probe: Gets its gradient when the pass is finished.
-        means2d: Memory for that, where there is a probe.
-        logits_are_leaf: False where a function of the model's logits was rendered; those have the derivative of the
-            rendered ones by them for a gradient, until the pass is finished.
+        means2d: Memory for that gradient, if there is a probe.
+        logits_are_leaf: False if a function of the model's logits was rendered; until the pass is finished, the
+            gradient of the model's logits is then the derivative of the rendered logits with respect to them.
     """
 
     frame: CudaFrame
@@ -156,7 +156,7 @@ class UnfinishedBackward:
     logits_are_leaf: bool
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
-        """Whether a step can be made with it at once: of what was rendered, and by no other gradient besides."""
+        """Whether the pass can be fused with a step: of the rendered parameters, without other gradients."""
         if tuple(parameters) != PARAMETERS:
             return False
         rendered = dict(zip(PARAMETERS, self.frame.parameters, strict=True))
@@ -172,8 +172,8 @@ class UnfinishedBackward:
         """Finish the pass and step the parameters; the probe gets its gradient.
 
         Args:
-            step: Adam's; what is said of the logits is filled in.
-            logits: The model's, with the gain for a gradient where others were rendered.
+            step: Adam's step; its logit fields are filled in here.
+            logits: The model's logits, with the gain as their gradient if a function of them was rendered.
         """
         if not self.logits_are_leaf:
             assert logits.grad is not None
@@ -184,7 +184,7 @@ class UnfinishedBackward:
             self.probe.grad = self.means2d
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:
-        """Finish the pass: add what it gives to the parameters' gradients, as any backward pass does."""
+        """Finish the pass: add its gradients to those of the parameters, as any backward pass does."""
         gradients, means2d = self.frame.project_backward(self.back)
         add_gradients(parameters, gradients, self.logits_are_leaf)
         if self.probe is not None:
@@ -199,12 +199,12 @@ def render_cuda(
     means2d_probe: Float[Tensor, "n 2"] | None,
     buffers: GradientBuffers | None = None,
 ) -> Render:
-    """Render with CUDA kernels; arguments as of ``rasterizer.render``.
+    """Render with CUDA kernels; arguments as for ``rasterizer.render``.
 
     Raises:
         ValueError: if a parameter is not float32 on the kernels' device.
-        torch.OutOfMemoryError: if memory is short in training, which can make chunks and then the model smaller.
-        MachineError: if it is, else.
+        torch.OutOfMemoryError: if memory is short in training, which can shrink the chunks and then the model.
+        MachineError: if memory is short elsewhere.
     """
     parameters = tuple(gaussians.tensors().values())
     for name, tensor in gaussians.tensors().items():
@@ -263,7 +263,7 @@ class _Rasterize(torch.autograd.Function):
         depth_square_sum: Tensor | None,
         *_: None,
     ) -> tuple[Tensor | None, ...]:
-        _ = ctx.saved_tensors  # raises where one was changed since
+        _ = ctx.saved_tensors  # raises if one was changed since
         frame: CudaFrame = ctx.frame
         wanted = ctx.needs_input_grad[4:]
         upstream = (colour, alpha, depth_sum, depth_square_sum)
@@ -281,7 +281,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def shot_of(camera: Camera, options: RenderOptions, sh_count: int) -> SplatShot:
-    """A camera and what to render, as the library takes them."""
+    """A camera and render options in the form that the library takes."""
     pose = np.asarray(camera.cam_from_world, np.float64)[:3]
     part = camera.window or Window(0, 0, camera.width, camera.height)
     return SplatShot(

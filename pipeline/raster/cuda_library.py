@@ -1,6 +1,6 @@
 """The CUDA kernels' shared library: loading and calling it, and why it cannot be used here.
 
-Light: torch is imported only where it is asked whether it knows the device, too.
+Cheap to import: torch is imported only to check whether it can use the device too.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from splatpipe.pipeline.raster.cuda_driver import driver, driver_release
 LIBRARY = Path(__file__).parent / "libsplat_cuda.so"
 NO_DEVICE = 100  # cudaErrorNoDevice, and the driver's code for it
 DRIVERS = {11: "450.80.02", 12: "525.60.13", 13: "580.65.06"}
-"""The first Linux driver for a major version of CUDA; its minor versions need no newer one (CUDA Compatibility, NVIDIA,
+"""The minimum Linux driver for each major version of CUDA, whatever the minor version (CUDA Compatibility, NVIDIA,
 "Minor version compatibility")."""
 
 
@@ -31,9 +31,9 @@ class CudaDevice:
         name: E.g. "NVIDIA H200".
         architecture: 10 · major + minor of its compute capability.
         driver: CUDA version that the driver knows, 1000 · major + 10 · minor; 0 without a driver.
-        runtime: That the library was built with.
-        memory_bytes: In all.
-        release: The driver's own version, e.g. "580.65.06"; "" where the system does not tell.
+        runtime: CUDA version that the library was built with.
+        memory_bytes: Total memory.
+        release: The driver's own version, e.g. "580.65.06"; "" if unknown.
     """
 
     name: str
@@ -44,7 +44,7 @@ class CudaDevice:
     release: str = ""
 
     def described(self) -> str:
-        """For manifests: what may change the last bits, and a report of a problem."""
+        """For manifests and problem reports: everything that may change the last bits."""
         known = f"CUDA {version_text(self.driver)}"
         versions = f"{self.release} ({known})" if self.release else known
         return f"cuda sm_{self.architecture} {self.name}, driver {versions}, kernels CUDA {version_text(self.runtime)}"
@@ -54,10 +54,10 @@ class CudaLibrary:
     """The loaded library.
 
     Args:
-        path: Of the shared object.
+        path: Path of the shared object.
 
-    Raises:
-        MachineError: if it is not there, cannot be loaded, or has another interface than this program.
+        Raises:
+            MachineError: if it is missing, cannot be loaded, or has a different interface version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -77,7 +77,7 @@ class CudaLibrary:
             raise MachineError(f"The CUDA kernels cannot be loaded: {error}.", _REINSTALL) from error
 
     def size(self, name: str, *arguments: object) -> int:
-        """Bytes of memory, by one of ``SIZES``.
+        """Call one of ``SIZES``; returns a number of bytes.
 
         Raises:
             ValueError: if an argument is invalid.
@@ -88,7 +88,7 @@ class CudaLibrary:
         return result
 
     def call(self, name: str, *arguments: object) -> None:
-        """One of ``CALLS``.
+        """Call one of ``CALLS``.
 
         Raises:
             ValueError: if an argument is invalid.
@@ -104,12 +104,12 @@ class CudaLibrary:
             )
 
     def error(self, code: int) -> str:
-        """What a code means."""
+        """The text of an error code."""
         text: bytes = self._functions.splat_error(code)
         return text.decode(errors="replace")
 
     def device(self, index: int) -> tuple[int, CudaDevice]:
-        """A device, and the code that asking for it returned; the versions hold where that is an error, too."""
+        """The return code of querying a device, and the device; its versions are valid even on an error."""
         found = SplatDevice()
         code = int(self._functions.splat_device(index, ctypes.byref(found)))
         name = found.name.decode(errors="replace")
@@ -119,7 +119,7 @@ class CudaLibrary:
 
 @functools.cache
 def load(path: Path = LIBRARY) -> CudaLibrary:
-    """The library, loaded once; errors as of ``CudaLibrary``."""
+    """The library, loaded once; errors as in ``CudaLibrary``."""
     return CudaLibrary(path)
 
 
@@ -136,20 +136,20 @@ class NoCuda:
     hint: str
 
     def error(self) -> MachineError:
-        """For who asked for CUDA all the same."""
+        """The error to raise if CUDA was requested explicitly."""
         return MachineError(f"CUDA does not work here. {self.reason}", self.hint)
 
 
 @dataclass(frozen=True)
 class CudaInstallation:
-    """What decides whether CUDA can be used here.
+    """The facts that decide whether CUDA can be used here.
 
     Attributes:
-        driver: CUDA version that the system's driver knows, 1000 · major + 10 · minor; 0 without a driver.
-        driver_code: What the driver said when it was asked to start; 0 if it did.
+        driver: CUDA version that the system's driver supports, 1000 · major + 10 · minor; 0 without a driver.
+        driver_code: Return code of the driver's initialization; 0 for success.
         has_library: Whether this program came with CUDA kernels.
-        library: What the library says of device 0, and the code with it; None where it was not asked.
-        torch_cuda: CUDA version that torch was built with, "" without; None where it was not asked.
+        library: Return code and properties of device 0 from the library; None if not queried.
+        torch_cuda: CUDA version that torch was built with, "" without CUDA; None if not queried.
         torch_works: Whether torch can use the device.
     """
 
@@ -178,7 +178,7 @@ _TORCH_CPU = NoCuda(
 
 
 def reason_of(installed: CudaInstallation) -> NoCuda | None:
-    """The first thing that is in the way of using CUDA, or None if nothing is."""
+    """The first obstacle to using CUDA, or None if there is none."""
     if installed.driver == 0:
         return _NO_DRIVER
     if installed.driver_code == NO_DEVICE:
@@ -209,10 +209,10 @@ def reason_of(installed: CudaInstallation) -> NoCuda | None:
 
 
 def why_not(path: Path = LIBRARY) -> NoCuda | None:
-    """Why CUDA cannot be used here; None if it can. Asks the cheap things first, and torch last.
+    """Why CUDA cannot be used here; None if it can. Checks cheap things first, and torch last.
 
     Args:
-        path: Of the library.
+        path: Path of the library.
     """
     code, known = driver()
     installed = CudaInstallation(known, code, path.exists())
@@ -227,16 +227,17 @@ def why_not(path: Path = LIBRARY) -> NoCuda | None:
     built_with = torch.version.cuda or ""
     if reason := reason_of(CudaInstallation(known, code, True, library, built_with)):
         return reason
-    with warnings.catch_warnings():  # of an old driver torch warns at length: what is returned says it
+    with warnings.catch_warnings():  # torch warns at length about an old driver, which the result reports anyway
         warnings.simplefilter("ignore")
         works = torch.cuda.is_available()
     return reason_of(CudaInstallation(known, code, True, library, built_with, works))
 
 
 def cannot_compute() -> NoCuda | None:
-    """Why torch cannot compute on a card that nothing is in the way of; None if it can.
+    """Why torch cannot compute on a card without known obstacles; None if it can.
 
-    Tried, which leaves a context of some hundred MB on the card: for processes that will compute there.
+    This runs a trial, which leaves a context of some hundred MB on the card: only for processes that will compute
+    there.
     """
     import torch
 
@@ -254,12 +255,12 @@ def version_text(version: int) -> str:
 
 
 def _major(version: str) -> int:
-    """Of "13.0"; 0 of ""."""
+    """The major version of e.g. "13.0"; 0 for ""."""
     return int(version.split(".")[0] or 0)
 
 
 def _too_old(installed: CudaInstallation) -> NoCuda:
-    """Told with the least driver that will do: for the kernels and for torch, which are not built alike."""
+    """The reason with the minimum driver for the kernels and torch, which may need different ones."""
     kernels = 0 if installed.library is None else installed.library[1].runtime // 1000
     built = {"the CUDA kernels": kernels, "the installed torch": _major(installed.torch_cuda or "")}
     known, most = installed.driver // 1000, max(built.values())

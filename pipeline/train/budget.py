@@ -1,7 +1,7 @@
-"""A training that fills a time budget: what an iteration costs, forecast, and the plan that meets the time.
+"""Filling a time budget: the forecast cost of an iteration, and the plan that meets the time.
 
-The forecast comes from real iterations on throw-away states (``measure``). It is used before training only: afterwards
-the plan says what every iteration computes, and the clock no more than after which of them the training ends.
+The forecast comes from real iterations on throw-away states (``measure``). It is used only before training: afterwards
+the plan determines what every iteration computes, and the clock only after which iteration the training ends.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 from splatpipe.pipeline.train.start import started
 from splatpipe.pipeline.train.windows import TrainingSize
 
-# Of these, up to COARSEST_MEGAPIXELS, none was compared by held-out quality: they are judgement, the reasons theirs.
+# None of the values up to COARSEST_MEGAPIXELS was tuned on held-out quality: they are judgement, for the given reasons.
 SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
-SIZE_STEP = 1.5  # between the sizes tried: fine enough to use the time, coarse enough for a short list
-FULL_SHARE = 0.9  # of the dataset's size is as good as all of it, and spares the resampling
+SIZE_STEP = 1.5  # ratio of the sizes tried: fine enough to use the time, coarse enough for a short list
+FULL_SHARE = 0.9  # of the dataset's size is as good as all of it, so resampling is skipped
 
-FIRST_GROWTH = 1.5  # times the Gaussians of sparse points that every plan has room for, before it takes larger photos
-FEWEST_GAUSSIANS = 1000  # a building cannot be told with fewer; the plan thins the initial ones down to it at most
-COARSEST_MEGAPIXELS = 0.05  # photos are halved at the start of a training no further than to this
+FIRST_GROWTH = 1.5  # times the sparse points' Gaussians must fit in every plan before it uses larger photos
+FEWEST_GAUSSIANS = 1000  # fewer cannot represent a building; the initial ones are thinned no further
+COARSEST_MEGAPIXELS = 0.05  # photos are halved no further at the start of a training
 
-EXPORT_GAUSSIAN_S = 8e-6  # a Gaussian of the model moved, written twice and hashed
+EXPORT_GAUSSIAN_S = 8e-6  # to move, write twice and hash a Gaussian of the model
 AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
-SAMPLES = 60  # points that a forecast takes of a training: its schedules are linear or steps
-SCHEDULE_SHARE = 0.95  # of the time for the planned schedule; what is over polishes at its last learning rates
-POLISH = 1.5  # times the planned iterations at most, where the forecast was too high
+SAMPLES = 60  # points at which a forecast samples a training: its schedules are linear or stepped
+SCHEDULE_SHARE = 0.95  # of the time for the planned schedule; the rest continues at its final learning rates
+POLISH = 1.5  # times the planned iterations at most, if the forecast was too high
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class Timing:
     """A measured iteration.
 
     Attributes:
-        gaussians: In the model.
-        pixels: That were compared.
-        seconds: Wall clock.
-        share: Of the photo that these pixels are.
+        gaussians: Number of Gaussians in the model.
+        pixels: Number of pixels compared.
+        seconds: Wall-clock time.
+        share: These pixels as a share of the photo.
     """
 
     gaussians: int
@@ -58,14 +58,14 @@ class Timing:
 
 @dataclass(frozen=True)
 class Speed:
-    """What an iteration takes: base + Gaussians + pixels + pairs, where a pixel's pairs grow with the Gaussians.
+    """Cost model of an iteration: base + Gaussians + pixels + pairs, where a pixel's pairs grow with the Gaussians.
 
     Attributes:
-        base_s: Whatever the size.
-        gaussian_s: A Gaussian, seen or not.
-        pixel_s: A pixel: loss, and the pairs that are there with few Gaussians already.
-        pair_s: A Gaussian times a pixel.
-        seen_s: A Gaussian times the share of the photo that the window is: projection, optimiser.
+        base_s: Fixed cost, seconds.
+        gaussian_s: Seconds per Gaussian, visible or not.
+        pixel_s: Seconds per pixel: loss, and the pairs present even with few Gaussians.
+        pair_s: Seconds per Gaussian times pixel.
+        seen_s: Seconds per Gaussian times the window's share of the photo: projection, optimizer.
     """
 
     base_s: float
@@ -75,7 +75,7 @@ class Speed:
     seen_s: float = 0.0
 
     def seconds(self, gaussians: int, pixels: int | float, share: float = 1.0) -> float:
-        """Of an iteration."""
+        """Seconds of an iteration."""
         alone = self.base_s + (self.gaussian_s + self.seen_s * share) * gaussians
         return alone + self.pixel_s * pixels + self.pair_s * gaussians * pixels
 
@@ -84,13 +84,13 @@ def fit_speed(timings: Sequence[Timing]) -> Speed:
     """The speed that explains the timings best (relative least squares), with no cost below zero.
 
     Raises:
-        ValueError: without timings, or with one that took no time.
+        ValueError: if there are no timings, or one is zero.
     """
     if not timings or min(timing.seconds for timing in timings) <= 0.0:
         raise ValueError("a speed needs timings of more than zero seconds")
     table = np.array([_terms(timing) for timing in timings])
     seconds = np.array([timing.seconds for timing in timings])
-    scale = table.max(axis=0)  # brings the columns to one size
+    scale = table.max(axis=0)  # normalizes the columns
     weighted = table / scale / seconds[:, None]
     costs = nnls(weighted, np.ones(len(timings)))[0] / scale
     return Speed(*costs.tolist())
@@ -108,7 +108,7 @@ def forecast(speed: Speed, schedule: Schedule, initial: int, footage: PhotoSizes
         speed: Of this machine on this scene.
         schedule: Of the training.
         initial: Gaussians at the start.
-        footage: The photos as they are trained on.
+        footage: The photos at their training sizes.
     """
     total, start = 0.0, 0
     for stretch in schedule.stretches:
@@ -124,17 +124,17 @@ def forecast(speed: Speed, schedule: Schedule, initial: int, footage: PhotoSizes
 
 @dataclass(frozen=True)
 class BudgetTask:
-    """What is to be planned.
+    """The planning problem.
 
     Attributes:
-        config: The options; its ``max_gaussians`` is the most that may be planned.
-        sparse: Gaussians of sparse points at the start, which every plan keeps where it can.
-        dense: Gaussians of dense points, which only fill what room a cap leaves.
-        sizes: Width and height of the photos in the dataset, and how many have them.
+        config: The options; its ``max_gaussians`` is the largest cap that may be planned.
+        sparse: Number of Gaussians from sparse points at the start, which every plan keeps if it can.
+        dense: Number of Gaussians from dense points, which only fill the room left by a cap.
+        sizes: Width, height and count of the photos in the dataset.
         window_pixels: Most pixels of a photo that an iteration uses; 0 for the whole photo.
         speed: Of this machine on this scene.
-        prepare_s: Decoding every photo once, whatever sizes are made of it.
-        seconds: What is left for the training.
+        prepare_s: Time to decode every photo once, whatever sizes are made of it.
+        seconds: Time left for the training.
     """
 
     config: TrainConfig
@@ -148,35 +148,35 @@ class BudgetTask:
 
     @property
     def megapixels(self) -> float:
-        """Most that photos may be trained at: their mean size in the dataset, or what the options allow."""
+        """Largest training size of photos: their mean size in the dataset, or what the options allow."""
         whole = 1e-6 * footage_of(self.sizes, None, 0).pixels(TrainingSize())
         return min(whole, self.config.max_megapixels or whole)
 
     def footage(self, megapixels: float) -> PhotoSizes:
-        """The photos at a size; at the largest one as the options have them."""
+        """The photos at a size; the largest size is the one set by the options."""
         most = self.config.max_megapixels or None
         return footage_of(self.sizes, most if megapixels >= self.megapixels else megapixels, self.window_pixels)
 
     def left(self, cap: int) -> float:
-        """Seconds for the training when as many Gaussians as the cap allows are to be exported."""
+        """Seconds left for training if as many Gaussians as the cap allows are exported."""
         return self.seconds - EXPORT_GAUSSIAN_S * cap
 
     def takes(self, options: TrainConfig, megapixels: float) -> float:
-        """Forecast of a training, its photos' decoding (once a size) included, seconds."""
+        """Forecast time of a training, including the decoding of its photos, seconds."""
         initial, footage = started(self.sparse, self.dense, options.max_gaussians), self.footage(megapixels)
         return self.prepare_s + AGEING * forecast(self.speed, resolve_schedule(options, footage), initial, footage)
 
 
 @dataclass(frozen=True)
 class BudgetChoice:
-    """What meets the time.
+    """The plan that meets the time.
 
     Attributes:
-        options: With its iterations, cap, size of the photos and halvings at the start.
-        iterations: The same as a number.
-        seconds: When the training ends, done or not.
-        forecast_s: When the schedule should be done.
-        is_most: Neither larger photos nor more Gaussians were to be had.
+        options: The options with iterations, cap, photo size and initial halvings set.
+        iterations: The iterations as a number.
+        seconds: Time after which the training ends, done or not.
+        forecast_s: Forecast time of the schedule.
+        is_most: Whether neither larger photos nor more Gaussians are available.
     """
 
     options: TrainConfig
@@ -187,17 +187,17 @@ class BudgetChoice:
 
     @property
     def last_iteration(self) -> int:
-        """The most iterations: beyond the schedule until the time is up, unless that is as long as is of use."""
+        """Maximum iterations: beyond the schedule until the time is up, unless the schedule has ``LONGEST``."""
         return self.iterations if self.iterations >= LONGEST else int(POLISH * self.iterations)
 
 
 def choose(task: BudgetTask) -> BudgetChoice:
-    """Divide the time between the size of the photos, iterations and Gaussians.
+    """Divide the time between photo size, iterations and Gaussians.
 
     Photos grow to the dataset's size first, as long as ``wanted_iterations`` and room for the first growth fit: a size
-    whose parts would be seen too seldom loses to the one before. Then the cap grows; what is over goes into iterations,
-    up to ``LONGEST``. Only where nothing more was to be had may a flat loss end the training before its time;
-    elsewhere it ends a size, and larger photos come earlier.
+    whose parts would be seen too seldom loses to the next smaller one. Then the cap grows; the remaining time goes into
+    iterations, up to ``LONGEST``. Only if everything is at its maximum may a flat loss end the training early;
+    otherwise it ends a photo size, and larger photos come earlier.
     """
     most = task.config.max_gaussians
     first = min(most, max(FEWEST_GAUSSIANS, int(FIRST_GROWTH * task.sparse)))
@@ -220,7 +220,7 @@ def choose(task: BudgetTask) -> BudgetChoice:
 
 
 def sizes(megapixels: float) -> list[float]:
-    """Sizes of photos to choose from, smallest first; the last one is the largest that there may be."""
+    """Candidate photo sizes, megapixels, smallest first; the last one is the given maximum."""
     ladder = []
     size = SMALLEST_MEGAPIXELS
     while size < FULL_SHARE * megapixels:
@@ -230,7 +230,7 @@ def sizes(megapixels: float) -> list[float]:
 
 
 def wanted_iterations(task: BudgetTask, megapixels: float) -> int:
-    """Iterations that are worth more than larger photos or more Gaussians: every part is seen often enough."""
+    """Iterations that take priority over larger photos and more Gaussians: every part is seen often enough."""
     least = worthwhile_iterations(task.seconds)
     return sum(count for _level, count in lengths(task.footage(megapixels), least))
 
@@ -255,7 +255,7 @@ def _fits(task: BudgetTask, megapixels: float, cap: int, iterations: int) -> boo
 
 
 def _largest(least: int, most: int, fits: Callable[[int], bool]) -> int:
-    """The largest count from ``least`` to ``most`` that fits, to three digits; ``least`` if none does."""
+    """The largest count from ``least`` to ``most`` that fits, to 0.1 %; ``least`` if none does."""
     if most <= least or not fits(least):
         return least
     if fits(most):

@@ -1,9 +1,9 @@
-"""How long a training is: so many visits of every part of every photo, at every size. Plain arithmetic, light.
+"""The length of a training: a number of visits to every part of every photo, at every size. Plain arithmetic, cheap.
 
 A training begins with whole photos, halved until they fit into a window, and then goes through the finer sizes window
-by window. The visits follow from the photos, so a capture of 11 and one of 500 photos are seen as well; what one
-iteration costs follows from the window. That coarse sizes come first, and long, is what others found, too: begun at
-full size, growth ends in blur (nerfstudio #2984, gaussian-splatting #958, #1146).
+by window. The number of visits follows from the photos, so captures of 11 and of 500 photos are seen equally often; the
+cost of an iteration follows from the window. Starting with a long coarse phase agrees with others' experience: started
+at full size, growth ends in blur (nerfstudio #2984, gaussian-splatting #958, #1146).
 """
 
 from __future__ import annotations
@@ -16,32 +16,33 @@ from functools import cache
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.windows import TrainingSize, windows_of
 
-# Judgement, but for what docs/lengths.md says of them.
-WHOLE_VISITS = 20  # of a photo at the size at which it is seen whole, at least
-PART_VISITS = 16  # of every part of every photo at each finer size, at least; 8 lost, see docs/lengths.md
-FIRST_SHARE = 0.5  # of the least iterations are at the first size,
-FIRST_MOST = 3500  # but no more than these where 20 visits are fewer: the finest size is worth more
+# Judgement, except where docs/lengths.md reports comparisons.
+WHOLE_VISITS = 20  # minimum per photo at the size at which it fits whole
+PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/lengths.md
+FIRST_SHARE = 0.5  # of the minimum iterations are at the first size,
+FIRST_MOST = 3500  # but no more than these if 20 visits are fewer: the finest size is worth more
 FEWEST_VISITS = (
     10.0  # of a part, below which a run that was given its length stays with the size before: it learns more
 )
-COARSE_SHARE = 0.5  # of the iterations at the first size are with photos that `coarse_levels` halves further
+COARSE_SHARE = 0.5  # of the iterations at the first size use photos halved further by `coarse_levels`
 
-UNTIL = 0.5  # of a run there is density control: published; of the finest size's iterations, where there are several
+UNTIL = 0.5  # end of density control, as a share of the run (published), or of the finest size's part of it
 
 WINDOW_PIXELS = {"cpu": 1 << 19, "cuda": 1 << 21}
-"""Of a photo that an iteration renders, by device. On a CPU an iteration's cost is that of its pixels, so small windows
-cost nothing but their margins; a CUDA device is busy only with larger ones. Powers of two: a little over half a
-megapixel and over two, so that photos which were reduced to those are still seen whole."""
+"""Pixels of a window, by device. On a CPU an iteration's cost is proportional to its pixels, so small windows only add
+the cost of their margins; a CUDA device is only fully used by larger ones. Powers of two slightly above half a
+megapixel
+and two, so that photos reduced to those sizes still fit whole."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Iterations that look at their photos in one way.
+    """A run of iterations at one training size.
 
     Attributes:
-        level: How often photos are halved.
-        window_pixels: Of a photo, that count in an iteration at most; 0 for all of it.
-        until: The last of the iterations.
+        level: Number of times photos are halved.
+        window_pixels: Most pixels of a photo that count in an iteration; 0 for the whole photo.
+        until: The last of these iterations.
     """
 
     level: int
@@ -50,16 +51,16 @@ class Stretch:
 
     @property
     def look(self) -> TrainingSize:
-        """The same for one iteration."""
+        """The training size of its iterations."""
         return TrainingSize(self.level, self.window_pixels)
 
 
 @dataclass(frozen=True)
 class PhotoSizes:
-    """Photos as they are trained on.
+    """Photos at their training sizes.
 
     Attributes:
-        sizes: Width and height at the finest size, pixels, and how many photos have it.
+        sizes: Width and height at the finest size, pixels, and the count of photos of that size.
         window_pixels: Most pixels of a photo that an iteration uses; 0 for the whole photo.
     """
 
@@ -68,12 +69,12 @@ class PhotoSizes:
 
     @property
     def photos(self) -> int:
-        """How many."""
+        """Number of photos."""
         return sum(count for _width, _height, count in self.sizes)
 
     @property
     def first_level(self) -> int:
-        """How often photos are halved until half of them fit into a window whole."""
+        """Number of halvings until half of the photos fit whole into a window."""
         areas = sorted((width * height, count) for width, height, count in self.sizes)
         seen, middle, level = 0, 0, 0
         for area, count in areas:
@@ -86,20 +87,20 @@ class PhotoSizes:
         return level
 
     def parts(self, level: int) -> int:
-        """Windows of all photos, halved so often."""
+        """Number of windows of all photos at a level."""
         return sum(count * _cut(w >> level, h >> level, self.window_pixels)[0] for w, h, count in self.sizes)
 
     def window_at(self, level: int) -> int:
-        """Most pixels of a window, at a level; 0 where all photos fit in whole."""
+        """Most pixels of a window at a level; 0 if all photos fit whole."""
         return 0 if self.parts(level) == self.photos else self.window_pixels
 
     def pixels(self, look: TrainingSize) -> float:
-        """Of a photo that an iteration looks at, on average."""
+        """Mean number of pixels that an iteration uses."""
         whole = sum(width * height * count for width, height, count in self.sizes) / 4.0**look.level
         return whole / (self.parts(look.level) if look.window_pixels else self.photos)
 
     def share(self, look: TrainingSize) -> float:
-        """Of a photo's pixels at that level, that an iteration looks at."""
+        """Share of a photo's pixels at that level that an iteration uses."""
         return self.photos / self.parts(look.level) if look.window_pixels else 1.0
 
     def largest(self, look: TrainingSize) -> int:
@@ -109,7 +110,7 @@ class PhotoSizes:
 
 @cache
 def _cut(width: int, height: int, window_pixels: int) -> tuple[int, int]:
-    """How many windows a picture has, and the pixels of the largest."""
+    """Number of windows of an image, and the pixels of the largest."""
     windows = windows_of(max(1, width), max(1, height), window_pixels)
     return len(windows), max(window.pixels for window in windows)
 
@@ -119,11 +120,11 @@ Length = tuple[int, int]
 
 
 def lengths(footage: PhotoSizes, least: int, finest: int = 0) -> list[Length]:
-    """Iterations at each level, the first one first.
+    """Iterations at each level, in training order.
 
     Args:
         footage: The photos.
-        least: Iterations in all, at least.
+        least: Minimum number of iterations in total.
         finest: The last level.
     """
     first = max(finest, footage.first_level)
@@ -135,14 +136,14 @@ def lengths(footage: PhotoSizes, least: int, finest: int = 0) -> list[Length]:
 
 
 def divided(footage: PhotoSizes, least: int, iterations: int) -> list[Length]:
-    """So many iterations: fewer than those of ``lengths`` divided like them, more of them at the finest size.
+    """A given number of iterations divided among levels: like ``lengths`` if fewer; any surplus at the finest size.
 
-    A size that comes too short is left out.
+    A size that would get too few visits is left out.
 
     Args:
         footage: The photos.
         least: As for ``lengths``.
-        iterations: In all.
+        iterations: Total number of iterations.
     """
     for finest in range(footage.first_level + 1):
         wanted = lengths(footage, least, finest)
@@ -158,25 +159,25 @@ def divided(footage: PhotoSizes, least: int, iterations: int) -> list[Length]:
 
 
 def lengths_of(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
-    """Iterations at each size of the photos, those of the options or what they ask for, the first one first."""
+    """Iterations at each photo size, in training order, as set by the options or derived from the photos."""
     if config.iterations == "auto":
         return lengths(footage, config.least_iterations)
     return divided(footage, config.least_iterations, config.iterations)
 
 
 def growth_until(each: Sequence[Length]) -> int:
-    """The last iteration of density control: every size adds the Gaussians that its detail asks for."""
+    """The last iteration of density control: every size adds the Gaussians that its detail needs."""
     *before, (_finest, count) = each
     return sum(earlier for _level, earlier in before) + int(UNTIL * count)
 
 
 def stretches(footage: PhotoSizes, each: Sequence[Length], coarse_levels: int = 0) -> tuple[Stretch, ...]:
-    """The same as what iterations look at.
+    """The same as stretches of training sizes.
 
     Args:
         footage: The photos.
         each: Levels and their iterations.
-        coarse_levels: Photos of the first are halved so many times more at the start, by equal shares.
+        coarse_levels: Extra halvings of the photos at the start of the first level, undone in equal shares.
     """
     (first, whole), *_ = each
     found, coarse = [], int(COARSE_SHARE * whole)

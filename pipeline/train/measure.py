@@ -1,4 +1,4 @@
-"""What this machine needs for this scene: real iterations on throw-away states, and a held-out view's evaluation."""
+"""Measuring this machine's speed on this scene: real iterations on throw-away states, and one view's evaluation."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.techniques import make_techniques
 from splatpipe.pipeline.train.upload import Uploader
 
-MOST_VIEWS = 8  # a size is timed on: their mean is within a few percent of all photos'
-PICTURES = 3  # that evaluate keeps of a view: photo, render, error
+MOST_VIEWS = 8  # timed per size: their mean is within a few percent of that of all photos
+PICTURES = 3  # images that `evaluate` keeps per view: photo, render, error
 NEVER = 1_000_000_000  # iterations until a step of density control
 WARM_UP_ITERATIONS = 100  # until opacities, which step by a twentieth of a logit, are spread as in training
-WARM_UP_SHARE = 0.5  # of the time for measuring at most
-PILOT_ITERATION = 10  # the state claims to be so far, so that all SH degrees take part
-WINDOW_SIDE = 2  # times smaller are the sides of the windows that are timed
-SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a surface shared out (0.5)
+WARM_UP_SHARE = 0.5  # largest share of the measuring time
+PILOT_ITERATION = 10  # iteration that the pilot's state claims, so that all SH degrees take part
+WINDOW_SIDE = 2  # divisor of the sides of the timed windows
+SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a split surface (0.5)
 STREAM = 7  # of the jitter's random numbers; the pilot is thrown away, so nothing depends on them
 
 Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
@@ -40,12 +40,12 @@ Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 
 @dataclass(frozen=True)
 class MachineSpeed:
-    """This machine on this scene.
+    """The speed of this machine on this scene.
 
     Attributes:
-        speed: Of an iteration.
-        decode_s: Reading a photo of the dataset and reducing it.
-        evaluate_s: Rendering, measuring and keeping a held-out view, a megapixel.
+        speed: Cost model of an iteration.
+        decode_s: Seconds to read and reduce a photo of the dataset.
+        evaluate_s: Seconds per megapixel to render, measure and store a held-out view.
     """
 
     speed: Speed
@@ -55,11 +55,11 @@ class MachineSpeed:
 
 @dataclass(frozen=True)
 class MeasuringBudget:
-    """What may be spent on measuring, and what for.
+    """The time for measuring, and its target.
 
     Attributes:
-        most_s: No round is begun after so many seconds; one is done always.
-        iteration_s: What an iteration of the plan may take, about: photos that take it are the ones to be timed.
+        most_s: No round is started after this many seconds; one is always done.
+        iteration_s: Approximate time of an iteration in the plan; photos of that cost are timed.
     """
 
     most_s: float
@@ -68,13 +68,13 @@ class MeasuringBudget:
 
 @dataclass(frozen=True)
 class TimedScene:
-    """What is trained for a moment.
+    """The scene of the timed trial.
 
     Attributes:
         start: The initial Gaussians.
         views: Views to train on.
         device: The compute device.
-        sky: As training begins with; a copy is trained.
+        sky: The initial sky; a copy is trained.
     """
 
     start: Gaussians
@@ -87,10 +87,10 @@ def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: Measuri
     """Time real iterations at two sizes, on windows of the larger one, and at two numbers of Gaussians.
 
     Args:
-        plan: Without a budget; its cap is the larger number of Gaussians.
-        subject: What is trained.
-        step: An iteration of training.
-        effort: Its limit.
+        plan: A plan without a budget; its cap is the larger number of Gaussians.
+        subject: The scene to time.
+        step: A training iteration.
+        effort: The time limit.
     """
     start, views, device = subject.start, subject.views, subject.device
     began = time.monotonic()
@@ -102,11 +102,11 @@ def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: Measuri
     states = [_pilot_state(model.to(device.tensors), trial, subject) for model in models]
     _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
     first = _timed(states[0], trial, small[0], step, device)
-    # Cost grows a little slower than size, so the line through two sizes is right near them only.
+    # Cost grows slightly slower than size, so the line through two sizes is accurate only near them.
     megapixels = SMALLEST_MEGAPIXELS * max(2.0, effort.iteration_s / first.seconds)
     large, decode_s = _photos(chosen, megapixels, device)
     finished = states[-1].finished().to(device.tensors)
-    _evaluation_seconds(finished, small[0], plan)  # pays for what is loaded once
+    _evaluation_seconds(finished, small[0], plan)  # absorbs one-time loading
     evaluate_s = _evaluation_seconds(finished, large[0], plan)
     timings = [first]
     for photos in zip(small, large, map(middle_of, large), strict=True):
@@ -118,13 +118,13 @@ def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: Measuri
 
 
 def pilot_schedule(schedule: Schedule) -> Schedule:
-    """The schedule without steps of density control, all SH degrees taking part."""
+    """The schedule without density-control steps and with all SH degrees active."""
     density = replace(schedule.density, first=1, last=NEVER, every=NEVER, reset_every=0)
     return replace(schedule, sh_every=1, density=density)
 
 
 def stretched(start: Gaussians, count: int, seed: int) -> Gaussians:
-    """The Gaussians thinned or multiplied to a number, their area on the photos about the same.
+    """The Gaussians thinned or multiplied to ``count``, with about the same area in the photos.
 
     Args:
         start: Of the scene.
@@ -150,7 +150,7 @@ def _pilot_state(start: Gaussians, trial: TrainingPlan, subject: TimedScene) -> 
 def _warm_up(
     states: Sequence[TrainState], trial: TrainingPlan, photos: Sequence[TrainingPhoto], step: Step, until: float
 ) -> None:
-    """Train each state a little: opacities and sizes that have left their start cost more than those there."""
+    """Train each state briefly: opacities and sizes cost more once they have moved from their initial values."""
     for number in range(WARM_UP_ITERATIONS):
         for state in states:
             step(state, trial, photos[number % len(photos)])
@@ -159,7 +159,7 @@ def _warm_up(
 
 
 def _photos(views: Sequence[View], megapixels: float, device: Device) -> tuple[list[TrainingPhoto], float]:
-    """The views as training sees them, and the seconds that one took."""
+    """The views as training photos, and the mean seconds per view."""
     began = time.monotonic()
     uploader, photos = Uploader(device.tensors), []
     for view in views:
@@ -170,7 +170,7 @@ def _photos(views: Sequence[View], megapixels: float, device: Device) -> tuple[l
 
 
 def middle_of(photo: TrainingPhoto) -> TrainingPhoto:
-    """The window in the middle of a photo, of half its sides: most of what is around it is not seen."""
+    """The window in the middle of a photo, with half its sides: most Gaussians around it are not visible."""
     camera = photo.camera
     width, height = max(1, camera.width // WINDOW_SIDE), max(1, camera.height // WINDOW_SIDE)
     left, top = (camera.width - width) // 2, (camera.height - height) // 2
@@ -192,7 +192,7 @@ def _timed(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto, step: S
 
 
 def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: TrainingPlan) -> float:
-    """What a held-out view takes a megapixel: a render, every measure, the pictures as PNG."""
+    """Seconds per megapixel of a held-out view: a render, every metric, the images as PNG."""
     began = time.monotonic()
     with torch.no_grad():
         options = rasterizer.RenderOptions(
@@ -205,7 +205,7 @@ def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Traini
         try:
             function(colour.cpu(), shown, mask)
         except ValueError:
-            continue  # too few pixels for this measure: evaluate leaves it out, too
+            continue  # too few pixels for this metric: `evaluate` leaves it out too
     pixels = (shown * 255.0).to(torch.uint8).numpy()
     for _ in range(PICTURES):
         cv2.imencode(".png", pixels)

@@ -1,4 +1,4 @@
-"""The plan of a training under budgets of time and memory, made once, before its first iteration."""
+"""Planning a training under time and memory budgets, once, before its first iteration."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.start import InitialGaussians, started
 from splatpipe.pipeline.train.windows import TrainingSize
 
-MEASURE_SHARE = 0.05  # of the budget at most goes into measuring
+MEASURE_SHARE = 0.05  # of the budget at most is spent on measuring,
 MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
 PILOT_GROWTH_A_SECOND = {"cpu": 150.0, "cuda": 15_000.0}
-"""Gaussians that a second of budget pays for, about: where the forecast has to be right. Measured on CPUs; for CUDA a
-judgement, two orders of magnitude more: an iteration of fewer is all fixed cost there, which tells nothing of a
-Gaussian's."""
-LEAST_SHARE = 0.1  # of the budget for the training, even where nothing is left: the tolerance of the whole
-FILM_VIEWS = 40  # held-out views that take as long to measure as a film of ten seconds takes to make
-EXPORT_SECONDS = 5.5  # the last stages whatever the size: digests, the report with its pictures, the end of the process
+"""Approximate number of Gaussians that a second of budget pays for: where the forecast has to be accurate. Measured on
+CPUs; for CUDA a judgement, two orders of magnitude more: with fewer Gaussians an iteration there is all fixed cost,
+which says nothing about the cost per Gaussian."""
+LEAST_SHARE = 0.1  # of the budget for the training, even if nothing is left: the overall tolerance
+FILM_VIEWS = 40  # held-out views that take as long to evaluate as a ten-second film takes to render
+EXPORT_SECONDS = 5.5  # fixed cost of the last stages: digests, the report with its images, process exit
 
 
 @dataclass(frozen=True)
 class PlanningInput:
-    """What is trained.
+    """The scene and machine to plan for.
 
     Attributes:
         config: The options, not resolved.
         start: The initial Gaussians.
         trained_on: Views to train on.
-        held_out: How many others evaluate measures.
-        machine: Threads, and when the command began.
-        device: What it is trained on.
-        sky: As training begins with; None without one.
+        held_out: Number of other views that `evaluate` measures.
+        machine: Threads, and the start time of the command.
+        device: The training device.
+        sky: The initial sky; None without one.
     """
 
     config: TrainConfig
@@ -62,13 +62,13 @@ def under_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: 
     """Fit a plan to the budgets of its options, and its initial Gaussians to the cap.
 
     Args:
-        plan: With resolved schedules.
-        scene: What is trained.
-        step: An iteration of training, to be measured.
+        plan: A plan with resolved schedules.
+        scene: The scene to train.
+        step: A training iteration, to be timed.
         report: Receives warnings.
 
     Raises:
-        MachineError: if the memory is too small for any training.
+        MachineError: if memory is too small for any training.
     """
     if plan.options.max_memory_bytes:
         plan = within_memory(plan, scene.start.sparse, report, scene.device.name == "cuda")
@@ -79,7 +79,7 @@ def under_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: 
 
 
 def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
-    """The plan that fills what is left of the time budget when the last stages have their share."""
+    """The plan that fills the time budget left after reserving time for the last stages."""
     budget, began = plan.options.time_budget_s, time.monotonic()
     if 0.0 < scene.machine.began_s < began:
         began = scene.machine.began_s
@@ -116,15 +116,15 @@ def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Re
 
 
 def pilot(plan: TrainingPlan, scene: PlanningInput) -> TrainingPlan:
-    """The plan of a short training with a cap near which the budget's may lie, to be measured at.
+    """The plan of a short trial run, with a cap close to the one that the budget may allow.
 
     Args:
-        plan: Without a budget.
-        scene: What is trained.
+        plan: A plan without a budget.
+        scene: The scene to train.
     """
     paid_for = PILOT_GROWTH_A_SECOND[scene.device.name] * scene.config.time_budget_s
     free = free_bytes(scene.device.tensors)
-    if free is not None:  # a smaller one is there at the same time, and both are thrown away
+    if free is not None:  # a smaller model exists at the same time; both are discarded
         paid_for = min(paid_for, free / (2 * device_bytes_per_gaussian(plan.options.sh_degree)))
     wanted = max(FIRST_GROWTH * scene.start.sparse, paid_for, FEWEST_GAUSSIANS)
     short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
