@@ -1,8 +1,8 @@
-// What this machine can do at best: multiply-adds in registers and copies in memory, on the threads asked for.
+// Peak performance of this machine: multiply-adds in registers and copies in memory, on a given number of threads.
 //
-// Usage: ceilings THREADS. Prints GFLOP/s of a core (an FMA is two, by CPU time with all threads at work) and GB/s that
+// Usage: ceilings THREADS. Prints GFLOP/s per core (an FMA is two, by CPU time with all threads busy) and GB/s that
 // all threads copy (read and written both count, by the wall clock).
-// LANES is given by the compiler's flags: floats in a vector register of the instruction set it was compiled for.
+// LANES is set by a compiler flag: floats in a vector register of the instruction set compiled for.
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
@@ -21,7 +21,7 @@ constexpr int kSteps = 2'000'000;
 constexpr size_t kBytes = size_t{512} << 20;  // all threads' sources and targets together: beyond any cache
 constexpr int kRepeats = 5;
 
-// Each thread's own; what they add up to is printed, so that no compiler leaves the work out.
+// Private to each thread; the sum is printed so that the compiler cannot optimise the work away.
 void multiply_add(float* sink) {
     Vector chains[kChains];
     for (int c = 0; c < kChains; ++c) chains[c] = Vector{} + static_cast<float>(c + 1);
@@ -48,7 +48,7 @@ double seconds(clockid_t clock, int threads, const std::function<void(int)>& wor
     return now(clock) - begin;
 }
 
-// The first run faults the memory in and lets the clock rate settle; it counts for nothing where others are shorter.
+// The first run faults the memory in and lets the clock rate settle; the shortest run counts.
 double shortest(clockid_t clock, int threads, const std::function<void(int)>& work) {
     double best = seconds(clock, threads, work);
     for (int i = 1; i < kRepeats; ++i) best = std::min(best, seconds(clock, threads, work));

@@ -1,7 +1,7 @@
-"""What is measured on surfaces: figures of arrays, which know nothing of who made them.
+"""Accuracy measures for surfaces: functions of arrays, independent of the method that made them.
 
-Errors are NaN where something is missing that should be there. That is wrong: it is farther off than any bound, in
-shares, in quantiles and in the NMAD. Only the bias, which has a sign, is of what is there; completeness tells the rest.
+Errors are NaN where something is missing that should exist. That counts as wrong: in shares, quantiles and the NMAD it
+is worse than any bound. Only the bias, which is signed, covers existing values alone; completeness covers the rest.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from tables import Row
 
-NMAD_OF_MAD = 1.4826  # the deviation of normal errors (Höhle and Höhle, 2009)
-LARGEST = 255.0  # of a colour
-MOVED_LIMIT = 1e3  # dB: of pictures that are the same
+NMAD_OF_MAD = 1.4826  # MAD to standard deviation for normal errors (Höhle and Höhle, 2009)
+LARGEST = 255.0  # of a colour channel
+MOVED_LIMIT = 1e3  # dB: for identical images
 
 
 def figures(errors_m: Float64[np.ndarray, " n"], gsd_m: float) -> Row:
-    """Errors of places that count, in GSD.
+    """Summarise the errors at places that count, in GSD.
 
     Args:
-        errors_m: Signed, normal to the surface; NaN where missing.
-        gsd_m: Of the original photos.
+        errors_m: Signed errors, normal to the surface; NaN where missing.
+        gsd_m: GSD of the original photos.
 
     Returns:
-        ``cells``, ``complete`` (share that is there), ``bias`` (median) and ``mean`` of what is there; ``nmad``,
-        ``p95`` and the shares ``within_2``, ``within_25`` (2.5) and ``within_3`` of all; None where it is not finite.
+        ``cells``, ``complete`` (share with a value), ``bias`` (median) and ``mean`` of the existing values; ``nmad``,
+            ``p95`` and the shares ``within_2``, ``within_25`` (2.5) and ``within_3`` of all; None where not finite.
     """
     row: Row = {"cells": int(errors_m.size)}
     if errors_m.size == 0:
@@ -51,12 +51,12 @@ def _finite(value: float) -> float | None:
 
 
 def near_steps(heights: Float64[np.ndarray, "h w"], step_m: float, cells: int) -> Bool[np.ndarray, "h w"]:
-    """Cells within some of a step of the true heights: where neighbours differ by more, or one of them is nothing.
+    """Return the cells within a distance of a step in the true heights, or of a hole.
 
     Args:
-        heights: True; not finite where there is nothing.
-        step_m: What neighbours of a roof never differ by.
-        cells: How near.
+        heights: True heights; not finite where there is nothing.
+        step_m: Difference that neighbours on a roof never reach.
+        cells: The distance, cells.
     """
     held = np.where(np.isfinite(heights), heights, -1e9)
     step = np.zeros(heights.shape, bool)
@@ -73,12 +73,12 @@ def near_steps(heights: Float64[np.ndarray, "h w"], step_m: float, cells: int) -
 def relief_errors(
     found: Float64[np.ndarray, "h w"], true: Float64[np.ndarray, "h w"], cosine: Float64[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, "h w"]:
-    """Distances normal to the true surface of heights over a grid, positive outside it; NaN where either is missing.
+    """Return the distances of grid heights normal to the true surface, positive outside; NaN where either is missing.
 
     Args:
-        found: NaN where missing.
-        true: Not finite where there is nothing.
-        cosine: Between the true normal and the direction of heights.
+        found: Heights; NaN where missing.
+        true: True heights; not finite where there is nothing.
+        cosine: Cosine between the true normal and the height axis.
     """
     return np.asarray(np.where(np.isfinite(true), found - np.where(np.isfinite(true), true, 0.0), np.nan) * cosine)
 
@@ -86,7 +86,7 @@ def relief_errors(
 def psnr(
     picture: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], counts: Bool[np.ndarray, "h w"]
 ) -> float:
-    """Of the pixels that count, dB; where the picture has none it is to be black."""
+    """Return the PSNR over the pixels that count, dB; the image must be black where it is empty."""
     apart = picture[counts].astype(np.float64) - truth[counts]
     mean = float(np.square(apart).mean())
     return MOVED_LIMIT if mean == 0.0 else 10.0 * math.log10(LARGEST**2 / mean)
@@ -95,7 +95,7 @@ def psnr(
 def fitted_colours(
     picture: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], counts: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with the affine change of each channel that is nearest to the truth where it counts."""
+    """Return the image with each channel fitted to the truth by an affine function over the pixels that count."""
     result = np.empty_like(picture)
     for channel in range(3):
         known = np.stack([picture[counts, channel].astype(np.float64), np.ones(int(counts.sum()))], axis=1)
@@ -105,17 +105,17 @@ def fitted_colours(
 
 
 def reached(distances_m: Float64[np.ndarray, " n"], bound_m: float) -> float:
-    """The share within a bound; zero of nothing, for what is not there reaches nothing."""
+    """Return the share within a bound; zero for an empty product."""
     return float((distances_m <= bound_m).mean()) if distances_m.size else 0.0
 
 
 def harmonic(precision: float, recall: float) -> float:
-    """F1."""
+    """Return the harmonic mean of precision and recall, F1."""
     return 2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0
 
 
 def rmse(apart: Float64[np.ndarray, "n 2"]) -> float | None:
-    """Of distances, from differences; None if one is missing (NaN), or there are none: what is not found is wrong."""
+    """Return the RMS length of difference vectors; None if one is missing (NaN) or there are none."""
     if apart.size == 0 or not np.isfinite(apart).all():
         return None
     return float(np.sqrt(np.square(apart).sum(axis=1).mean()))

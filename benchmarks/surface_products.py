@@ -1,4 +1,4 @@
-"""The surface products of a run, or files of anybody's, read for measuring; and the way from their frames to the truth.
+"""Read a run's surface products, or anyone's files, and transform them from their frames to the truth's.
 
 ``facades.json`` is a list (or an object with the list under ``facades``) of objects with ``name``, ``corners`` (upper
 left, upper right, lower right, lower left; three coordinates of the CRS each), ``depth`` (a TIFF of metres before the
@@ -47,11 +47,11 @@ Z_UP_FROM_GLB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """A GeoTIFF.
+    """A GeoTIFF raster.
 
     Attributes:
         bands: (bands, h, w), as stored.
-        there: Where it has data.
+        there: Mask of valid data.
         affine: From column, row to the CRS: (2, 3).
         crs: As ``parse_crs`` takes it.
     """
@@ -63,21 +63,21 @@ class Raster:
 
     @property
     def cell(self) -> float:
-        """A cell's side, units of the CRS."""
+        """Return the side of a cell, units of the CRS."""
         return float(np.hypot(self.affine[0, 0], self.affine[1, 0]))
 
     def to_grid(self, coordinates: Points) -> Points:
-        """Coordinates of the CRS to column, row and height."""
+        """Transform coordinates of the CRS to column, row and height."""
         plan = np.linalg.solve(self.affine[:, :2], (coordinates[:, :2] - self.affine[:, 2]).T).T
         return np.column_stack([plan, coordinates[:, 2]])
 
     def from_grid(self, places: Points) -> Points:
-        """Column, row and height to coordinates of the CRS."""
+        """Transform column, row and height to coordinates of the CRS."""
         return np.column_stack([places[:, :2] @ self.affine[:, :2].T + self.affine[:, 2], places[:, 2]])
 
 
 def read_raster(path: Path) -> Raster:
-    """Read a GeoTIFF; NaN is no data, whatever the file says."""
+    """Read a GeoTIFF; NaN is no data, whatever the file declares."""
     with rasterio.open(path) as held:
         bands, there = held.read(), held.dataset_mask() > 0
         if held.crs is None:
@@ -89,7 +89,7 @@ def read_raster(path: Path) -> Raster:
 
 
 def plan_crs(wkt: str) -> str:
-    """The EPSG code of a CRS's plan; of one without a code, its whole text."""
+    """Return the EPSG code of a CRS's horizontal part; its whole text if it has none."""
     crs = pyproj.CRS.from_wkt(wkt)
     plan = (crs.sub_crs_list[0] if crs.is_compound else crs).to_2d()
     code = plan.to_epsg()
@@ -97,19 +97,19 @@ def plan_crs(wkt: str) -> str:
 
 
 def colours(raster: Raster) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture's, black where it has nothing."""
+    """Return an image's colours, black where it is empty."""
     picture = np.moveaxis(raster.bands[:3], 0, -1).astype(np.uint8)
     return np.where(raster.there[..., None], picture, 0).astype(np.uint8)
 
 
 @dataclass(frozen=True)
 class ProductTransform:
-    """The way between a product's coordinates and the truth's local metres.
+    """Transforms between a product's coordinates and the truth's local metres.
 
     Attributes:
         truth: The truth's own frame, with coordinates in the CRS.
-        run: The run's, likewise; the truth's where files come without a run.
-        laid_over: From the run's local frame to the truth's, if the run is to be laid over the truth by its cameras.
+        run: The run's frame, likewise; the truth's for files without a run.
+        laid_over: From the run's local frame to the truth's, if the run is to be aligned to the truth by its cameras.
     """
 
     truth: World
@@ -117,35 +117,35 @@ class ProductTransform:
     laid_over: Similarity | None
 
     def true_from_local(self, points: Points) -> Points:
-        """The run's local metres to the truth's."""
+        """Transform the run's local metres to the truth's."""
         if self.laid_over is not None:
             return self.laid_over.apply(points)
         return self.truth.local_from_crs(self.run.crs_from_local(points))
 
     def true_from_crs(self, points: Points) -> Points:
-        """Coordinates of the CRS to the truth's local metres."""
+        """Transform coordinates of the CRS to the truth's local metres."""
         return self.true_from_local(self.run.local_from_crs(points))
 
     def crs_from_true(self, points: Points) -> Points:
-        """And back."""
+        """Transform the truth's local metres to coordinates of the CRS."""
         if self.laid_over is not None:
             return self.run.crs_from_local(self.laid_over.inverse().apply(points))
         return self.truth.crs_from_local(points)
 
 
 def true_frame(crs: str) -> Frame:
-    """The frame of the truth, with coordinates in a CRS."""
+    """Return the frame of the truth, with coordinates in a CRS."""
     origin = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["frame"]["origin"]
     return Frame("enu", Similarity.identity(), Origin(**origin), ELLIPSOIDAL, crs=crs)
 
 
 def frames_of(out: Path, crs: str, align: str) -> ProductTransform:
-    """Of a run's products, or of files in a folder that is no run's, whose local frame is then the truth's.
+    """Return the transforms of a run's products, or of files in another folder, whose local frame is then the truth's.
 
     Args:
         out: OUT.
-        crs: Of the products.
-        align: ``none``: as they are handed over. ``cameras``: laid over the truth by the run's camera centres.
+        crs: CRS of the products.
+        align: ``none``: as delivered. ``cameras``: aligned to the truth by the run's camera centres.
     """
     truth = open_world(true_frame(crs))
     parts = _parts(out)
@@ -173,7 +173,7 @@ def _parts(out: Path) -> dict[str, Any]:
 
 
 def find_products(out: Path) -> dict[str, Path]:
-    """The files of the products that are there."""
+    """Return the paths of the existing products."""
     found = {}
     for product, names in FILES.items():
         places = (out / folder / name for folder in FOLDERS for name in names)
@@ -184,13 +184,13 @@ def find_products(out: Path) -> dict[str, Path]:
 
 
 def read_mesh(path: Path) -> Float64[np.ndarray, "m 3 3"]:
-    """The corners of a mesh's triangles, local metres, z up."""
+    """Read the corners of a mesh's triangles, local metres, z up."""
     corners = np.asarray(trimesh.load(path, force="mesh").triangles, np.float64)
     return corners @ Z_UP_FROM_GLB.T if path.suffix == ".glb" else corners
 
 
 def read_cloud(path: Path, from_crs: Callable[[Points], Points], from_local: Callable[[Points], Points]) -> Points:
-    """A cloud's points: LAZ is in the CRS, PLY in local metres."""
+    """Read a cloud's points: LAZ is in the CRS, PLY in local metres."""
     if path.suffix == ".ply":
         return from_local(np.asarray(trimesh.load(path).vertices, np.float64))
     return from_crs(np.asarray(laspy.read(path).xyz, np.float64))
@@ -198,12 +198,12 @@ def read_cloud(path: Path, from_crs: Callable[[Points], Points], from_local: Cal
 
 @dataclass(frozen=True, eq=False)
 class Facade:
-    """An elevation.
+    """A façade elevation.
 
     Attributes:
-        name: As the run calls it.
+        name: The run's name for it.
         corners: Upper left, upper right, lower right, lower left; truth's local metres: (4, 3).
-        depth: Metres before the plane, NaN where it has none; (h, w).
+        depth: Metres in front of the plane, NaN where missing; (h, w).
     """
 
     name: str
@@ -211,14 +211,14 @@ class Facade:
     depth: Float64[np.ndarray, "h w"]
 
     def axes(self) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
-        """Of a column, of a row (metres each), and the unit normal towards the viewer."""
+        """Return the steps of a column and of a row (metres each), and the unit normal towards the viewer."""
         height, width = self.depth.shape
         right, down = (self.corners[1] - self.corners[0]) / width, (self.corners[3] - self.corners[0]) / height
         normal = np.cross(down, right)
         return right, down, normal / np.linalg.norm(normal)
 
     def points(self) -> Points:
-        """Where the cells that have a depth lie."""
+        """Return the positions of the cells that have a depth."""
         right, down, normal = self.axes()
         row, column = np.nonzero(np.isfinite(self.depth))
         on_plane = self.corners[0] + (column + 0.5)[:, None] * right + (row + 0.5)[:, None] * down
@@ -226,16 +226,16 @@ class Facade:
 
 
 def open_plain(path: Path) -> rasterio.DatasetReader:
-    """A TIFF that need not say where it lies."""
+    """Open a TIFF that may lack a georeference."""
     warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
     return rasterio.open(path)
 
 
 def read_facades(path: Path, from_crs: Callable[[Points], Points]) -> list[Facade]:
-    """The elevations that a ``facades.json`` names.
+    """Read the elevations listed in a ``facades.json``.
 
     Raises:
-        UsageError: if it is not understood.
+        UsageError: if it is invalid.
     """
     try:
         told = json.loads(path.read_text(encoding="utf-8"))

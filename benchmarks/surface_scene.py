@@ -1,4 +1,4 @@
-"""The demo's truth on a product's own grid: heights, parts, which places count, and the true picture."""
+"""The demo's truth on a product's own grid: heights, parts, the places that count, and the true image."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from splatpipe.demo.visibility import FEWEST, TrueView, photos_that_see, true_si
 GSD_M = 0.028  # of the original photos, at the house
 STEP_M = 4.0 * GSD_M  # more than roofs (slope 0.9) rise between cells of 2 GSD; chimneys, dormers and walls are higher
 STEP_CELLS = 2
-ROOF_UP = 0.5  # upward part of a roof's normal: 60°
-ROOF_M = 2.0  # height of the lowest roof, less a little: steps and sills are none
+ROOF_UP = 0.5  # upward component of a roof's normal: 60°
+ROOF_M = 2.0  # height of the lowest roof, less a little; excludes steps and sills
 BUILT = (HOUSE, TILED, SLATED, SHEETED, PLAIN, BRICKS)
-BOX = np.array([[x, y, z] for x in (-24.0, 24.0) for y in (-24.0, 24.0) for z in (0.0, 11.0)])  # what is measured in
-STRAIGHT_M = 2e-3  # that the way to a CRS may bend within that box
+BOX = np.array([[x, y, z] for x in (-24.0, 24.0) for y in (-24.0, 24.0) for z in (0.0, 11.0)])  # region of interest
+STRAIGHT_M = 2e-3  # deviation from linearity allowed in the transform to a CRS within that box
 LINEAR_OF_CODED = np.where(
     np.arange(256) <= 10, np.arange(256) / 255.0 / 12.92, ((np.arange(256) / 255.0 + 0.055) / 1.055) ** 2.4
 ).astype(np.float32)  # sRGB, IEC 61966-2-1
@@ -39,8 +39,8 @@ class SceneTruth:
     """The demo scene and its flight.
 
     Attributes:
-        triangles: Of the whole scene.
-        parts: What each is of.
+        triangles: Triangles of the whole scene.
+        parts: The part that each triangle belongs to.
         sights: What the photos truly see.
     """
 
@@ -50,7 +50,7 @@ class SceneTruth:
 
     @cached_property
     def normals(self) -> Float64[np.ndarray, "m 3"]:
-        """Unit normals of the triangles."""
+        """Return unit normals of the triangles."""
         return unit_normals(self.triangles)
 
     @cached_property
@@ -58,17 +58,17 @@ class SceneTruth:
         return Delaunay(np.array([centre(pose)[:2] for pose in true_poses().values()]))
 
     def flown_over(self, points: Points) -> Bool[np.ndarray, " n"]:
-        """Which places lie below the flight: within the hull of the cameras, seen from above. Nothing else counts."""
+        """Return which places lie below the flight: within the cameras' convex hull in plan. Nothing else counts."""
         return np.asarray(self._flown.find_simplex(points[:, :2]) >= 0)
 
     @property
     def flown_box(self) -> Float64[np.ndarray, "2 2"]:
-        """Least and largest east and north of that."""
+        """Return the least and largest east and north of that hull."""
         return np.stack([self._flown.points.min(axis=0), self._flown.points.max(axis=0)])
 
 
 def load_truth(depths: Path | None = None) -> SceneTruth:
-    """Of the capture; depths as ``true_sights`` takes them."""
+    """Load the capture's truth; for the depths see ``true_sights``."""
     triangles = true_surface()
     return SceneTruth(triangles, parts_of(triangles), true_sights(triangles, depths))
 
@@ -89,16 +89,16 @@ class AffineMap:
         return np.asarray(points @ self.matrix.T + self.offset)
 
     def back(self, points: Points) -> Points:
-        """The inverse."""
+        """Apply the inverse map."""
         return np.asarray(np.linalg.solve(self.matrix, (points - self.offset).T).T)
 
 
 def straight(way: Callable[[Points], Points], cell: float) -> AffineMap:
-    """The affine map that a map is within the scene.
+    """Return the affine map that a transform is equal to within the scene.
 
     Args:
-        way: From the truth's metres to a grid's cells and metres of height.
-        cell: Metres of a cell.
+        way: Transform from the truth's metres to a grid's cells and metres of height.
+        cell: Size of a cell, metres.
     """
     there = way(BOX)
     known = np.column_stack([BOX, np.ones(len(BOX))])
@@ -110,16 +110,16 @@ def straight(way: Callable[[Points], Points], cell: float) -> AffineMap:
 
 @dataclass(frozen=True, eq=False)
 class TruthGrid:
-    """The truth on a part of a product's grid, which is all that was flown over.
+    """The truth on the part of a product's grid that was flown over.
 
     Attributes:
         truth: The scene.
-        way: From the truth's metres to column and row of this part, and height.
-        left: The product's column that is this part's first; may be negative.
-        top: The product's row likewise.
+        way: Map from the truth's metres to column and row of this part, and height.
+        left: Product column of this part's first column; may be negative.
+        top: Product row of this part's first row; may be negative.
         relief: True heights.
-        seen: Where at least three photos truly see what is there, below the flight.
-        below: What lies below the flight.
+        seen: Where at least three photos truly see the surface, below the flight.
+        below: Mask of places below the flight.
     """
 
     truth: SceneTruth
@@ -132,7 +132,7 @@ class TruthGrid:
 
     @cached_property
     def parts(self) -> Int8[np.ndarray, "h w"]:
-        """Of what is there; -1 where there is nothing."""
+        """Return the part at each cell; -1 where there is nothing."""
         return np.where(self.relief.triangle >= 0, self.truth.parts[self.relief.triangle], np.int8(-1))
 
     @cached_property
@@ -141,7 +141,7 @@ class TruthGrid:
 
     @cached_property
     def true_heights(self) -> Float64[np.ndarray, "h w"]:
-        """Of the truth's own frame: what a roof's height above the plot is."""
+        """Return heights in the truth's own frame: a roof's height above the plot."""
         rows, columns = np.indices(self.relief.height.shape)
         places = np.column_stack([columns.ravel() + 0.5, rows.ravel() + 0.5, self.relief.height.ravel()])
         places[:, 2] = np.where(np.isfinite(places[:, 2]), places[:, 2], 0.0)
@@ -149,26 +149,26 @@ class TruthGrid:
 
     @cached_property
     def ground(self) -> Bool[np.ndarray, "h w"]:
-        """The plot."""
+        """Return the cells of the plot."""
         return np.asarray(self.parts == GROUND)
 
     @cached_property
     def roofs(self) -> Bool[np.ndarray, "h w"]:
-        """What of the house faces up, higher than a person: slopes, and what lies on them."""
+        """Return the house's cells that face up and are above head height: slopes, and what lies on them."""
         return np.asarray(np.isin(self.parts, BUILT) & (self._up > ROOF_UP) & (self.true_heights > ROOF_M))
 
     @cached_property
     def house(self) -> Bool[np.ndarray, "h w"]:
-        """All of the house that is so high."""
+        """Return all cells of the house at that height."""
         return np.asarray(np.isin(self.parts, BUILT) & (self.true_heights > ROOF_M))
 
     @cached_property
     def steps(self) -> Bool[np.ndarray, "h w"]:
-        """Cells within two of a height step."""
+        """Return the cells within two of a height step."""
         return near_steps(self.relief.height, STEP_M, STEP_CELLS)
 
     def cut(self, band: np.ndarray, fill: float) -> np.ndarray:
-        """This part of the product's band; what it does not reach is filled."""
+        """Cut this part out of a product's band; cells outside the product get the fill value."""
         height, width = self.relief.height.shape
         part = np.full((height, width, *band.shape[2:]), fill, band.dtype)
         top, left = max(0, self.top), max(0, self.left)
@@ -180,13 +180,13 @@ class TruthGrid:
 
 
 def site_of(truth: SceneTruth, raster: Raster, crs_from_true: Callable[[Points], Points], every: int = 1) -> TruthGrid:
-    """The truth on a product's grid.
+    """Compute the truth on a product's grid.
 
     Args:
         truth: The scene.
         raster: The product.
         crs_from_true: From the truth's metres to its CRS.
-        every: Cells, a side, that share whether three photos see them.
+        every: Side of the cell blocks that share one visibility test.
     """
     whole = straight(lambda points: raster.to_grid(crs_from_true(points)), raster.cell)
     (west, south), (east, north) = truth.flown_box
@@ -218,11 +218,11 @@ def _seen(
 def true_picture(
     path: Path, view: ParallelView, site: TruthGrid
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The true picture on a site's grid, each pixel the mean of the light on it, and where there is one.
+    """Return the true image on a site's grid, each pixel the mean of its light, and the mask of its valid pixels.
 
     Args:
-        path: A picture by ``demo.orthographic``.
-        view: The view that it is of, its own size of pixels aside.
+        path: An image by ``demo.orthographic``.
+        view: Its view, except for the pixel size.
         site: The product's grid.
     """
     coded = np.asarray(Image.open(path).convert("RGB"))
@@ -231,7 +231,7 @@ def true_picture(
     corners = np.array([[0.0, 0.0, 0.0], [width, 0.0, 0.0], [0.0, height, 0.0]])
     places = own.to_grid(site.way.back(corners))[:, :2]
     steps = (places[1:] - places[0]) / [[width], [height]]
-    fine = max(1, round(float(np.linalg.norm(steps[0]))))  # samples a pixel, a side
+    fine = max(1, round(float(np.linalg.norm(steps[0]))))  # samples per pixel and side
     light = LINEAR_OF_CODED[coded]
     matrix = np.column_stack([steps[0] / fine, steps[1] / fine, places[0] - 0.5 + (steps[0] + steps[1]) / fine / 2.0])
     size, flags = (width * fine, height * fine), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -243,6 +243,6 @@ def true_picture(
 
 
 def coded_of(light: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Linear light, 0 to 1, as 8-bit sRGB."""
+    """Encode linear light, 0 to 1, as 8-bit sRGB."""
     values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
     return np.asarray(np.clip(values * 255.0 + 0.5, 0.0, 255.0), np.uint8)

@@ -1,8 +1,8 @@
-"""CPU seconds of the surface model and the orthophoto by the million cells: ``surface_speed.py --depths FOLDER``.
+"""Measure CPU seconds of surface model and orthophoto per million cells: ``surface_speed.py --depths FOLDER``.
 
-FOLDER is of ``python -m splatpipe.demo.depth_maps`` (extra ``demo``): depth maps of the demo's photos, true ones or, of
-its ``--noise``, such with errors, and beside the true ones the photos without their lens. A part of the plot around the
-house is made, on one thread; nearly all photos see all of it.
+FOLDER is written by ``python -m splatpipe.demo.depth_maps`` (extra ``demo``): depth maps of the demo's photos, true or
+with errors (``--noise``), and beside the true ones the undistorted photos. A part of the plot around the house is
+processed on one thread; nearly all photos see all of it.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, MetricMap
 
 GSD_M = 0.028  # of the original photos, at the house
-HALF_M = 9.0  # of the part's side
+HALF_M = 9.0  # half the side of the part
 RELIEF = HeightRange(-2.0, 14.0)
 HELD_BYTES = 1 << 30
-EVERY = 5  # cells of the surface model from place to place that exposures are compared at
+EVERY = 5  # spacing, in cells of the surface model, of the places where exposures are compared
 FIGURES = {"what": "what:", "cells": "cells:,", "CPU s": "cpu:.2f", "s a million": "million:.1f", "known": "known:.4f"}
 Result = TypeVar("Result")
 
 
 def lattice_of(cell_m: float) -> Lattice:
-    """The part in cells of a size."""
+    """Return the part's lattice with a given cell size."""
     side = round(2.0 * HALF_M / cell_m)
     return Lattice(-HALF_M, HALF_M, cell_m, side, side)
 
 
 def timed(make: Callable[[], Result]) -> tuple[Result, float]:
-    """A result, and the CPU seconds that it took."""
+    """Return a function's result and the CPU seconds that it took."""
     start = time.process_time()
     return make(), time.process_time() - start
 
 
 def heights_of(sources: list[DepthSource], lattice: Lattice) -> HeightField:
-    """The surface model."""
+    """Compute the surface model."""
     height = np.full((lattice.height, lattice.width), np.nan, np.float32)
     capture = HeightInput(sources, lattice, RELIEF, LruCache(HELD_BYTES))
     for part in surface_heights(capture, list(lattice.tiles(HEIGHTS_TILE)), threads=1):
@@ -58,7 +58,7 @@ def heights_of(sources: list[DepthSource], lattice: Lattice) -> HeightField:
 
 
 def coloured(photos: list[PhotoSource], surface: HeightField, lattice: Lattice) -> float:
-    """The share of an orthophoto's pixels that have a colour."""
+    """Compute an orthophoto and return the share of its pixels that have a colour."""
     centres = surface.lattice.centres(next(surface.lattice.tiles(surface.lattice.width)))
     places = np.concatenate([centres, surface.height[..., None].astype(np.float64)], axis=-1)
     places = places[::EVERY, ::EVERY].reshape(-1, 3)

@@ -1,14 +1,14 @@
-"""A run's surface products against the demo's truth: ``surface_truth.py OUT --pictures FOLDER --depths FOLDER``.
+"""Compare a run's surface products with the demo's truth: ``surface_truth.py OUT --pictures FOLDER --depths FOLDER``.
 
 OUT may be any folder with some of ``dsm.tif``, ``ortho.tif``, ``facades.json``, ``mesh.ply`` (or ``.glb``) and
-``cloud.laz``; what is missing is said, and fails. Distances are normal to the true surface, in GSD of the original
-photos. What counts lies below the flight (within the hull of the cameras, from above), where at least three photos
-truly see it, and not within two cells of a height step: those are counted apart. What is missing is wrong.
+``cloud.laz``; missing ones are reported, and fail. Distances are normal to the true surface, in GSD of the original
+photos. Places count if they lie below the flight (within the cameras' hull in plan), at least three photos truly see
+them, and they are not within two cells of a height step, which are counted separately. Missing values count as wrong.
 
-The true pictures are by ``python -m splatpipe.demo.orthographic`` (extra ``demo``), the true depths, which take a CPU
-minute, by ``python -m splatpipe.demo.depth_maps``; without the first, PSNR, edges and contrasts are not measured, and
-fail; without the second, depths at half the size are made. The run needs control: its products are compared where they
-say that they lie. ``--align cameras`` lays it over the truth by its camera centres instead.
+The true images are made by ``python -m splatpipe.demo.orthographic`` (extra ``demo``), the true depths by ``python -m
+splatpipe.demo.depth_maps`` (a CPU minute). Without the images, PSNR, edges and contrasts are not measured, and fail;
+without the depths, they are computed at half the size. The run needs control: its products are compared at their stated
+coordinates. ``--align cameras`` aligns it to the truth by its camera centres instead.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from triangle_distances import areas, spread, surface_of
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 
-CRS = "EPSG:32633"  # of the demo, where no product tells another
+CRS = "EPSG:32633"  # the demo's, if no product states another
 MOST_MESH_PLACES = 4_000_000
 PRODUCTS = ("dsm", "ortho", "facades", "cloud", "mesh")
 
@@ -93,12 +93,12 @@ class Demand:
     """A bound that the issue sets.
 
     Attributes:
-        what: It is of.
-        table: Where its figure is.
-        row: Of that table.
-        key: Of that row.
-        bound: On the figure's size, or from below.
-        least: Whether the bound is from below.
+        what: What it applies to.
+        table: Table with its figure.
+        row: Row of that table.
+        key: Key in that row.
+        bound: Upper bound on the figure's magnitude, or lower bound.
+        least: Whether it is a lower bound.
     """
 
     what: str
@@ -110,13 +110,13 @@ class Demand:
 
     @property
     def product(self) -> str:
-        """Whose it is."""
+        """Return the product concerned."""
         if self.table == "points":
             return str(self.row)
         return "ortho" if self.table == "contrasts" else self.table
 
     def judge(self, tables: dict[str, list[Row]]) -> Row:
-        """Its row; a figure that is not there fails."""
+        """Return the row of the verdict; a missing figure fails."""
         rows = tables.get(self.table, [])
         found = [row for k, row in enumerate(rows) if self.row in (k, row.get("what"), row.get("texture"))]
         value = found[0].get(self.key) if found else None
@@ -164,14 +164,14 @@ DEMANDS_OF_THE_ISSUE = tuple(_demands())
 def measure(
     out: Path, chosen: list[str], align: str, pictures: Path | None, depths: Path | None
 ) -> dict[str, list[Row]]:
-    """The tables of all products that are there.
+    """Return the tables of all existing products.
 
     Args:
         out: OUT, or a folder with products.
         chosen: Products to measure.
         align: As ``frames_of`` takes it.
-        pictures: Folder of the true ones; None for none.
-        depths: Folder of the true ones; None to make them.
+        pictures: Folder of the true images; None for none.
+        depths: Folder of the true depths; None to compute them.
 
     Raises:
         UsageError: if there is nothing to measure.
@@ -213,7 +213,7 @@ def _measure_cloud_or_mesh(name: str, path: Path, truth: SceneTruth, frames: Pro
 
 
 def surface_of_points(points: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Distances to the nearest of points."""
+    """Return a function that measures distances to the nearest of the points."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points, balanced_tree=False)

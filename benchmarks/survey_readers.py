@@ -1,4 +1,4 @@
-"""What `splatpipe export` hands to surveyors and trainers, read by pycolmap and laspy."""
+"""Read what `splatpipe export` delivers to surveyors and trainers, with pycolmap and laspy."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jaxtyping import Float64
 from splatpipe.pipeline.splat.scene import Scene
 
 Check = tuple[str, str, str, str, bool]
-"""Reader, format, what, figure, whether it is met."""
+"""Reader, format, what is checked, figure, and whether the requirement is met."""
 SAME_CENTRE_M = 1e-4
 HALF_STEP_M = 0.002  # LAZ is written to a millimetre, and local to projected coordinates are exact to less
 SAMPLES = 500
 
 
 def check_colmap(out: Path) -> Iterator[Check]:
-    """The dataset's model: as many photos as were registered, and where `cameras.json` has them."""
+    """Check the dataset's model: as many photos as were registered, and at the poses of `cameras.json`."""
     folder = out / "export/dataset"
     if not (folder / "sparse/0").is_dir():
         yield _not_there("pycolmap", "colmap")
@@ -44,7 +44,7 @@ def check_colmap(out: Path) -> Iterator[Check]:
 
 
 def check_laz(out: Path, scene: Scene) -> Iterator[Check]:
-    """Centres: in the run's CRS, and where pyproj puts the Gaussians."""
+    """Check the centres: in the run's CRS, where pyproj puts the Gaussians."""
     path = out / "export/centres.laz"
     if not path.is_file():
         yield _not_there("laspy", "laz")
@@ -67,7 +67,7 @@ def check_laz(out: Path, scene: Scene) -> Iterator[Check]:
 def projected(
     local_m: Float64[np.ndarray, "n 3"], origin: dict[str, float], crs: pyproj.CRS
 ) -> Float64[np.ndarray, "n 3"]:
-    """East, north, up about a place to a CRS, by proj's own topocentric conversion; heights stay ellipsoidal."""
+    """Project east, north, up about an origin to a CRS by PROJ's topocentric conversion; heights stay ellipsoidal."""
     step = f"+proj=topocentric +lat_0={origin['latitude']} +lon_0={origin['longitude']} +h_0={origin['height_m']}"
     pipeline = f"+proj=pipeline +step +inv {step} +ellps=WGS84 +step +inv +proj=cart +ellps=WGS84"
     geodetic = pyproj.Transformer.from_pipeline(f"{pipeline} +step +proj=unitconvert +xy_in=rad +xy_out=deg")

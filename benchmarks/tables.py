@@ -1,4 +1,4 @@
-"""Tables of figures on the terminal."""
+"""Print tables of figures on the terminal."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rich.table import Table
 
 Row = dict[str, Any]
 
-PIPE_WIDTH = 200  # columns where nobody's window limits them
+PIPE_WIDTH = 200  # columns if the output is not a terminal
 
 
 def console() -> Console:
-    """Of standard output."""
+    """Return the console of standard output."""
     return Console(width=PIPE_WIDTH if not sys.stdout.isatty() else None)
 
 

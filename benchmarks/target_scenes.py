@@ -1,9 +1,9 @@
-"""Targets rendered into photos, with the exact place of their centres: perspective, blur, exposure, noise, JPEG.
+"""Render targets into photos with exactly known centres: perspective, blur, exposure, noise, JPEG.
 
-A target is a square with a pattern, seen through a homography: a plane tilted against the view, with perspective of its
-own. It is drawn at eight by eight samples a pixel, blurred as the lens and the motion of the camera blur, and laid over
-the photo; the whole photo is then exposed, gets noise, and is compressed. Its size is the square root of its area in
-the photo, pixels; of a coded one that of its black square.
+A target is a square with a pattern, seen through a homography: a plane tilted against the view, with its own
+perspective. It is drawn with eight by eight samples per pixel, blurred by defocus and camera motion, and composited
+into the photo; the whole photo is then exposed, gets noise, and is compressed. A target's size is the square root of
+its area in the photo, pixels; for a coded one, that of its black square.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
-Pattern = Callable[[Floats, Floats], tuple[Floats, Floats]]  # of a plane's x and y: how white, and whether it is there
+Pattern = Callable[[Floats, Floats], tuple[Floats, Floats]]  # from a plane's x and y to whiteness and coverage
 SAMPLES = 8  # along a pixel's side
-WHITE_MARGIN = 1.0  # of a coded target, cells
+WHITE_MARGIN = 1.0  # around a coded target, cells
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class TargetAppearance:
         sizes_px: Least and largest size.
         tilt_deg: Largest angle between the plane and the view.
         defocus_px: Least and largest standard deviation of the lens's blur.
-        motion_px: Largest length of the motion's blur.
+        motion_px: Largest length of the motion blur.
         exposures_ev: Least and largest exposure of the photo.
         noise: Largest standard deviation, of 255.
-        quality: Least and largest of JPEG.
+        quality: Least and largest JPEG quality.
     """
 
     sizes_px: tuple[float, float]
@@ -47,13 +47,13 @@ class TargetAppearance:
 
 @dataclass(frozen=True)
 class RenderedTarget:
-    """A target as it was put into a photo.
+    """A target as rendered into a photo.
 
     Attributes:
-        centre: (0, 0) is the top-left corner of the first pixel.
-        size_px: The root of its area.
-        thin_px: Its lesser extent: what its side is foreshortened to, at the worst.
-        name: Of a coded one, its id.
+        centre: Pixels; (0, 0) is the top-left corner of the first pixel.
+        size_px: Square root of its area.
+        thin_px: Its smaller extent: the shortest that foreshortening makes its side.
+        name: Kind; for a coded target its ID.
     """
 
     centre: tuple[float, float]
@@ -63,27 +63,27 @@ class RenderedTarget:
 
 
 def quadrants(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Four squares in black and white; the plane's target is [-1, 1]²."""
+    """Pattern of four black and white squares; the target is the plane's [-1, 1]²."""
     inside = (np.abs(x) <= 1.0) & (np.abs(y) <= 1.0)
     return (x * y > 0.0).astype(np.float64), inside.astype(np.float64)
 
 
 def disc(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Four sectors of a disc; its square has the same extent."""
+    """Pattern of a disc of four sectors in a square of the same extent."""
     return (x * y > 0.0).astype(np.float64), (x * x + y * y <= 1.0).astype(np.float64)
 
 
 def bow_tie(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Four triangles of a square, parted by its diagonals."""
+    """Pattern of a square cut into four triangles by its diagonals."""
     white, _ = quadrants(x + y, x - y)
     return white, (np.abs(x) <= 1.0).astype(np.float64) * (np.abs(y) <= 1.0)
 
 
 def coded(cells: npt.NDArray[np.uint8]) -> Pattern:
-    """A coded target: its black square is [-1, 1]², with a white margin around.
+    """Pattern of a coded target: its black square is [-1, 1]², with a white margin around it.
 
     Args:
-        cells: Of the square, 0 black and 1 white, with the black border.
+        cells: Cells of the square, 0 black and 1 white, including the black border.
     """
     count = len(cells)
     reach = 1.0 + 2.0 * WHITE_MARGIN / count
@@ -99,12 +99,12 @@ def coded(cells: npt.NDArray[np.uint8]) -> Pattern:
 
 
 def plane_to_photo(centre: Floats, size_px: float, tilt_deg: float, rng: np.random.Generator) -> Floats:
-    """A homography that takes [-1, 1]² of a plane to a target of a size, tilted by up to an angle."""
+    """Return a homography from a plane's [-1, 1]² to a target of a given size, tilted by up to an angle."""
     spin, axis, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(0, tilt_deg))
     turn = cv2.Rodrigues(np.array([0.0, 0.0, spin]))[0]
     lean = cv2.Rodrigues(tilt * np.array([np.cos(axis), np.sin(axis), 0.0]))[0]
     rotation = lean @ turn
-    distance = rng.uniform(20.0, 60.0)  # of half sides: near ones show perspective
+    distance = rng.uniform(20.0, 60.0)  # in half sides: near targets show perspective
     columns = np.stack([rotation[:, 0], rotation[:, 1], np.array([0.0, 0.0, distance])], axis=1)
     unit = np.diag([1.0, 1.0, 1.0]) @ columns
     corners = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]) @ unit.T
@@ -114,7 +114,7 @@ def plane_to_photo(centre: Floats, size_px: float, tilt_deg: float, rng: np.rand
 
 
 def draw(photo: Floats, pattern: Pattern, homography: Floats, levels: tuple[Floats, Floats], kernel: Floats) -> Floats:
-    """Lay a target over a photo (RGB, 0 to 255): antialiased, blurred by a kernel."""
+    """Composite a target into a photo (RGB, 0 to 255), antialiased and blurred by a kernel."""
     height, width = photo.shape[:2]
     reach = np.array([[-2, -2, 1], [2, -2, 1], [2, 2, 1], [-2, 2, 1]]) @ homography.T
     reach = reach[:, :2] / reach[:, 2:]
@@ -139,12 +139,12 @@ def draw(photo: Floats, pattern: Pattern, homography: Floats, levels: tuple[Floa
 
 
 def blur_kernel(look: TargetAppearance, rng: np.random.Generator) -> Floats:
-    """Defocus and motion, at a sample a pixel."""
+    """Return a kernel of defocus and motion, one sample per pixel."""
     size = int(2 * np.ceil(3 * look.defocus_px[1] + look.motion_px) + 1)
     fine = np.zeros((size * SAMPLES, size * SAMPLES))
     middle, length, angle = size * SAMPLES / 2, rng.uniform(0, look.motion_px) * SAMPLES, rng.uniform(0, np.pi)
     along = np.linspace(-length / 2, length / 2, 41)
-    # The bilinear weights keep the mean at the middle: the blur moves nothing.
+    # The bilinear weights keep the mean at the centre: the blur does not shift the image.
     for at_x, at_y in zip(middle - 0.5 + along * np.cos(angle), middle - 0.5 + along * np.sin(angle), strict=True):
         ix, iy = int(np.floor(at_x)), int(np.floor(at_y))
         fx, fy = at_x - ix, at_y - iy
@@ -157,7 +157,7 @@ def blur_kernel(look: TargetAppearance, rng: np.random.Generator) -> Floats:
 def render(
     photo: Bytes, kinds: list[tuple[str, Pattern]], look: TargetAppearance, rng: np.random.Generator, apart_px: float
 ) -> tuple[Bytes, list[RenderedTarget]]:
-    """A photo with one target of each kind at random places, and where they are."""
+    """Return a photo with one target of each kind at random places, and the targets."""
     height, width = photo.shape[:2]
     canvas, placed = photo.astype(np.float64), []
     border = 2.0 * look.sizes_px[1] + 4.0
@@ -165,7 +165,7 @@ def render(
         centre = _place(placed, (width, height), border, apart_px, rng)
         size = float(np.exp(rng.uniform(*np.log(look.sizes_px))))
         homography = plane_to_photo(centre, size, look.tilt_deg, rng)
-        light = rng.uniform(0.5, 1.0)  # in the sun or in the shade
+        light = rng.uniform(0.5, 1.0)  # in sunlight or in shade
         levels = (light * rng.uniform(15, 60) * _tint(rng), light * rng.uniform(180, 245) * _tint(rng))
         canvas = draw(canvas, pattern, homography, levels, blur_kernel(look, rng))
         corners = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]) @ homography.T

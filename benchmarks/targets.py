@@ -1,9 +1,9 @@
-"""Targets rendered into photos and found again: ``targets.py PHOTOS [--photos N] [--seed N] [--empty FOLDER …]``.
+"""Render targets into photos and detect them: ``targets.py PHOTOS [--photos N] [--seed N] [--empty FOLDER …]``.
 
-Into each photo targets of random size, tilt (to 60 degrees), blur, light, exposure, noise and JPEG quality are drawn
-(`target_scenes.py`), quadrants from 12 px on and coded ones from 20 px on, and looked for in the whole photo. What is
-told by kind and size: the share that is found, and the root mean square error of the centres along an axis. Photos of
-the folders that ``--empty`` names have no targets: all that is found in them is false.
+Targets of random size, tilt (up to 60 degrees), blur, light, exposure, noise and JPEG quality are drawn into each photo
+(`target_scenes.py`), quadrants from 12 px and coded ones from 20 px, and searched for in the whole photo. Reported by
+kind and size: the share detected, and the RMS error of the centres along an axis. Photos in the folders of ``--empty``
+contain no targets: every detection there is false.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from splatpipe.pipeline.photos.coded_targets import DICTIONARIES, find_coded_tar
 from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
 
 SIZES_PX = (12.0, 20.0, 30.0, 45.0)
-NEAR_PX = 2.0  # what is further from the truth is another find
+NEAR_PX = 2.0  # a detection farther from the truth is another one
 APART_PX = 100.0
 QUADRANTS = {"quadrants": quadrants, "disc": disc, "bow tie": bow_tie}
 Results = defaultdict[tuple[str, float], list[tuple[float, float] | None]]
 
 
 def main() -> None:
-    """Run it."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("photos", type=Path)
     parser.add_argument("--photos", dest="most", type=int, default=20)
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def read_photo(path: Path) -> np.ndarray:
-    """RGB in the stored grid."""
+    """Read RGB in the stored orientation."""
     pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise SystemExit(f"{path} cannot be read")
@@ -60,7 +60,7 @@ def read_photo(path: Path) -> np.ndarray:
 
 
 def marker(name: str, rng: np.random.Generator) -> tuple[str, Pattern]:
-    """A coded target of a dictionary."""
+    """Return a coded target of a dictionary."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
     number = int(rng.integers(0, len(dictionary.bytesList)))
     cells = dictionary.generateImageMarker(number, dictionary.markerSize + 2) > 127
@@ -70,7 +70,7 @@ def marker(name: str, rng: np.random.Generator) -> tuple[str, Pattern]:
 def trial(
     photo: np.ndarray, kinds: list[tuple[str, Pattern]], least: float, rng: np.random.Generator, results: Results
 ) -> None:
-    """Draw targets into a photo and look for them."""
+    """Draw targets into a photo and detect them."""
     drawn, placed = render(photo, kinds, TargetAppearance((least, SIZES_PX[-1])), rng, APART_PX)
     finds = {"": [(t.x, t.y) for t in find_quadrant_targets(drawn)]} if least < SIZES_PX[1] else {}
     if not finds:
@@ -82,14 +82,14 @@ def trial(
 
 
 def error_of(target: RenderedTarget, finds: list[tuple[float, float]]) -> tuple[float, float] | None:
-    """Of the find that is nearest; None where none is near."""
+    """Return the error of the nearest detection; None if none is near."""
     errors = [(x - target.centre[0], y - target.centre[1]) for x, y in finds]
     near = [error for error in errors if np.hypot(*error) < NEAR_PX]
     return min(near, key=lambda error: np.hypot(*error), default=None)
 
 
 def false_finds(folder: Path) -> None:
-    """Tell what is found where nothing is."""
+    """Print false detections in photos without targets."""
     began, pixels, photos, found = time.process_time(), 0.0, 0, 0
     for path in sorted(each for each in folder.iterdir() if each.suffix.lower() in (".jpg", ".jpeg", ".png")):
         photo = read_photo(path)

@@ -1,9 +1,9 @@
-"""How much of the photos' texture a splat of the demo has: ``texture_contrast.py OUT [OUT …] --megapixels 4``.
+"""Measure how much of the photos' texture a splat of the demo has: ``texture_contrast.py OUT [OUT …] --megapixels 4``.
 
-On the house's bricks and tiles, as the true surface shows them in the held-out views, bands of the luminance (between
-Gaussian blurs of the photo's pixels) in render and photo are compared: the ratio of their standard deviations, which is
-contrast as the eye sees it, and the part of the photo's texture that the render has in the same place (the slope of
-render on photo), which noise and invented texture do not raise. Edges of a surface are left out.
+On the house's bricks, tiles and slates, located by the true surface in the held-out views, bands of the luminance
+(between Gaussian blurs of the photo's pixels) are compared in render and photo: the ratio of their standard deviations,
+which is the perceived contrast, and the part of the photo's texture that the render reproduces in place (the slope of
+render on photo), which noise and invented texture do not raise. Edges of a surface are excluded.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from splatpipe.pipeline.raster.threads import same_bits
 TEXTURES = {"bricks": BRICK, "tiles": TILES, "slates": SLATE}
 BANDS = {"1-2 px": (0.5, 1.0), "2-4 px": (1.0, 2.0), "4-8 px": (2.0, 4.0), "all": (0.0, 4.0)}
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-EDGE_PX = 6  # from the border of a surface: blurs reach over it
+EDGE_PX = 6  # from the border of a surface: blurs reach across it
 FEWEST_PIXELS = 500  # of a texture in a view
-SAME_DEPTH = 1e-4  # relative: some millimetres, less than targets stand before walls
+SAME_DEPTH = 1e-4  # relative: a few millimetres, less than targets stand out from walls
 COLUMNS = {"run": "run:", "texture": "texture:", "pixels": "pixels:,"} | {
     f"{band} {what}": f"{band} {what}:.2f" for band in BANDS for what in ("contrast", "slope")
 }
 
 
 def band(picture: Pixels, low: float, high: float) -> Float32[np.ndarray, "h w"]:
-    """What of the luminance lies between two blurs, in 8-bit steps.
+    """Return the luminance between two blurs, in 8-bit steps.
 
     Args:
-        picture: RGB.
-        low: Sigma of the blur that stays, pixels; 0 for none.
-        high: Sigma of the blur that is taken off.
+        picture: Image, RGB.
+        low: Sigma of the blur that is kept, pixels; 0 for none.
+        high: Sigma of the blur that is subtracted.
     """
     light = picture.astype(np.float32) @ LUMA
     fine = cv2.GaussianBlur(light, (0, 0), low) if low else light
@@ -51,7 +51,7 @@ def band(picture: Pixels, low: float, high: float) -> Float32[np.ndarray, "h w"]
 
 
 def textured(camera: Camera) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Where a camera in the true frame sees each texture, borders left out."""
+    """Return where a camera in the true frame sees each texture, borders excluded."""
     first = depth_map(camera, true_surface())
     found = {}
     for name, paint in TEXTURES.items():
@@ -64,7 +64,7 @@ def textured(camera: Camera) -> dict[str, Bool[np.ndarray, "h w"]]:
 
 
 def measure(run: OpenedRun, megapixels: float, save: Path | None) -> list[Row]:
-    """A row a texture, over all held-out views."""
+    """Return a row per texture, over all held-out views."""
     truth = truth_from_model({view.camera.name: view.camera.cam_from_world for view in run.views})
     samples: dict[str, list[tuple[Pixels, Pixels, Bool[np.ndarray, "h w"]]]] = {name: [] for name in TEXTURES}
     for view in run.views:
@@ -81,7 +81,7 @@ def measure(run: OpenedRun, megapixels: float, save: Path | None) -> list[Row]:
 
 
 def figures(samples: list[tuple[Pixels, Pixels, Bool[np.ndarray, "h w"]]]) -> Row:
-    """Contrast and slope of each band, over the pixels of all views that show enough of it."""
+    """Return contrast and slope of each band, over the pixels of all views with enough of the texture."""
     samples = [sample for sample in samples if sample[2].sum() >= FEWEST_PIXELS]
     row: Row = {"pixels": int(sum(mask.sum() for _, _, mask in samples))}
     for name, (low, high) in BANDS.items() if samples else ():

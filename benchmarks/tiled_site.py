@@ -1,4 +1,4 @@
-"""A large site made of tiles: a run's photos, cameras, points and splat, again and again on a grid of its plan."""
+"""A large synthetic site: a run's photos, cameras, points and splat, repeated as tiles on a grid in plan."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.sky_file import write_skies
 
-LOOSER = 1.2  # voxels from one try to the next, until the splats of all tiles are as many as the coarse pass has
+LOOSER = 1.2  # factor between voxel sizes tried, until all tiles' splats together match the coarse pass's count
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ class Tiling:
 
     Attributes:
         run: The run.
-        cell: Its site in its plan.
-        plan: The ground's.
-        offsets: Of each tile, in the model's frame.
+        cell: Its site, in plan.
+        plan: The ground plan.
+        offsets: Offset of each tile, in the model's frame.
     """
 
     run: OpenedRun
@@ -49,11 +49,11 @@ class Tiling:
 
     @staticmethod
     def of(run: OpenedRun, photos: int) -> Tiling:
-        """As many tiles as have so many photos, in a grid that is about square.
+        """Create enough tiles for at least ``photos`` photos, in a grid that is roughly square.
 
         Args:
             run: The run.
-            photos: At least.
+            photos: Minimum number of photos.
         """
         dataset = run.parts["undistort.dataset"].path
         points, tracks = load_points_and_tracks(dataset)
@@ -68,27 +68,27 @@ class Tiling:
 
     @property
     def photos(self) -> int:
-        """Of all tiles."""
+        """Return the number of photos of all tiles."""
         return len(self.offsets) * len(self.run.views)
 
     def names(self) -> Iterator[tuple[str, str]]:
-        """Each photo's name, and its name in the run."""
+        """Yield each photo's name, and its name in the run."""
         for tile in range(len(self.offsets)):
             for view in self.run.views:
                 yield tile_name(tile, view.camera.name), view.camera.name
 
 
 def tile_name(tile: int, name: str) -> str:
-    """A photo's in a tile."""
+    """Return a photo's name in a tile."""
     return f"tile_{tile:03d}/{name}"
 
 
 def write_site(tiling: Tiling, folder: Path) -> dict[str, Path]:
-    """Write dataset and split of all tiles, photos as links.
+    """Write dataset and split of all tiles, with photos as links.
 
     Args:
         tiling: The tiles.
-        folder: Where to.
+        folder: Output folder.
 
     Returns:
         The parts, by name.
@@ -142,13 +142,13 @@ def _tiled_model(of_one: pycolmap.Reconstruction, tiling: Tiling) -> pycolmap.Re
 
 
 def write_coarse(tiling: Tiling, most: int, folder: Path, threads: int) -> None:
-    """Write what a coarse pass of all tiles would leave: the run's splat in each, thinned; its sky and exposures.
+    """Write the output of a coarse pass over all tiles: the run's splat in each, thinned; its sky and exposures.
 
     Args:
         tiling: The tiles.
-        most: Gaussians.
-        folder: Where to.
-        threads: That look for the sky.
+        most: Maximum number of Gaussians.
+        folder: Output folder.
+        threads: Threads of the sky detection.
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
@@ -168,7 +168,7 @@ def write_coarse(tiling: Tiling, most: int, folder: Path, threads: int) -> None:
 
 
 def _tiled_splat(tiling: Tiling, most: int) -> Gaussians:
-    """At most so many: what of the run's splat lies in its site, thinned evenly, in every tile."""
+    """Repeat the Gaussians of the run's site, thinned evenly to at most ``most`` in total, in every tile."""
     model = read_splat(tiling.run.parts["train.model"].path)
     inside = tiling.cell.contains(tiling.plan.places(model.means.double().numpy()))
     model = model.select(torch.from_numpy(np.flatnonzero(inside)))
@@ -188,7 +188,7 @@ def _moved(gaussians: Gaussians, offset: Float64[np.ndarray, " 3"]) -> Gaussians
 
 
 def middle_and_edge(cells: Sequence[Cell]) -> tuple[int, int]:
-    """The cell nearest to the site's middle, and the one farthest from it."""
+    """Return the cell nearest to the site's centre, and the one farthest from it."""
     centres = np.array([[(a + b) / 2 for a, b in zip(cell.low, cell.high, strict=True)] for cell in cells])
     away = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
     return int(np.argmin(away)), int(np.argmax(away))

@@ -1,8 +1,8 @@
-"""How good a held-out view is after how long: ``time_to_quality.py --data DATASET --held-out NAME --json FILE``.
+"""Measure held-out quality over time: ``time_to_quality.py --data DATASET --held-out NAME --json FILE``.
 
-The line's own training with its defaults for that number of iterations. Every few CPU seconds the clocks stop, and the
-held-out view is rendered and measured as `evaluate` does, in 8 bits. The clocks run from the first iteration: photos
-are reduced and the start is made before, as the stages before training do it.
+The pipeline's own training with its defaults for that number of iterations. Every few CPU seconds the clocks are
+paused, and the held-out view is rendered and measured as in `evaluate`, in 8 bits. The clocks run from the first
+iteration: photos are downsampled and the Gaussians initialized beforehand, as in the stages before training.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ COLUMNS = {
 
 @dataclass
 class Clocks:
-    """Time that training took, without what was measured in between.
+    """Time spent in training, excluding the measurements in between.
 
     Attributes:
-        wall_s: By the wall clock.
-        cpu_s: Of all threads.
+        wall_s: Wall-clock seconds.
+        cpu_s: CPU seconds of all threads.
     """
 
     wall_s: float = 0.0
@@ -77,26 +77,26 @@ class Clocks:
     _since: tuple[float, float] = field(default=(0.0, 0.0))
 
     def start(self) -> None:
-        """Go on."""
+        """Resume the clocks."""
         self._since = time.perf_counter(), time.process_time()
 
     def stop(self) -> None:
-        """Hold, and add what passed."""
+        """Pause the clocks, and add the elapsed time."""
         self.wall_s += time.perf_counter() - self._since[0]
         self.cpu_s += time.process_time() - self._since[1]
 
     def cpu_now(self) -> float:
-        """CPU seconds while they run."""
+        """Return the CPU seconds so far, while the clocks run."""
         return self.cpu_s + time.process_time() - self._since[1]
 
 
 def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Train, and measure the held-out views now and then and at the end.
+    """Train, and measure the held-out views at intervals and at the end.
 
     Args:
-        dataset: As ``measure.prepare`` leaves it.
-        config: Of the line.
-        arguments: The command line.
+        dataset: As written by ``measure.prepare``.
+        config: Configuration of the pipeline.
+        arguments: The parsed command line.
     """
     before = restart_peak()
     clocks, due, peak = Clocks(), arguments.every, 0
@@ -141,7 +141,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
 
 
 def held_out(state: TrainState, plan: TrainingPlan, dataset: Path) -> Row:
-    """Mean PSNR, PSNR after a colour fit and SSIM of the views that were held out, as `evaluate` measures them."""
+    """Return mean PSNR, PSNR after a colour fit and SSIM of the held-out views, as measured by `evaluate`."""
     gaussians = state.finished()
     options = plan.rendering().options(gaussians)
     sky = state.techniques.find(SkyModel)
@@ -156,7 +156,7 @@ def held_out(state: TrainState, plan: TrainingPlan, dataset: Path) -> Row:
 
 
 def passed(rows: list[Row], marks: list[float]) -> Iterator[Row]:
-    """When each mark was first reached, dB; nothing but the mark where it never was."""
+    """Yield when each mark, dB, was first reached; only the mark if it never was."""
     for mark in marks:
         found = next((row for row in rows if row["psnr"] >= mark), None)
         keys = ("cpu_s", "wall_s", "iteration", "gaussians")

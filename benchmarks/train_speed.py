@@ -1,9 +1,8 @@
-"""How long an iteration of training takes, by part: ``train_speed.py --data DATASET --threads N --json FILE``.
+"""Measure the time of a training iteration, by part: ``train_speed.py --data DATASET --threads N --json FILE``.
 
-Training's own code, the number of Gaussians fixed, all photos in turn; each point set of the dataset (`sparse`,
-`sparse_100k`) in each size, every case in a process of its own. Medians over the iterations, and
-the shortest; `alone` is the rasterizer's forward and backward pass after them, over the same photos, with nothing of
-training between.
+Training's own code at a fixed number of Gaussians, over all photos in turn; each point set of the dataset (`sparse`,
+`sparse_100k`) at each size, every case in a process of its own. Reports medians and minima over the iterations; `alone`
+is the rasterizer's forward and backward pass afterwards, over the same photos, without the rest of training.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ def main() -> None:
                     statistics=not arguments.no_statistics,
                 )
                 row = {"points": points} | run_apart([__file__], case)
-                # Multiplications and additions that the core could have done in the time of a pair.
+                # Multiplications and additions that the core could have executed in the time of a pair.
                 row["flop_slots_per_pair"] = facts["fma_gflops_per_core"] / row["gpairs_per_s_per_core"]
                 rows.append(row)
     report("train_speed", facts, rows, COLUMNS, arguments.json)

@@ -1,4 +1,4 @@
-"""Distances of points to triangles, and places spread over triangles."""
+"""Measure distances of points to triangles, and sample triangles."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from scipy.spatial import cKDTree
 Points = Float64[np.ndarray, "n 3"]
 Triangles = Float64[np.ndarray, "m 3 3"]
 
-CANDIDATES = 8  # of the nearest places spread, whose triangles are measured to
+CANDIDATES = 8  # number of nearest samples whose triangles are measured
 AT_ONCE = 50_000  # points
 
 
 def areas(triangles: Triangles) -> Float64[np.ndarray, " m"]:
-    """Of triangles."""
+    """Return the triangles' areas."""
     sides = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     return np.asarray(0.5 * np.linalg.norm(np.cross(*sides), axis=1))
 
 
 def spread(triangles: Triangles, count: int, rng: np.random.Generator) -> tuple[Points, Int64[np.ndarray, " n"]]:
-    """Places evenly at random over triangles, and the row of the triangle of each."""
+    """Sample triangles uniformly at random; return the samples and the row of each one's triangle."""
     area = areas(triangles)
     rows = rng.choice(len(triangles), count, p=area / area.sum())
     first, second = rng.random((2, count))
@@ -33,7 +33,7 @@ def spread(triangles: Triangles, count: int, rng: np.random.Generator) -> tuple[
 
 
 def point_triangle(points: Points, triangles: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " n"]:
-    """The distance of each point to its own triangle: to the plane where it is above it, else to the nearest side."""
+    """Return each point's distance to its own triangle: to the plane if it projects inside, else to a side."""
     a, b, c = (triangles[:, k] for k in range(3))
     normal = np.cross(b - a, c - a)
     square = (normal**2).sum(axis=1)
@@ -55,12 +55,12 @@ def _to_segment(points: Points, start: Points, end: Points) -> Float64[np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles ready to be measured to.
+    """Triangles prepared for distance queries.
 
     Attributes:
         triangles: Their corners.
-        rows: The triangle of each place that the tree holds: places spread over all, and the middle of each.
-        tree: Of these places.
+        rows: Triangle of each place in the tree: samples, and the centre of each triangle.
+        tree: Tree of these places.
     """
 
     triangles: Triangles
@@ -68,9 +68,9 @@ class Surface:
     tree: cKDTree
 
     def distances(self, points: Points) -> Float64[np.ndarray, " n"]:
-        """Of points to the nearest of the triangles about each.
+        """Return the distances of points to the nearest of their candidate triangles.
 
-        Exact near the surface, where some place of the nearest triangle is among the candidates; never too short.
+        Exact near the surface, if a sample of the nearest triangle is among the candidates; never too short.
         """
         found = np.empty(len(points))
         for first in range(0, len(points), AT_ONCE):
@@ -83,7 +83,7 @@ class Surface:
 
 
 def surface_of(triangles: Triangles, spacing_m: float, rng: np.random.Generator) -> Surface:
-    """Triangles with places spread over them, one a square of the spacing."""
+    """Prepare triangles with samples spread over them, one per square of the spacing."""
     places, rows = spread(triangles, max(1, round(float(areas(triangles).sum()) / spacing_m**2)), rng)
     places = np.concatenate([places, triangles.mean(axis=1)])
     rows = np.concatenate([rows, np.arange(len(triangles))])
@@ -91,7 +91,7 @@ def surface_of(triangles: Triangles, spacing_m: float, rng: np.random.Generator)
 
 
 def thinned(points: Points, cell_m: float) -> Points:
-    """One point of each cube, so that no place counts more for having been measured often."""
+    """Keep one point per cube, so that places measured repeatedly count only once."""
     if len(points) == 0:
         return points
     cells = np.floor((points - points.min(axis=0)) / cell_m).astype(np.int64)

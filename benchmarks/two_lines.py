@@ -1,13 +1,13 @@
-"""The two lines beside each other: photos → dense cloud → mesh → orthophoto, and photos → splat → the same products.
+"""Compare the two pipelines: photos → dense cloud → mesh → orthophoto, and photos → splat → the same products.
 
-``two_lines.py --photos OUT --splat OUT --pictures FOLDER --depths FOLDER``: of finished runs on the demo capture from
-the same cameras, ``--photos`` with surfaces of the photos' depths, ``--splat`` with those of the splat's. Either may be
-left out. ``--poisson FOLDER`` adds a mesh by ``poisson_mesh.py`` of the first line's cloud. It runs nothing: times and
-memory are what the runs' manifests say, of the machine that they name.
+``two_lines.py --photos OUT --splat OUT --pictures FOLDER --depths FOLDER`` compares finished runs on the demo capture
+from the same cameras: ``--photos`` with surfaces from the photos' depths, ``--splat`` with those from the splat's.
+Either may be omitted. ``--poisson FOLDER`` adds a mesh by ``poisson_mesh.py`` of the first pipeline's cloud. Nothing is
+run: times and memory are taken from the runs' manifests, for the machine that they name.
 
-The first table has the stages of each line, those that both need once; the second, what the products are: size,
-completeness, accuracy against truth by ``surface_truth.py``. The third is what the paper that splatpipe follows
-published of three buildings, on other hardware.
+The first table lists the stages of each pipeline, shared ones once; the second, the products' size, completeness, and
+accuracy against the truth by ``surface_truth.py``. The third has the figures that the paper that splatpipe follows
+published for three buildings, on other hardware.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ PUBLISHED_COLUMNS = {
     "classical, min": "classical:",
     "hardware": "on:",
 }
-# Of each table of surface_truth: the row, the key, and what it is called.
+# From each table of surface_truth: the row, the key, and its label.
 TOLD = {
     "dsm": (
         ("roofs and ground", "nmad", "NMAD, GSD"),
@@ -83,11 +83,11 @@ TOLD = {
 
 
 def stage_rows(line: str, artifacts: Mapping[str, Artifact]) -> list[Row]:
-    """A row for each finished stage: what its manifest says of time, memory and files.
+    """Return a row for each finished stage: time, memory and files from its manifest.
 
     Args:
-        line: Its name; a stage that both lines need has none.
-        artifacts: By the stages' names, in the line's order.
+        line: Name of the pipeline; a stage that both need has none.
+        artifacts: Artifacts by stage name, in the pipeline's order.
     """
     rows = []
     for name, artifact in artifacts.items():
@@ -108,19 +108,19 @@ def stage_rows(line: str, artifacts: Mapping[str, Artifact]) -> list[Row]:
 
 
 def finished_stages(out: Path, without: tuple[str, ...]) -> dict[str, Artifact]:
-    """The latest artifact of each stage that a run finished."""
+    """Return the latest artifact of each stage that a run finished."""
     store = open_run_folder(out, LINE).store
     found = {stage.name: store.artifacts(stage.name) for stage in LINE if stage.name not in without}
     return {name: artifacts[0] for name, artifacts in found.items() if artifacts}
 
 
 def product_rows(line: str, out: Path, tables: Mapping[str, list[Row]]) -> list[Row]:
-    """A row for each figure of a line's products, their sizes with the first of each.
+    """Return a row for each figure of a pipeline's products, with the product's size in its first row.
 
     Args:
-        line: Its name.
-        out: Where its products are.
-        tables: By ``surface_truth.measure``.
+        line: Name of the pipeline.
+        out: Folder of its products.
+        tables: Tables from ``surface_truth.measure``.
     """
     rows: list[Row] = []
     files = find_products(out)

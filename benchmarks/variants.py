@@ -1,4 +1,4 @@
-"""Variants of the line's configuration: named options on top of a base, checked before anything runs."""
+"""Variants of the pipeline's configuration: named options on top of a base, validated before anything runs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from splatpipe.pipeline.engine.config import load_file, load_preset, parse_set, 
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.stages.options import LineConfig
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}")  # also a folder's
-PRESET = "standard"  # what `splatpipe run` takes without --preset
-# What all variants have in common: the dataset that they train on, and what they are measured against.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}")  # also a folder's name
+PRESET = "standard"  # default of `splatpipe run` without --preset
+# Common to all variants: the dataset that they train on, and what they are measured against.
 SHARED = ("features.", "matches.", "sparse.", "undistort.max_megapixels", "split.every", "split.views")
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A technique.
+    """A technique to be compared.
 
     Attributes:
-        name: Of it.
+        name: Its name.
         sets: ``SECTION.OPTION=VALUE``, on top of the base's.
-        what: It does, in a line.
+        what: What it does, in a line.
     """
 
     name: str
@@ -36,13 +36,13 @@ class Variant:
 
 
 def choose(file: Path, extra: Sequence[str], only: Sequence[str] | None, base: Sequence[str]) -> list[Variant]:
-    """The base and the variants asked for, their options checked by the line's own configuration.
+    """Return the base and the selected variants, their options validated by the pipeline's configuration.
 
     Args:
-        file: TOML with variants.
-        extra: More of them, each ``NAME=SECTION.OPTION=VALUE …``.
-        only: Names; None for all.
-        base: Options that all have.
+        file: TOML file with variants.
+        extra: Further variants, each ``NAME=SECTION.OPTION=VALUE …``.
+        only: Names to select; None for all.
+        base: Options shared by all.
 
     Raises:
         UsageError: names the variant and what is wrong with it.
@@ -65,7 +65,7 @@ def choose(file: Path, extra: Sequence[str], only: Sequence[str] | None, base: S
 
 
 def base_of(path: Path) -> tuple[str, ...]:
-    """What a TOML file of variants wants all of them, and the base, to have: the options of its table ``base``.
+    """Read the options of the table ``base`` of a TOML file of variants: shared by all of them and the base.
 
     Raises:
         UsageError: as ``read``.
@@ -74,16 +74,16 @@ def base_of(path: Path) -> tuple[str, ...]:
 
 
 def read(path: Path) -> list[Variant]:
-    """Variants from a TOML file: a table each, with ``set`` and ``what``.
+    """Read variants from a TOML file: a table each, with ``set`` and ``what``.
 
     Raises:
-        UsageError: if it is not one.
+        UsageError: if the file is invalid.
     """
     return [checked_name(variant) for variant in tables_of(path) if variant.name != BASE]
 
 
 def tables_of(path: Path) -> list[Variant]:
-    """All tables of the file, the base's too; their names are not checked."""
+    """Read all tables of the file, including the base's; names are not validated."""
     found = []
     for name, table in load_file(path).items():
         sets = table.get("set") if isinstance(table, dict) else None
@@ -97,7 +97,7 @@ def tables_of(path: Path) -> list[Variant]:
 
 
 def checked_name(variant: Variant) -> Variant:
-    """The variant.
+    """Return the variant if its name is valid.
 
     Raises:
         UsageError: if its name cannot be a folder's, or is the base's.
@@ -110,7 +110,7 @@ def checked_name(variant: Variant) -> Variant:
 
 
 def check(variant: Variant, sets: Sequence[str]) -> None:
-    """Refuse options that the line does not know, and those that would change nothing or not only the variant.
+    """Reject options that the pipeline does not know, that change nothing, or that do not change only the variant.
 
     Raises:
         UsageError: says which.
@@ -123,7 +123,7 @@ def check(variant: Variant, sets: Sequence[str]) -> None:
 
 
 def split(text: str) -> tuple[str, ...]:
-    """Assignments separated by blanks; quotes keep blanks.
+    """Split assignments at blanks; quotes keep blanks.
 
     Raises:
         UsageError: if a quote is not closed.
@@ -135,6 +135,6 @@ def split(text: str) -> tuple[str, ...]:
 
 
 def config_of(sets: Sequence[str], seed: int) -> LineConfig:
-    """The whole configuration of a run, as ``splatpipe run`` resolves it."""
+    """Return the complete configuration of a run, as ``splatpipe run`` resolves it."""
     assigned = [parse_set(each, LineConfig) for each in sets]
     return resolve(LineConfig, [load_preset(PRESET), with_seed(LineConfig, seed), *assigned])

@@ -1,6 +1,6 @@
-"""How soon `viewer.html` of a large model shows it, and how soon it then answers, in a browser that draws in software.
+"""Measure how soon a large model's `viewer.html` shows it and then responds, in a browser with software rendering.
 
-The model is a run's, each Gaussian replaced by several smaller ones within it, so that depth complexity, opacities and
+The model is a run's, with each Gaussian replaced by several smaller ones within it, so depth complexity, opacities and
 colours are those of a trained model.
 
     python benchmarks/viewer_page.py OUT
@@ -26,14 +26,14 @@ from splatpipe.pipeline.survey.handover import in_world
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-SPREAD = 0.9  # of the parent's standard deviations: how its parts lie in it
-SHRINK = 0.5  # of the parts' sizes
+SPREAD = 0.9  # times the parent's standard deviations: spread of its parts
+SHRINK = 0.5  # times the parent's size
 QUESTIONS = 200
 BETWEEN_S = 0.05
 
 
 def main() -> None:
-    """Print sizes, the time to the first complete frame, and the times of answers at rest and while moving."""
+    """Print sizes, the time to the first complete frame, and response times at rest and in motion."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="OUT of a finished run")
     parser.add_argument("--gaussians", type=int, default=1_000_000)
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def write_page(run: OpenedRun, count: int, folder: Path) -> None:
-    """Write the page of a model of that many Gaussians, the splat within."""
+    """Write a page that embeds a model with that many Gaussians."""
     gaussians, sky = run.model
     frame = load_frame(run.parts["georef.frame"].path)
     look = viewer_rendering(run.options, sky)
@@ -61,13 +61,13 @@ def write_page(run: OpenedRun, count: int, folder: Path) -> None:
 
 
 def multiplied(gaussians: Gaussians, count: int) -> Gaussians:
-    """So many Gaussians, each a smaller part of one of these."""
+    """Return ``count`` Gaussians, each a smaller part of a given one."""
     generator = torch.Generator().manual_seed(0)
     many = gaussians.select(torch.randint(len(gaussians), (count,), generator=generator))
     quats = many.quats / torch.linalg.vector_norm(many.quats, dim=1, keepdim=True)
     w, xyz = quats[:, :1], quats[:, 1:]
     offset = SPREAD * torch.exp(many.log_scales) * torch.randn(count, 3, generator=generator)
-    cross = 2.0 * torch.linalg.cross(xyz, offset)  # v + 2 w (q × v) + 2 q × (q × v): v turned by the quaternion
+    cross = 2.0 * torch.linalg.cross(xyz, offset)  # v + 2 w (q × v) + 2 q × (q × v): v rotated by the quaternion
     many.means = many.means + offset + w * cross + torch.linalg.cross(xyz, cross)
     many.log_scales = many.log_scales + float(np.log(SHRINK))
     return many
@@ -97,7 +97,7 @@ def measure(page: Page, path: Path) -> None:
 
 
 def tell(what: str, page: Page, ask: Callable[[int], object]) -> None:
-    """Ask many times, with pauses, and print the times of the answers."""
+    """Ask many times, with pauses, and print the response times."""
     times = []
     for i in range(QUESTIONS):
         began = time.perf_counter()

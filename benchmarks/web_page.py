@@ -1,7 +1,7 @@
-"""How soon a site (`web/`) of a large model shows all of it, coarse, and then in full, over a slow network.
+"""Measure how soon a large model's site (`web/`) shows all of it, first coarse, then in full, over a slow network.
 
-Beside it `viewer.html` of the same model. The browser draws in software. The model is a run's, each Gaussian replaced
-by several smaller ones within it, see `viewer_page.py`.
+`viewer.html` of the same model is measured beside it. The browser uses software rendering. The model is a run's, with
+each Gaussian replaced by several smaller ones within it; see `viewer_page.py`.
 
     python benchmarks/web_page.py OUT --folder /tmp/site
 """
@@ -35,7 +35,7 @@ PATIENCE_S = 420.0
 
 
 def main() -> None:
-    """Write both, unless they are there, and print how each comes up at each size."""
+    """Write both, unless they exist, and print how each loads at each window size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="OUT of a finished run")
     parser.add_argument("--folder", type=Path, required=True, help="for the two pages; reused where they are there")
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def write_pages(run: OpenedRun, count: int, folder: Path) -> None:
-    """Write a site and a page of a model of that many Gaussians."""
+    """Write a site and a page of a model with that many Gaussians."""
     gaussians, sky = run.model
     frame = load_frame(run.parts["georef.frame"].path)
     look = viewer_rendering(run.options, sky)
@@ -82,12 +82,12 @@ def write_pages(run: OpenedRun, count: int, folder: Path) -> None:
 
 @dataclass
 class Traffic:
-    """What a page asked for.
+    """Network requests of a page.
 
     Attributes:
-        hosts: Of its requests.
-        requests: Their numbers.
-        received: Bytes, as they came over the network.
+        hosts: Hosts of its requests.
+        requests: IDs of its requests.
+        received: Bytes received over the network.
     """
 
     hosts: set[str] = field(default_factory=set)
@@ -95,7 +95,7 @@ class Traffic:
     received: float = 0.0
 
     def listen(self, session: CDPSession) -> None:
-        """Count what the browser tells of."""
+        """Count the browser's network events."""
 
         def asked(event: dict) -> None:
             url = event["request"]["url"]
@@ -104,24 +104,24 @@ class Traffic:
                 self.hosts.add(url.split("/")[2])
 
         def received(event: dict) -> None:
-            if event["requestId"] in self.requests:  # not what comes from the page itself
-                self.received += event["dataLength"]  # the host compresses nothing
+            if event["requestId"] in self.requests:  # excludes data embedded in the page
+                self.received += event["dataLength"]  # the host does not compress
 
         session.on("Network.requestWillBeSent", asked)
         session.on("Network.dataReceived", received)
 
     def told(self) -> str:
-        """In a few words."""
+        """Summarise the traffic."""
         return f"{self.received / 1e6:.1f} MB in {len(self.requests)} requests to {len(self.hosts)} host"
 
 
 class PageVisit:
-    """One page in a fresh browser behind a slow network.
+    """One page in a fresh browser on a slow network.
 
     Args:
-        browser: Fresh.
-        size: Of the window, e.g. ``390x844``; a narrow one is a phone's.
-        options: The command's.
+        browser: A fresh browser.
+        size: Window size, e.g. ``390x844``; a narrow one stands for a phone.
+        options: The command's options.
     """
 
     def __init__(self, browser: Browser, size: str, options: argparse.Namespace) -> None:
@@ -134,7 +134,7 @@ class PageVisit:
         self._traffic = Traffic()
 
     def go(self, address: str, pictures: Path) -> None:
-        """Open it and print what it takes."""
+        """Open the page and print its timings."""
         options, page = self._options, self._page
         session = page.context.new_cdp_session(page)
         session.send("Network.enable")
@@ -164,7 +164,7 @@ class PageVisit:
         page.screenshot(path=pictures / f"{name}-{self._size}-near.png")
 
     def _tell_memory(self) -> None:
-        """Of the browser's processes: the page's own, and the one that draws, where a GPU's memory would be."""
+        """Print the memory of the browser's processes: the page's own, and the renderer's, in place of GPU memory."""
         session = self._browser.new_browser_cdp_session()
         told = {}
         for process in session.send("SystemInfo.getProcessInfo")["processInfo"]:
@@ -177,7 +177,7 @@ class PageVisit:
 
 
 def nearer(page: Page) -> None:
-    """Two thirds of the way to the scene's middle."""
+    """Move two thirds of the way to the scene's centre."""
     page.evaluate(
         """() => {
           const { position } = splatpipe.cameraState();
@@ -188,7 +188,7 @@ def nearer(page: Page) -> None:
 
 
 def resident_bytes(process: int) -> float:
-    """Of a process: what it has in memory, shared pages in part (PSS)."""
+    """Return a process's memory, with shared pages counted proportionally (PSS)."""
     for line in Path(f"/proc/{process}/smaps_rollup").read_text(encoding="utf-8").splitlines():
         if line.startswith("Pss:"):
             return 1024.0 * float(line.split()[1])
@@ -196,7 +196,7 @@ def resident_bytes(process: int) -> float:
 
 
 class QuietHandler(SimpleHTTPRequestHandler):
-    """A plain host: nothing is compressed on the way."""
+    """A plain host without compression."""
 
     protocol_version = "HTTP/1.1"
 
@@ -206,7 +206,7 @@ class QuietHandler(SimpleHTTPRequestHandler):
 
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """A host on this machine; its address."""
+    """Serve a folder on this machine; yield the address."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:

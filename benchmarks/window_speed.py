@@ -1,9 +1,10 @@
-"""What an iteration of a window costs beside one of a whole photo of its size: ``window_speed.py --data DATASET``.
+"""Compare an iteration on a window with one on a whole photo of the same size: ``window_speed.py --data DATASET``.
 
-The same scene with the same Gaussians, trained by training's own code with exposures and the sky, on photos of several
-sizes in turn, an iteration of each after the other, so that whatever else the machine does falls on all alike. Photos
-of the first size are whole, those of the others are seen in windows of at most that size, each window of each photo
-equally often. Time is of all threads that compute, the one that reads windows among them. Photos are decoded before.
+The same scene with the same Gaussians is trained by training's own code, with exposures and the sky, on photos of
+several sizes in turn, one iteration of each after the other, so that other load on the machine affects all alike.
+Photos of the first size are whole; those of the others are seen in windows of at most that size, each window of each
+photo equally often. Time is that of all compute threads, including the one that reads windows. Photos are decoded
+beforehand.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
 from splatpipe.pipeline.train.windows import TrainingSize
 
-WARMUP = 4  # iterations of each that do not count
-ROUNDING = 1.01  # sides are whole pixels, so that a quarter of 4 MP is a little more than 1 MP
+WARMUP = 4  # iterations of each that are not measured
+ROUNDING = 1.01  # sides are whole pixels, so a quarter of 4 MP is slightly more than 1 MP
 COLUMNS = {
     "photos of MP": "megapixels:.1f",
     "seen": "seen:",
@@ -64,14 +65,14 @@ class TimedTraining:
 
     Attributes:
         name: How its photos are seen.
-        megapixels: Of its photos.
-        plan: Its own.
-        state: Its own.
-        photos: Those of its iterations.
-        cpu_s: Of each iteration.
-        counted: Pixels in the loss, in all.
-        rendered: Pixels, in all.
-        pairs: That the rasterizer blended, in all.
+        megapixels: Size of its photos.
+        plan: Its plan.
+        state: Its state.
+        photos: Photos of its iterations.
+        cpu_s: CPU seconds of each iteration.
+        counted: Pixels in the loss, in total.
+        rendered: Pixels rendered, in total.
+        pairs: Pairs that the rasterizer blended, in total.
     """
 
     name: str
@@ -85,7 +86,7 @@ class TimedTraining:
     pairs: int = 0
 
     def turn(self) -> None:
-        """One iteration that counts."""
+        """Run one measured iteration."""
         began = time.process_time()
         photo = next(self.photos)
         iterate(self.state, self.plan, photo)
@@ -97,7 +98,7 @@ class TimedTraining:
         self.pairs += contributing_pairs(self.state.gaussians, photo.camera, self.plan, self.state.iteration)
 
     def row(self, whole: TimedTraining) -> Row:
-        """Its figures beside those of the whole photos."""
+        """Return its figures beside those of the whole photos."""
         turns = len(self.cpu_s)
         median, mean = statistics.median(self.cpu_s), statistics.fmean(self.cpu_s)
         ratio, mean_ratio = median / statistics.median(whole.cpu_s), mean / statistics.fmean(whole.cpu_s)
@@ -120,7 +121,7 @@ class TimedTraining:
 def begin(
     dataset: Path, start: Gaussians, looks: list[TrainingSize], threads: int
 ) -> tuple[TrainingPlan, TrainState, PhotoStream]:
-    """A training of a fixed number of Gaussians with the rates of a long run, its photos decoded, its sky found."""
+    """Start a training with fixed Gaussians and the rates of a long run, photos decoded and sky detected."""
     views = load_views(dataset)
     config = TrainConfig(iterations=PUBLISHED_ITERATIONS, max_gaussians=10**9, exposure="affine")
     plan = make_plan(config, views, Split(tuple(view.camera.name for view in views)), len(start))
@@ -134,7 +135,7 @@ def begin(
 
 
 def measure(arguments: argparse.Namespace, folder: Path) -> list[Row]:
-    """The figures of each size."""
+    """Return the figures of each size."""
     window = round(1e6 * arguments.window * ROUNDING)
     runners: list[TimedTraining] = []
     with contextlib.ExitStack() as open_streams:

@@ -1,4 +1,4 @@
-// node bundle.mjs OUTFILE, run in the folder that has node_modules: draw.js with all that it imports, as one script.
+// node bundle.mjs OUTFILE, run in the folder that has node_modules: bundles draw.js and all its imports into one script.
 import { createRequire } from "node:module";
 import { join } from "node:path";
 

@@ -1,10 +1,10 @@
-// Draws a splat file as spark does, or as three reads a GLB and spark draws what it read: window.draw(...) for a test.
+// Draws a splat file with spark, or a GLB read by three and drawn by spark: window.draw(...) for a test.
 
 import { Color, Matrix4, PerspectiveCamera, Quaternion, Scene, Vector3, WebGLRenderer } from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { ExtSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
-const BLUR_PX2 = 0.3; // and the two below: what the rasterizer that it is compared with does
+const BLUR_PX2 = 0.3; // this and the two below match the rasterizer that it is compared with
 const ALPHA_MIN = 1 / 255;
 const SIGMAS = Math.sqrt(2 * Math.log(255));
 const SH_C0 = 0.28209479177387814;
@@ -38,7 +38,7 @@ async function splatsOfGlb(bytes) {
       new Color(...colour),
     );
   }
-  return new ExtSplats({ extArrays: splats.extArrays, numSplats: position.count }); // pushed ones stay unseen: spark 2.2.0
+  return new ExtSplats({ extArrays: splats.extArrays, numSplats: position.count }); // pushed ones stay invisible: spark 2.2.0
 }
 
 /**

@@ -1,4 +1,4 @@
-// node validate.mjs FILE.glb, run in the folder that has node_modules: what gltf-validator says, as JSON.
+// node validate.mjs FILE.glb, run in the folder that has node_modules: prints gltf-validator's report as JSON.
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { join } from "node:path";
