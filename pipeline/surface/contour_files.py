@@ -1,9 +1,9 @@
 """Contours as GeoJSON for maps and as DXF for CAD.
 
-GeoJSON is in WGS 84 longitude and latitude (RFC 7946 knows no other CRS, and web maps read no other); heights are a
-property, as a third coordinate would be taken for an ellipsoidal one. Between WGS 84 and an older datum programs choose
-transformations of their own, metres apart: the DXF is in the run's CRS, heights in the drawing's unit. It is of AutoCAD
-2000: the oldest with a drawing's unit and polylines of an elevation, and so read by the most programs.
+GeoJSON is in WGS 84 longitude and latitude (RFC 7946 allows no other CRS, and web maps read no other); heights are a
+property, because a third coordinate would be read as an ellipsoidal height. Between WGS 84 and an older datum, programs
+choose different transformations, metres apart, so the DXF is in the run's CRS, with heights in the drawing's unit. It
+has the AutoCAD 2000 format: the oldest with drawing units and polylines with an elevation, so most programs read it.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ DXF_VERSION = "R2000"
 DXF_UNITS = {"metre": 6, "foot": 2, "US survey foot": 21}  # of $INSUNITS
 LAYER, INDEX_LAYER = "CONTOURS", "CONTOURS_INDEX"
 LINE_WEIGHTS = {LAYER: 13, INDEX_LAYER: 35}  # hundredths of a millimetre
-LAYER_COLOURS = {LAYER: 8, INDEX_LAYER: 7}  # AutoCAD's grey; black or white, as the background asks
+LAYER_COLOURS = {LAYER: 8, INDEX_LAYER: 7}  # AutoCAD's grey; black or white, depending on the background
 DEGREE_DIGITS = 9  # a tenth of a millimetre
 UNIT_DIGITS = 4  # the same, of metres and feet
 
 
 def write_geojson(path: Path, contours: Contours, grid: Grid) -> None:
-    """Write contours as GeoJSON; a closed one's last position is its first.
+    """Write contours as GeoJSON; a closed line repeats its first position at the end.
 
     Args:
-        path: Where.
+        path: Output file.
         contours: In the grid's CRS.
-        grid: The grid that they were made in.
+        grid: The grid of the surface model.
 
     Raises:
-        SplatpipeError: if the frame lies nowhere on the earth.
+        SplatpipeError: if the frame is not georeferenced.
     """
     if grid.crs.world is None:
         raise SplatpipeError(
@@ -66,9 +66,9 @@ def write_dxf(path: Path, contours: Contours, crs: MapCrs) -> None:
     """Write contours as DXF: polylines with an elevation on two layers.
 
     Args:
-        path: Where.
+        path: Output file.
         contours: In the CRS.
-        crs: It.
+        crs: CRS of the contours.
     """
     with the_same_bytes():
         drawing = new_drawing(DXF_VERSION, units=DXF_UNITS.get(unit_name(crs.unit_m), 0))

@@ -1,7 +1,7 @@
-"""Contours of a surface model: lines of one height, traced window by window and joined where windows meet.
+"""Contours of a surface model, traced window by window and joined where windows meet.
 
-Windows share a row or column of centres of cells, so a line leaves one where it enters the next. Lines end where there
-is no data. They are simplified within a window, between its borders, where points stay: so nothing tears.
+Windows share a row or column of cell centres, so a line leaves one exactly where it enters the next. Lines end where
+there is no data. They are simplified within a window; points on its borders are kept, so that lines stay connected.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from splatpipe.pipeline.surface.geotiff import gdal
 
 INDEX_EVERY = 5  # every fifth contour is drawn bold, as on maps
 CELLS_AN_INTERVAL = 6.0  # 95 % of heights are within 3 cells: half an interval, as map standards ask of contours
-LEVELS_AT_MOST = 100  # of what is chosen here, over the relief
-MOST_LEVELS = 10_000  # of what somebody asks for
+LEVELS_AT_MOST = 100  # over the relief, with an interval chosen here
+MOST_LEVELS = 10_000  # with a given interval
 MOST_VERTICES = 3_000_000  # 300 MB until they are written
 WINDOW = 1024  # cells
 TOLERANCE_CELLS = 0.3  # of simplified lines: less than half a cell, which is what a height's place means
 LEAST_LOOP_CELLS = 12.0  # around: a loop of less is a single cell's noise
-SAME_PLACE_CELLS = 1e-6  # two windows round one crossing differently
+SAME_PLACE_CELLS = 1e-6  # two windows round the same crossing differently
 
 Line = Float64[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """One line.
+    """A contour line.
 
     Attributes:
         height: Its height in the CRS's unit.
-        is_index: Whether it is every fifth's.
-        closed: Whether it goes on from its last point to its first, which are two then.
+        is_index: Whether it is an index contour (every fifth).
+        closed: Whether its last point connects to its first, which is not repeated.
         line: Eastings and northings.
     """
 
@@ -55,11 +55,11 @@ class Contour:
 
 @dataclass(frozen=True, eq=False)
 class Contours:
-    """All of them.
+    """All contours of a surface model.
 
     Attributes:
-        interval: From height to height, in the CRS's unit.
-        lines: By height.
+        interval: Contour interval, in the CRS's unit.
+        lines: Contour lines, sorted by height.
     """
 
     interval: float
@@ -67,11 +67,11 @@ class Contours:
 
 
 def neat_interval(cell: float, relief: float) -> float:
-    """1, 2 or 5 times a power of ten: what heights are good for, and not too many lines.
+    """A contour interval of 1, 2 or 5 times a power of ten that suits the heights' accuracy and limits the lines.
 
     Args:
-        cell: Side of a cell, in the heights' unit.
-        relief: From the lowest to the highest.
+        cell: Cell size, in the heights' unit.
+        relief: Difference between the highest and the lowest height.
     """
     least = max(CELLS_AN_INTERVAL * cell, relief / LEVELS_AT_MOST)
     power = 10.0 ** math.floor(math.log10(least))
@@ -79,14 +79,14 @@ def neat_interval(cell: float, relief: float) -> float:
 
 
 def trace_contours(dsm: Path, interval: float | None = None) -> Contours:
-    """The contours of `dsm.tif`.
+    """Trace the contours of `dsm.tif`.
 
     Args:
-        dsm: Heights in the first band.
-        interval: In their unit; None for a neat one.
+        dsm: Raster with heights in the first band.
+        interval: In the heights' unit; None for an automatic one.
 
     Raises:
-        SplatpipeError: if the interval is none, or so small that lines are too many.
+        SplatpipeError: if the interval is invalid, or so small that there are too many lines.
     """
     with gdal(dsm.parent), rasterio.open(dsm) as raster:
         low, high = _height_range(raster)
@@ -105,7 +105,7 @@ def trace_contours(dsm: Path, interval: float | None = None) -> Contours:
 
 
 def _cell_in_heights(raster: Any) -> float:
-    """The CRS's unit in the heights' unit."""
+    """The plan unit of the CRS, in height units."""
     units = raster.crs.linear_units_factor[1] if raster.crs is not None and raster.crs.is_projected else 1.0
     heights = {"foot": 0.3048, "US survey foot": 1200.0 / 3937.0}.get(raster.units[0] or "", 1.0)
     return float(units) / heights
@@ -121,7 +121,7 @@ def _height_range(raster: Any) -> tuple[float, float]:
 
 
 def _windows(raster: Any) -> Iterator[Window]:
-    """Windows that share their borders' cells: no two a square of four centres."""
+    """Windows that share their border cells, so that each square of four centres is in exactly one."""
     for row in range(0, max(raster.height - 1, 1), WINDOW):
         for column in range(0, max(raster.width - 1, 1), WINDOW):
             width, height = min(WINDOW + 1, raster.width - column), min(WINDOW + 1, raster.height - row)
@@ -146,7 +146,7 @@ def _pieces(raster: Any, window: Window, interval: float) -> Iterator[tuple[int,
 
 
 def _simplified(line: Line, corner: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "k 2"]:
-    """By Douglas and Peucker; float32 from the window's corner is exact to 1e-4 of a cell, and ends stay the same."""
+    """Simplify by Douglas-Peucker; float32 from the window's corner is exact to 1e-4 cells, and ends stay unchanged."""
     closed = bool((line[0] == line[-1]).all())
     near = (line[:-1] if closed else line) - corner
     kept = cv2.approxPolyDP(near.astype(np.float32)[:, None], TOLERANCE_CELLS, closed)[:, 0].astype(np.float64) + corner
@@ -166,7 +166,7 @@ _Place = tuple[int, int, int]  # level, and where in steps of SAME_PLACE_CELLS
 
 
 class _Joints:
-    """Pieces on their way to lines: each goes on from one that ends where it begins."""
+    """Joins pieces into lines: a piece continues one that ends where it begins."""
 
     def __init__(self) -> None:
         self._begin: dict[_Place, list[_Chain]] = {}
@@ -203,13 +203,13 @@ class _Joints:
             self._join(chain, after)
 
     def _join(self, chain: _Chain, after: _Chain) -> None:
-        """Let a chain go on as another one, whose end it takes."""
+        """Append the chain ``after`` to ``chain``, which takes over its end."""
         waiting = self._end[_place(after.level, after.parts[-1][-1])]
         waiting[waiting.index(after)] = chain
         chain.parts.extend(after.parts)
 
     def lines(self) -> list[tuple[int, Line]]:
-        """All lines with their levels, but for the smallest loops; the same order whatever the windows."""
+        """All lines with their levels, without the smallest loops; in an order that is independent of the windows."""
         opened = [(chain.level, _joined(chain)) for chains in self._begin.values() for chain in chains]
         lines = [found for found in self._whole + opened if not _is_noise(found[1])]
         return sorted(lines, key=lambda found: (found[0], *found[1].min(axis=0), *found[1].max(axis=0)))

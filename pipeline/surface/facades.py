@@ -1,4 +1,4 @@
-"""The façades of a run: every wall that is found, or those that somebody states, drawn and written into a folder."""
+"""The façades of a run: elevations of all detected walls, or of given ones, written into a folder."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ Line = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class FacadesTask:
-    """What façades are made from.
+    """Inputs of façades.
 
     Attributes:
         surface: The run's photos and depths; walls whose middles lie outside of its area are not drawn.
-        pixel_m: Side of a pixel of the elevations; what it becomes has three digits.
-        lines: Walls in plan, the CRS's coordinates: left and right end, seen from before them. Without any, walls are
-            found.
-        threads: Tiles at a time.
+        pixel_m: Pixel size of the elevations, metres; rounded to three digits.
+        lines: Walls in plan, in the CRS's coordinates: left and right end, as seen from in front. If empty, walls are
+            detected.
+        threads: Tiles in parallel.
     """
 
     surface: RunSurface
@@ -60,18 +60,18 @@ class FacadesTask:
 def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[str, Any]]:
     """Write the files of all façades, and `facades.json` at the end.
 
-    A façade whose own JSON is there is not drawn again: its other files were written before.
+    A façade whose own JSON exists is not drawn again: its other files were written before it.
 
     Args:
-        task: What they are made from.
-        out: Where the files go; what a killed call left there is gone on from.
-        report: Told how far it is.
+        task: Inputs.
+        out: Output folder; a killed call resumes from it.
+        report: Receives progress.
 
     Returns:
-        What `facades.json` tells of each.
+        The entries of `facades.json`.
 
     Raises:
-        SplatpipeError: if nothing stands along a stated line, or a wall has too many pixels.
+        SplatpipeError: if there is no wall along a given line, or a wall has too many pixels.
         MachineError, OSError: if the disk is full or not writable.
     """
     report.progress(0, 1, "looking for walls")
@@ -101,7 +101,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
 
 
 def _within(walls: Sequence[Wall], area: PlanArea | None) -> list[Wall]:
-    """Walls whose middles lie in an area, named anew."""
+    """Walls whose middles lie in an area, renamed."""
     if area is None or not walls:
         return list(walls)
     middles = np.array([[*((wall.left + wall.right) / 2.0), wall.low_m] for wall in walls])
@@ -109,10 +109,10 @@ def _within(walls: Sequence[Wall], area: PlanArea | None) -> list[Wall]:
 
 
 def parse_lines(text: str) -> list[Line]:
-    """Walls in plan of ``x1,y1,x2,y2; …``.
+    """Parse walls in plan from ``x1,y1,x2,y2; …``.
 
     Raises:
-        UsageError: if it is anything else.
+        UsageError: if the text has another form.
     """
     if len(text) > LONGEST_TEXT:
         raise UsageError(f"{len(text):,} characters of lines are too many.", hint="Draw them in several runs.")
@@ -132,12 +132,12 @@ def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wal
     """Walls along lines in plan.
 
     Args:
-        lines: The CRS's coordinates: left and right end, seen from before the wall.
-        facets: What stands there.
-        crs: The lines'.
+        lines: In the CRS's coordinates: left and right end, as seen from in front of the wall.
+        facets: Facets of all photos.
+        crs: CRS of the lines.
 
     Raises:
-        SplatpipeError: if nothing stands along one of them.
+        SplatpipeError: if there is no wall along one of them.
     """
     middle = np.median(facets.places, axis=0) if len(facets) else np.zeros(3)
     height = float(crs.crs_from_local(middle[None])[0, 2])

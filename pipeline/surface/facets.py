@@ -1,4 +1,4 @@
-"""Upright facets: small planes of photos' depths that stand, from which walls are found."""
+"""Vertical facets: small planes fitted to photos' depths, from which walls are detected."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ MOST_FACETS = 1_000_000  # of all photos; of more, some are left out evenly
 
 @dataclass(frozen=True)
 class Facets:
-    """Small upright planes.
+    """Small vertical planes.
 
     Attributes:
-        places: Their middles, local metres.
-        facing: Unit vectors in plan that they face.
-        areas: Square metres.
-        pixels_m: Side of a pixel of the depths at each, at a right angle to the ray.
+        places: Centres, local metres.
+        facing: Outward unit normals in plan.
+        areas: Areas, square metres.
+        pixels_m: Size of a depth pixel at each, perpendicular to the ray, metres.
     """
 
     places: Float64[np.ndarray, "n 3"]
@@ -40,7 +40,7 @@ class Facets:
     pixels_m: Float64[np.ndarray, " n"]
 
     def select(self, rows: Bool[np.ndarray, " n"] | Int64[np.ndarray, " k"]) -> Facets:
-        """Those of it."""
+        """The facets of these rows."""
         return Facets(self.places[rows], self.facing[rows], self.areas[rows], self.pixels_m[rows])
 
     def __len__(self) -> int:
@@ -48,11 +48,11 @@ class Facets:
 
 
 def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
-    """Upright facets of all photos, without what only coarse pixels show; the same bits for any number of threads.
+    """Vertical facets of all photos, without those of coarse pixels; bit-identical for any number of threads.
 
     Args:
         sources: Depths of photos, always in the same order.
-        threads: Photos at a time.
+        threads: Photos in parallel.
     """
     share = max(1, math.ceil(len(sources) * BLOCKS_A_PHOTO / 4 / MOST_FACETS))  # a quarter stands, at most
 
@@ -65,7 +65,7 @@ def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
 
 
 def facets_of(found: PosedDepthMap) -> Facets:
-    """Upright facets of one photo: least squares through its inverse depths, block by block.
+    """Vertical facets of one photo: least-squares planes through its inverse depths, block by block.
 
     Inverse depth is linear in a plane's pixels: w = n · (x, y, 1) for the plane n · X = 1.
     """
@@ -77,7 +77,7 @@ def facets_of(found: PosedDepthMap) -> Facets:
 
 
 def _strip_facets(found: PosedDepthMap, top: int, rows: int, side: int) -> Facets:
-    """Those of some rows of the photo."""
+    """Facets in some rows of the photo."""
     camera, strip = found.camera, np.s_[top : top + rows]
     depth = found.depth[strip].astype(np.float64)
     inverse = _blocks(np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0.0), side)
@@ -105,7 +105,7 @@ def _joined(parts: Sequence[Facets]) -> Facets:
 
 
 def _blocks(values: np.ndarray, side: int) -> np.ndarray:
-    """(rows, columns, side, side) of whole blocks; pixels beyond them at the right and below count nowhere."""
+    """Whole blocks as (rows, columns, side, side); remaining pixels at the right and bottom are dropped."""
     rows, columns = values.shape[0] // side, values.shape[1] // side
     return values[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
 
@@ -113,7 +113,7 @@ def _blocks(values: np.ndarray, side: int) -> np.ndarray:
 def _planes(
     terms: Float64[np.ndarray, "b p 3"], values: Float64[np.ndarray, "b p"], weight: Float64[np.ndarray, "b p"]
 ) -> Float64[np.ndarray, "b 3"]:
-    """Least squares of each block about its middle, which keeps the equations apart."""
+    """Least squares for each block about its middle, which decouples the equations."""
     total = weight.sum(axis=1)
     middle = np.einsum("bp,bpk->bk", weight, terms) / total[:, None]
     mean = (weight * values).sum(axis=1) / total
@@ -129,13 +129,13 @@ def _standing(
     normals: Float64[np.ndarray, "n 3"],
     side: int,
 ) -> Facets:
-    """Those whose normals are level, towards the camera.
+    """Facets of planes with level normals, facing the camera.
 
     Args:
-        camera: The photo's.
-        rays: To their middles, (x, y, 1) in the camera.
-        normals: n of n · X = 1, in the camera: away from it.
-        side: Of their blocks, pixels.
+        camera: The photo's camera.
+        rays: Rays to the centres, (x, y, 1) in the camera frame.
+        normals: n of n · X = 1, in the camera frame, pointing away from the camera.
+        side: Side of the blocks, pixels.
     """
     length = np.linalg.norm(normals, axis=1)
     w = (rays * normals).sum(axis=1)

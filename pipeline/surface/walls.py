@@ -1,7 +1,7 @@
-"""Walls of buildings, as upright planes from corner to corner and from the ground to the eaves.
+"""Walls of buildings, as vertical planes from corner to corner and from the ground to the eaves.
 
-They are found where upright facets lie in one plane, from the strongest place outwards, and end where they meet the
-plane of another wall; low, short and crooked ones are dropped: fences, cars, hedges.
+Walls are detected where vertical facets lie in one plane, starting with the strongest evidence, and end where they meet
+the plane of another wall; low, short and uneven ones are dropped: fences, cars, hedges.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class Wall:
 
     Attributes:
         name: The direction it faces, numbered from the second on: ``south``, ``south-2``.
-        left: East and north of its left end, seen by who looks at it.
-        right: Of its right end.
+        left: East and north of its left end, as seen from in front of it.
+        right: East and north of its right end.
         low_m: Height of its foot.
-        high_m: Of its top.
+        high_m: Height of its top.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Wall:
 
     @property
     def length_m(self) -> float:
-        """From end to end."""
+        """Length from end to end, metres."""
         return float(np.linalg.norm(self.right - self.left))
 
     @property
@@ -81,13 +81,13 @@ class Wall:
 
     @property
     def area_m2(self) -> float:
-        """Of its rectangle."""
+        """Area of its rectangle, square metres."""
         return self.length_m * (self.high_m - self.low_m)
 
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """A plane seen from above: places p with ``facing @ p == offset``."""
+    """A vertical plane in plan: points p with ``facing @ p == offset``."""
 
     facing: Plan
     offset: float
@@ -105,14 +105,14 @@ class _Line:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A plane and from where to where along it, and between which heights, there is a wall."""
+    """A plane with the extent of a wall in it: its ends along the plane, and its heights."""
 
     line: _Line
     ends: tuple[float, float]
     heights: tuple[float, float]
 
     def crossing(self, other: _Piece) -> float | None:
-        """Where along this one the other's plane crosses it, if the other comes near to there; else None."""
+        """Position along this wall where the other's plane crosses it; None if the other does not reach near it."""
         if abs(float(self.line.facing @ other.line.facing)) > CORNER_COSINE:
             return None
         if self.heights[1] < other.heights[0] or other.heights[1] < self.heights[0]:
@@ -126,7 +126,7 @@ class _Piece:
 
 
 def find_walls(facets: Facets) -> list[Wall]:
-    """The walls that the facets of all photos show, by size within each direction."""
+    """Detect walls in the facets of all photos; sorted by size within each direction."""
     if not len(facets):
         return []
     band_m = _band(facets)
@@ -157,12 +157,12 @@ def find_walls(facets: Facets) -> list[Wall]:
 
 
 def _band(facets: Facets) -> float:
-    """How far before and behind a plane its facets lie: further where pixels are coarse."""
+    """Half width of the band of a plane's facets, metres: wider for coarse pixels."""
     return max(BAND_M, BAND_PIXELS * float(np.median(facets.pixels_m)))
 
 
 def named(walls: Sequence[Wall]) -> list[Wall]:
-    """Walls by the direction that they face, numbered by size: of two that face one way the larger comes first."""
+    """Name walls by the direction that they face, numbered by size within a direction, the largest first."""
     counts: dict[str, int] = {}
     result = []
     for wall in sorted(walls, key=lambda wall: -wall.area_m2):
@@ -175,12 +175,12 @@ def named(walls: Sequence[Wall]) -> list[Wall]:
 
 
 def stated_wall(left: Plan, right: Plan, facets: Facets) -> Wall | None:
-    """A wall in the plane that somebody states, with the heights of the facets near it; None where there are none.
+    """A wall in a given plane, with the heights of the facets near it; None if there are none.
 
     Args:
-        left: East and north of its left end, seen by who looks at it.
-        right: Of its right end; another place.
-        facets: Of all photos.
+        left: East and north of its left end, as seen from in front of it.
+        right: East and north of its right end, different from the left one.
+        facets: Facets of all photos.
     """
     wall = Wall("", left, right, 0.0, 0.0)
     line = _Line(wall.facing, float(wall.facing @ left))
@@ -194,7 +194,7 @@ def stated_wall(left: Plan, right: Plan, facets: Facets) -> Wall | None:
 def _grown(
     facets: Facets, free: Bool[np.ndarray, " n"], start: Bool[np.ndarray, " n"], band_m: float
 ) -> tuple[_Line, tuple[float, float]] | None:
-    """The plane through facets, and how far it goes on both sides."""
+    """Grow a plane from starting facets; returns it with its two ends, or None if it is not a wall."""
     rows = np.flatnonzero(start)
     line = _fitted(facets.select(rows), None, 2.0 * band_m)
     if line is None:
@@ -233,7 +233,7 @@ def _around(
 
 
 def _run(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float] | None:
-    """From where to where places lie without a gap, of those about a place."""
+    """Start and end of the run of positions without a gap around a position; None if there is none."""
     if not len(along):
         return None
     there = np.unique(np.floor(along / BIN_M).astype(np.int64))
@@ -243,12 +243,12 @@ def _run(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float]
 
 
 def _fitted(facets: Facets, start: _Line | None, band_m: float) -> _Line | None:
-    """The upright plane through facets: robust least squares in plan (Tukey's biweight); None through a few.
+    """Fit a vertical plane to facets: robust least squares in plan (Tukey's biweight); None if there are too few.
 
     Args:
-        facets: Near it.
-        start: What it lies near; the facets' own mean direction without.
-        band_m: Distance at which a facet counts nothing.
+        facets: Facets near the plane.
+        start: Initial plane; None starts from the facets' mean direction.
+        band_m: Distance from which a facet has weight zero.
     """
     if len(facets) < CELL_FACETS:
         return None
@@ -269,7 +269,7 @@ def _fitted(facets: Facets, start: _Line | None, band_m: float) -> _Line | None:
 
 @dataclass(frozen=True)
 class _Face:
-    """Where on a plane there are facets: from end to end, from foot to top, and how many square metres."""
+    """The extent of a plane's facets: ends, heights, and area in square metres."""
 
     ends: tuple[float, float]
     heights: tuple[float, float]
@@ -302,7 +302,7 @@ def _face(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float)
 
 
 def _connected(there: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
-    """Numbers of parts that hang together, openings and gaps bridged; 0 where there is nothing."""
+    """Labels of connected parts, with openings and gaps bridged; 0 where there is nothing."""
     across = 2 * round(GAP_M / CELL_M / 2.0) + 1
     wide = np.pad(there.astype(np.uint8), ((CLOSED_CELLS, CLOSED_CELLS), (across, across)))
     wide = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((CLOSED_CELLS, across), np.uint8)))
@@ -311,7 +311,7 @@ def _connected(there: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
 
 
 def _piece(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> _Piece | None:
-    """What of a plane is a wall; None where it is too low, too short, too small or too crooked for one."""
+    """The part of a plane that is a wall; None if it is too low, too short, too small or too uneven."""
     face = _face(facets, line, ends, band_m)
     if face is None or face.area_m2 < LEAST_M2:
         return None
@@ -326,7 +326,7 @@ def _piece(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float
 
 
 def _cornered(pieces: Sequence[_Piece]) -> list[_Piece]:
-    """The same, each of its ends in the plane of another wall that it meets there, without low ones that meet none."""
+    """Extend or trim the walls' ends to the planes of walls that they meet; drops low walls that meet none."""
     result = []
     for piece in pieces:
         met = [place for other in pieces if other is not piece and (place := piece.crossing(other)) is not None]
@@ -345,5 +345,5 @@ def _wall(piece: _Piece) -> Wall:
 
 
 def _reached(heights: tuple[float, float]) -> tuple[float, float]:
-    """To where a wall goes whose facets lie between some heights."""
+    """Foot and top of a wall, from the heights of its facets."""
     return heights[0], heights[1] + TOP_M
