@@ -1,4 +1,4 @@
-"""Colours of places from a full-size photo, with a filter that fits the scale."""
+"""Colours of points from a full-size photo, with a filter that fits the scale."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from splatpipe.pipeline.surface.sources import DepthSource
 
 @dataclass(frozen=True, eq=False)
 class DistortionGrid:
-    """The way from a pinhole's pixels to those of the photo that it stands for.
+    """Mapping from a pinhole camera's pixels to those of the original photo.
 
-    Distortion is smooth: it is sampled every few pixels, and straight between (within 0.001 px for lenses that drones
-    have, where the lens model itself takes ten times as long).
+    Distortion is smooth, so it is sampled every few pixels and interpolated linearly (within 0.001 px for drone lenses,
+    ten times as fast as the lens model itself).
 
     Attributes:
-        width: Of the photo.
-        height: Of the photo.
-        step: Pinhole pixels from node to node.
+        width: Width of the photo, pixels.
+        height: Height of the photo, pixels.
+        step: Spacing of the nodes, pinhole pixels.
         nodes: Column and row in the photo of the pinhole's pixels (0, 0), (step, 0), …
     """
 
@@ -41,11 +41,11 @@ class PhotoSource:
     """A photo that colours the surface.
 
     Attributes:
-        camera: A pinhole, local metres: of the photo as it is without its lens, or of the photo where it has none.
-        load: Reads the photo's own pixels, (h, w, 3), 8 bits.
-        depths: What tells whether it sees a place; None where nothing does, and then it colours nothing.
-        lens: Where the photo's own pixels show what the pinhole's would; None where they are those. So colours are
-            taken from a photo once, and not from one that was made straight before.
+        camera: Pinhole camera, local metres: of the undistorted photo, or of the photo itself if it has no distortion.
+        load: Reads the photo's original pixels, (h, w, 3), 8 bits.
+        depths: Depths for visibility tests; None if there are none, and then the photo colours nothing.
+        lens: Mapping from pinhole to original pixels; None if they are the same. With it, colours are resampled once
+            from the original photo instead of from an undistorted copy.
     """
 
     camera: Camera
@@ -55,22 +55,23 @@ class PhotoSource:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the photo's own grid."""
+        """Width and height of the original photo, pixels."""
         return (self.camera.width, self.camera.height) if self.lens is None else (self.lens.width, self.lens.height)
 
 
 def rated(
     camera: Camera, points: Points, cell_m: float, said: UInt8[np.ndarray, " *n"]
 ) -> tuple[UInt16[np.ndarray, " *n"], Bool[np.ndarray, " *n"]]:
-    """What it costs to colour points by a photo, in thousandths, and whether it sees them.
+    """Cost of colouring points from a photo, in thousandths, and whether it sees them.
 
-    It leans, is coarser than the cells, they lie near its edge, or its depths are not sure of them.
+    The cost grows for an oblique view, pixels coarser than the cells, points near the photo's edge, and uncertain
+    depths.
 
     Args:
-        camera: The photo's pinhole.
-        points: East, north, up; nan is nowhere.
-        cell_m: Side of the points' cells.
-        said: What its depths say, as of ``sight``.
+        camera: The photo's pinhole camera.
+        points: East, north, up; NaN for missing points.
+        cell_m: Size of the points' cells, metres.
+        said: Visibility according to its depths, from ``sight``.
     """
     cost, seen = np.empty(said.shape, np.uint16), np.empty(said.shape, np.bool_)
     _native.rate(native_camera(camera), contiguous(points), cell_m, said, cost, seen.view(np.uint8))
@@ -85,21 +86,21 @@ def sampled(
     cell_m: float,
     tone: UInt8[np.ndarray, "256 3"],
 ) -> UInt8[np.ndarray, " *n 3"]:
-    """Colours of points in a photo by a cubic, black where it does not see them.
+    """Sample colours of points from a photo with a cubic filter; black where it does not see them.
 
-    Where its pixels are finer than the cells it is halved before, as often as fits. The same bits whatever points are
-    asked for at once.
+    If its pixels are finer than the cells, the photo is first halved as often as fits. A point's bits do not depend on
+    the other points.
 
     Args:
         source: The photo.
-        pixels: All of it; only what lies around the points is read.
+        pixels: All its pixels; only those around the points are read.
         points: East, north, up.
-        seen: Whether it sees them; what lies beyond its edges has the edge's colour.
-        cell_m: Side of the points' cells.
-        tone: What becomes of each value in each channel.
+        seen: Whether the photo sees them; beyond its edges, the edge's colour is repeated.
+        cell_m: Size of the points' cells, metres.
+        tone: Output value for each input value and channel.
 
     Raises:
-        ValueError: if the pixels are not of the photo's size.
+        ValueError: if the pixels do not have the photo's size.
     """
     colour = np.zeros((*seen.shape, 3), np.uint8)
     lens = None if source.lens is None else (source.lens.step, source.lens.nodes)
@@ -109,10 +110,10 @@ def sampled(
 
 
 def loaded(source: PhotoSource) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
-    """A photo and its size in memory, as a shelf wants it.
+    """Load a photo; returns it with its size in bytes, as ``LruCache`` needs.
 
     Raises:
-        ValueError: if it is not of its camera's size.
+        ValueError: if its size differs from its camera's.
     """
     pixels = source.load()
     width, height = source.size
@@ -122,7 +123,7 @@ def loaded(source: PhotoSource) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
 
 
 def loader(source: PhotoSource) -> Callable[[], tuple[UInt8[np.ndarray, "h w 3"], int]]:
-    """``loaded`` of it, for later."""
+    """``loaded`` for this photo as a function to call later."""
     return partial(loaded, source)
 
 
@@ -130,12 +131,12 @@ PLAIN_TONE = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
 
 
 def tone_curve(gain: Float64[np.ndarray, " 3"]) -> UInt8[np.ndarray, "256 3"]:
-    """Values of a photo as if it had been exposed so many times longer, a channel each (IEC 61966-2-1 for sRGB)."""
+    """Lookup table that multiplies a photo's exposure by a gain per channel (IEC 61966-2-1 for sRGB)."""
     light = linear(np.arange(256) / 255.0)[:, None] * gain
     encoded = np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
     return np.asarray(np.clip(np.round(encoded * 255.0), 0, 255), np.uint8)
 
 
 def linear(value: Float64[np.ndarray, " *n"]) -> Float64[np.ndarray, " *n"]:
-    """Light of sRGB values from 0 to 1."""
+    """Linear light of sRGB values, 0 to 1."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

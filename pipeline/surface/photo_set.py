@@ -1,4 +1,4 @@
-"""Photos with their depths, as clouds and meshes ask them: which of them see a place, and how finely."""
+"""Photos with their depths, for clouds and meshes: which of them see a place, and at what resolution."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ LEAST_COSINE = 0.1  # of a ray and a surface's normal: flatter rays count as thi
 
 @dataclass(frozen=True, eq=False)
 class PhotoSet:
-    """All that clouds and meshes are made from.
+    """Inputs of clouds and meshes.
 
     Attributes:
         sources: Photos, always in the same order.
-        levels: By how much photos' light is multiplied.
-        depths: Holds a few of their depths.
+        levels: Exposure gains of the photos.
+        depths: Cache of a few of their depth maps.
     """
 
     sources: Sequence[PhotoSource]
@@ -37,11 +37,11 @@ class PhotoSet:
     depths: LruCache[PosedDepthMap]
 
     def with_depths(self) -> list[int]:
-        """Numbers of the photos that have depths: the others say nothing of the surface."""
+        """Indices of the photos with depths; the others do not contribute to the surface."""
         return [number for number, source in enumerate(self.sources) if source.depths is not None]
 
     def depth_map(self, number: int) -> PosedDepthMap:
-        """A photo's depths, loaded if they are not at hand.
+        """A photo's depths, loaded if they are not cached.
 
         Raises:
             ValueError: if they do not fit their camera.
@@ -51,9 +51,9 @@ class PhotoSet:
         return self.depths.get(number, source.loaded)
 
     def parts_in(self, lattice: Lattice, tile: Tile, relief: HeightRange) -> list[DepthPart]:
-        """The parts of all photos' depths that may lie in a tile, between the heights that there are in it.
+        """The parts of all photos' depths that may lie in a tile, within the tile's own height range.
 
-        Between a whole site's heights, a tile in the hills would be most of each photo.
+        With the whole site's height range, a tile in the hills would cover most of each photo.
         """
         numbers = self._seeing(lattice, tile, relief)
         narrow = self._heights_in(numbers, lattice, tile, relief)
@@ -72,7 +72,7 @@ class PhotoSet:
     def _heights_in(
         self, numbers: Sequence[int], lattice: Lattice, tile: Tile, relief: HeightRange
     ) -> HeightRange | None:
-        """Between which heights two photos at least see something in a tile; None where nothing is."""
+        """Range of heights at which at least two photos see something in a tile; None if there are none."""
         photos = np.zeros(int((relief.high_m - relief.low_m) / LAYER_M) + 1, np.int64)
         for number in numbers:
             found = self.depth_map(number)
@@ -89,7 +89,7 @@ class PhotoSet:
 
 
 def _some_places(found: PosedDepthMap, window: PhotoWindow) -> Float64[np.ndarray, "3 n"]:
-    """East, north, up of some of the depths in a window, evenly."""
+    """East, north, up of evenly sampled depths in a window."""
     row, column = (
         grid.ravel() for grid in np.mgrid[window.top : window.bottom : EVERY, window.left : window.right : EVERY]
     )
@@ -101,7 +101,7 @@ def _some_places(found: PosedDepthMap, window: PhotoWindow) -> Float64[np.ndarra
 def place_of(
     camera: Camera, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], inverse: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "3 n"]:
-    """East, north, up of pixels' centres at inverse depths, each by itself."""
+    """East, north, up of pixel centres at inverse depths, each computed independently."""
     x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
     ray = turned(camera.cam_from_world[:3, :3].T, x, y)
     centre = camera.centre()
@@ -114,19 +114,19 @@ def turned(
     y: Float64[np.ndarray, " n"],
     z: Float64[np.ndarray, " n"] | float = 1.0,
 ) -> list[Float64[np.ndarray, " n"]]:
-    """A matrix times vectors, each by itself: a library's product would depend on how many there are."""
+    """A matrix times vectors, each computed independently: a library's product would depend on their number."""
     return [turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z for i in range(3)]
 
 
 @dataclass(frozen=True, eq=False)
 class DepthPart:
-    """A rectangle of a photo's depths, a map of its own.
+    """A crop of a photo's depth map.
 
     Attributes:
-        number: The photo's.
-        camera: Of the part.
-        depth: As in the whole map; a copy, so that the whole one need not stay.
-        confidence: Likewise.
+        number: Index of the photo.
+        camera: Camera of the crop.
+        depth: As in the full map; a copy, so that the full one can be freed.
+        confidence: As in the full map, likewise a copy.
     """
 
     number: int
@@ -146,26 +146,27 @@ class SurfacePieces:
     """Small pieces of a surface.
 
     Attributes:
-        xyz: East, north, up, metres: (3, n), a row an axis.
-        normal: Of unit length, likewise.
+        xyz: East, north, up, metres: (3, n), one row per axis.
+        normal: Unit normals, likewise.
     """
 
     xyz: Float64[np.ndarray, "3 n"]
     normal: Float64[np.ndarray, "3 n"]
 
     def select(self, rows: np.ndarray | slice) -> SurfacePieces:
-        """Those of them."""
+        """The pieces of these rows."""
         return SurfacePieces(self.xyz[:, rows], self.normal[:, rows])
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """How a camera looks at pieces of a surface.
+    """Surface pieces as seen by a camera.
 
     Attributes:
-        pieces: They.
-        place: Where they lie in it; ``sine`` is of the ray's angle against the surface.
-        footprint: How long a pixel is on the surface, metres; infinite where it sees them from behind or not at all.
+        pieces: The pieces.
+        place: Their image coordinates; ``sine`` is of the ray's angle to the surface.
+        footprint: Size of a pixel on the surface, metres; infinite where the camera sees them from behind or not at
+            all.
     """
 
     pieces: SurfacePieces
@@ -173,13 +174,13 @@ class SurfaceView:
     footprint: Float64[np.ndarray, " n"]
 
     def sight(self, found: PosedDepthMap, rows: np.ndarray | slice) -> PointVisibility:
-        """What the photo's depths, in whose grid the look is, say of some of the pieces."""
+        """Visibility of some of the pieces according to the photo's depths, which must have this view's grid."""
         east, north, up = self.pieces.xyz[:, rows]
         return sight(found, (east, north, up), 0.0, np.ascontiguousarray(self.place.sine[rows]))
 
 
 def look_at(camera: Camera, pieces: SurfacePieces) -> SurfaceView:
-    """Where pieces of a surface lie in a camera's picture, and how finely it sees them, each by itself."""
+    """Project surface pieces into a camera, with their footprints; each computed independently."""
     place = place_in(camera, *pieces.xyz)
     towards = camera.centre()[:, None] - pieces.xyz
     away = np.sqrt(np.square(towards[0]) + np.square(towards[1]) + np.square(towards[2]))
@@ -190,5 +191,5 @@ def look_at(camera: Camera, pieces: SurfacePieces) -> SurfaceView:
 
 
 def dot(a: Float64[np.ndarray, "3 n"], b: Float64[np.ndarray, "3 n"]) -> Float64[np.ndarray, " n"]:
-    """Of vectors, each by itself."""
+    """Dot products of vectors, each computed independently."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

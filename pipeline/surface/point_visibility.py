@@ -1,4 +1,4 @@
-"""What a photo's depths say about a place: it is what the photo sees there, something is before it, or nothing is."""
+"""Visibility of points by a photo's depths: seen, hidden, or seen through."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Points = tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"], Float64[n
 
 @dataclass(frozen=True)
 class PhotoCoordinates:
-    """Where points lie in a photo.
+    """Image coordinates of points.
 
     Attributes:
-        column: With fractions; the first pixel's centre is 0.5.
-        row: Likewise.
-        depth: Along the view axis, metres.
-        sine: Of the ray's angle against the ground.
-        inside: Whether the photo has that pixel, before it.
+        column: Fractional; the first pixel's centre is 0.5.
+        row: Fractional, likewise.
+        depth: Depth along the optical axis, metres.
+        sine: Sine of the ray's angle to the ground.
+        inside: Whether the point is in front of the camera and inside the image.
     """
 
     column: Float64[np.ndarray, " *n"]
@@ -40,7 +40,7 @@ def place_in(
     north: Float64[np.ndarray, "*#n"],
     up: Float64[np.ndarray, "*#n"],
 ) -> PhotoCoordinates:
-    """Project points, each by itself, so that the bits do not depend on how many there are; nan is outside."""
+    """Project points, each independently, so that the bits do not depend on their number; NaN is outside."""
     m = camera.cam_from_world
     x, y, depth = (m[i, 0] * east + m[i, 1] * north + m[i, 2] * up + m[i, 3] for i in range(3))
     ahead = depth > 0.0
@@ -54,45 +54,45 @@ def place_in(
 
 @dataclass(frozen=True)
 class PointVisibility:
-    """What a photo says about points.
+    """Visibility of points in a photo.
 
     Attributes:
-        said: Bits for each, as kernels take them.
+        said: Bit flags for each point, as in the kernels.
     """
 
     said: UInt8[np.ndarray, " *n"]
 
     @property
     def seen(self) -> Bool[np.ndarray, " *n"]:
-        """It sees them."""
+        """Points that the photo sees."""
         return np.asarray(self.said & _native.SEEN != 0)
 
     @property
     def through(self) -> Bool[np.ndarray, " *n"]:
-        """It sees something behind them."""
+        """Points that the photo sees through, to something behind them."""
         return np.asarray(self.said & _native.THROUGH != 0)
 
     @property
     def mixed(self) -> Bool[np.ndarray, " *n"]:
-        """It sees them, but a nearer surface lies in the next pixel."""
+        """Points that the photo sees, but with a nearer surface in an adjacent pixel."""
         return np.asarray(self.said & _native.MIXED != 0)
 
     @property
     def unknown(self) -> Bool[np.ndarray, " *n"]:
-        """It looks there, but has no depth: it may see them."""
+        """Points in view where the photo has no depth, so it may see them."""
         return np.asarray(self.said & _native.UNKNOWN != 0)
 
 
 def sight(
     found: PosedDepthMap, points: Points, least_m: float, sines: Float64[np.ndarray, " *n"] | None = None
 ) -> PointVisibility:
-    """Compare points with a photo's depths: they are the same within some pixels' widths, more where the ray is flat.
+    """Compare points with a photo's depths, with a tolerance of a few pixel widths, larger for grazing rays.
 
     Args:
         found: The depths.
-        points: East, north, up; nan is nowhere.
-        least_m: Differences along the view axis up to it are none.
-        sines: Of the rays' angles against the surface there; None: against the ground.
+        points: East, north, up; NaN for missing points.
+        least_m: Differences along the optical axis up to this are ignored, metres.
+        sines: Sines of the rays' angles to the surface; None: to the ground.
 
     Raises:
         ValueError: if the depths do not fit their camera.
@@ -103,6 +103,6 @@ def sight(
 
 
 def contiguous(points: Points) -> Points:
-    """Points as kernels take them."""
+    """Points as contiguous arrays for the kernels."""
     east, north, up = (np.ascontiguousarray(part, np.float64) for part in points)
     return east, north, up

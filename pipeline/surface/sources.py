@@ -1,4 +1,4 @@
-"""Photos and their depths as the surface asks for them: loaded when a tile needs them, a few at a time."""
+"""Access to photos and their depths for surface products: loaded when a tile needs them, a few at a time."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 Loaded = TypeVar("Loaded")
 
-LEAST_CONFIRMED = 2  # other photos that confirm a depth that clouds, meshes, walls and sections are made from
-REACH_PX = 4  # pixels around a tile in a photo: more than slopes and filters look at
+LEAST_CONFIRMED = 2  # other photos that have to confirm a depth used for clouds, meshes, walls and sections
+REACH_PX = 4  # pixels around a tile in a photo: more than slopes and filters need
 
 
 @runtime_checkable
 class PosedDepthMap(Protocol):
-    """Depths of a photo: what `mvs` makes.
+    """Depth map of a photo, as produced by `mvs`.
 
     Attributes:
-        camera: In the map's grid, local metres.
-        depth: Along the view axis, metres; 0 where none is known.
+        camera: The camera at the map's resolution, local metres.
+        depth: Depth along the optical axis, metres; 0 where unknown.
         confidence: How many other photos confirm it.
     """
 
@@ -41,7 +41,7 @@ class PosedDepthMap(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MetricMap:
-    """A ``PosedDepthMap`` in local metres, or in those of a sheet that things are drawn on."""
+    """A ``PosedDepthMap`` in local metres or in a sheet's frame."""
 
     camera: Camera
     depth: Float32[np.ndarray, "h w"]
@@ -50,21 +50,21 @@ class MetricMap:
 
 @dataclass(frozen=True, eq=False)
 class DepthSource:
-    """Where a photo's depths come from.
+    """Source of a photo's depths.
 
     Attributes:
-        camera: Of the map, so that it is loaded only where it can see something.
-        load: Reads it; called from several threads.
+        camera: The map's camera, so that the map is only loaded where it can see something.
+        load: Reads the map; called from several threads.
     """
 
     camera: Camera
     load: Callable[[], PosedDepthMap]
 
     def loaded(self) -> tuple[PosedDepthMap, int]:
-        """The map and its size in memory, as a shelf wants it.
+        """Load the map; returns it with its size in bytes, as ``LruCache`` needs.
 
         Raises:
-            ValueError: if it is not of its camera's size.
+            ValueError: if its size differs from its camera's.
         """
         found = self.load()
         shape = (found.camera.height, found.camera.width)
@@ -74,10 +74,10 @@ class DepthSource:
 
 
 class LruCache(Generic[Loaded]):
-    """What was loaded last, up to so many bytes; the last one stays, however large it is.
+    """Least-recently-used cache limited in bytes; the last item stays, however large it is.
 
     Args:
-        limit_bytes: Of all that is held.
+        limit_bytes: Limit on the size of all items.
     """
 
     def __init__(self, limit_bytes: int) -> None:
@@ -87,11 +87,12 @@ class LruCache(Generic[Loaded]):
         self._lock = threading.Lock()
 
     def get(self, key: Hashable, load: Callable[[], tuple[Loaded, int]]) -> Loaded:
-        """What was loaded under this key, or what ``load`` returns with its size in bytes.
+        """Return the cached item, or load it.
 
         Args:
-            key: Names it.
-            load: May run twice at once where two threads ask; both get the same.
+            key: Key of the item.
+            load: Returns the item and its size in bytes; may run twice at once if two threads request it, and both get
+                the same item.
         """
         with self._lock:
             if key in self._held:
@@ -109,11 +110,11 @@ class LruCache(Generic[Loaded]):
 
 @dataclass(frozen=True)
 class HeightRange:
-    """Between which heights the ground and all on it lie; what is outside counts as noise.
+    """Height range of the ground and everything on it; anything outside counts as noise.
 
     Attributes:
-        low_m: Local metres.
-        high_m: Local metres.
+        low_m: Lowest height, local metres.
+        high_m: Highest height, local metres.
     """
 
     low_m: float
@@ -126,7 +127,7 @@ class HeightRange:
 
 @dataclass(frozen=True)
 class PhotoWindow:
-    """The part of a photo that a tile can lie in.
+    """The part of a photo that may show a tile, pixels.
 
     Attributes:
         left: First column.
@@ -142,7 +143,7 @@ class PhotoWindow:
 
 
 def window_of(camera: Camera, lattice: Lattice, tile: Tile, relief: HeightRange) -> PhotoWindow | None:
-    """Where in a photo the cells of a tile may lie, whatever their heights; None where it cannot see them."""
+    """The window of a photo that may show a tile's cells at any height in range; None if it cannot see them."""
     corners = _corners(lattice, tile, relief)
     rays = corners @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     if (rays[:, 2] <= 0.0).all():
@@ -163,7 +164,7 @@ def window_of(camera: Camera, lattice: Lattice, tile: Tile, relief: HeightRange)
 
 
 def _corners(lattice: Lattice, tile: Tile, relief: HeightRange) -> Float64[np.ndarray, "8 3"]:
-    """Of the box that the tile's cells lie in, and one more around."""
+    """Corners of the box around a tile's cells and a margin of one cell."""
     columns = tile.column - 1, tile.column + tile.width + 1
     rows = tile.row - 1, tile.row + tile.height + 1
     easts = [lattice.east_m + column * lattice.cell_m for column in columns]
@@ -174,6 +175,6 @@ def _corners(lattice: Lattice, tile: Tile, relief: HeightRange) -> Float64[np.nd
 def photos_seeing(
     cameras: Sequence[Camera], lattice: Lattice, tile: Tile, relief: HeightRange
 ) -> list[tuple[int, PhotoWindow]]:
-    """Numbers of the photos that may see a tile, and where in them it lies."""
+    """Indices of the photos that may see a tile, and the tile's windows in them."""
     windows = ((number, window_of(camera, lattice, tile, relief)) for number, camera in enumerate(cameras))
     return [(number, window) for number, window in windows if window is not None]
