@@ -68,7 +68,7 @@ def convert(
     format_name: FormatOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a splat in another format; what it says of its place on the earth goes along."""
+    """Convert a splat file to another format; its georeference is kept."""
     with CommandSummary(target, as_json) as done:
         from splatpipe.pipeline.app.console import say
         from splatpipe.pipeline.app.formats import convert_file

@@ -2,7 +2,7 @@
 
 If the cameras are known, a Gaussian is suspected of floating if it lies in front of everything around it in the photos
 (``depth_islands``). If the images are known too, the change of their error with and without it decides, together with
-how far in front of the scene it hangs and how it is held (``floaters``); else whether it is connected to the scene at
+how far in front of the scene it floats and how it is held (``floaters``); else whether it is connected to the scene at
 all (``isolation``). Without photos, small groups apart from all others are removed.
 
 All limits are set to keep real objects rather than to find every floater: leaves, wires, what only one photo shows.

@@ -205,7 +205,7 @@ class Viewer {
     return true;
   }
 
-  /** The current pose, with the photo's lens. */
+  /** A pose to change: that of the photo whose lens is in use, else of the start photo. */
   pose() {
     return this.view.poseOf(this.view.lens.rotation ? this.view.lens : this.photos[this.facts.start]);
   }
