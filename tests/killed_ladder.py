@@ -1,4 +1,4 @@
-"""Runs the line of lines/leftovers.py, and kills itself once a stage tells of something; a program for
+"""Runs the pipeline of lines/leftovers.py, and kills itself once a stage reports something; a program for
 test_ladder_kills.py.
 
 Arguments: photos, out, what has to be told ("" to live), threads.

@@ -1,4 +1,4 @@
-"""The captures of a batch: folders, and lists that anybody may have written."""
+"""The captures of a batch: folders, and hand-written lists."""
 
 from pathlib import Path
 

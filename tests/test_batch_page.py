@@ -1,4 +1,4 @@
-"""The batch's page: one file, true while the batch runs and after it, whatever captures are called."""
+"""The batch's page: a single file, correct during and after the batch, whatever the captures are called."""
 
 import base64
 import io

@@ -1,4 +1,4 @@
-"""A batch whose line has a stage made of shards: a job each, as many as the stage before it counts."""
+"""A batch whose pipeline has a sharded stage: one job per shard counted by the stage before it."""
 
 import json
 import os

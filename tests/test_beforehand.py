@@ -1,4 +1,4 @@
-"""What a run says before it begins: what it takes, and that a limit of memory is too small."""
+"""What a run reports before it begins: its cost, and a memory limit that is too small."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blocks: cells of alike work, the photos that see them, what is drawn around them, and a merge that nobody can see."""
+"""Blocks: cells of similar work, the photos that see them, what is drawn around them, and a seamless merge."""
 
 import json
 import math

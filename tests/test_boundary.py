@@ -1,4 +1,4 @@
-"""A boundary is read from anybody's GeoJSON, laid onto the model wherever its numbers say, or refused with a reason."""
+"""A boundary is read from anyone's GeoJSON and placed on the model by its coordinates, or rejected with a reason."""
 
 import json
 from collections.abc import Callable

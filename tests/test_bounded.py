@@ -1,4 +1,4 @@
-"""What readers share: broken, cut off and lying files end in our error and take no memory."""
+"""Common rules of readers: broken, truncated and lying files end in our error and use little memory."""
 
 import gzip
 import io

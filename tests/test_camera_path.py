@@ -1,4 +1,4 @@
-"""Ways of a camera: level, smooth in speed and turn, near the photos, clear of what is solid; keyframes from files."""
+"""Camera paths: level, smooth in speed and rotation, near the photos, collision-free; keyframes from files."""
 
 import json
 import math

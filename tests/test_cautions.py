@@ -1,4 +1,4 @@
-"""What `doctor` warns of, by the kernel's texts as they are on the systems that it is about."""
+"""Warnings of `doctor`, by the kernel's texts on the systems concerned."""
 
 from __future__ import annotations
 

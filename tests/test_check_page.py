@@ -1,4 +1,4 @@
-"""The preflight's page: one file, its map and pictures, whatever photos are called and however many there are."""
+"""The preflight page: a single file with map and images, whatever the photos' names and number."""
 
 import os
 import re

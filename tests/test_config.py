@@ -1,4 +1,4 @@
-"""Configuration: layers, presets, and what a wrong one is told."""
+"""Configuration: layers, presets, and error messages for invalid ones."""
 
 import copy
 import tomllib

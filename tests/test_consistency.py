@@ -1,4 +1,4 @@
-"""Disagreement of depths, from exact depth maps of planes and boxes."""
+"""Depth disagreement between views, from exact depth maps of planes and boxes."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Control and check points against the demo's truth: what they give, what bends to them, what is wrong with them."""
+"""Control and check points against the demo's truth: accuracy, the adjustment to them, and mistakes in them."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Marks written into control files line by line: what is read back is what was marked, and nothing else changes."""
+"""Marks written into control files line by line: they read back unchanged, and nothing else changes."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""CRSs, worlds and georef.json, against published points, PROJ's own direct ways and the demo's truth."""
+"""CRSs, worlds and georef.json, against published points, PROJ's own direct transforms and the demo's truth."""
 
 import json
 import math

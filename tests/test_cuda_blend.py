@@ -1,4 +1,4 @@
-"""The CUDA backend's blending by itself, on the harness, against the definition in float64. Its lists are made here."""
+"""The CUDA backend's blending alone, in the harness, against the float64 definition, with lists made here."""
 
 from __future__ import annotations
 

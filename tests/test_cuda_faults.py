@@ -1,4 +1,4 @@
-"""Mistakes planted in the CUDA kernels' sources are found, each, by the checks that the sources themselves pass."""
+"""Every mistake planted in the CUDA kernels' sources is caught by the checks that the sources themselves pass."""
 
 from __future__ import annotations
 

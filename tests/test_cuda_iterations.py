@@ -1,4 +1,4 @@
-"""Whole iterations on a CUDA device beside the CPU's; without one, by the same kernels' sources on the CPU."""
+"""Whole iterations on a CUDA device against the CPU's; without one, the kernels' sources on the CPU."""
 
 import sys
 from collections.abc import Iterator

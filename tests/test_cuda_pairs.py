@@ -1,4 +1,4 @@
-"""A view of more pairs than 32 bits count on a CUDA device; without one, of more chunks, by the kernels on the CPU."""
+"""A view with more pairs than 32 bits can count on a CUDA device; without one, with more chunks, on the CPU."""
 
 import math
 import sys

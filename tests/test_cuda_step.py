@@ -1,4 +1,4 @@
-"""The CUDA kernels' projection and optimiser, run on this CPU: the same numbers as the CPU's own kernels give."""
+"""The CUDA kernels' projection and optimiser, run on this CPU: identical to the CPU's own kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trainer on a real device: what has no meaning where device and host share their memory."""
+"""The trainer on a real device: behaviour that cannot be tested where device and host share memory."""
 
 import sys
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Training on windows of photos with the CUDA kernels, proven with their sources on the CPU."""
+"""Training on windows of photos with the CUDA kernels, verified with their sources on the CPU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Density control: who is cloned, split, pruned and held back, and that its random numbers repeat."""
+"""Density control: which Gaussians are cloned, split, pruned and held back, and reproducible random numbers."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The sky as a device makes it, in products of matrices, beside how the CPU does: on the CPU."""
+"""The device's sky, computed by matrix products, against the CPU's method: on the CPU."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The spread of depths along a ray: what it measures, its gradient, and that training with it leaves one surface."""
+"""Distortion loss: what it measures, its gradient, and that training with it leaves a single surface."""
 
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Dropout, for few views."""
+"""Dropout, for captures of few views."""
 
 import math
 from dataclasses import replace

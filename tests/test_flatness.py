@@ -1,4 +1,4 @@
-"""Early end: told from the training photos' loss alone, after a tail, at the same iteration however it was run."""
+"""Early stopping: decided by the loss on training photos alone, after a tail, at the same iteration in every run."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""A flattened copy: what draws its surfaces together, that it does, and that kills and threads leave the same bits."""
+"""The flattened copy: its terms pull surfaces together, and kills and thread counts leave the same bits."""
 
 import json
 import os

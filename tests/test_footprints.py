@@ -1,4 +1,4 @@
-"""Pairs by overlapping footprints: against plain geometry, and against what the demo's photos truly show in common."""
+"""Pairs by overlapping footprints: against plain geometry, and against the demo photos' true overlap."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Forecasts: what they follow from, where they stand, and that they are light."""
+"""Forecasts: what they depend on, where they are shown, and that they are cheap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GeoTIFFs: Cloud Optimised, the values and the place that were written, read by rasterio, Pillow and pyproj."""
+"""GeoTIFFs: Cloud Optimized, with the values and georeference written, read by rasterio, Pillow and pyproj."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""A day with a GPU goes on piece by piece: what fails, hangs or comes too late is told, with what it had."""
+"""A GPU session continues after failures: a part that fails, hangs or is late is reported with its results so far."""
 
 import os
 import sys

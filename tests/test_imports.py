@@ -1,4 +1,4 @@
-"""What demo, benchmarks and tests import by name is there: nothing else looks before they run, and some seldom do."""
+"""Every name that demo, benchmarks and tests import exists: nothing else checks this before they run."""
 
 import ast
 from collections.abc import Iterable, Iterator

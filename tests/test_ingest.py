@@ -1,4 +1,4 @@
-"""Ingest on folders as people give them: all kinds of pictures, broken ones, masks, positions."""
+"""Ingest on realistic folders: all kinds of images, broken ones, masks, positions."""
 
 import hashlib
 import io

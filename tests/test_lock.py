@@ -1,4 +1,4 @@
-"""One splatpipe at a time in an OUT: on this machine by the kernel's lock, across machines by signs of life."""
+"""One splatpipe at a time in an OUT: by the kernel's lock on one machine, by heartbeats across machines."""
 
 from __future__ import annotations
 

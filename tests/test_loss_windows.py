@@ -1,4 +1,4 @@
-"""The loss of parts of a photo, cut with what SSIM's windows see around them, against the whole photo's."""
+"""The loss on parts of a photo, cropped with the margin of SSIM's windows, against the whole photo's."""
 
 from __future__ import annotations
 

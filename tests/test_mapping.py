@@ -1,4 +1,4 @@
-"""Mapping from the best keypoints and completion by all: cameras come out at the truth, the same bits again."""
+"""Mapping from the strongest keypoints, completed by all: accurate cameras, bit-identical on repetition."""
 
 import sys
 from pathlib import Path

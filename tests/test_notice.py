@@ -1,4 +1,4 @@
-"""Notices: what a command finds in its environment, and that neither names nor its own failures do any harm."""
+"""Notices: what a command finds in its environment, and that neither contents nor failures of notices do harm."""
 
 from __future__ import annotations
 

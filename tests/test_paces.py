@@ -1,4 +1,4 @@
-"""How far a step moves a Gaussian: the same angle for its photo's camera, wherever it lies."""
+"""Step lengths of Gaussians: the same angle in the photo's camera, wherever they lie."""
 
 from __future__ import annotations
 

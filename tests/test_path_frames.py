@@ -1,4 +1,4 @@
-"""A change of exposure is told from a change of content, along a path in the order that was asked for."""
+"""A change of exposure is distinguished from a change of content, along a path in the given order."""
 
 import sys
 from pathlib import Path

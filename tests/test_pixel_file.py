@@ -1,4 +1,4 @@
-"""Decoded photos in a file: each is decoded once, and nothing is left."""
+"""Decoded photos in a file: each is decoded once, and nothing remains afterwards."""
 
 import sys
 from collections import Counter

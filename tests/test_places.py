@@ -1,4 +1,4 @@
-"""Pages tell no folders of the machine that made them."""
+"""Pages do not reveal folders of the machine that made them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clouds: LAZ of the specification, read back by laspy, with coordinates of PROJ."""
+"""Point clouds: LAZ by the specification, read back by laspy, with PROJ's coordinates."""
 
 import struct
 import sys

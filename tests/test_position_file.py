@@ -1,4 +1,4 @@
-"""Files of photos' positions: geo.txt as ODM defines it, CSV as people write it, and what is neither."""
+"""Files of photo positions: geo.txt as ODM defines it, CSV as people write it, and invalid files."""
 
 import random
 from pathlib import Path

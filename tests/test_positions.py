@@ -1,4 +1,4 @@
-"""Positions of photos: precedence, accuracies, conventions, datums and flights, and which positions are wrong."""
+"""Photo positions: precedence, accuracies, conventions, datums, flights, and outliers."""
 
 from collections.abc import Mapping
 from pathlib import Path

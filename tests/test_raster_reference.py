@@ -1,4 +1,4 @@
-"""The rasterizer's definition against what can be computed by hand, and its gradients against finite differences."""
+"""The reference rasterizer against hand calculations, and its gradients against finite differences."""
 
 from __future__ import annotations
 

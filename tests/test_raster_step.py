@@ -1,4 +1,4 @@
-"""A backward pass that ends with the optimiser's step: the bits of the pass and the step one after the other."""
+"""The backward pass fused with the optimiser's step: bit-identical to running them one after the other."""
 
 from __future__ import annotations
 

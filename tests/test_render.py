@@ -1,4 +1,4 @@
-"""`flythrough` and `splatpipe render`: films and stills of a real run, held against truth and a browser's decoder."""
+"""`flythrough` and `splatpipe render`: videos and stills of a real run, against truth and a browser's decoder."""
 
 import json
 import shutil

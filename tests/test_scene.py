@@ -1,4 +1,4 @@
-"""What a splat file says of itself: axes, place, edits; written, read back, and read from anybody."""
+"""Metadata of a splat file: axes, georeference, edits; written, read back, and read from other programs."""
 
 import json
 from dataclasses import replace

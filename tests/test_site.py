@@ -1,4 +1,4 @@
-"""The viewer as a folder for web hosts, in a real browser: coarse and whole at first, in full in the end."""
+"""The viewer as a folder for web hosts, in a real browser: complete but coarse at first, in full detail in the end."""
 
 import gzip
 import io

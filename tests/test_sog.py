@@ -1,4 +1,4 @@
-"""SOG: read back by the letter of the specification, by our reader, and under attack."""
+"""SOG: read back strictly by the specification, by our reader, and under attack."""
 
 from __future__ import annotations
 

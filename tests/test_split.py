@@ -1,4 +1,4 @@
-"""The stage that decides what is held out: its part, what it refuses, and who is asked for it."""
+"""The stage that selects held-out photos: its artifact, what it rejects, and which stages depend on it."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Streamed SOG: each leaf's runs in the files are what the levels hold there, in PlayCanvas' frame and numbering."""
+"""Streamed SOG: each leaf's runs in the files match the levels, in PlayCanvas' frame and numbering."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Façades of a house whose walls are known: found, measured, drawn, and read by others."""
+"""Façades of a house with known walls: detected, measured, drawn, and read by other programs."""
 
 import json
 import shutil

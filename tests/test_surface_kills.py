@@ -1,4 +1,4 @@
-"""A writer of a surface product that dies leaves nothing under the product's name, and the next one cleans up."""
+"""A killed writer of a surface product leaves nothing under the product's name, and the next one cleans up."""
 
 import subprocess
 import sys

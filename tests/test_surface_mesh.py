@@ -1,4 +1,4 @@
-"""The mesh: its blocks, its order, its colours, its files; and, where open3d is installed, the whole of it."""
+"""The mesh: blocks, order, colours, files; and the complete mesh where open3d is installed."""
 
 import json
 import sys

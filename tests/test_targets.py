@@ -1,4 +1,4 @@
-"""Control without clicking: targets in photos, their names, scale bars."""
+"""Control without clicking: targets in photos, their IDs, scale bars."""
 
 from __future__ import annotations
 

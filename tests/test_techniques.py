@@ -1,4 +1,4 @@
-"""Optional techniques: the order in which an iteration calls their hooks, and what a checkpoint keeps of them."""
+"""Optional techniques: the order in which an iteration calls their hooks, and what checkpoints store of them."""
 
 import sys
 from collections.abc import Mapping

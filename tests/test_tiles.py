@@ -1,4 +1,4 @@
-"""3D Tiles: what is written, read by the letter of 3D Tiles, glTF and SPZ, lies where pyproj says it should."""
+"""3D Tiles: parsed from the specifications of 3D Tiles, glTF and SPZ, the output lies where pyproj puts it."""
 
 import gzip
 import json

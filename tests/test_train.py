@@ -1,4 +1,4 @@
-"""train: learns a known model, honours masks, and ends with the same bits however it was run."""
+"""train: learns a known model, respects masks, and ends bit-identical however it was run."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""The plan and the checkpoints of training: schedules, round trips, and files that are broken."""
+"""The plan and the checkpoints of training: schedules, round trips, and broken files."""
 
 import json
 import sys

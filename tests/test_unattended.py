@@ -1,4 +1,4 @@
-"""Nobody watches: full, read-only and vanished disks end clearly, lose nothing finished, and it goes on later."""
+"""Unattended runs: full, read-only and vanished disks end in clear errors, lose nothing, and the run resumes."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The undistorted dataset: where its pixels are, what its model says, and who else can read it."""
+"""The undistorted dataset: its pixels, its model, and other programs that can read it."""
 
 import hashlib
 import sys

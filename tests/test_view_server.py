@@ -1,4 +1,4 @@
-"""What ``splatpipe view`` gives to whom, tried against the real server process: what is not for us is refused."""
+"""Access control of ``splatpipe view``, against the real server process: requests meant for others are refused."""
 
 import contextlib
 import http.client

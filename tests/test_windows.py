@@ -1,4 +1,4 @@
-"""Windows of photos: parts of the whole photo, each as often as the others, and what they say adds up to it."""
+"""Windows of photos: parts of the photo, each used equally often, that together add up to the whole."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""When a frame counts as equal to the definition: tolerances by quantity, and what is beyond them. Without torch."""
+"""When a frame counts as equal to the definition: tolerances by quantity, and violations. Without torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Builds the CUDA kernels' sources for the CPU, on top of ``cuda_on_cpu.h``; what was built once is kept by content."""
+"""Build the CUDA kernels' sources for the CPU, on top of ``cuda_on_cpu.h``; builds are cached by content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The checks of the CUDA kernels that planted faults have to face: the same that the kernels pass. Without torch.
+"""The CUDA kernels' checks, for planted faults: the same that the kernels pass. Without torch.
 
 As a program, it makes the checks on each fault of a library in a process of its own: what is broken may crash.
 """

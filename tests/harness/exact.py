@@ -1,4 +1,4 @@
-"""Frames by the definition in float64, and by the CPU's own kernels."""
+"""Frames by the float64 definition, and by the CPU's own kernels."""
 
 from __future__ import annotations
 

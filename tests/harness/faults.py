@@ -1,4 +1,4 @@
-"""Mistakes to plant in the CUDA kernels' sources, and their planting."""
+"""Mistakes to plant into the CUDA kernels' sources, and the planting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames through the C interface of the CUDA kernels on this machine's memory. Without torch: faults run apart."""
+"""Frames through the CUDA kernels' C interface in this machine's memory. Without torch: faults run separately."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The CUDA kernels, run on the CPU, in the place of a device."""
+"""The CUDA kernels, run on the CPU in place of a device."""
 
 from __future__ import annotations
 

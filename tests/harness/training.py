@@ -1,4 +1,4 @@
-"""What training asks of the CUDA kernels beside frames, and when that is right: for ``checking``, without torch."""
+"""What training requires of the CUDA kernels besides frames, with tolerances: for ``checking``, without torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small real line for the engine's tests: reads numbers from files, adds, multiplies, prints a report."""
+"""A small real pipeline for the engine's tests: reads numbers from files, adds, multiplies, prints a report."""
 
 import json
 import os

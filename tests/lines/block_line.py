@@ -1,4 +1,4 @@
-"""The line's stages `blocks` and `train` on a dataset that is given, in a process of their own.
+"""The pipeline's stages `blocks` and `train` on a given dataset, in a process of their own.
 
 Called as ``block_line.py SCENE OUT SHARD OPTIONS [THREADS]``: makes that shard, or with an empty name walks the line.
 """

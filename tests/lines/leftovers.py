@@ -1,4 +1,4 @@
-"""A line that takes what `ingest`, `features` and `matches` would leave from the photo folder, then runs `sparse`."""
+"""A pipeline that copies the output of `ingest`, `features` and `matches` from the photo folder, then runs `sparse`."""
 
 import shutil
 from pathlib import Path

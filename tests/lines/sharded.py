@@ -1,4 +1,4 @@
-"""A small real line with a stage made of shards: numbers are divided into pieces, which are added and joined."""
+"""A small real pipeline with a sharded stage: numbers are divided into pieces, summed and merged."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A made building site from above: ground with two buildings, as Gaussians, flown over by nadir and oblique photos."""
+"""A synthetic building site: ground with two buildings, as Gaussians, with nadir and oblique photos."""
 
 from __future__ import annotations
 

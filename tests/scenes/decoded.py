@@ -1,4 +1,4 @@
-"""A film as a real browser sees it: Chromium's decoder shares nothing with the one that wrote it."""
+"""A video as a real browser decodes it: Chromium's decoder shares no code with the encoder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A GLB by the letter of its specification (glTF 2.0, section 4.4): its document and its data, and back."""
+"""A GLB's document and data, split and joined by its specification (glTF 2.0, section 4.4)."""
 
 import json
 import struct

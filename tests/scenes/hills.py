@@ -1,4 +1,4 @@
-"""A smooth surface about a place, and the files that are made of it."""
+"""A smooth surface around a place, and the files made from it."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The house's photos with their depths, as a run has them: exact, or with patches of nonsense."""
+"""The house's photos with their depths, as in a run: exact, or with patches of wrong values."""
 
 from collections.abc import Sequence
 from functools import cache

@@ -1,4 +1,4 @@
-"""A house with a gabled roof, a tree and a lawn, seen exactly: depths and colours by rays, heights by rule."""
+"""A house with a gabled roof, a tree and a lawn, without noise: depths and colours by rays, analytic heights."""
 
 from dataclasses import dataclass
 

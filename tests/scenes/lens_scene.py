@@ -1,4 +1,4 @@
-"""Points seen through known lenses, as mapping would leave them: simple lenses, adjusted to noisy keypoints."""
+"""Points seen through known lenses, as if after mapping: simple lenses, adjusted to noisy keypoints."""
 
 from __future__ import annotations
 

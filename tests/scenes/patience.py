@@ -1,4 +1,4 @@
-"""How long tests wait for what takes a moment: only a hang takes longer, even where the machine has other work."""
+"""How long tests wait for something that takes a moment: only a hang takes longer, even on a busy machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rays into a mesh, for the truth of depths and points."""
+"""Rays into a mesh, for true depths and points."""
 
 import numpy as np
 from numpy.typing import NDArray

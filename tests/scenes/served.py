@@ -1,4 +1,4 @@
-"""A real ``splatpipe view`` process, and requests to it byte by byte as no client would send them."""
+"""A real ``splatpipe view`` process, and raw requests to it such as no client would send."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos of a textured plain with blocks on it under a sky, by tracing rays: where the sky is in them is known."""
+"""Photos of a textured plain with blocks under a sky, by ray tracing: the sky's pixels are known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The demo capture as structure from motion would have it, made from its truth: exact cameras, seen with noise.
+"""The demo capture after an ideal structure from motion: exact cameras, noisy observations.
 
 Points lie on the true surface and are seen by every photo that they face, walls or not: for geometry that is no matter.
 """

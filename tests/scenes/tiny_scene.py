@@ -1,4 +1,4 @@
-"""A small dataset whose truth is known: photos of a Gaussian model, made by our own renderer, and its sparse points."""
+"""A small dataset with known truth: photos of a Gaussian model, made by our renderer, and its sparse points."""
 
 from __future__ import annotations
 

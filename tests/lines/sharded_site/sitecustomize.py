@@ -1,4 +1,4 @@
-"""On the path of a process, the whole program runs the line of `sharded` instead of its own, without presets."""
+"""On a process's path, makes the program run the pipeline of `sharded` instead of its own, without presets."""
 
 import sys
 
