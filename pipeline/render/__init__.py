@@ -1,1 +1,1 @@
-"""A model as it was trained to be rendered, and what is measured on its pictures."""
+"""Rendering a model as it was trained, and measuring its images."""

@@ -1,15 +1,15 @@
-"""Whether neighbouring views agree on how far the surface is: the disagreement of their median depths.
+"""Depth consistency of neighbouring views: the disagreement of their median depths.
 
-Haze that was fitted to one photo is a surface along that photo's rays alone: the neighbour, which sees the same place
-from beside, looks through it. So the pixels of a view are placed in space by its median depth and looked up in the
-neighbour's depth map, as the consistency checks of multi-view stereo do (Schönberger et al.: "Pixelwise View Selection
-for Unstructured Multi-View Stereo", ECCV 2016).
+Haze fitted to one photo is a surface only along that photo's rays: a neighbour that sees the same place from the side
+looks through it. The pixels of a view are therefore unprojected by its median depth and looked up in the neighbour's
+depth map, as in the consistency checks of multi-view stereo (Schönberger et al.: "Pixelwise View Selection for
+Unstructured Multi-View Stereo", ECCV 2016).
 
-What the neighbour sees nearer says nothing: something may hide the place from it, as corners do. What it sees farther
-is a contradiction: it looks through what the other calls a surface. The check is one-sided, and runs in both
-directions: haze before the neighbour is a hidden place in one direction and a contradiction in the other. One pixel is
-allowed: of the nine around, the depth that agrees best counts, or the outline of everything real would be a
-contradiction. A solid floater that both views see in the same place is none; ``free_space`` finds those.
+A nearer depth in the neighbour says nothing: something may occlude the place, as corners do. A farther depth is a
+contradiction: the neighbour looks through what the view shows as a surface. The check is one-sided and runs in both
+directions: haze in front of the neighbour is an occlusion in one direction and a contradiction in the other. One pixel
+of tolerance is allowed: the best-matching depth of the nine pixels counts; otherwise every real silhouette would be a
+contradiction. A solid floater that both views see in the same place is not detected here but by ``free_space``.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from jaxtyping import Float, Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 
 AGREEMENT = 0.05  # of the depth: far more than a pixel's step on slanted ground, far less than a floater's distance
-SAMPLE_EVERY = 4  # pixels, both ways: thousands are left of the smallest picture
-NO_SURFACE = 1.0  # stands for the infinite difference where the neighbour sees through everything, and caps the others
-PAIRS = 12  # of neighbours: enough for the median, and a few seconds of rendering
+SAMPLE_EVERY = 4  # pixels, both ways: thousands remain of the smallest image
+NO_SURFACE = 1.0  # stands for the infinite difference where the neighbour sees no surface, and caps the others
+PAIRS = 12  # of neighbours: enough for the median, in a few seconds of rendering
 
 
 @dataclass(frozen=True)
 class DepthDisagreement:
-    """How far median depths of neighbouring views are apart.
+    """Disagreement of the median depths of neighbouring views.
 
     Attributes:
-        median: Of the differences' magnitudes, a share of the depth; None without pixels.
-        share: Of the pixels where the neighbour sees more than `AGREEMENT` farther; None without pixels.
-        pixels: How many were compared.
+        median: Median magnitude of the differences, as a share of the depth; None without pixels.
+        share: Share of the pixels where the neighbour sees more than `AGREEMENT` farther; None without pixels.
+        pixels: Number of pixels compared.
     """
 
     median: float | None
@@ -44,11 +44,11 @@ class DepthDisagreement:
 
 
 def neighbouring_pairs(seen: Sequence[Int64[np.ndarray, " _"]], most: int = PAIRS) -> list[tuple[int, int]]:
-    """Pairs of views that share sparse points: evenly chosen views, each with the one that shares most with it.
+    """Pairs of views that share sparse points: evenly chosen views, each with the view that shares most.
 
     Args:
         seen: Rows of the points that each view observes.
-        most: Pairs at most.
+        most: Maximum number of pairs.
 
     Returns:
         Pairs of indices, the smaller first, each once, in order.
@@ -72,17 +72,17 @@ def neighbouring_pairs(seen: Sequence[Int64[np.ndarray, " _"]], most: int = PAIR
 def depth_differences(
     camera: Camera, depth: Float[np.ndarray, "h w"], neighbour: Camera, neighbour_depth: Float[np.ndarray, "nh nw"]
 ) -> Float64[np.ndarray, " k"]:
-    """How much farther a neighbour sees than where a view says that the surface is, pixel by pixel.
+    """How much farther a neighbour sees than the surface in a view, per pixel.
 
     Args:
-        camera: The view's, in its depth map's grid.
+        camera: The view's camera, at the size of its depth map.
         depth: Its median depth, world units along the view axis; 0 or not finite where it has none.
-        neighbour: The neighbour's, in its depth map's grid.
-        neighbour_depth: The same for it; where it has none, it sees through.
+        neighbour: The neighbour's camera, at the size of its depth map.
+        neighbour_depth: The neighbour's depth; without one, it sees no surface.
 
     Returns:
-        (neighbour's depth - the place's) / the place's, `NO_SURFACE` at most, of every few pixels: those that the
-        view gives a depth, that fall into the neighbour's picture, and that nothing nearer hides from it.
+        (neighbour's depth - point's depth) / point's depth, at most `NO_SURFACE`, for every few pixels that have a
+        depth, project into the neighbour's image and are not occluded there.
     """
     rows, columns = np.mgrid[
         SAMPLE_EVERY // 2 : camera.height : SAMPLE_EVERY, SAMPLE_EVERY // 2 : camera.width : SAMPLE_EVERY
@@ -100,7 +100,7 @@ def depth_differences(
 def _best_around(
     pixels: Int64[np.ndarray, "k 2"], z: Float64[np.ndarray, " k"], depth: Float[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, " k"]:
-    """Of the nine pixels around each, the relative difference of least magnitude."""
+    """The relative difference of smallest magnitude among the nine pixels around each."""
     h, w = depth.shape
     best = np.full(len(z), NO_SURFACE)
     for down in (-1, 0, 1):
@@ -114,10 +114,10 @@ def _best_around(
 
 
 def depth_disagreement(differences: Sequence[Float64[np.ndarray, " _"]]) -> DepthDisagreement:
-    """The figures of all compared pixels.
+    """The figures over all compared pixels.
 
     Args:
-        differences: Of ``depth_differences``, of both directions of each pair.
+        differences: Results of ``depth_differences``, for both directions of each pair.
     """
     every = np.concatenate([np.empty(0), *differences])
     if every.size == 0:

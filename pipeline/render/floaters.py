@@ -1,5 +1,4 @@
-"""What evaluation says of floaters: the veil before held-out photos, the part of the splat in free space, and whether
-neighbouring views agree."""
+"""Floater metrics: veil in front of held-out photos, share of the splat in free space, depth consistency."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ from splatpipe.pipeline.splat.free_space import free_space, near_or_free, share_
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 
-LARGEST_MEGAPIXELS = 0.5  # of a depth map: what floats is larger than its pixels, and figures of all sizes compare
+LARGEST_MEGAPIXELS = 0.5  # of a depth map: floaters are larger than its pixels, and results of all sizes compare
 
 
 def measure_floaters(
@@ -35,14 +34,14 @@ def measure_floaters(
     options: rasterizer.RenderOptions,
     area: PlanArea | None = None,
 ) -> dict[str, Any]:
-    """The figures of `floaters` in metrics.json; None where the sparse model does not tell.
+    """The figures of `floaters` in metrics.json; None where the sparse model gives no answer.
 
-    All registered photos say where the air is. That is also what training goes by, with its own photos, so that only
-    the veil before held-out photos, which is measured in another way, is a verdict on it.
+    Free space is determined from all registered photos. Training uses the same criterion with its own photos, so only
+    the veil in front of held-out photos, which is measured differently, is an independent check.
 
     Args:
         gaussians: The model.
-        cameras: Of all registered photos, at the size that the model is evaluated at.
+        cameras: Cameras of all registered photos, at the evaluation size.
         held_out: Names of the photos that were not trained on.
         dataset: Their dataset, with the sparse points.
         options: How the model is rendered.
@@ -85,7 +84,7 @@ def _inside(area: PlanArea, gaussians: Gaussians) -> Bool[Tensor, " n"]:
 
 
 def _flagged(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> Gaussians:
-    """The same Gaussians, the chosen white and the others black: a render is the part of the light that they give."""
+    """The same Gaussians, the chosen ones white and the others black: a render shows their share of light."""
     colours = rgb_to_dc(chosen.to(gaussians.sh)[:, None].expand(-1, 3))
     return replace(gaussians, sh=colours[:, None].contiguous())
 
@@ -93,7 +92,7 @@ def _flagged(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> Gaussians:
 def _look(
     flagged: Gaussians, camera: Camera, options: rasterizer.RenderOptions
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, " 2"]]:
-    """A view's median depth, and the light that reaches it: from the chosen Gaussians, and from all."""
+    """A view's median depth, and the total light that it gets from the chosen Gaussians and from all."""
     with torch.no_grad():
         rendered = rasterizer.render(flagged, camera, options.for_depths())
     light = [part.numpy(force=True).sum(dtype=np.float64) for part in (rendered.colour[..., 0], rendered.alpha)]

@@ -1,4 +1,4 @@
-"""A trained model as it was trained to be rendered: its colours before its sky, its depths, its normals."""
+"""Rendering a model as it was trained: colours over its sky, depths and normals."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from splatpipe.pipeline.splat.panorama import STEP_PX, Panorama, composite_over
 from splatpipe.pipeline.splat.sh import rgb_to_dc
 
 Model = tuple[Gaussians, Panorama | None]
-SURFACE = 0.5  # least alpha of a pixel that shows one, as for the median depth
-MEAN_OFF_PX = 2.0  # on the ground, that a mean depth may be off the median: beyond, it is haze that tells
-STRIP_PIXELS = 1 << 21  # that are rendered at once: a picture of 100 megapixels takes no more memory than one of two
+SURFACE = 0.5  # minimum alpha of a pixel that shows a surface, as for the median depth
+MEAN_OFF_PX = 2.0  # maximum distance of a mean depth from the median, in GSD: beyond it the mean follows haze
+STRIP_PIXELS = 1 << 21  # rendered at once: an image of 100 megapixels takes no more memory than one of two
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class Rendering:
     """How a model is to be rendered, known before it is trained.
 
     Attributes:
-        antialias: With opacities that allow for the blur on screen.
-        background: What is behind it, red, green, blue, 0..1.
-        near: Of the near plane, world units.
+        antialias: Whether opacities compensate for the screen-space blur.
+        background: Background colour: red, green, blue, 0..1.
+        near: Near plane, world units.
         megapixels: Photos are reduced to at most this size; None keeps the dataset's size.
     """
 
@@ -48,7 +48,7 @@ class Rendering:
         return json.dumps(asdict(self), indent=1) + "\n"
 
     def options(self, gaussians: Gaussians) -> rasterizer.RenderOptions:
-        """The rasterizer's, for a model of its degree."""
+        """The rasterizer's options for a model."""
         return rasterizer.RenderOptions(
             sh_degree=gaussians.sh_degree,
             background=self.background,
@@ -59,7 +59,7 @@ class Rendering:
 
 
 def load_rendering(path: Path) -> Rendering:
-    """Read what `train` left.
+    """Read the output `rendering.json` of `train`.
 
     Raises:
         StageError: if it is not such a file.
@@ -77,7 +77,7 @@ def as_trained(rendering: Path, gaussians: Gaussians) -> tuple[rasterizer.Render
     """How the model was trained to be rendered, and the megapixels that photos were reduced to.
 
     Args:
-        rendering: `train.rendering`.
+        rendering: Path of `train.rendering`.
         gaussians: The model.
 
     Raises:
@@ -88,13 +88,13 @@ def as_trained(rendering: Path, gaussians: Gaussians) -> tuple[rasterizer.Render
 
 
 def placed(model: Model, device: Device) -> Model:
-    """The model where it is rendered."""
+    """The model on the rendering device."""
     gaussians, sky = model
     return gaussians.to(device.tensors), None if sky is None else sky.to(device.tensors)
 
 
 def strips(camera: Camera) -> list[Camera]:
-    """Parts of a picture from top to bottom, of ``STRIP_PIXELS`` at most, whose borders are on the sky's nodes."""
+    """Strips of an image from top to bottom, of at most ``STRIP_PIXELS``, with borders on the sky's nodes."""
     rows = camera.height
     if camera.width * rows > STRIP_PIXELS:
         rows = max(STEP_PX, STRIP_PIXELS // camera.width // STEP_PX * STEP_PX)
@@ -103,7 +103,7 @@ def strips(camera: Camera) -> list[Camera]:
 
 
 def _by_strips(camera: Camera, made: Callable[[Camera], np.ndarray]) -> np.ndarray:
-    """A picture made strip by strip, in one array from the start."""
+    """An image made strip by strip, into a single array."""
     first, *rest = strips(camera)
     part = made(first)
     if not rest:
@@ -145,10 +145,10 @@ def _depths(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOpti
 def render_mean_depth(
     gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions
 ) -> Float[np.ndarray, "h w"]:
-    """A camera's mean depth, of all that a ray meets by the light that each gives, as ``render_depth``.
+    """A camera's mean depth along each ray, weighted by contribution; units as for ``render_depth``.
 
-    No farther than ``MEAN_OFF_PX`` pixels on the ground from the median, which what shines through from far behind does
-    not draw behind the surface. Of a model that was flattened, the mean is the surer one of the two.
+    Clamped to ``MEAN_OFF_PX`` GSD around the median, which distant background shining through does not pull behind the
+    surface. For a flattened model the mean is the more accurate of the two.
     """
     with torch.no_grad():
         return _by_strips(camera, lambda strip: _mean_depths(gaussians, strip, options.for_depths()))
@@ -166,11 +166,11 @@ def _mean_depths(gaussians: Gaussians, camera: Camera, options: rasterizer.Rende
 def render_normals(
     gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions
 ) -> Float[np.ndarray, "h w 3"]:
-    """Normals of the surface that a camera sees, unit vectors in the model's frame towards it; 0 where nothing is.
+    """Surface normals in a camera's view: unit vectors in the model's frame, towards the camera; 0 without a surface.
 
-    From the rasterizer's own sums: a Gaussian's normal is that of the plane on which rays are deepest in it (the one
-    that the depths come from: Zhang et al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting", 2024), and takes the
-    place of its colour. The median depth's gradient would have a step wherever one Gaussian takes over from the next.
+    Each Gaussian is rendered with its normal as colour: that of the plane on which rays peak in it (the one that depths
+    come from: Zhang et al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting", 2024). The gradient of the median depth
+    would have a step wherever one Gaussian takes over from the next.
     """
     with torch.no_grad():
         splats = project(gaussians, camera, options)
@@ -189,7 +189,7 @@ def render_normals(
 
 
 def _directions(coloured: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w 3"]:
-    """Unit vectors of Gaussians whose colours are theirs, halved about 0.5."""
+    """Unit vectors from Gaussians whose colours encode them, as 0.5 + 0.5 n."""
     rendered = rasterizer.render(coloured, camera, options)
     alpha = rendered.alpha[..., None]
     summed = 2.0 * rendered.colour - alpha

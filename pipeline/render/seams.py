@@ -1,20 +1,20 @@
-"""Whether a splat that was put together from blocks shows where: gaps, doubled surfaces and steps of colour on borders.
+"""Seam detection in a splat merged from blocks: gaps, doubled surfaces and colour steps along borders.
 
-Each border is looked at by cameras in the vertical plane that it spans, from the height of the flight: straight down,
-and obliquely along it both ways. There the border is the picture's middle column, exactly and whatever the depth, so
-that the splat's own depth is not asked where its two sides are. From each picture that of a model without blocks, be it
-a coarse one, is taken off, and with it most edges that the scene has of itself. What is measured on the border's column
-is also measured on the columns beside it, where no border is: a seam is what stands out among them, all along the
-border or a piece of it. So what is left of the scene's edges raises what a seam has to show, instead of an alarm.
+Each border is rendered by cameras in the vertical plane that it spans, from flight height: nadir, and oblique along it
+both ways. The border is then exactly the image's middle column, whatever the depth, so the splat's own depth is not
+needed to tell its two sides apart. A render of a model without blocks, e.g. the coarse one, is subtracted from each
+image, and with it most of the scene's own edges. Each measure at the border's column is also taken at the columns
+beside it, where there is no border: a seam is what stands out among them, along the whole border or a piece of it.
+Remaining edges of the scene thus raise the threshold for a seam instead of causing false alarms.
 
-| measure | in a strip at the border, against strips on its two sides | kind |
+| measure | in a strip at the border, compared with strips on its two sides | kind |
 |---|---|---|
-| alpha | how much less of the light the splat stops | gap |
+| alpha | how much lower the opacity is | gap |
 | hole | how much deeper the surface lies, pixels | gap |
 | bump | how much nearer the surface lies, pixels | doubled |
-| spread | how much farther along the rays what stops them is spread, pixels | doubled |
-| line | how far its colour is from the mean of both sides' | colour |
-| step | how far the two sides' colours are apart | colour |
+| spread | how much larger the spread of depths along the rays is, pixels | doubled |
+| line | difference of its colour from the mean of both sides | colour |
+| step | difference between the two sides' colours | colour |
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 KINDS = {"alpha": "gap", "hole": "gap", "bump": "doubled", "spread": "doubled", "line": "colour", "step": "colour"}
-WIDTHS = (2, 4, 8, 16)  # pixels of half a strip: a gap's, or that of the step that Gaussians of some pixels make
+WIDTHS = (2, 4, 8, 16)  # half widths of a strip, pixels: of a gap, or of a step made by Gaussians of several pixels
 REACH = 160  # columns beside the border that are compared with it
 GUARD = 2  # times the strip's width: nearer columns see the seam themselves
-MOST = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05, "step": 0.08}  # of a row: one edge of a
-# house is not to outweigh all others
-STATION = 0.7  # of the height above the surface, from one camera over the border to the next
+MOST = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05, "step": 0.08}  # cap per row: a single
+# edge of a house must not outweigh all others
+STATION = 0.7  # spacing of cameras along the border, as a share of the height above the surface
 FARTHEST = 2.5  # times that height: farther rows are seen at too small an angle
-PIECE = 0.35  # of that height: the least length of a border that is judged by itself
-LEAST_ROWS = 24  # of a piece, in all pictures together
+PIECE = 0.35  # of that height: minimum length of a piece of border that is judged by itself
+LEAST_ROWS = 24  # per piece, over all images
 TILT = math.radians(45.0)  # of the oblique cameras, below the horizon
-LIMITS = {  # of a seam along a whole border: score, and size; `benchmarks/seams.py` prints what they find
+LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks/seams.py` prints what they detect
     "alpha": (5.0, 0.002),
     "hole": (4.2, 0.15),
     "bump": (4.2, 0.25),
@@ -51,22 +51,22 @@ LIMITS = {  # of a seam along a whole border: score, and size; `benchmarks/seams
     "line": (7.5, 0.015),
     "step": (5.5, 0.012),
 }
-PIECE_FACTORS = (2.2, 2.5)  # on both for a piece of a border, or one that is as short: chance has more tries there
-SHORT = 0.7  # of the height: a border that is no longer counts as a piece
-LEVEL_COLUMNS = 32  # on each side of the border, whose median depth says where a row lies
+PIECE_FACTORS = (2.2, 2.5)  # on both limits for a piece or a short border, where chance has more tries
+SHORT = 0.7  # of the height: a border of at most this length counts as a piece
+LEVEL_COLUMNS = 32  # on each side of the border: their median depth locates a row
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What a measure says of one piece of a border.
+    """The value of a measure at one piece of a border.
 
     Attributes:
         measure: One of `KINDS`.
-        piece: Its number along the border; -1 for the whole border.
+        piece: Index of the piece along the border; -1 for the whole border.
         width: Half the strip's width, pixels.
-        size: At the border.
-        others: At the columns beside it.
-        rows: Of pictures that it was taken from.
+        size: Value at the border.
+        others: Values at the columns beside it.
+        rows: Number of image rows that it was taken from.
     """
 
     measure: str
@@ -78,15 +78,15 @@ class Response:
 
     @property
     def score(self) -> float:
-        """How far it stands out among the others, in their standard deviations."""
+        """How far it stands out from the others, in their standard deviations."""
         return (self.size - float(self.others.mean())) / max(float(self.others.std()), 1e-9)
 
     def excess(self, score_factor: float, size_factor: float) -> float:
-        """How often it has what a seam is to have; 1 or more is one.
+        """Ratio to the seam limits; 1 or more is a seam.
 
         Args:
-            score_factor: On the least score.
-            size_factor: On the least size.
+            score_factor: Factor on the minimum score.
+            size_factor: Factor on the minimum size.
         """
         score, size = LIMITS[self.measure]
         return min(self.score / (score * score_factor), self.size / (size * size_factor))
@@ -94,13 +94,13 @@ class Response:
 
 @dataclass(frozen=True)
 class Seam:
-    """A border that can be seen.
+    """A visible border.
 
     Attributes:
         kind: ``gap``, ``doubled`` or ``colour``.
-        response: What shows it most.
-        start: Where on the border it begins, plan units.
-        end: Where it ends.
+        response: The strongest response.
+        start: Where along the border it begins, plan units.
+        end: Where it ends, plan units.
     """
 
     kind: str
@@ -111,10 +111,10 @@ class Seam:
 
 @dataclass(frozen=True, eq=False)
 class _BorderRows:
-    """Rows of a picture that show the border, about its column.
+    """The rows of an image that show the border, around its column.
 
     Attributes:
-        along: Where on the border each row lies, plan units.
+        along: Position of each row along the border, plan units.
         channels: Opacity, depth and spread of depth in pixels, red, green, blue of the columns from left to right.
     """
 
@@ -125,13 +125,13 @@ class _BorderRows:
 def border_cameras(
     gaussians: Gaussians, plan: GroundPlan, line: PlanLine, like: Sequence[Camera], options: rasterizer.RenderOptions
 ) -> tuple[list[Camera], float]:
-    """Cameras over a border, and how high above the surface they stand, world units; none where no surface is.
+    """Cameras over a border and their height above the surface, world units; no cameras where there is no surface.
 
     Args:
         gaussians: The model.
-        plan: The ground's.
+        plan: The ground plan.
         line: The border.
-        like: The photos' cameras, at the size that the model is judged at: the new ones are of their middle kind.
+        like: The photos' cameras, at the evaluation size; the new ones copy the one of median focal length.
         options: How the model is rendered.
     """
     middle = sorted(like, key=lambda camera: (camera.fx, camera.name))[len(like) // 2]
@@ -162,13 +162,13 @@ def find_seams(
     like: Sequence[Camera],
     options: rasterizer.RenderOptions,
 ) -> list[Seam]:
-    """What shows of a border: of each kind the strongest sign; none where nobody would see it.
+    """The visible seams of a border: the strongest of each kind; empty if none is visible.
 
     Args:
         models: As for ``responses``.
-        plan: The ground's, in the model's frame.
+        plan: The ground plan, in the model's frame.
         line: The border, in plan.
-        like: The photos' cameras, at the size that the model is judged at.
+        like: The photos' cameras, at the evaluation size.
         options: How the model is rendered.
     """
     found, height = responses(models, plan, line, like, options)
@@ -192,13 +192,13 @@ def responses(
     like: Sequence[Camera],
     options: rasterizer.RenderOptions,
 ) -> tuple[list[Response], float]:
-    """All that the measures say of a border: of each of its pieces, and of all of it; and how high the cameras stand.
+    """All measures of a border, for each piece and the whole, and the height of the cameras, world units.
 
     Args:
-        models: The one that was put together, and one of the same scene without blocks; without sky.
-        plan: The ground's, in the model's frame.
+        models: The merged model, and one of the same scene without blocks; both without sky.
+        plan: The ground plan, in the model's frame.
         line: The border, in plan.
-        like: The photos' cameras, at the size that the model is judged at.
+        like: The photos' cameras, at the evaluation size.
         options: How the model is rendered.
     """
     cameras, height = border_cameras(models[0], plan, line, like, options)
@@ -206,14 +206,14 @@ def responses(
         return [], height
     pieces = max(1, int(line.length / (PIECE * height)))
     sums: dict[tuple[int, str], Float64[np.ndarray, "p _ k"]] = {}
-    counts = np.zeros(pieces + 1, np.int64)  # of the rows of all, and of each piece
-    for camera in cameras:  # each picture's rows are added up at once: all of them would be hundreds of megabytes
+    counts = np.zeros(pieces + 1, np.int64)  # rows in total, and of each piece
+    for camera in cameras:  # summed per image: all rows together would take hundreds of megabytes
         rows = _rows(models, plan, line, camera, (options, height))
         number = np.clip((rows.along / line.length * pieces).astype(np.int64), 0, pieces - 1)
         chosen = [np.ones(len(number), np.bool_), *(number == piece for piece in range(pieces))]
         counts += [int(part.sum()) for part in chosen]
         reach = rows.channels.shape[2] // 2
-        for width in (width for width in WIDTHS if reach >= (4 + GUARD) * width + 4):  # narrow pictures have fewer
+        for width in (width for width in WIDTHS if reach >= (4 + GUARD) * width + 4):  # narrow images have fewer
             for name, values in _measured(rows.channels, width).items():
                 added = np.stack([values[:, part].sum(axis=1) for part in chosen])
                 sums[width, name] = sums.get((width, name), 0.0) + added
@@ -227,7 +227,7 @@ def responses(
 
 
 def _response(mean: Float64[np.ndarray, "_ k"], which: tuple[str, int, int], rows: int) -> Response:
-    """A measure's mean over rows at each column, as it is at the border and beside it."""
+    """The response from a measure's mean over rows at each column."""
     curve = np.linalg.norm(mean, axis=0) if len(mean) > 1 else mean[0]
     middle = len(curve) // 2
     beside = np.abs(np.arange(len(curve)) - middle) >= GUARD * which[2] + 4
@@ -235,12 +235,12 @@ def _response(mean: Float64[np.ndarray, "_ k"], which: tuple[str, int, int], row
 
 
 def _measured(channels: Float64[np.ndarray, "6 r c"], width: int) -> dict[str, Float64[np.ndarray, "_ r k"]]:
-    """Each measure of each row, at each column that has its strips."""
+    """Each measure for each row, at each column with room for the strips."""
     sums = np.concatenate([np.zeros((*channels.shape[:2], 1)), np.cumsum(channels, axis=2)], axis=2)
     places = channels.shape[2] + 1 - 6 * width
 
     def mean(begin: int, end: int) -> Float64[np.ndarray, "6 r k"]:
-        """Of the columns from ``begin`` to ``end`` right of each place."""
+        """Mean of the columns from ``begin`` to ``end`` right of each place."""
         first, last = (sums[..., 3 * width + at :][..., :places] for at in (begin, end))
         return np.asarray((last - first) / (end - begin))
 
@@ -265,7 +265,7 @@ def _rows(
     camera: Camera,
     how: tuple[rasterizer.RenderOptions, float],
 ) -> _BorderRows:
-    """What a camera over a border shows of it, less what it shows of the second model."""
+    """The rows of a camera over a border, less those of the second model."""
     options, height = how
     stacks = [_stack(model, camera, options, height) for model in models]
     reach = stacks[0].shape[2] // 2
@@ -291,7 +291,7 @@ def _rows(
 def _stack(
     gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions, height: float
 ) -> Float64[np.ndarray, "6 h c"]:
-    """Opacity, median depth, spread of depth, red, green and blue of the columns about a picture's middle."""
+    """Opacity, median depth, spread of depth, red, green and blue of the columns around an image's middle."""
     with torch.no_grad():
         seen = rasterizer.render(gaussians, camera, options).colour
         deep = rasterizer.render(gaussians, camera, replace(options.for_depths(), depth_origin=height))
@@ -305,7 +305,7 @@ def _stack(
 
 
 def _height_above(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> float | None:
-    """The median depth below a camera that looks straight down; None where it sees no surface."""
+    """The median depth below a nadir camera; None if it sees no surface."""
     with torch.no_grad():
         depth = rasterizer.render(gaussians, camera, options.for_depths()).median_depth.numpy(force=True)
     near = depth[:, camera.width // 2 - LEVEL_COLUMNS : camera.width // 2 + LEVEL_COLUMNS]
@@ -313,7 +313,7 @@ def _height_above(gaussians: Gaussians, camera: Camera, options: rasterizer.Rend
 
 
 def _view(like: Camera, plan: GroundPlan, ahead: np.ndarray, forward: np.ndarray) -> Camera:
-    """A camera at the origin that looks forward, in a vertical plane which is its middle column: even, and centred."""
+    """A centred camera of even size at the origin that looks forward, its middle column in a vertical plane."""
     width, height = min(like.width - like.width % 2, 2 * REACH), like.height - like.height % 2
     right = np.cross(ahead, plan.up)
     pose = np.eye(4)

@@ -1,8 +1,8 @@
-"""How accurate the splat itself is: surveyed points against where its own depth puts them.
+"""Accuracy of the splat itself: surveyed points compared with their positions by the splat's own depth.
 
-Each observed pixel of a surveyed point is unprojected at the trained model's rendered median depth; the median over the
-photos, a coordinate at a time, is compared with the survey. Photos that were held out of training speak alone where
-enough of them see the point: the others' pixels were fitted.
+Each observed pixel of a surveyed point is unprojected at the trained model's rendered median depth; the per-coordinate
+median over the photos is compared with the survey. If enough held-out photos see the point, only they are used, because
+the others' pixels were fitted.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.survey.frames import Frame, load_frame
 from splatpipe.pipeline.survey.residuals import accuracy_table
 
-ONE_SURFACE = 0.02  # of the depth, between neighbouring pixels: ground at a slant has less, an edge far more
-ENOUGH = 3  # held-out photos of a point: of two, a single floater moves the median by half of its distance
-DIGITS = 5  # of lengths in metres: a hundredth of a millimetre
+ONE_SURFACE = 0.02  # of the depth, between neighbouring pixels: sloping ground has less, an edge far more
+ENOUGH = 3  # held-out photos of a point: with two, a single floater moves the median by half of its distance
+DIGITS = 5  # decimals of lengths in metres: a hundredth of a millimetre
 POINT_FACTS = ("name", "role", "why", "surveyed_crs", "surveyed_m", "sigma_m", "estimated_m", "residual_m")
 DepthMap = Float[np.ndarray, "h w"]
 
@@ -49,10 +49,10 @@ class ObservedPoint:
     """A surveyed point and the photos that show it.
 
     Attributes:
-        name: Of the point.
+        name: Name of the point.
         role: ``control``, ``check`` or ``left_out``.
-        place_m: East, north, up in the world frame; up is NaN where it was not measured.
-        observations: Those in photos of the dataset, without marks that georef left out as wrong.
+        place_m: East, north, up in the world frame; up is NaN if it was not measured.
+        observations: Those in photos of the dataset, without marks that georef rejected.
     """
 
     name: str
@@ -67,13 +67,13 @@ def measure_accuracy(
     held_out: Sequence[str],
     depth_of: Callable[[Camera], DepthMap],
 ) -> dict[str, Any]:
-    """What metrics.json has as `accuracy`: georef's tables and points, and the splat's own.
+    """The `accuracy` entry of metrics.json: georef's tables and points, and the splat's own.
 
     Args:
-        parts: With ``georef.frame``, ``georef.control``, ``georef.accuracy`` and ``georef.boundary``, outside of which
-            no point speaks for the splat; where a dataset alone is evaluated, these are not there.
-        cameras: Of the dataset's photos, at the size that depth is rendered at.
-        held_out: Names of photos that training did not see.
+        parts: Has ``georef.frame``, ``georef.control``, ``georef.accuracy`` and ``georef.boundary``, outside of which
+            points do not count for the splat; all absent if only a dataset is evaluated.
+        cameras: Cameras of the dataset's photos, at the size that depth is rendered at.
+        held_out: Names of the held-out photos.
         depth_of: Renders a photo's median depth.
 
     Raises:
@@ -102,7 +102,7 @@ def measure_accuracy(
 
 
 def georef_points(control: Path) -> list[dict[str, Any]]:
-    """Each point of `control.json` with what georef found of it, without its single observations.
+    """Each point of `control.json` with georef's results, without its individual observations.
 
     Raises:
         StageError: if it is broken.
@@ -145,16 +145,16 @@ def read_surveyed(control: Path, photos: Sequence[str]) -> list[ObservedPoint]:
 
 
 def depth_at(depth: DepthMap, pixel: Float64[np.ndarray, " 2"]) -> float | None:
-    """Depth of a map between its pixels' centres; of the nearest pixel where the four around are not of one surface.
+    """Depth interpolated between pixel centres; that of the nearest pixel if the four around are not one surface.
 
-    On a plane 1 / depth is linear over the picture, so that is what is interpolated.
+    On a plane 1 / depth is linear over the image, so 1 / depth is interpolated.
 
     Args:
         depth: World units along the view axis; 0 where there is none.
         pixel: x, y; the centre of the first pixel is (0.5, 0.5).
 
     Returns:
-        None outside of the picture, and where there is no depth.
+        World units; None outside the image and where there is no depth.
     """
     h, w = depth.shape
     if not (0.0 <= pixel[0] < w and 0.0 <= pixel[1] < h):
@@ -171,13 +171,13 @@ def depth_at(depth: DepthMap, pixel: Float64[np.ndarray, " 2"]) -> float | None:
 
 
 def _chosen(point: ObservedPoint, held_out: Sequence[str]) -> list[Observation]:
-    """Those in held-out photos; all of them where these are too few for a median."""
+    """The observations in held-out photos; all observations if these are too few for a median."""
     unseen = [seen for seen in point.observations if seen.photo in set(held_out)]
     return unseen if len(unseen) >= ENOUGH else list(point.observations)
 
 
 def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Frame) -> list[dict[str, Any]]:
-    """Where the splat's depth puts an observation, in the world; nothing where it has none."""
+    """World position of an observation by the splat's depth; empty if it has none."""
     pixel = camera.pixels_of(seen.ray)
     z = depth_at(depth, pixel)
     if z is None:

@@ -1,10 +1,9 @@
-"""What hangs before the points that held-out photos see: a verdict on floaters that training has no say in.
+"""The veil in front of points that held-out photos see: a floater metric independent of training.
 
-Training removes what hangs in the space that its own photos see through (``splat.free_space``): Gaussian by Gaussian,
-by the least depth of a cell's points. Here rays decide, those of photos that were never trained on: from a held-out
-photo's camera to each of the sparse points that it observes nothing is to stop the light. What does is a floater,
-whether solid or a haze of many, and also where no cell of a training photo says that the air is free. Where no photo is
-held out, training photos are all that there are to look from.
+Training removes Gaussians in the free space of its own photos (``splat.free_space``), one by one, by the smallest depth
+of a cell's points. Here the rays of photos that were never trained on decide: nothing should stop the light between a
+held-out photo's camera and each sparse point that it observes. Whatever does is a floater, solid or a haze of many,
+even where no cell of a training photo shows free space. If no photo is held out, training photos are used.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.free_space import MARGIN, SUPPORT_TRACK, spread_along
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-LARGEST_MEGAPIXELS = 0.5  # of the renders: what floats is larger than their pixels
-SLICES = 8  # of a photo's points by depth, each with a render of what is nearer than its first: 8 renders a photo
+LARGEST_MEGAPIXELS = 0.5  # of the renders: floaters are larger than their pixels
+SLICES = 8  # of a photo's points by depth, each with a render of everything nearer than its first: 8 renders a photo
 LEAST_POINTS = 20  # of a photo that counts: fewer lie in one corner of it
 MOST_TRAINED = (
     64  # training photos, evenly over the capture, where none is held out: as many as a large capture holds out
@@ -39,13 +38,13 @@ def measure_veil(
     held_out: Container[str],
     options: rasterizer.RenderOptions,
 ) -> dict[str, Any]:
-    """The figures of `floaters.veil` in metrics.json; None where no photo that is asked sees points enough.
+    """The figures of `floaters.veil` in metrics.json; None if no photo used sees enough points.
 
     Args:
         gaussians: The model.
-        cameras: Of all registered photos.
+        cameras: Cameras of all registered photos.
         observed: The sparse points, world units, and the rows of those that each camera's photo observes.
-        held_out: Names of the photos that were not trained on; where no camera's is, training photos are asked.
+        held_out: Names of the held-out photos; if there are none among the cameras, training photos are used.
         options: How the model is rendered.
     """
     asked = [place for place, camera in enumerate(cameras) if camera.name in held_out]
@@ -54,7 +53,7 @@ def measure_veil(
         asked = list(range(0, len(cameras), max(1, math.ceil(len(cameras) / MOST_TRAINED))))
     xyz, seen = observed
     photos = sum((np.bincount(np.unique(rows), minlength=len(xyz)) for rows in seen), np.zeros(len(xyz), np.int64))
-    sure = (photos >= SUPPORT_TRACK) & np.isfinite(xyz).all(axis=1)  # a point of two rays may lie behind the surface
+    sure = (photos >= SUPPORT_TRACK) & np.isfinite(xyz).all(axis=1)  # a two-ray point may lie behind the surface
     veils: dict[str, float] = {}
     points = 0
     for place in asked:
@@ -77,19 +76,20 @@ def measure_veil(
 def light_stopped(
     gaussians: Gaussians, camera: Camera, xyz: Float64[np.ndarray, "n 3"], options: rasterizer.RenderOptions
 ) -> Float64[np.ndarray, " k"]:
-    """The part of the light, 0 to 1, that is stopped on its way from points to a camera.
+    """The share of light, 0 to 1, that is stopped on its way from points to a camera.
 
-    A tenth of the way before a point does not count, nor what reaches into it with one of its standard deviations: that
-    is the surface. Points come in slices of depth, each with what is nearer than its first, so it is a little more.
+    The last tenth of the way to a point does not count, nor Gaussians that reach into it within one standard deviation:
+    that is the surface. Points are processed in depth slices, each with everything nearer than its first point, so the
+    margin is slightly larger for the others.
 
     Args:
         gaussians: The model.
         camera: The camera.
-        xyz: The points, world units; those outside the picture are left out.
-        options: How the model is rendered: what its near plane cuts off is in no picture, and stops nothing.
+        xyz: The points, world units; those outside the image are left out.
+        options: How the model is rendered; Gaussians before its near plane stop nothing.
 
     Returns:
-        The accumulated opacity of each point in the picture, in the order of their depths.
+        The accumulated opacity in front of each point in the image, in order of depth.
     """
     _, pixels, depths = camera.in_view(xyz)
     order = np.argsort(depths, kind="stable")
@@ -97,7 +97,7 @@ def light_stopped(
     reach = camera.depths(gaussians.means.numpy(force=True).astype(np.float64))
     reach += spread_along(gaussians, np.arange(len(gaussians)), camera.cam_from_world[2, :3])
     stopped = np.zeros(len(depths))
-    options = replace(options, sh_degree=0, depth=False)  # alpha is all that counts
+    options = replace(options, sh_degree=0, depth=False)  # only alpha is used
     for part in np.array_split(np.arange(len(depths)), SLICES):
         before = np.flatnonzero(reach < (1.0 - MARGIN) * depths[part[0]]) if len(part) else part
         if len(before):

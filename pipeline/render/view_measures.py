@@ -1,4 +1,4 @@
-"""Held-out views: how like its photo a render is, and the pictures of both that are kept."""
+"""Held-out views: similarity metrics of render and photo, and the images that are kept."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.splat import metrics
 
-ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels that is the brightest colour, the same in every picture
-EQUAL_DB = 100.0  # stands for the infinite PSNR of pictures that are equal: JSON has no infinity
+ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels shown as the brightest colour, in every image
+EQUAL_DB = 100.0  # stands for the infinite PSNR of identical images: JSON has no infinity
 MASKED_GREY = 128
-LEAST_INSIDE = 0.01  # of a picture: a photo that shows less inside a boundary tells nothing of it
+LEAST_INSIDE = 0.01  # of an image: a photo that shows less inside a boundary is not measured
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
 def evaluate_view(
     view: tuple[Camera, Pixels, Mask | None], render: Pixels, stem: Path, inside: Mask | None = None
 ) -> dict[str, Any]:
-    """Measure one view, and keep its pictures.
+    """Measure one view and write its images.
 
     Args:
-        view: The held-out photo at the size that it is judged at: camera, photo and mask.
-        render: What the model shows instead.
-        stem: Path of the pictures without their endings.
-        inside: Pixels that show what lies inside the boundary, which alone count then; None without one.
+        view: The held-out photo at evaluation size: camera, photo and mask.
+        render: The model's render of the view.
+        stem: Path of the images without suffixes.
+        inside: Pixels that show the area inside the boundary, the only ones that count then; None without a boundary.
 
     Returns:
-        Its name, the pictures' common stem, its size, and a figure a measure; with a boundary those of the ``whole``
-        picture, too.
+        Its name, the images' common stem, its size and the value of each metric; with a boundary also those of the
+        ``whole`` image.
     """
     camera, photo, mask = view
     whole = {} if inside is None else {"whole": measure(render, photo, mask)}
@@ -59,11 +59,11 @@ def evaluate_view(
 
 
 def shows_inside(area: PlanArea, camera: Camera, depth: Float[np.ndarray, "h w"]) -> Mask:
-    """Which pixels show what lies inside a boundary, as far as the model's own depth tells.
+    """Which pixels show the area inside a boundary, according to the model's own depth.
 
     Args:
-        area: In the model's frame.
-        camera: The view's.
+        area: The boundary's area, in the model's frame.
+        camera: The view's camera.
         depth: Its median depth along the view axis; 0 where there is none.
     """
     rows, columns = np.nonzero(depth > 0.0)
@@ -74,7 +74,7 @@ def shows_inside(area: PlanArea, camera: Camera, depth: Float[np.ndarray, "h w"]
 
 
 def measure(render: Pixels, photo: Pixels, mask: Mask | None) -> dict[str, float | None]:
-    """All measures of an 8-bit render against an 8-bit photo; None where one is not defined (too few pixels).
+    """All metrics of an 8-bit render against an 8-bit photo; None where one is undefined (too few pixels).
 
     Args:
         render: (h, w, 3).
@@ -89,16 +89,16 @@ def measure(render: Pixels, photo: Pixels, mask: Mask | None) -> dict[str, float
 def _measured(function: Callable[..., float], render: Tensor, photo: Tensor, mask: Tensor | None) -> float | None:
     try:
         value = float(function(render, photo, mask))
-    except ValueError:  # too few pixels for this measure
+    except ValueError:  # too few pixels for this metric
         return None
     finally:
-        return_free_heap()  # measures free hundreds of megabytes, which the heaps of several threads would keep
+        return_free_heap()  # metrics free hundreds of megabytes, which the heaps of several threads would keep
     value = min(value, EQUAL_DB) if function in (metrics.psnr, metrics.psnr_cc) else value
     return round(value, 6) if math.isfinite(value) else None
 
 
 def mean_measures(per_view: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Each measure's mean over the views in which it is defined; None without any."""
+    """Each metric's mean over the views in which it is defined; None without any."""
     means: dict[str, float | None] = {}
     for name in metrics.METRICS:
         values = [view[name] for view in per_view if view[name] is not None]
@@ -123,7 +123,7 @@ def error_picture(render: Pixels, photo: Pixels, mask: Mask | None) -> Pixels:
 
 
 def flat_stems(names: Sequence[str]) -> list[str]:
-    """File names without endings for photos whose names may have folders: safe and unique, also without case.
+    """File stems for photos whose names may contain folders: safe, and unique even ignoring case.
 
     Args:
         names: Photo names, in POSIX form.
