@@ -1,1 +1,1 @@
-"""Films: a camera's way through a scene, and the file that it becomes."""
+"""Films: a camera path through a scene, and the video file made from it."""

@@ -1,4 +1,4 @@
-"""How far places are from what is solid in a scene, so that a camera on its way flies through nothing."""
+"""Distances from positions to the solid parts of a scene, so that a camera path does not fly through anything."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-OPAQUE = 0.5  # least opacity of what a camera must not fly through
-MOST_POINTS = 400_000  # of which the distance is taken: more tell nothing more about metres
-WITNESSES = 8  # so many points have to be that near: a few floaters are no wall
+OPAQUE = 0.5  # minimum opacity of Gaussians that a camera must not fly through
+MOST_POINTS = 400_000  # used for distances: more do not help at the scale of metres
+WITNESSES = 8  # minimum number of points that near: a few floaters are not a wall
 
 
 class Clearance:
-    """Distances to the solid things of a scene."""
+    """Distances to the solid parts of a scene."""
 
     def __init__(self, solid: Float64[np.ndarray, "n 3"]) -> None:
         """Index the points.
 
         Args:
-            solid: Places that are solid, world units; those that are not finite are left out.
+            solid: Solid points, world units; non-finite ones are ignored.
         """
         solid = solid[np.isfinite(solid).all(axis=1)]
         solid = solid[:: max(1, -(-len(solid) // MOST_POINTS))]
         self._tree = cKDTree(solid) if len(solid) >= WITNESSES else None
 
     def at(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " m"]:
-        """Distance from each place to the `WITNESSES`-th nearest point, world units; infinite where none is."""
+        """Distance from each place to the `WITNESSES`-th nearest point, world units; infinite if there is none."""
         if self._tree is None or len(places) == 0:
             return np.full(len(places), np.inf)
         return np.asarray(self._tree.query(places, [WITNESSES])[0][:, 0])
@@ -41,13 +41,13 @@ class Clearance:
         Args:
             start: Where it begins.
             end: Where it ends.
-            step: At most so far apart, world units, > 0.
+            step: Maximum spacing of the samples, world units, > 0.
         """
         count = int(np.clip(np.ceil(np.linalg.norm(end - start) / step), 1, 1000)) + 1
         return self.at(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
 
 
 def solid_places(gaussians: Gaussians) -> Float64[np.ndarray, "n 3"]:
-    """Centres of the Gaussians that are rather opaque, in the model's frame."""
+    """Centres of the opaque Gaussians, in the model's frame."""
     opaque = torch.sigmoid(gaussians.opacity_logits.detach()) >= OPAQUE
     return gaussians.means.detach()[opaque].cpu().numpy().astype(np.float64)

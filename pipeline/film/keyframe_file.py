@@ -1,9 +1,10 @@
-"""Keyframes of a camera's way from an untrusted file, JSON or CSV, in the frame of `splat.ply`.
+"""Camera path keyframes from an untrusted file, JSON or CSV, in the frame of `splat.ply`.
 
 JSON is ``{"keyframes": [...]}`` or the list alone; each has ``position`` [east, north, up] and either ``target`` of the
-same kind or ``heading_deg`` (clockwise from north) and ``pitch_deg`` (0 level, -90 straight down); where all have
-``time_s`` they are passed at these times; ``fov_deg`` is the angle seen along the picture's longer side. CSV has the
-columns ``x, y, z`` and either ``target_x, target_y, target_z`` or ``heading, pitch``; ``time`` and ``fov`` if wanted.
+same form or ``heading_deg`` (clockwise from north) and ``pitch_deg`` (0 level, -90 straight down); if all have
+``time_s``, they are passed at these times; ``fov_deg`` is the field of view along the image's longer side. CSV has the
+columns ``x, y, z`` and either ``target_x, target_y, target_z`` or ``heading, pitch``; ``time`` and ``fov`` are
+optional.
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ KIND = TableKind(
 MOST_KEYFRAMES = 10_000
 LONGEST_S = 3600.0
 WIDEST_DEG, NARROWEST_DEG = 150.0, 1.0
-STEEPEST_DEG, LEAST_TILT_DEG = 90.0, 89.999  # straight down there still is a heading
-FULL_TURNS_DEG = 36_000.0  # of a heading: no way turns more often
+STEEPEST_DEG, LEAST_TILT_DEG = 90.0, 89.999  # keeps a heading defined when looking straight down
+FULL_TURNS_DEG = 36_000.0  # largest heading: no path turns more often
 SPELLINGS = {
     "x": ("x", "east", "e"),
     "y": ("y", "north", "n"),
@@ -71,13 +72,13 @@ Numbers = dict[str, float]
 
 @dataclass(frozen=True, eq=False)
 class Keyframes:
-    """What a file says.
+    """The keyframes of a file.
 
     Attributes:
-        route: In the world of `splat.ply`, x east.
-        targets: That are looked at; None where a keyframe has none.
-        times_s: Rising from 0; None where the file has none.
-        angles_deg: Seen along the picture's longer side; None where the file has none.
+        route: In the world frame of `splat.ply`, x east.
+        targets: Points to look at; None if a keyframe has none.
+        times_s: Increasing from 0; None if the file has none.
+        angles_deg: Field of view along the image's longer side; None if the file has none.
     """
 
     route: Route
@@ -86,20 +87,20 @@ class Keyframes:
     angles_deg: Float64[np.ndarray, " n"] | None
 
     def film(self, distance: float, fps: int, seconds: float) -> tuple[Route, Float64[np.ndarray, " frames"] | None]:
-        """A smooth way through the keyframes: at their times, else at an even speed.
+        """A smooth path through the keyframes: at their times, otherwise at an even speed.
 
-        Where all have targets, what is looked at moves as smoothly; else the direction does.
+        If all have targets, the target moves smoothly too; otherwise the viewing direction does.
 
         Args:
-            distance: Of what is looked at, world units: see ``Route.steps``.
+            distance: Distance of what is viewed, world units: see ``Route.steps``.
             fps: Frames per second.
-            seconds: That it lasts, where the file has no times.
+            seconds: Duration, if the file has no times.
 
         Returns:
-            A place a frame, and its angle where the file has angles.
+            One route position per frame, and the fields of view if the file has them.
 
         Raises:
-            UsageError: if there is no way: a single keyframe, or several that are the same.
+            UsageError: if there is no path: a single keyframe, or several identical ones.
         """
         if len(self.route) < 2:
             raise UsageError("A film needs at least two keyframes.", hint="For a single one, use --stills.")
@@ -126,7 +127,7 @@ def read_keyframes(path: Path) -> Keyframes:
     """Read a file of keyframes.
 
     Raises:
-        SplatpipeError: if it is none; names the line, or the keyframe in JSON, that is wrong.
+        SplatpipeError: if it is not a valid file; names the faulty line, or the keyframe in JSON.
     """
     lines = read_lines(path, KIND)
     with line_errors(path, KIND):
@@ -188,7 +189,7 @@ def _of_csv(lines: Sequence[tuple[int, str]]) -> list[tuple[int, Numbers]]:
 
 
 def _keyframes(items: Sequence[tuple[int, Numbers]]) -> Keyframes:
-    """Keyframes of numbers; in messages the first of each pair is its line, or its number in JSON."""
+    """Keyframes from numbers; the first of each pair is the line, or the number in JSON, for messages."""
     if not 1 <= len(items) <= MOST_KEYFRAMES:
         raise LineError(0, f"it has {len(items):,} keyframes, and there are 1 to {MOST_KEYFRAMES:,} in a path")
     places = np.array([_place(number, item) for number, item in items])
@@ -212,7 +213,7 @@ def _place(number: int, item: Numbers) -> list[float]:
 
 
 def _target(number: int, item: Numbers) -> list[float]:
-    """NaN without one."""
+    """The target of a keyframe; NaN without one."""
     found = [item.get(name, math.nan) for name in TARGET]
     if 0 < sum(math.isnan(value) for value in found) < 3:
         raise LineError(number, "a keyframe has an incomplete target")
@@ -220,7 +221,7 @@ def _target(number: int, item: Numbers) -> list[float]:
 
 
 def _ahead(number: int, item: Numbers) -> list[float]:
-    """The way that a keyframe looks, of any length."""
+    """The viewing direction of a keyframe, of any length."""
     if TARGET[0] in item:
         ahead = [item[target] - item[place] for target, place in zip(TARGET, PLACE, strict=True)]
         if not any(ahead):

@@ -1,4 +1,4 @@
-"""A circle around what a capture shows: one turn of a camera that looks at its middle."""
+"""An orbit around a capture: one turn of a camera that looks at its centre."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from splatpipe.pipeline.film.clearance import Clearance
 from splatpipe.pipeline.film.photo_route import PhotoTrack, followed_photos
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
-LOOKED_AT = 72  # places of a circle at which it has to be clear
-CLEAR = 0.25  # of its distance from the middle: from what is solid
-STEP_DEG = 5.0  # a circle that is not clear is raised by that
+LOOKED_AT = 72  # positions on a circle at which clearance is checked
+CLEAR = 0.25  # minimum clearance from solid parts, as a share of the distance from the centre
+STEP_DEG = 5.0  # elevation step by which a circle without clearance is raised
 HIGHEST_DEG = 70.0
-WIDER = (1.0, 1.25, 1.5, 2.0)  # times the photos' distance, should no height do
-OVER_A_MAP_DEG = 50.0  # elevation where all photos look down: walls that no photo shows stay out of sight
+WIDER = (1.0, 1.25, 1.5, 2.0)  # times the photos' distance, if no elevation is clear
+OVER_A_MAP_DEG = 50.0  # elevation if all photos are nadir: keeps walls that no photo covers out of view
 LEAST_ELEVATION_DEG = 5.0
 
 
 def orbit(capture: PhotoTrack, frames: int) -> Route:
-    """One turn around the middle of what the photos show, at their distance and height; its end joins its beginning.
+    """One turn around the centre of what the photos show, at their distance and height; its end joins its beginning.
 
-    Where something is in the way the circle is raised, then widened.
+    If something is in the way, the circle is raised, then widened.
 
     Args:
         capture: At least one photo.
         frames: At least one.
 
     Returns:
-        A route a frame, in the upright frame of ``capture.up``.
+        One route position per frame, in the upright frame of ``capture.up``.
 
     Raises:
-        UsageError: if the photos show nothing to go around.
+        UsageError: if the photos do not determine a centre.
     """
     kept, _ = followed_photos(capture)
     if len(kept) == 0:
@@ -54,7 +54,7 @@ def orbit(capture: PhotoTrack, frames: int) -> Route:
 
 
 def _clear(clearance: Clearance, wanted: tuple[np.ndarray, float, float], upright: np.ndarray) -> tuple[float, float]:
-    """Distance and elevation (radians) of the first circle that is clear; of the clearest where none is."""
+    """Distance and elevation (radians) of the first circle with clearance; of the clearest if none has it."""
     middle, distance, lowest = wanted
     angles = 2.0 * math.pi * np.arange(LOOKED_AT) / LOOKED_AT
     tried: list[tuple[float, float, float]] = []

@@ -1,8 +1,8 @@
-"""Which of a capture's photos a film goes along, and in what order.
+"""Which of a capture's photos a film follows, and in what order.
 
-The photos' names mostly tell how the drone flew, so that is the order unless another is much shorter. It breaks where
-the next photo is far away or something solid is between the two; strays stand alone there. Of what is left a film
-takes the stretch that fits its time at a comfortable speed and whose photos see the most.
+Photo names mostly follow the flight, so they give the order unless another one is much shorter. The path breaks where
+the next photo is far away or something solid is in between; stray photos are dropped. From the rest a film takes the
+stretch that fits its duration at a comfortable speed and whose photos see the most points.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from splatpipe.pipeline.film.clearance import Clearance
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
-SPEED = 0.7  # comfortable, lengths of the way (see ``camera_path``) a second: around a building, 28° a second
+SPEED = 0.7  # comfortable speed, path lengths (see ``camera_path``) per second: around a building, 28° per second
 CORNER_S = 1.0  # standard deviation of the Gaussian that rounds corners, seconds at that speed
-CORNER_LEGS = 0.6  # the same in legs from photo to photo, where these are longer
-ALONE_LEGS, ALONE_LENGTH = 4.0, 0.5  # a stray's way to the nearest photo: in medians of that, and in lengths
-FEWEST_SEEN = 10  # sparse points; a photo that sees fewer hangs in the air
-ODD_DEPTH = 5.0  # times nearer or farther than the others': the ground at take-off, a test shot of the sky
-LONG_LEG = 5.0  # medians: no flight goes on there
-LONGEST_LEG = 2.0  # lengths; some 80° around a building
-DETOUR_TIMES, DETOUR_LEGS = 3.0, 1.5  # a photo aside: there and back over straight on; each over the median leg
-FEWEST_LEGS = 4  # to know what is aside
-LONGER = 1.6  # names are the order unless they make the way so many times longer
-CLEAR = 0.5  # of the photos' own distance from what is solid, all the way
-CLEAR_STEPS = 4.0  # looked at so many times within that distance
-MOST_COMPARED = 3000  # photos, each with each: tables of 72 MB
-SOFTER = 5  # halvings of the rounding, should a rounded corner come too near
+CORNER_LEGS = 0.6  # the same in legs between photos, if these are longer
+ALONE_LEGS, ALONE_LENGTH = 4.0, 0.5  # a stray's distance to the nearest photo: in median distances, and in lengths
+FEWEST_SEEN = 10  # sparse points; a photo that sees fewer is unreliable
+ODD_DEPTH = 5.0  # times nearer or farther than the others: the ground at take-off, a test shot of the sky
+LONG_LEG = 5.0  # median legs: the flight is interrupted there
+LONGEST_LEG = 2.0  # path lengths; about 80° around a building
+DETOUR_TIMES, DETOUR_LEGS = 3.0, 1.5  # a detour: there and back over the direct leg; each over the median leg
+FEWEST_LEGS = 4  # to detect detours
+LONGER = 1.6  # names give the order unless they make the path longer by this factor
+CLEAR = 0.5  # minimum clearance, as a share of the photos' own distance from solid parts
+CLEAR_STEPS = 4.0  # samples per that distance
+MOST_COMPARED = 3000  # photos compared pairwise: tables of 72 MB
+SOFTER = 5  # halvings of the smoothing width, if a rounded corner comes too near
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoTrack:
-    """What a film needs to know of a capture.
+    """The data of a capture that a film needs.
 
     Attributes:
-        cameras: Of all photos, sorted by name.
-        seen: Of each, rows of the sparse points that it observes.
+        cameras: Cameras of all photos, sorted by name.
+        seen: For each, rows of the sparse points that it observes.
         points: The sparse points, world units.
-        up: Against gravity, a unit vector.
-        clearance: From what is solid.
+        up: Unit vector against gravity.
+        clearance: Distances to solid parts.
     """
 
     cameras: Sequence[Camera]
@@ -55,7 +55,7 @@ class PhotoTrack:
     clearance: Clearance
 
     def depths(self) -> Float64[np.ndarray, " m"]:
-        """Median depth of each photo's points, world units; NaN where it sees none."""
+        """Median depth of each photo's points, world units; NaN if it sees none."""
         medians = np.full(len(self.cameras), np.nan)
         for number, (camera, rows) in enumerate(zip(self.cameras, self.seen, strict=True)):
             z = camera.depths(self.points[rows])
@@ -70,13 +70,13 @@ def photo_film(capture: PhotoTrack, frames: int, seconds: float) -> Route:
     Args:
         capture: At least two photos.
         frames: At least one.
-        seconds: That they last.
+        seconds: Duration.
 
     Returns:
-        A route a frame, in the upright frame of ``capture.up``.
+        One route position per frame, in the upright frame of ``capture.up``.
 
     Raises:
-        UsageError: if there is no way between any two photos.
+        UsageError: if there is no path between any two photos.
     """
     kept, distance = followed_photos(capture)
     if len(kept) < 2:
@@ -86,7 +86,7 @@ def photo_film(capture: PhotoTrack, frames: int, seconds: float) -> Route:
     kept = kept[_no_detours(upright_route([capture.cameras[int(index)] for index in kept], capture.up), distance)]
     whole = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
     legs = whole.steps(distance)
-    way, own = smoothed(whole, distance, CORNER_S * SPEED)  # photos taken to and fro come to no length
+    way, own = smoothed(whole, distance, CORNER_S * SPEED)  # back-and-forth photos add no length
     length = np.append(0.0, np.cumsum(way.steps(distance)))
     lengths = np.diff(np.interp(own, np.arange(len(way)), length))
     stretch = _stretch(capture, kept, legs, lengths, SPEED * seconds)
@@ -100,7 +100,7 @@ def photo_film(capture: PhotoTrack, frames: int, seconds: float) -> Route:
 
 
 def _clear_way(capture: PhotoTrack, route: Route, distance: float, width: float) -> Route:
-    """A route smoothed as far as it stays away from what is solid."""
+    """A route smoothed as far as it keeps clear of solid parts."""
     upright = rotation_to_up(capture.up)
     wanted = CLEAR * float(capture.clearance.at(route.places @ upright).min())
     way, _ = smoothed(route, distance, width)
@@ -113,7 +113,7 @@ def _clear_way(capture: PhotoTrack, route: Route, distance: float, width: float)
 
 
 def _no_detours(route: Route, distance: float) -> Int64[np.ndarray, " k"]:
-    """All but single photos from which the way leads back at once: a close-up, a shot of something else."""
+    """Indices of all photos except single detours, e.g. a close-up or a shot of something else."""
     legs = route.steps(distance)
     if len(legs) < FEWEST_LEGS:
         return np.arange(len(route))
@@ -124,7 +124,7 @@ def _no_detours(route: Route, distance: float) -> Int64[np.ndarray, " k"]:
 
 
 def followed_photos(capture: PhotoTrack) -> tuple[Int64[np.ndarray, " k"], float]:
-    """The photos that are no strays, in name order, and how far away what they see is."""
+    """Indices of the photos that are not strays, in name order, and the median distance of what they see."""
     depths = capture.depths()
     enough = np.array([len(rows) >= FEWEST_SEEN for rows in capture.seen]) & np.isfinite(depths)
     if enough.sum() < 2:
@@ -144,7 +144,7 @@ def followed_photos(capture: PhotoTrack) -> tuple[Int64[np.ndarray, " k"], float
 
 
 def _table(route: Route, distance: float) -> Float64[np.ndarray, "n n"]:
-    """Lengths of the ways between all pairs."""
+    """Path lengths between all pairs."""
     places, views = route.places / distance, route.directions()
     squares = (places**2).sum(axis=1)
     moved2 = np.maximum(squares[:, None] + squares[None] - 2.0 * places @ places.T, 0.0)
@@ -152,7 +152,7 @@ def _table(route: Route, distance: float) -> Float64[np.ndarray, "n n"]:
 
 
 def _order(route: Route, distance: float) -> Int64[np.ndarray, " n"]:
-    """As the photos are sorted, or from each to the nearest that is left, where that is much shorter."""
+    """Name order, or greedy nearest-neighbour order if that is much shorter."""
     named = np.arange(len(route))
     if len(route) > MOST_COMPARED:
         return named
@@ -174,7 +174,7 @@ def _order(route: Route, distance: float) -> Int64[np.ndarray, " n"]:
 def _open(
     capture: PhotoTrack, photos: Int64[np.ndarray, " n"], legs: Float64[np.ndarray, " m"]
 ) -> Bool[np.ndarray, " m"]:
-    """Whether a film may go from each photo to the next."""
+    """Whether a film may continue from each photo to the next."""
     near = (legs <= LONG_LEG * max(float(np.median(legs)), 1e-9)) & (legs <= LONGEST_LEG)
     places = np.array([capture.cameras[int(index)].centre() for index in photos])
     own = capture.clearance.at(places)
@@ -193,14 +193,14 @@ def _stretch(
     lengths: Float64[np.ndarray, " m"],
     longest: float,
 ) -> slice:
-    """The photos, one after the other without a break, within a length, that see the most points.
+    """The consecutive photos without a break, within a path length, that see the most points.
 
     Args:
-        capture: That they are of.
-        photos: In the order of the way.
-        legs: From each to the next.
-        lengths: The same of the smooth way.
-        longest: Of these together.
+        capture: The photos' capture.
+        photos: Photo indices in path order.
+        legs: Length from each photo to the next.
+        lengths: The same along the smoothed path.
+        longest: Maximum sum of these.
 
     Raises:
         UsageError: if no two are left.

@@ -1,7 +1,7 @@
-"""Films as browsers play them, through the OpenCV that is there anyway: VP8 in WebM, or VP9 in MP4.
+"""Video files that browsers play, written through OpenCV: VP8 in WebM, or VP9 in MP4.
 
-Both are free of patents. OpenCV asks either for a bit a pixel and leaves no choice of effort: VP9 then takes four times
-the time of VP8 for a fifth less of a file of the same quality.
+Both are patent-free. OpenCV sets a bit rate of one bit per pixel for either and offers no effort setting: VP9 then
+takes four times as long as VP8 for a file a fifth smaller at the same quality.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.photos.images import Pixels
 
 CODECS = {".webm": "VP80", ".mp4": "vp09"}
-HEADER_BYTES = 4096  # of a WebM, within which its one track is numbered
+HEADER_BYTES = 4096  # start of a WebM that contains its track number
 TRACK_NUMBERS = (b"\x73\xc5\x88", b"\x63\xc5\x88")  # Matroska's TrackUID and TagTrackUID, each of eight bytes
 
 
 class VideoWriter:
-    """Writes frames into a film; used with ``with``. The file is there whole at the end, or not at all.
+    """Writes frames to a video file; a context manager. The file appears complete at the end, or not at all.
 
-    A frame is coded on a thread of its own while the caller makes the next one. The same frames leave the same bytes.
+    Frames are encoded on a separate thread while the caller makes the next one. The same frames give the same bytes.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:
         """Begin a film.
 
         Args:
-            path: Ends in `.webm` or `.mp4`; its folder is there. What is there is replaced at the end.
+            path: Ends in `.webm` or `.mp4`; its folder exists. An existing file is replaced at the end.
             size: Width and height, pixels, both even.
             fps: Frames per second.
 
         Raises:
-            ValueError: if a side is odd, or the suffix another one.
+            ValueError: if a side is odd, or the suffix is not supported.
             MachineError: if the file cannot be written.
         """
         if size[0] % 2 or size[1] % 2:
@@ -50,13 +50,13 @@ class VideoWriter:
         self._partial = self._path.with_name(f".{self._path.stem}.part{path.suffix}")
         self._frames = 0
         try:
-            self._partial.write_bytes(b"")  # OpenCV does not say why it cannot
+            self._partial.write_bytes(b"")  # OpenCV would not report why it cannot
         except OSError as error:
             raise MachineError(
                 f"Cannot write {path}: {error.strerror}.", hint="Check the folder, its permissions and the free space."
             ) from error
         codec = cv2.VideoWriter.fourcc(*CODECS[path.suffix])
-        with _silent():  # of how WebM calls VP8
+        with _silent():  # suppresses a warning about WebM's tag for VP8
             self._writer = cv2.VideoWriter(str(self._partial), cv2.CAP_FFMPEG, codec, float(fps), size)
         if not self._writer.isOpened():
             self._partial.unlink()
@@ -93,7 +93,7 @@ class VideoWriter:
         self._partial.replace(self._path)
 
     def _check(self) -> None:
-        """OpenCV does not tell of a full disk: play the film once, a thirtieth of the time it took to write."""
+        """Decode the film once, because OpenCV does not report a full disk; takes a thirtieth of the writing time."""
         film = cv2.VideoCapture(str(self._partial), cv2.CAP_FFMPEG)
         size = (round(film.get(cv2.CAP_PROP_FRAME_WIDTH)), round(film.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         frames = 0
@@ -109,7 +109,7 @@ class VideoWriter:
             )
 
     def _number_track(self) -> None:
-        """Give the track the number 1 for the random one: the same frames leave the same bytes."""
+        """Replace the random track number by 1, so that the same frames give the same bytes."""
         with self._partial.open("r+b") as file:
             head = file.read(HEADER_BYTES)
             for element in TRACK_NUMBERS:
@@ -121,7 +121,7 @@ class VideoWriter:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Nothing reaches stderr, not from C either."""
+    """Suppress stderr, including output from C."""
     kept = os.dup(2)
     try:
         with Path(os.devnull).open("wb") as nothing:
