@@ -1,4 +1,4 @@
-"""The dense cloud of a capture as a file, `cloud.laz`: tile by tile of the plan fused, thinned, coloured."""
+"""The dense cloud of a capture as a file, `cloud.laz`: fused, thinned and coloured tile by tile in plan."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ MARGIN = 3  # cells around a tile from which points may move into it
 
 @dataclass(frozen=True, eq=False)
 class CloudTask:
-    """What a cloud is made from.
+    """Inputs of a cloud.
 
     Attributes:
         surface: The run's photos and depths.
-        site: What they show.
-        spacing_m: A cube of that side holds one point at most; the photos' GSD.
-        threads: Tiles or photos at a time.
+        site: The area that they cover.
+        spacing_m: A cube of this side holds at most one point; the photos' GSD, metres.
+        threads: Tiles or photos in parallel.
     """
 
     surface: RunSurface
@@ -47,16 +47,16 @@ class CloudTask:
 
 
 def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
-    """Write the cloud; a killed one goes on from the last finished part of the plan.
+    """Write the cloud; a killed run resumes after the last finished part of the plan.
 
     Args:
-        task: What it is made from.
-        work: Folder of what is kept meanwhile.
-        out: Where the file goes.
-        report: Told of progress.
+        task: Inputs.
+        work: Folder for intermediate files.
+        out: Output folder.
+        report: Receives progress.
 
     Returns:
-        Figures for people: points, their spacing.
+        Statistics: number of points, their spacing, and the CRS.
 
     Raises:
         SplatpipeError: if the site is absurdly large.
@@ -86,7 +86,7 @@ def _lattice(task: CloudTask) -> Lattice:
 
 
 def _tiles(task: CloudTask, lattice: Lattice, part: Tile) -> list[Tile]:
-    """Tiles of a part in which the site is."""
+    """Tiles of a part that the site covers."""
     found = []
     for tile in tiled(part.height, part.width, TILE):
         moved = Tile(part.row + tile.row, part.column + tile.column, tile.height, tile.width)
@@ -103,13 +103,13 @@ def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, HeightRange],
     if task.surface.area is not None:
         points = points.select(task.surface.area.contains(points.pieces.xyz.T))
     colours, known = point_colours(photos, points.pieces, task.spacing_m, task.threads)
-    points = points.select(known)  # one that moved to where no photo sees it is none
+    points = points.select(known)  # drop points that moved to where no photo sees them
     positions, normals = (np.ascontiguousarray(each.T) for each in (points.pieces.xyz, points.pieces.normal))
     return CloudChunk(positions, colours[known], normals.astype(np.float32), points.confidence)
 
 
 def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: HeightRange, tile: Tile) -> FusedPoints:
-    """The points of one tile, by cell and height: one for each cube of a cell's side at most."""
+    """The points of one tile, by cell and height: at most one for each cube of cell size."""
     wide = tile.grown(MARGIN)
     points = fused(photos.parts_in(lattice, wide, relief), lattice, wide, relief)
     return points.select(finest_of_cubes(points.pieces.xyz, points.footprint, lattice, tile))

@@ -1,4 +1,4 @@
-"""Depths as pieces of a surface: where they are, which way they face, how fine they are."""
+"""Depths as surface pieces: positions, normals and pixel footprints."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ REACHES = (3, 1)  # pixels on either side that a normal is taken from: nearer on
 
 @dataclass(frozen=True, eq=False)
 class DepthPoints:
-    """Pieces of a surface by one photo.
+    """Surface pieces from one photo.
 
     Attributes:
-        number: The photo's.
-        pieces: Where they are, facing the photo.
-        footprint: How long a pixel is on each, metres.
+        number: Index of the photo.
+        pieces: Positions, and normals that face the photo.
+        footprint: Size of a pixel on each, metres.
     """
 
     number: int
@@ -31,18 +31,18 @@ class DepthPoints:
     footprint: Float64[np.ndarray, " n"]
 
     def select(self, rows: np.ndarray | slice) -> DepthPoints:
-        """Those of them."""
+        """The points of these rows."""
         return DepthPoints(self.number, self.pieces.select(rows), self.footprint[rows])
 
 
 def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: HeightRange) -> DepthPoints:
-    """What a photo's depths show in a tile, pixel by pixel, walls and all; without lone pixels.
+    """Points of a photo's depths in a tile, one per pixel, including walls; without isolated pixels.
 
     Args:
-        part: Of the photo's depths, in which the tile lies.
-        lattice: Whose cells are meant.
-        tile: Which of them.
-        relief: Outside of these heights nothing is returned.
+        part: Part of the photo's depths that shows the tile.
+        lattice: The lattice of the tile.
+        tile: The tile.
+        relief: Height range; points outside of it are dropped.
     """
     row, column = np.nonzero(part.depth > 0.0)
     xyz = place_of(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64))
@@ -61,16 +61,16 @@ def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: HeightRa
 def picture_normals(
     part: DepthPart, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], reach: int
 ) -> tuple[Float64[np.ndarray, "3 n"], Bool[np.ndarray, " n"]]:
-    """Normals of pixels' surfaces from depths on all four sides, and where these lie in one surface.
+    """Normals of pixels from the depths on all four sides, and whether these lie on one surface.
 
-    Inverse depth is linear in a plane's pixels, w = n · (x, y, 1) for the plane n · X = 1; so its gradient in the
-    picture is the plane's normal in the camera.
+    Inverse depth is linear in a plane's pixels, w = n · (x, y, 1) for the plane n · X = 1, so its gradient in the image
+    gives the plane's normal in the camera frame.
 
     Args:
-        part: Of a photo's depths.
-        row: Of the pixels.
-        column: Of the pixels.
-        reach: Pixels on either side that are looked at.
+        part: Part of a photo's depths.
+        row: Rows of the pixels.
+        column: Columns of the pixels.
+        reach: Distance to the pixels used on either side.
     """
     height, width = part.depth.shape
     here = part.depth[row, column].astype(np.float64)
@@ -97,7 +97,7 @@ def _normal(
     inverse: Float64[np.ndarray, " n"],
     slopes: Float64[np.ndarray, "2 n"],
 ) -> Float64[np.ndarray, "3 n"]:
-    """Unit normals towards the camera, from inverse depths and how they grow a pixel to the right and down."""
+    """Unit normals towards the camera, from inverse depths and their increase per pixel right and down."""
     camera = part.camera
     x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
     across, down = slopes[0] * camera.fx, slopes[1] * camera.fy

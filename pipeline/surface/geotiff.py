@@ -1,17 +1,17 @@
-"""Cloud Optimised GeoTIFFs, written tile by tile in bounded memory, by GDAL (rasterio).
+"""Cloud Optimised GeoTIFFs, written tile by tile in bounded memory, with GDAL (rasterio).
 
-What is in the files, and why:
-- Heights are alone in `dsm.tif`. A GeoTIFF has one type and one nodata value for all bands, programs for terrain and
-  CAD take the only band, and QGIS draws two bands as a red and green picture. Confidence is a file on the same grid.
-- nodata is -9999, which every program knows; NaN is none to some.
-- Heights lie on steps of 2⁻¹⁰ m: off by half a millimetre at most, and half the size of noise in all bits (1.1 bytes a
-  cell against 2.2, of a made surface with 2 mm of noise).
-- DEFLATE with TIFF's predictors: ZSTD is a twentieth smaller, and unknown to some readers. Colours are lossless with an
-  alpha band, as files that are measured in should be: 2.2 bytes a cell of a photo of the demo. As JPEG of quality 92
-  they are half of that, 51 dB from what they were, with a mask: as nodata, its noise would eat into what is black.
-- The vertical CRS is there where EPSG has one. GeoTIFF cannot say that a projected CRS has ellipsoidal heights (GDAL
-  would put that into a file beside): the tag VERTICAL_DATUM says it for all.
-- No date and no version is in a file: the same values give the same bytes.
+Contents of the files, and why:
+- `dsm.tif` only has heights. A GeoTIFF has one type and one nodata value for all bands, terrain and CAD programs expect
+  a single band, and QGIS draws two bands as a red and green image. Confidence is a separate file on the same grid.
+- nodata is -9999, which every program knows; some do not treat NaN as nodata.
+- Heights are quantized to 2⁻¹⁰ m: off by half a millimetre at most, and half the size of files with noise in all bits
+  (1.1 instead of 2.2 bytes per cell for a synthetic surface with 2 mm of noise).
+- DEFLATE with TIFF predictors: ZSTD is 5 % smaller, but some readers do not know it. Colours are lossless with an
+  alpha band, as files used for measuring should be: 2.2 bytes per cell for a photo of the demo. JPEG of quality 92
+  takes half of that, at a PSNR of 51 dB, with a mask: with nodata, its noise would affect black areas.
+- The vertical CRS is included if EPSG has one. GeoTIFF cannot express ellipsoidal heights of a projected CRS (GDAL
+  would write a sidecar file), so the tag VERTICAL_DATUM states the heights in every file.
+- Files have neither date nor version: the same values give the same bytes.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.whole_file import whole_file
 
 NODATA_HEIGHT = -9999.0
-HEIGHT_STEPS_A_UNIT = 1024.0  # a power of two, so that steps have few bits and compress
-CACHE_MEGABYTES = 128  # of GDAL's blocks; its own default is a share of the machine's memory
+HEIGHT_STEPS_A_UNIT = 1024.0  # a power of two, so that steps have few bits and compress well
+CACHE_MEGABYTES = 128  # for GDAL's blocks; the default is a share of the machine's memory
 JPEG_QUALITY = 92
-GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)  # the last where a copy of GDAL's fails without a word
+GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)  # the last if a GDAL copy fails without a message
 
 
 @dataclass(frozen=True)
 class RasterForm:
-    """What a raster has, and how it is packed.
+    """Layout and compression of a raster.
 
     Attributes:
-        dtype: Of all bands.
-        bands: Their names.
-        nodata: Of all bands; None where an alpha band tells.
+        dtype: Type of all bands.
+        bands: Names of the bands.
+        nodata: Nodata value of all bands; None if there is an alpha band instead.
         packing: Options of GDAL's COG driver.
         has_heights: Whether values are heights in the CRS's unit.
     """
@@ -73,11 +73,11 @@ COLOURS_AS_JPEG = RasterForm("uint8", _RGBA, None, _JPEG)
 
 
 class RasterFile:
-    """A raster under way.
+    """A raster that is being written.
 
     Args:
-        raster: GDAL's.
-        form: Its form.
+        raster: The rasterio dataset.
+        form: Its layout.
     """
 
     def __init__(self, raster: Any, form: RasterForm) -> None:
@@ -85,15 +85,15 @@ class RasterFile:
         self._form = form
 
     def write(self, tile: Tile, values: np.ndarray) -> None:
-        """Write a tile; what is never written has no data.
+        """Write a tile; tiles that are never written are nodata.
 
         Args:
-            tile: Of the grid.
-            values: (bands, height, width), or (height, width) of a raster of one band; of the form's type. Heights that
-                are not finite are nodata, and so are colours whose alpha is 0.
+            tile: Tile of the grid.
+            values: (bands, height, width), or (height, width) for a raster of one band; of the layout's type.
+                Non-finite heights are nodata, and so are colours with alpha 0.
 
         Raises:
-            ValueError: if they are not of the form's type and the tile's size.
+            ValueError: if the values do not have the layout's type and the tile's size.
             MachineError: if the disk is full.
         """
         values = values[None] if values.ndim == 2 else values
@@ -108,11 +108,11 @@ class RasterFile:
 
 @contextmanager
 def raster_file(path: Path, grid: Grid, form: RasterForm) -> Iterator[RasterFile]:
-    """Write a Cloud Optimised GeoTIFF; it is there when the block ends, whole, and not if that fails.
+    """Write a Cloud Optimised GeoTIFF; it is complete when the block ends, and absent if that fails.
 
     Args:
-        path: Where.
-        grid: Its grid.
+        path: Output file.
+        grid: Grid of the raster.
         form: ``HEIGHTS``, ``CONFIDENCE``, ``COLOURS`` or ``COLOURS_AS_JPEG``.
 
     Raises:
@@ -132,12 +132,12 @@ def raster_file(path: Path, grid: Grid, form: RasterForm) -> Iterator[RasterFile
 
 
 def gdal(scratch: Path) -> rasterio.Env:
-    """GDAL as files are written with it: no network, no files beside, little memory, one thread.
+    """GDAL environment for writing files: no network, no sidecar files, little memory, one thread.
 
-    It has a PROJ of its own, with its own settings: pyproj's stay as they are.
+    GDAL has its own PROJ with its own settings; pyproj's stay unchanged.
 
     Args:
-        scratch: Folder for GDAL's files under way.
+        scratch: Folder for GDAL's temporary files.
     """
     return rasterio.Env(
         CPL_TMPDIR=str(scratch),
@@ -154,7 +154,7 @@ _COG = {"BLOCKSIZE": str(TILE), "OVERVIEW_RESAMPLING": "AVERAGE", "BIGTIFF": "IF
 
 
 def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
-    """What the tiled raster is made with, from which the final one is copied."""
+    """Creation options of the tiled raster from which the final one is copied."""
     return {
         "driver": "GTiff",
         "width": grid.width,
@@ -177,7 +177,7 @@ def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
 
 
 def _written_crs(grid: Grid, form: RasterForm) -> CRS:
-    """Heights have theirs, but for a datum by parameters (+towgs84): in a compound CRS, GDAL loses those on the way."""
+    """The CRS to write: compound for heights, except for a datum by +towgs84, which GDAL loses in a compound CRS."""
     plane = grid.crs.horizontal
     crs = grid.crs.compound if form.has_heights and not plane.is_bound else plane
     return CRS.from_wkt(crs.to_wkt("WKT1_GDAL" if plane.is_engineering else "WKT2_2019"))
@@ -193,16 +193,16 @@ def _describe(raster: Any, grid: Grid, form: RasterForm) -> None:
 
 
 def _packed_heights(values: np.ndarray) -> np.ndarray:
-    """On whole steps; nodata where they are not finite."""
+    """Heights rounded to whole steps; nodata where they are not finite."""
     steps = np.round(values.astype(np.float64) * HEIGHT_STEPS_A_UNIT) / HEIGHT_STEPS_A_UNIT
     return np.where(np.isfinite(steps), steps, NODATA_HEIGHT).astype(np.float32)
 
 
 def _require_whole(path: Path, grid: Grid) -> None:
-    """GDAL tells of a full disk in its log alone when it closes a file: so the last block has to be there.
+    """Check that the last block was written: on closing a file, GDAL reports a full disk only in its log.
 
     Raises:
-        RasterioError: if it is not.
+        RasterioError: if the file is incomplete.
     """
     with rasterio.open(path) as raster:
         if raster.shape != (grid.height, grid.width):

@@ -1,8 +1,8 @@
-"""The raster grid of a run's surface products: north up in the run's CRS, its lines at whole multiples of its cells.
+"""The raster grid of a run's surface products: north up in the run's CRS, aligned to whole multiples of its cell size.
 
-So rasters of one cell size lie on each other, whatever their extents, and nobody has to resample. Cells are counted
-from the upper left corner; the centre of the first is (0.5, 0.5). A value stands for its cell's area (GeoTIFF's
-PixelIsArea, which is all readers' default and knows no shift by half a cell).
+So rasters of one cell size align, whatever their extents, without resampling. Cells are counted from the upper left
+corner; the centre of the first is (0.5, 0.5). A value stands for its cell's area (GeoTIFF's PixelIsArea, the default of
+all readers, without a half-cell shift).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.world import World
 
 TILE = 512  # cells: a block of the files
-DIGITS = 3  # of a cell's size: 0.028 rather than 0.027963; at most half a per cent of it
-LIKE_GROUND = 0.005  # a grid's metre as near to the ground's is one, as surveyors take it: 2 cm stay 2 cm in UTM
+DIGITS = 3  # significant digits of the cell size: 0.028 rather than 0.027963; at most half a per cent off
+LIKE_GROUND = 0.005  # a grid metre this close to a ground metre counts as one: 2 cm stay 2 cm in UTM
 LEAST_CELL_M, MOST_CELL_M = 1e-4, 1e3
 MOST_CELLS_A_SIDE = 1_000_000
 MOST_CELLS = 20_000_000_000  # 8 km² at 2 cm, a file of 80 GB of heights before compression
-ROUNDING = 1e-6  # cells: an extent that ends on a line of the grid takes no cell beyond
+ROUNDING = 1e-6  # cells: an extent that ends on a grid line gets no cell beyond it
 EDGE_STEPS = 9  # samples along each side of the scene's box
-HEIGHT_MARGIN_M = 10.0  # of the lattice beyond the scene: heights are straight lines in it, wherever it ends
+HEIGHT_MARGIN_M = 10.0  # of the lattice beyond the scene: heights are interpolated linearly in it
 
 
 Exact = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
@@ -42,15 +42,15 @@ class Grid:
 
     Attributes:
         crs: Its CRS.
-        cell: Side of a cell, in the CRS's unit.
-        left: The left border in cells from the CRS's zero: a whole number.
-        top: The upper border in cells from the CRS's zero.
+        cell: Cell size, in the CRS's unit.
+        left: The left border in cells from the CRS's origin: a whole number.
+        top: The upper border in cells from the CRS's origin.
         width: In cells.
         height: In cells.
-        cell_m: Side of a cell on the ground, metres.
+        cell_m: Cell size on the ground, metres.
         crs_from_local: East, north, up (metres) to easting, northing, height in the CRS's units; within 0.2 mm of PROJ
             over a scene of less than 20 km.
-        local_from_crs: The way back, as near.
+        local_from_crs: The inverse, equally accurate.
     """
 
     crs: MapCrs
@@ -75,7 +75,7 @@ class Grid:
         return self.left * self.cell, bottom * self.cell, right * self.cell, self.top * self.cell
 
     def tiles(self, size: int = TILE) -> Iterator[Tile]:
-        """All of it, row by row of tiles."""
+        """Tiles of the whole grid, row by row."""
         return tiled(self.height, self.width, size)
 
     def cells_from_local(self, local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

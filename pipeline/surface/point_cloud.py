@@ -1,9 +1,9 @@
-"""A point cloud as LAZ: LAS 1.4 of point format 7, written chunk by chunk in bounded memory (laspy, lazrs).
+"""A point cloud as LAZ: LAS 1.4 with point format 7, written chunk by chunk in bounded memory (laspy, lazrs).
 
-Colours have 16 bits, as the format asks. Normals are extra bytes by the names of PDAL and CloudCompare, each a signed
-byte of steps of 1/127, as Metashape writes them: 0.2° at most, finer than any depth map's, and 2 bytes a point in the
-file where float32 takes 9 (measured with 3 bytes for the rest). The CRS is WKT of 2001, which the format asks for; what
-it cannot say of the heights stands in a text beside.
+Colours have 16 bits, as the format requires. Normals are extra bytes with the names of PDAL and CloudCompare, each a
+signed byte in steps of 1/127, as Metashape writes them: an error of 0.2° at most, finer than any depth map's, and 2
+bytes per point in the file where float32 takes 9 (measured with 3 bytes for the rest). The CRS is WKT of 2001, as the
+format requires; what it cannot express about the heights is in a text file beside.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ NORMAL_FIELDS = ("NormalX", "NormalY", "NormalZ")
 CONFIDENCE_FIELD = "Confidence"
 SIXTEEN_BITS = 257  # 255 becomes 65,535
 ROWS = 1 << 18  # points converted at a time
-LIMITS_KNOWN = 0b110  # of an extra byte's options: laspy 2.7 takes them from the first point of each chunk alone
-UNDATED = date(2000, 1, 1)  # the format wants a date, and the same points are to give the same bytes
+LIMITS_KNOWN = 0b110  # option bits of extra bytes: laspy 2.7 takes the limits from the first point of each chunk only
+UNDATED = date(2000, 1, 1)  # the format requires a date, and the same points have to give the same bytes
 PROGRAM = "splatpipe"
 
 
 @dataclass(frozen=True, eq=False)
 class CloudChunk:
-    """Some points.
+    """A chunk of points.
 
     Attributes:
         positions: East, north, up, metres.
         colours: Red, green, blue.
-        normals: East, north, up, of unit length; zero where not known.
-        confidence: Photos that confirm each.
+        normals: East, north, up, of unit length; zero where unknown.
+        confidence: Number of photos that confirm each point.
     """
 
     positions: Float64[np.ndarray, "n 3"]
@@ -54,13 +54,13 @@ class CloudChunk:
 
 @dataclass(frozen=True, eq=False)
 class CloudFrame:
-    """The way from a scene's metres to a cloud's coordinates.
+    """Transformation from a scene's local metres to a cloud's coordinates.
 
     Attributes:
-        crs: Of the file.
+        crs: CRS of the file.
         crs_from_local: East, north, up (metres) to its coordinates.
-        corner: Whole numbers near all of them, which the file counts from.
-        middle: Of the scene, east, north, up: where directions are turned by.
+        corner: Offset of the file's coordinates: whole numbers near the points.
+        middle: Middle of the scene (east, north, up), at which the rotation of directions is taken.
     """
 
     crs: MapCrs
@@ -70,27 +70,27 @@ class CloudFrame:
 
     @staticmethod
     def of_grid(grid: Grid) -> CloudFrame:
-        """Of a raster that covers the points."""
+        """The frame of a raster grid that covers the points."""
         west, south, _, _ = grid.bounds
         middle = grid.local_from_cells(np.array([[grid.width / 2.0, grid.height / 2.0, 0.0]]))
         return CloudFrame(grid.crs, grid.crs_from_local, np.array([np.floor(west), np.floor(south), 0.0]), middle)
 
     @staticmethod
     def of_crs(crs: MapCrs) -> CloudFrame:
-        """Of points anywhere: by PROJ itself, a few seconds a million."""
+        """The frame for points anywhere, with PROJ itself: a few seconds per million points."""
         middle = np.zeros((1, 3))
         corner = np.floor(crs.crs_from_local(middle)[0])
         return CloudFrame(crs, crs.crs_from_local, np.array([corner[0], corner[1], 0.0]), middle)
 
 
 def write_cloud(path: Path, chunks: Iterable[CloudChunk], frame: CloudFrame, taken_on: date = UNDATED) -> int:
-    """Write a cloud; it is there when all chunks are in it, and not if that fails.
+    """Write a cloud; the file is complete, or absent if that fails.
 
     Args:
-        path: Where: a name that ends in .laz.
-        chunks: Asked for one by one.
-        frame: The way to its CRS.
-        taken_on: The date in the file: the photos', for one.
+        path: Output file, ending in .laz.
+        chunks: Consumed one by one.
+        frame: Transformation to its CRS.
+        taken_on: Date in the file, e.g. that of the photos.
 
     Returns:
         Number of points.
@@ -132,7 +132,7 @@ def _header(frame: CloudFrame, taken_on: date) -> laspy.LasHeader:
 
 
 def _pieces(chunks: Iterable[CloudChunk]) -> Iterator[CloudChunk]:
-    """The same points, no more than ``ROWS`` at a time."""
+    """The same points, at most ``ROWS`` at a time."""
     for chunk in chunks:
         for start in range(0, len(chunk.positions), ROWS):
             rows = slice(start, start + ROWS)
@@ -163,9 +163,9 @@ def _steps(coordinates: Float64[np.ndarray, "n 3"], header: laspy.LasHeader) -> 
 
 
 def _turn(frame: CloudFrame) -> Float64[np.ndarray, "3 3"]:
-    """The rotation of directions from the local frame to the CRS's axes: by the convergence, above all.
+    """Rotation of directions from the local frame to the CRS's axes, mainly the grid convergence.
 
-    It is the one at the scene's middle: 3 km away it is another by 0.03°.
+    It is taken at the scene's middle; 3 km away it differs by 0.03°.
     """
     there = frame.crs_from_local(frame.middle + np.concatenate([np.eye(3), -np.eye(3)]))
     derivative = (there[:3] - there[3:]).T * np.array([[frame.crs.unit_m]] * 2 + [[frame.crs.height_unit_m]])
