@@ -1,4 +1,4 @@
-"""Runs the line like the command does, and kills itself in the middle of a stage; a program for test_line.py.
+"""Runs the pipeline like the command does, and kills itself in the middle of a stage; a program for test_line.py.
 
 Arguments: photos, out, the stage to die in, "alone" or "group", then --set assignments.
 """

@@ -1,4 +1,4 @@
-"""benchmarks/ablation: what it runs, what it does not run again, and the arithmetic of its tables."""
+"""benchmarks/ablation: what it runs, what it does not repeat, and the arithmetic of its tables."""
 
 import json
 import math

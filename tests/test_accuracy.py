@@ -1,4 +1,4 @@
-"""The accuracy of the splat itself, on a wall whose place is known; and the table of residuals."""
+"""The accuracy of the splat itself, on a wall at a known place; and the table of residuals."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""With a boundary Gaussians, figures and what is handed over are of the inside; the outside stays a coarse backdrop."""
+"""With a boundary, Gaussians, figures and deliverables cover the inside; the outside stays a coarse backdrop."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""A night of captures on Snakemake: each in its right state, nothing done twice, nothing left behind, never a lie."""
+"""A batch of captures on Snakemake: each in the right state, nothing repeated or left behind, honest reports."""
 
 import ast
 import csv

@@ -1,4 +1,4 @@
-"""benchmarks: they run on any dataset, count what they say they count, and train what the line trains."""
+"""benchmarks: they run on any dataset, count what they claim to count, and train as the pipeline does."""
 
 import argparse
 import json

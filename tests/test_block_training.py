@@ -1,4 +1,4 @@
-"""Training one block: only its Gaussians change, on the windows that show it, with the same bits however it is run."""
+"""Training one block: only its Gaussians change, on the windows that show it, bit-identical however it is run."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Blocks in the line: how many there are, shards of the training, and what they are joined to."""
+"""Blocks in the pipeline: their number, shards of the training, and the merge."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Budgets of time and memory: what is planned, that it is kept, and that its limits hold."""
+"""Budgets of time and memory: the plan, that it is met, and that its limits hold."""
 
 import hashlib
 import json

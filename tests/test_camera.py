@@ -1,4 +1,4 @@
-"""Projection, one for pinholes and one for lenses: each other's inverse, and what pycolmap says."""
+"""Projection for pinholes and for lenses: inverse to unprojection, and equal to pycolmap's."""
 
 import numpy as np
 import pycolmap

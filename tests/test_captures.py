@@ -1,4 +1,4 @@
-"""The line on real photos, from outside the project: `make test-captures` where there are any."""
+"""The pipeline on real photos from outside the project: `make test-captures`, where they exist."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""`splatpipe check`: faults put into good photos are found and named, and good photos are left alone."""
+"""`splatpipe check`: faults injected into good photos are found and named, and good photos raise no findings."""
 
 import io
 import json

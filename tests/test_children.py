@@ -1,4 +1,4 @@
-"""Processes of a stage's own: they run side by side, and none is left, whatever ends the stage."""
+"""A stage's child processes: they run in parallel, and none survives, whatever ends the stage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`clean`: what it takes from a splat of a small dataset whose truth is known, and what it leaves as it is."""
+"""`clean`: what it removes from the splat of a small dataset with known truth, and what it keeps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cleaning against truth: a box on a plain made of Gaussians, cameras around it, and what does or does not belong."""
+"""Cleaning against truth: a box on a plain made of Gaussians, cameras around it, and Gaussians that do not belong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What hangs in free space: removed in training where it is asked for, at the steps that look."""
+"""Gaussians in free space: removed during training if enabled, at the scheduled steps."""
 
 from __future__ import annotations
 

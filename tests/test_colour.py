@@ -1,4 +1,4 @@
-"""Affine maps of a picture's colours: on every instruction set that this CPU has."""
+"""Affine maps of an image's colours: on every instruction set that this CPU has."""
 
 import pytest
 import torch

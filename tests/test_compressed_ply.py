@@ -1,4 +1,4 @@
-"""Compressed PLY: what the file says, read one number after another, is what was written; and files of all kinds."""
+"""Compressed PLY: the file, decoded value by value, contains what was written; and files of all kinds."""
 
 import math
 import struct

@@ -1,4 +1,4 @@
-"""The examples for containers and clusters: their commands are ones, their limits hold what the issue asks for."""
+"""The examples for containers and clusters: their commands exist, and their limits hold."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Contours: where the heights are, whole across windows, and in files that GDAL reads."""
+"""Contours: at the right heights, continuous across windows, and in files that GDAL reads."""
 
 import json
 import sys

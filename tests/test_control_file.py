@@ -1,4 +1,4 @@
-"""Files of control points: every form that surveyors hand over, and none that breaks the reader."""
+"""Control point files: every form that surveyors deliver, and none that breaks the reader."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The harness that runs CUDA kernels on a CPU: what it computes is right, and what it is there to find, it finds."""
+"""The harness that runs CUDA kernels on a CPU: its results are right, and it detects what it is built to detect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the CUDA backend does beside the frame, loss, colours and draws, on the CPU through the harness."""
+"""The CUDA backend apart from the frame: loss, colours and draws, on the CPU in the harness."""
 
 import ctypes
 import sys

@@ -1,4 +1,4 @@
-"""CUDA tensors under autograd, proven with the kernels' sources on the CPU: gradients, the fused step, memory."""
+"""CUDA tensors under autograd, verified with the kernels' sources on the CPU: gradients, fused step, memory."""
 
 import sys
 from dataclasses import replace

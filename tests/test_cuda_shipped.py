@@ -1,4 +1,4 @@
-"""What is shipped of CUDA: one library with the C interface and nothing else, for every device that was asked for.
+"""The shipped CUDA library: one file with the C interface and nothing else, for every requested architecture.
 
 Whether there is one follows from SPLATPIPE_CUDA, as in `pipeline/raster/native/cuda/CMakeLists.txt`: CI asks for all.
 Where the build was to find out for itself, it says what it found.

@@ -1,4 +1,4 @@
-"""The sky by the CUDA backend's kernels, through the harness and on a device, beside the CPU's."""
+"""The sky by the CUDA backend's kernels, in the harness and on a device, against the CPU's."""
 
 import sys
 from collections.abc import Iterator

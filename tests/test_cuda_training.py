@@ -1,4 +1,4 @@
-"""Training on CUDA, proven with the kernels' sources on the CPU: as there, the same bits always, in little memory."""
+"""Training on CUDA, verified with the kernels' sources on the CPU: always the same bits, in little memory."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Pinhole views, and how a dataset's views are read and divided."""
+"""Pinhole views, and how a dataset's views are read and split."""
 
 import contextlib
 from pathlib import Path

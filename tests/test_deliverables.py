@@ -1,4 +1,4 @@
-"""Formats of a run: read back by other programs in the frame and the CRS that the run has; asked for and refused."""
+"""Export formats of a run: read back by other programs in the run's frame and CRS; requested and rejected."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""The demo capture is what it says: photos, metadata, cameras, marks and surface agree with each other."""
+"""The demo capture is consistent: photos, metadata, cameras, marks and surface agree with each other."""
 
 from __future__ import annotations
 

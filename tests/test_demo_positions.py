@@ -1,4 +1,4 @@
-"""The demo's photos, placed by what they state, against their true cameras."""
+"""The demo's photos, placed by their stated positions, against their true cameras."""
 
 import json
 from dataclasses import replace

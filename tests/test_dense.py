@@ -1,4 +1,4 @@
-"""The denser start: depths against a room whose walls are known, and who may have a say in them."""
+"""Dense initialization: depths against a room with known walls, and which photos may contribute."""
 
 import shutil
 import sys

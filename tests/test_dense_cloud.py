@@ -1,4 +1,4 @@
-"""The dense cloud of a scene whose surfaces are known: once each, without nonsense, the same bits always."""
+"""The dense cloud of a scene with known surfaces: no duplicates, no outliers, always the same bits."""
 
 import sys
 from functools import cache

@@ -1,4 +1,4 @@
-"""The sky as a dome of Gaussians: it shows the panorama without holes, and what is inside stays in sight."""
+"""The sky as a dome of Gaussians: it shows the panorama without holes, and its contents stay visible."""
 
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Edges of near things in a depth map, put where the photo has them."""
+"""Edges of near objects in a depth map, aligned to the photo's."""
 
 import numpy as np
 from jaxtyping import Float32, UInt8

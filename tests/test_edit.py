@@ -1,4 +1,4 @@
-"""`splatpipe edit`: what comes out looks as it should from known views, lies where it should, and says how."""
+"""`splatpipe edit`: the result looks right from known views, lies in the right place, and records its edits."""
 
 import json
 import math

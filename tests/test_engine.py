@@ -1,4 +1,4 @@
-"""The engine on a small real line: what is reused, what is rerun, and what survives a crash, a kill and a full disk."""
+"""The engine on a small real pipeline: reuse, reruns, and surviving a crash, a kill and a full disk."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Depths of two sources in one map: the photo's stay, the splat's come where there are none, moved to the photo's."""
+"""Depths of two sources in one map: the photos' are kept, gaps are filled by the splat's, shifted to the photos'."""
 
 import numpy as np
 import pytest

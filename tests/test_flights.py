@@ -1,4 +1,4 @@
-"""Flights: told apart by what photos state, each with an offset of its own in the fit."""
+"""Flights: separated by the photos' metadata, each with its own offset in the fit."""
 
 import math
 from pathlib import Path

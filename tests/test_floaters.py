@@ -1,4 +1,4 @@
-"""The floaters' figures of a model whose truth is known, with and without something hanging before a camera."""
+"""The floater features of a model with known truth, with and without something floating before a camera."""
 
 import json
 import sys

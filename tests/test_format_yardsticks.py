@@ -1,4 +1,4 @@
-"""benchmarks of formats and cleaning: they measure what they say, on scenes whose truth is known."""
+"""Benchmarks of formats and cleaning: they measure what they claim, on scenes with known truth."""
 
 import gzip
 import math

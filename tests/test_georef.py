@@ -1,4 +1,4 @@
-"""Georef on made-up models: known cameras in a known place, seen by noisy and wrong positions."""
+"""Georeferencing of synthetic models: known cameras in a known place, with noisy and wrong positions."""
 
 import json
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""GLB: what is written, read by the letter of glTF; others' files, in all the ways that glTF allows; hostile files."""
+"""GLB: our files, parsed strictly by the glTF specification; others' files, in all permitted forms; hostile files."""
 
 import io
 import struct

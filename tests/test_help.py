@@ -1,4 +1,4 @@
-"""Each command's ``--help`` is whole and short, and a shell completes commands, presets and stages."""
+"""Each command's ``--help`` is complete and short, and shells complete commands, presets and stages."""
 
 import os
 import shutil

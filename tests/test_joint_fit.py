@@ -1,4 +1,4 @@
-"""The weighted fit of control and positions, and points from rays, against made-up truth."""
+"""The weighted fit of control and positions, and points from rays, against synthetic truth."""
 
 import numpy as np
 import pycolmap

@@ -1,4 +1,4 @@
-"""JPEGs written strip by strip: any reader finds the pixels of one that was coded in one piece."""
+"""JPEGs written strip by strip: any reader decodes the pixels of one encoded in one piece."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Judging a model by verified matches: right ones are good, each way of being wrong is called bad, with its reason."""
+"""Judging a model by verified matches: right ones are good, each kind of error is called bad, with its reason."""
 
 import sys
 from dataclasses import replace

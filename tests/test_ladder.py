@@ -1,4 +1,4 @@
-"""The ladder on a room whose cameras are known: photos left on purpose come in where they were, or not at all."""
+"""The ladder on a room with known cameras: unregistered photos are placed correctly, or not at all."""
 
 import json
 import sys

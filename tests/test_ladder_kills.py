@@ -1,4 +1,4 @@
-"""Every rung of the ladder in one run of the stage: killed in each, it leaves the same bits when it is run again."""
+"""Every rung of the ladder in one run of the stage: killed in each, a rerun gives the same bits."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A render laid over the sky by the kernels of the CPU: each instruction set that it has, beside the definition."""
+"""A render composited over the sky by the CPU's kernels: each instruction set against the definition."""
 
 from dataclasses import replace
 

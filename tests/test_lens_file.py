@@ -1,4 +1,4 @@
-"""Files of lenses: what other programs write is read as they mean it, and what is broken or hostile is refused."""
+"""Lens files: other programs' files are read as they mean them; broken or hostile ones are rejected."""
 
 from __future__ import annotations
 

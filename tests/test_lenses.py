@@ -1,4 +1,4 @@
-"""Lenses are freed where they have more to them, and only there."""
+"""Lens parameters are freed where the lens deviates from the simple model, and only there."""
 
 from __future__ import annotations
 

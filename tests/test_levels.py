@@ -1,4 +1,4 @@
-"""Levels of detail: every Gaussian in one leaf, errors that fall towards the leaves, boxes around what they hold."""
+"""Levels of detail: every Gaussian in one leaf, errors that decrease towards the leaves, boxes around contents."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where the live page's pictures are rendered: as the run says, and never at the cost of what trains on the card."""
+"""Where the live page's images are rendered: as configured, and never at the expense of training on the GPU."""
 
 import json
 import sys

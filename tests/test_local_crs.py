@@ -1,4 +1,4 @@
-"""The polynomial that stands for PROJ in a page: near enough, also of large scenes, geographic CRS and odd units."""
+"""The polynomial that replaces PROJ in a page: accurate, even for large scenes, geographic CRSs and odd units."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Memory and processors as the kernel tells them: trees of files as containers see them, and this machine's own."""
+"""Memory and processors as the kernel reports them: file trees as seen in containers, and this machine's own."""
 
 from __future__ import annotations
 

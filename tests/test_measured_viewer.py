@@ -1,4 +1,4 @@
-"""viewer.html and the report with what was measured: the same bits for the same state, and only what still holds."""
+"""viewer.html and the report with measurements: the same bits for the same state, and only valid measurements."""
 
 import json
 import os

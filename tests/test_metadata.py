@@ -1,4 +1,4 @@
-"""EXIF and XMP: what drones write is read, and hostile bytes do no harm."""
+"""EXIF and XMP: drones' metadata is read, and hostile bytes do no harm."""
 
 import io
 import math

@@ -1,4 +1,4 @@
-"""Image measures: known answers, and definitions written again in numpy."""
+"""Image metrics: known answers, and definitions reimplemented in numpy."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Several cameras, zooms, sizes and ways of holding them in one capture."""
+"""Several cameras, focal lengths, sizes and orientations in one capture."""
 
 import sys
 from pathlib import Path

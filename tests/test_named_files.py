@@ -1,4 +1,4 @@
-"""Surveyor's files as external parts: found with the photos or named, felt by who reads them and by nobody else."""
+"""Surveyors' files as external inputs: found with the photos or named; only stages that read them depend on them."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The fused Adam against torch's, and the state that density control reshapes."""
+"""The fused Adam against torch's, and its state as density control reshapes it."""
 
 import functools
 import math

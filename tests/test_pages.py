@@ -1,4 +1,4 @@
-"""The pages' scripts as they are bundled, in a real browser."""
+"""The pages' bundled scripts, in a real browser."""
 
 from collections.abc import Callable
 from pathlib import Path

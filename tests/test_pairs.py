@@ -1,4 +1,4 @@
-"""Which photos are matched: by position, order or likeness, and always in one piece."""
+"""Selection of photo pairs: by position, order or similarity, and always a connected graph."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Codebooks and palettes, against what is known to be best."""
+"""Codebooks and palettes, against known optima."""
 
 from __future__ import annotations
 

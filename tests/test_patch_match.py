@@ -1,4 +1,4 @@
-"""PatchMatch's kernel: a slanted wall, its planes, and what it refuses."""
+"""PatchMatch's kernel: a slanted wall, its planes, and input that it rejects."""
 
 from collections.abc import Iterator
 

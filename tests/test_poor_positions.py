@@ -1,4 +1,4 @@
-"""Positions worse than they state place the model, and what is said of its accuracy is true of it."""
+"""Positions worse than their stated accuracy still georeference the model, and its accuracy report is right."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""A part of a picture shows what the whole shows there, and has the gradients that the whole has from there."""
+"""A window of an image has the same pixels and gradients as that part of the whole image."""
 
 from __future__ import annotations
 

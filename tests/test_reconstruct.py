@@ -1,4 +1,4 @@
-"""Two mappers, one judge: auto takes the better answer, and new pairs prove a bend that the old ones leave."""
+"""Two mappers, one judge: auto takes the better answer, and new pairs prove a bend that the old ones permit."""
 
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Merging keeps mass, mean and covariance; reducing gives the count asked for, the same bits, and takes any input."""
+"""Merging preserves mass, mean and covariance; reducing gives the requested count and the same bits for any input."""
 
 import math
 

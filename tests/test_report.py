@@ -1,4 +1,4 @@
-"""The report: of finished, stopped and failed runs it tells the truth, in a real browser and without a network."""
+"""The report: correct for finished, stopped and failed runs, in a real browser and without a network."""
 
 import base64
 import fcntl

@@ -1,4 +1,4 @@
-"""Moving things: what one photo shows and the others contradict is left out of the loss, and little else is."""
+"""Moving objects: what one photo shows and the others contradict is excluded from the loss, and little else is."""
 
 import sys
 from dataclasses import dataclass

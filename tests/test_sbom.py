@@ -1,4 +1,4 @@
-"""What the wheel has from others: each has its licence, and the bill of materials (SBOM) names it as CycloneDX asks."""
+"""Third-party parts of the wheel: each has its licence and is listed in the bill of materials (SBOM, CycloneDX)."""
 
 import importlib.metadata
 import json

@@ -1,4 +1,4 @@
-"""Seams: a splat without any raises no alarm, and planted ones are found for what they are."""
+"""Seams: a seamless splat raises no alarm, and planted seams are found and classified."""
 
 import subprocess
 import sys

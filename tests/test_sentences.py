@@ -1,4 +1,4 @@
-"""Each stage's line on the terminal: a sentence with units, silent on what is as it should be."""
+"""Each stage's line on the terminal: a sentence with units that omits the expected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From photos to a sparse model: keypoints, matches and mapping of a scene whose cameras are known."""
+"""From photos to a sparse model: keypoints, matches and mapping of a scene with known cameras."""
 
 import hashlib
 import sys

@@ -1,4 +1,4 @@
-"""benchmarks: the made flight is what it says, and what is measured is what is told."""
+"""benchmarks: the synthetic flight is as described, and figures are reported as measured."""
 
 import json
 import subprocess

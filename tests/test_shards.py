@@ -1,4 +1,4 @@
-"""Stages made of shards: any process makes any in any order, a killed one costs itself, the bits are the same."""
+"""Sharded stages: any process makes any shard in any order, a kill costs only its shard, the bits are the same."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Sky found without weights: where it is, and nowhere else."""
+"""Sky detection without learned weights: where the sky is, and nowhere else."""
 
 import sys
 import tracemalloc

@@ -1,4 +1,4 @@
-"""Photos to look at small: the same pictures as by the area filter from all of their pixels, at a part of the cost."""
+"""Photos reduced for viewing: the same images as an area filter over all their pixels, at a fraction of the cost."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Models on a disk that runs full: pycolmap writes what fits and says nothing."""
+"""Models on a disk that runs full: pycolmap writes what fits and reports nothing."""
 
 import errno
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Splat files of any format: found by content, written by name, folders and all."""
+"""Splat files of any format: recognised by content, written by name, including folders."""
 
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""SPZ: what the file says, read by the letter of its specification, is what was written."""
+"""SPZ: the file, parsed strictly by its specification, contains what was written."""
 
 import gzip
 import math

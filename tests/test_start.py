@@ -1,4 +1,4 @@
-"""What training starts with, where the cap leaves no room for all of it."""
+"""The initial Gaussians, if the cap is too small for all of them."""
 
 import json
 import sys

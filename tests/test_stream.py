@@ -1,4 +1,4 @@
-"""Photos of training: in order, to the bit, at the size asked for, decoded once, and never all in memory."""
+"""Training photos: in order, to the bit, at the requested size, decoded once, and never all in memory."""
 
 import resource
 import shutil

@@ -1,4 +1,4 @@
-"""The surface model of a scene whose heights are known."""
+"""The surface model of a scene with known heights."""
 
 import sys
 from dataclasses import replace

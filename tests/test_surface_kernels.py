@@ -1,4 +1,4 @@
-"""The surface's native kernels: against their definitions, on every instruction set, and what they refuse."""
+"""The surface's native kernels: against their definitions, on every instruction set, and input they reject."""
 
 import sys
 from collections.abc import Callable

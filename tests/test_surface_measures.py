@@ -1,4 +1,4 @@
-"""benchmarks: figures of surfaces tell what is wrong with them, and nothing else."""
+"""benchmarks: surface metrics report the errors that exist, and no others."""
 
 import sys
 from pathlib import Path

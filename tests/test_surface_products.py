@@ -1,4 +1,4 @@
-"""Surface products as files, of a scene whose heights and colours are known, in a frame of local metres."""
+"""Surface products as files, of a scene with known heights and colours, in a local metric frame."""
 
 import shutil
 import sys

@@ -1,4 +1,4 @@
-"""Sections through a house whose heights and walls are known, and their files as others read them."""
+"""Sections through a house with known heights and walls, and their files as other programs read them."""
 
 import csv
 import sys

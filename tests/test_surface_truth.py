@@ -1,4 +1,4 @@
-"""The yardstick of surface products: the demo's own truth is perfect by it, and what is wrong is told."""
+"""The surface products' benchmark: the demo's own truth is perfect by it, and errors are reported."""
 
 import json
 import subprocess

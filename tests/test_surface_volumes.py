@@ -1,4 +1,4 @@
-"""Volumes of solids whose volume is known, and how far noise moves them."""
+"""Volumes of solids with known volume, and their sensitivity to noise."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Which control points targets are: by numbers, by places, with and without positions; and which are none."""
+"""Assignment of targets to control points: by ID, by place, with and without positions; and rejected ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What training does differently on a device, piece by piece: which one, rows, memory, colours, losses."""
+"""Differences of training on a device, one by one: device choice, rows, memory, colours, losses."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Training on windows: it learns what whole photos teach, and ends with the same bits however it was run."""
+"""Training on windows: it learns what whole photos teach, and ends bit-identical however it was run."""
 
 import hashlib
 import sys

@@ -1,4 +1,4 @@
-"""The demo capture against its truth: where the cameras stood, where the points lie, how deep the splat is."""
+"""The demo capture against its truth: camera positions, sparse points, and the splat's depths."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The table of the two lines: what manifests say, and what was measured."""
+"""The table of the two pipelines: figures of the manifests, and measured ones."""
 
 import sys
 from pathlib import Path

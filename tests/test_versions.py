@@ -1,4 +1,4 @@
-"""What CI has to notice: other answers under the same version, imports against the order, options without docs."""
+"""Regressions that CI must notice: changed results under one version, forbidden imports, undocumented options."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""Films: played by a browser's own decoder, whole or not there, the same bytes each time."""
+"""Videos: decoded by a browser, complete or absent, the same bytes each time."""
 
 import hashlib
 import os

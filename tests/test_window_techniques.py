@@ -1,4 +1,4 @@
-"""Techniques on windows: what the windows of a photo say, each by its share, is what the whole photo says."""
+"""Techniques on windows: a photo's windows, weighted by their shares, give the same as the whole photo."""
 
 import sys
 from pathlib import Path

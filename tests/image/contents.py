@@ -1,4 +1,4 @@
-"""What is in an image: its sizes by package, as pulled and unpacked, and tools that do not belong there."""
+"""Contents of an image: sizes by package, compressed and unpacked, and tools that do not belong in it."""
 
 from __future__ import annotations
 

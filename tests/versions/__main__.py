@@ -1,4 +1,4 @@
-"""``make versions``: brings ``stages/versions.toml`` up to date, and asks for raised versions where they are needed."""
+"""``make versions``: updates ``stages/versions.toml``, and demands raised versions where they are needed."""
 
 from __future__ import annotations
 

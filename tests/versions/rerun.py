@@ -1,4 +1,4 @@
-"""Runs stages of the tree that PYTHONPATH names on what an earlier run left; a program for ``stage_comparison``.
+"""Runs stages of the tree in PYTHONPATH on an earlier run's output; a program for ``stage_comparison``.
 
 Each stage reads the parts that the earlier run left, whatever other stages leave now, so that what differs is its own
 doing. It takes a JSON object: ``earlier`` (that run's OUT), ``photos``, ``out``, ``threads``, ``stages`` (names), and

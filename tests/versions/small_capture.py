@@ -1,4 +1,4 @@
-"""The small input that two states of the code are compared on: little of everything that the stages tell apart."""
+"""The small input on which two states of the code are compared: a little of everything that stages handle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs an earlier state of the code and the present one on a small input, and compares what each stage leaves."""
+"""Runs an earlier state of the code and the present one on a small input, and compares each stage's output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trees of sources that can run beside each other: of a commit, and of the working folder, each with its kernels."""
+"""Source trees that can run side by side: of a commit, and of the working folder, each with its kernels."""
 
 from __future__ import annotations
 
