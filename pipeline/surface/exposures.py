@@ -1,7 +1,7 @@
-"""Exposures of photos and their shading, levelled where several see the same.
+"""Radiometric balancing of photos: exposure and shading, levelled where several see the same.
 
-Lenses darken corners, and fields are brighter away from the sun: without its shading levelled, each photo's part of an
-orthophoto is a patch that can be told from the next.
+Lenses darken corners (vignetting), and fields look brighter away from the sun: unless shading is levelled, each photo's
+part of an orthophoto is a visible patch.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ Numbers = Int64[np.ndarray, " k"]
 def exposure_levels(
     sources: Sequence[PhotoSource], places: Float64[np.ndarray, "m 3"], cell_m: float, threads: int
 ) -> PhotoGains:
-    """By how much each photo's light is to be multiplied so that photos agree where they see the same.
+    """Estimate gains by which to multiply each photo's light so that photos agree where they see the same.
 
-    Least squares of the logarithms over places that two photos see at least, robust (Huber's weights), about the mean
-    of all; bounded.
+    Robust least squares of the logarithms (Huber weights) over points that at least two photos see, relative to the
+    mean of all; bounded.
 
     Args:
         sources: The photos.
-        places: On the surface, in their cameras' frame: some thousand, evenly.
-        cell_m: How fine photos are compared; a little softer than what is coloured, matches need not be exact.
-        threads: Photos at a time.
+        places: A few thousand evenly spaced points on the surface, in their cameras' frame.
+        cell_m: Resolution of the comparison, metres; slightly coarser than the product, as alignment is not exact.
+        threads: Photos in parallel.
     """
     if not sources:
         return PhotoGains.plain(0)
@@ -68,7 +68,7 @@ def exposure_levels(
 def _light(
     places: Float64[np.ndarray, "m 3"], cell_m: float, source: PhotoSource
 ) -> tuple[Numbers, Float64[np.ndarray, "k 3"], Float64[np.ndarray, "k t"]]:
-    """Which places a photo sees well, logarithms of its light there, and where in the photo they lie."""
+    """Points that a photo sees well, the logarithms of its light there, and the shading terms at their pixels."""
     unseen = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, SHADES))
     points: Points = (places[:, 0], places[:, 1], places[:, 2])
     place = place_in(source.camera, *points)
@@ -92,14 +92,14 @@ def _levelled(
     numbers: tuple[Numbers, Numbers],
     photos: int,
 ) -> Float64[np.ndarray, "n t"]:
-    """What is to be added to the logarithms of a channel's light, of each photo a factor for each term.
+    """Corrections to the logarithms of a channel's light: for each photo a factor per term.
 
     Args:
-        light: Of each photo's each place.
-        terms: What a photo's factors are multiplied with there; the first is one.
-        rest: How much a factor keeps to what it is on the average.
-        numbers: The photo and the place of each.
-        photos: How many there are.
+        light: Logarithm of light for each observation of a point in a photo.
+        terms: Shading terms of each observation; the first is one.
+        rest: Strength with which each factor is held at the average.
+        numbers: Photo and point of each observation.
+        photos: Number of photos.
     """
     photo, place = numbers
     found, weight = np.zeros((photos, terms.shape[1])), np.ones(len(light))

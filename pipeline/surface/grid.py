@@ -93,7 +93,7 @@ class Grid:
         return self.local_from_crs(coordinates)
 
     def centres_in_local(self, tile: Tile, heights: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
-        """East, north, up (metres) of a tile's centres of cells at heights in the CRS's unit."""
+        """East, north, up (metres) of the centres of a tile's cells, with heights in the CRS's unit."""
         columns = tile.column + 0.5 + np.arange(tile.width)
         rows = tile.row + 0.5 + np.arange(tile.height)
         cells = np.stack([*np.meshgrid(columns, rows), heights], axis=-1)
@@ -104,12 +104,12 @@ def make_grid(frame: Frame, box: Float64[np.ndarray, "2 3"], gsd_m: float) -> Gr
     """The grid that covers a scene.
 
     Args:
-        frame: Metric.
+        frame: A metric frame.
         box: Least and largest east, north, up of the scene in the frame's metres.
-        gsd_m: Side of a cell on the ground, metres. What the cell becomes has three digits in the CRS's unit.
+        gsd_m: Cell size on the ground, metres. It is rounded to three significant digits in the CRS's unit.
 
     Raises:
-        SplatpipeError: if the frame has no metres or its CRS cannot be used, or the grid would be absurdly large.
+        SplatpipeError: if the frame is not metric or its CRS cannot be used, or the grid would be absurdly large.
     """
     if not LEAST_CELL_M <= gsd_m <= MOST_CELL_M:
         raise SplatpipeError(f"Cells of {gsd_m:g} m are not valid for a surface.", "Give a size such as --gsd 2cm.")
@@ -134,11 +134,11 @@ def make_grid(frame: Frame, box: Float64[np.ndarray, "2 3"], gsd_m: float) -> Gr
 
 
 def cell_size(crs: MapCrs, gsd_m: float) -> float:
-    """Side of a cell in a CRS's unit, of a few digits.
+    """Cell size in a CRS's unit, rounded to a few digits.
 
     Args:
         crs: The CRS: its unit may be a foot, and its metre longer than the ground's, as in Web Mercator.
-        gsd_m: Side of a cell on the ground, metres.
+        gsd_m: Cell size on the ground, metres.
     """
     scale = 1.0 if crs.world is None else _ground_scale(crs.world)
     stretched = gsd_m if abs(scale - 1.0) < LIKE_GROUND else gsd_m * scale
@@ -159,14 +159,14 @@ def _require_reasonable(width: int, height: int, gsd_m: float) -> None:
 
 
 def _border(box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Samples of a box's sides, at its bottom and its top."""
+    """Samples along a box's sides, at its bottom and its top."""
     steps = np.linspace(0.0, 1.0, EDGE_STEPS)
     plane = np.stack(np.meshgrid(steps, steps, [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
     return np.asarray(box[0] + plane * (box[1] - box[0]))
 
 
 def _smooth(exact: Exact, box: Float64[np.ndarray, "2 3"], unit_m: float, height_unit_m: float) -> SmoothMap:
-    """A lattice over a box and a margin, in any units."""
+    """A smooth map over a box and a margin, in any units."""
     spacing = SPACING_M / unit_m
     margin = np.array([spacing, spacing, HEIGHT_MARGIN_M / height_unit_m])
     return sample_map(exact, box[0] - margin, box[1] + margin, spacing)

@@ -1,4 +1,4 @@
-"""The photos and depths of a run, as the surface asks for them: in local metres, read when they are needed."""
+"""The photos and depths of a run for surface products: in local metres, read when needed."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ LENS_STEP = 8.0  # pixels
 
 @dataclass(frozen=True, eq=False)
 class RunSurface:
-    """What all products of a run are made from.
+    """Inputs of all surface products of a run.
 
     Attributes:
-        frame: The run's, in metres.
-        area: Nothing outside of it is shown; None for all.
-        boundary: The part that tells the area; None where the run has none.
-        depths: Of its photos.
-        photos: As flown, those with depths and others.
-        finer: How many pixels of a photo as flown lie along one of its depths, the middle one of all.
+        frame: The run's frame, metric.
+        area: Products are limited to it; None for everything.
+        boundary: The part with the area; None if the run has none.
+        depths: Depths of its photos.
+        photos: The original photos, with or without depths.
+        finer: Side of a depth pixel in pixels of the original photo, the median over all photos.
     """
 
     frame: Frame
@@ -53,12 +53,12 @@ class RunSurface:
 
 
 def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
-    """Open what a run's products are made from; None without metres, or without any depths.
+    """Open the inputs of a run's products; None if the frame is not metric or there are no depths.
 
     Args:
-        inputs: Of a stage that reads `depths.maps`, `splat_depths.maps`, `undistort.dataset`, `georef.frame`,
+        inputs: Inputs of a stage that reads `depths.maps`, `splat_depths.maps`, `undistort.dataset`, `georef.frame`,
             `georef.model`, `georef.boundary` and `ingest.photos`.
-        report: Told of photos that are not there.
+        report: Receives warnings about missing photos.
 
     Raises:
         SplatpipeError: if one of them is broken.
@@ -80,17 +80,17 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
 
 
 def open_surveyed(wanted: bool, inputs: Inputs, report: Reporter) -> tuple[RunSurface, SiteExtent, float] | None:
-    """The same, with the site that `dsm` left and the side of its cells.
+    """Open the same inputs, with the site that `dsm` wrote and the DSM's cell size.
 
-    None, which is told, where there is no surface model or nothing is wanted.
+    Returns None, with a message, if there is no surface model or the product is not requested.
 
     Args:
-        wanted: Whether the stage's product is asked for.
-        inputs: Of a stage that reads `dsm.site` besides.
-        report: As above.
+        wanted: Whether the stage's product is requested.
+        inputs: Inputs of a stage that also reads `dsm.site`.
+        report: As in ``open_run_surface``.
 
     Raises:
-        SplatpipeError: as above.
+        SplatpipeError: as ``open_run_surface``.
     """
     surveyed = load_site(inputs["dsm.site"]) if wanted else None
     surface = None if surveyed is None else open_run_surface(inputs, report)
@@ -101,14 +101,14 @@ def open_surveyed(wanted: bool, inputs: Inputs, report: Reporter) -> tuple[RunSu
 
 
 def metric_depths(maps: Sequence[DepthMapFile], local_from_model: Similarity) -> list[DepthSource]:
-    """Depth maps of the model's frame in local metres."""
+    """Convert depth maps from the model's frame to local metres."""
     return [_in_metres(kept, None, local_from_model) for kept in maps]
 
 
 def _of_both(
     found: Sequence[DepthMapFile], rendered: Sequence[DepthMapFile]
 ) -> dict[str, tuple[DepthMapFile, DepthMapFile | None]]:
-    """Each photo's depths by its name, and what fills their holes."""
+    """Each photo's depths by its name, and the rendered depths that fill their gaps."""
     others = {kept.camera.name: kept for kept in rendered}
     if not found:
         return {name: (kept, None) for name, kept in others.items()}
@@ -136,12 +136,12 @@ def photo_sources(
     local_from_model: Similarity,
     folders: tuple[Path, Path],
 ) -> list[PhotoSource]:
-    """The photos as flown, at their full size, through their lenses.
+    """The original photos at full size, with their lens distortion.
 
     Args:
-        placed: With their pinhole cameras of full size.
-        depths: By the photos' names; a photo without any colours nothing.
-        local_from_model: The frame's, in metres.
+        placed: Photos with their full-size pinhole cameras.
+        depths: By the photos' names; a photo without depths colours nothing.
+        local_from_model: Transform to local metres.
         folders: The part ``ingest.photos``, and the user's photo folder.
     """
     lenses: dict[int, DistortionGrid] = {}

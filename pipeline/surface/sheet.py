@@ -25,12 +25,12 @@ SIDE = 2048  # cells of a sheet of the ground: four blocks of the files
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A plane, and what of the space about it counts.
+    """A plane with cells, and the height range to consider over it.
 
     Attributes:
         from_local: Rigid, from local metres to the sheet's: along the rows, against the columns, towards the viewer.
         lattice: Its cells.
-        relief: Between which heights over the plane things are looked for.
+        relief: Range of heights over the plane.
     """
 
     from_local: Float64[np.ndarray, "4 4"]
@@ -42,18 +42,18 @@ class Sheet:
         return np.asarray(local @ self.from_local[:3, :3].T + self.from_local[:3, 3])
 
     def local(self, places: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """What ``place`` undoes."""
+        """The inverse of ``place``."""
         return np.asarray((places - self.from_local[:3, 3]) @ self.from_local[:3, :3])
 
     def moved(self, camera: Camera) -> Camera:
-        """A camera of the local frame in the sheet's."""
+        """Transform a camera from the local to the sheet's frame."""
         back = np.eye(4)
         back[:3, :3] = self.from_local[:3, :3].T
         back[:3, 3] = -back[:3, :3] @ self.from_local[:3, 3]
         return replace(camera, cam_from_world=camera.cam_from_world @ back)
 
     def moved_depths(self, source: DepthSource) -> DepthSource:
-        """Depths of a photo of the local frame in the sheet's."""
+        """Transform a photo's depths from the local to the sheet's frame."""
         camera = self.moved(source.camera)
 
         def load() -> PosedDepthMap:
@@ -63,7 +63,7 @@ class Sheet:
         return DepthSource(camera, load)
 
     def moved_photo(self, photo: PhotoSource) -> PhotoSource:
-        """A photo of the local frame, with its depths, in the sheet's."""
+        """Transform a photo with its depths from the local to the sheet's frame."""
         depths = None if photo.depths is None else self.moved_depths(photo.depths)
         return replace(photo, camera=self.moved(photo.camera), depths=depths)
 
@@ -73,8 +73,8 @@ class GridSheet:
     """A part of a raster's grid as a sheet, level at the middle of the part.
 
     Attributes:
-        grid: The raster's.
-        part: Which of its cells; the sheet's lattice has the same.
+        grid: The raster's grid.
+        part: The grid's cells that the sheet's lattice has.
         sheet: The sheet.
     """
 
@@ -85,18 +85,18 @@ class GridSheet:
     def heights(
         self, tile: Tile, over: Float64[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]
     ) -> Float64[np.ndarray, "h w"]:
-        """Heights over the sheet (metres, nan where there are none) in the CRS's unit.
+        """Convert heights over the sheet to heights in the CRS's unit.
 
         Args:
-            tile: Of the sheet's lattice.
-            over: Of its cells.
+            tile: Tile of the sheet's lattice.
+            over: Heights of its cells over the sheet, metres; NaN where there are none.
         """
         places = np.concatenate([self.sheet.lattice.centres(tile), over.astype(np.float64)[..., None]], axis=-1)
         cells = self.grid.cells_from_local(self.sheet.local(places.reshape(-1, 3)))
         return np.asarray(cells[:, 2].reshape(over.shape))
 
     def lattice_of(self, other: Grid, part: Tile) -> Lattice:
-        """Cells of another grid of the same CRS on this sheet."""
+        """The lattice of another grid's cells on this sheet; the grid has the same CRS."""
         scale = self.sheet.lattice.cell_m / self.grid.cell  # metres of the sheet in a unit of the CRS
         west, north = (other.left + part.column) * other.cell, (other.top - part.row) * other.cell
         left, top = (
@@ -108,19 +108,19 @@ class GridSheet:
         return Lattice(east_m, north_m, other.cell * scale, part.width, part.height)
 
     def over(self, other: Grid, part: Tile, heights: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-        """Heights in the CRS's unit of another grid's cells, over this sheet in metres."""
+        """Convert heights of another grid's cells in the CRS's unit to metres over this sheet."""
         local = other.centres_in_local(part, heights)
         return np.asarray(self.sheet.place(local)[..., 2])
 
 
 def grid_sheets(grid: Grid, low: float, high: float, side: int = SIDE) -> Iterator[GridSheet]:
-    """All of a grid in sheets, row by row.
+    """Divide a grid into sheets, row by row.
 
     Args:
-        grid: The raster's.
-        low: No height of the scene is lower, the CRS's unit.
-        high: Nor higher.
-        side: Cells of a sheet.
+        grid: The raster's grid.
+        low: Lowest height of the scene, in the CRS's unit.
+        high: Highest height of the scene, in the CRS's unit.
+        side: Cells per side of a sheet.
     """
     for part in tiled(grid.height, grid.width, side):
         yield GridSheet(grid, part, _sheet(grid, part, low, high))

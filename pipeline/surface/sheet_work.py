@@ -1,4 +1,4 @@
-"""A raster made sheet by sheet: what a killed run finished stays, and memory holds one sheet."""
+"""Compute a raster sheet by sheet: a killed run resumes after its last sheet, and memory holds only one."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class SheetWork:
-    """Sheets to be made.
+    """Sheets to compute.
 
     Attributes:
-        sheets: All of a grid's.
-        wanted: Whether there may be anything in a tile of a sheet.
-        area: Nothing outside of it is made; None for all.
-        tile: Cells of a tile's side.
-        folder: Where finished sheets are kept.
-        report: Told of progress.
-        what: Is being made, in a few words.
+        sheets: All sheets of a grid.
+        wanted: Tells whether a tile of a sheet may have any content.
+        area: Cells outside of it stay empty; None for no limit.
+        tile: Cells per side of a tile.
+        folder: Folder of the finished sheets.
+        report: Receives progress.
+        what: Name of the product, for progress.
     """
 
     sheets: Sequence[GridSheet]
@@ -40,11 +40,11 @@ class SheetWork:
     what: str
 
     def run(self, make: Callable[[GridSheet, Sequence[Tile]], Iterator[tuple[Tile, Arrays]]]) -> None:
-        """Make what is not there yet; progress is told of to the end, also where nothing was left to make.
+        """Compute the missing sheets; progress is reported up to the end even if none is missing.
 
         Args:
-            make: Yields the arrays of a sheet's tiles, each of a tile's size; what lies outside the area is set to 0,
-                or nan.
+            make: Yields the arrays of a sheet's tiles, each of a tile's size; cells outside of the area are set to 0 or
+                NaN.
         """
         self.folder.mkdir(exist_ok=True)
         wanted = [
@@ -65,7 +65,7 @@ class SheetWork:
         self.report.progress(max(1, done), max(1, total), self.what, "tiles")
 
     def finished(self) -> Iterator[tuple[Tile, Arrays]]:
-        """The sheets that have anything, with the part of the grid that each is."""
+        """The non-empty sheets, with the part of the grid that each covers."""
         for number, sheet in enumerate(self.sheets):
             path = self._path(number)
             if path.is_file():

@@ -1,6 +1,6 @@
-"""The site that a run's depths show: how fine its photos are, between which heights it lies, what enough photos see.
+"""The extent of a run's site from its depths: GSD of the photos, height range, and the area that enough photos see.
 
-From a sample of every photo's depths, so that it costs seconds; the products' grids and tiles follow from it.
+It uses a sample of every photo's depths, so it takes seconds; the products' grids and tiles follow from it.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
 
-SAMPLES = 3000  # depths of a photo, evenly
-CELL_GSD = 100.0  # ground sample distances of a plan cell: so many samples of a photo lie in each that it sees
+SAMPLES = 3000  # evenly spaced depths per photo
+CELL_GSD = 100.0  # plan cell size in GSDs, such that each cell that a photo sees has several of its samples
 MOST_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
-LEAST_PHOTOS = 3  # that see a place
-FARTHEST = 4.0  # pixels on the ground so many times the usual are of the far land, which no product shows
-LEAST_PART = 0.02  # of what is seen: smaller parts that lie by themselves are left out
-NOISE = 0.001  # of the samples, the lowest and the highest, that may be wrong
-MARGIN = 0.1  # of the relief, below and above, for what samples missed,
-LEAST_MARGIN_M = 3.0  # and at least so much: a mast or a well
+LEAST_PHOTOS = 3  # photos that have to see a cell
+FARTHEST = 4.0  # pixels larger on the ground than this many times the usual show distant land, not the site
+LEAST_PART = 0.02  # of the area seen: smaller isolated parts are left out
+NOISE = 0.001  # share of the lowest and of the highest samples that may be wrong
+MARGIN = 0.1  # of the relief, below and above, for what the samples missed,
+LEAST_MARGIN_M = 3.0  # but at least this: a mast or a well
 
 
 @dataclass(frozen=True, eq=False)
 class SiteExtent:
-    """What a run's photos show.
+    """The site that a run's photos cover.
 
     Attributes:
-        gsd_m: Of the photos as flown: a pixel's side at what it shows, across the ray; the mean of the photos' medians.
-        low_m: No height lies lower; local metres.
-        high_m: Nor higher.
-        reach: Least east and north, largest east and north of what is seen, local metres.
-        corner: East and north of the plan's first cell's outer corner (its least ones), local metres.
-        cell_m: Of the plan.
-        covered: Which cells of the plan enough photos see, and their neighbours, rows to the north.
+        gsd_m: GSD of the original photos: pixel size at the surface, across the ray; the mean of the photos' medians.
+        low_m: Lowest height, local metres.
+        high_m: Highest height, local metres.
+        reach: Least east and north, largest east and north of the area seen, local metres.
+        corner: East and north of the outer (south-west) corner of the plan's first cell, local metres.
+        cell_m: Cell size of the plan, metres.
+        covered: Cells of the plan that enough photos see, and their neighbours; rows towards north.
     """
 
     gsd_m: float
@@ -62,22 +62,22 @@ class SiteExtent:
         return np.array([[west, south, self.low_m], [east, north, self.high_m]])
 
     def sees(self, box: Float64[np.ndarray, "2 2"]) -> bool:
-        """Whether any of it lies in a rectangle: least and largest east and north."""
+        """Whether any covered cell lies in a rectangle (least and largest east and north)."""
         (left, bottom), (right, top) = np.floor((box - self.corner) / self.cell_m).astype(np.int64)
         return bool(self.covered[max(bottom, 0) : max(top, -1) + 1, max(left, 0) : max(right, -1) + 1].any())
 
     def area_m2(self) -> float:
-        """Of what is covered."""
+        """Covered area, square metres."""
         return float(self.covered.sum()) * self.cell_m**2
 
 
 def save_site(path: Path, site: SiteExtent | None, dsm_cell_m: float = 0.0) -> None:
-    """As JSON; ``load_site`` reads it.
+    """Write a site as JSON for ``load_site``.
 
     Args:
-        path: Where.
-        site: None where nothing is seen.
-        dsm_cell_m: Side of the surface model's cells.
+        path: Output file.
+        site: The site; None if nothing is seen.
+        dsm_cell_m: Cell size of the surface model, metres.
     """
     if site is None:
         write_json(path, None)
@@ -90,10 +90,10 @@ def save_site(path: Path, site: SiteExtent | None, dsm_cell_m: float = 0.0) -> N
 
 
 def load_site(path: Path) -> tuple[SiteExtent, float] | None:
-    """What ``save_site`` was given.
+    """Read a file of ``save_site``: the site and the DSM's cell size; None if nothing is seen.
 
     Raises:
-        StageError: if it is broken.
+        StageError: if the file is broken.
     """
     try:
         told: dict[str, Any] | None = json.loads(path.read_text(encoding="utf-8"))
@@ -115,13 +115,13 @@ def load_site(path: Path) -> tuple[SiteExtent, float] | None:
 def measure_extent(
     sources: Sequence[DepthSource], finer: float, area: PlanArea | None, threads: int
 ) -> SiteExtent | None:
-    """Look at the depths of all photos; None where nothing is seen by enough of them.
+    """Measure the site from the depths of all photos; None if enough photos see nothing.
 
     Args:
-        sources: In local metres.
-        finer: How many times finer photos as flown are than their depths.
-        area: Nothing outside of it counts; None where all does.
-        threads: Photos at a time.
+        sources: Depths in local metres.
+        finer: Resolution of the original photos over that of their depths.
+        area: Only depths inside count; None for all.
+        threads: Photos in parallel.
     """
     looks = list(ordered_map(partial(_look, finer), sources, threads))
     seen = [look for look in looks if len(look)]
@@ -151,7 +151,7 @@ def measure_extent(
 
 
 def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
-    """East, north, up of some depths, and a pixel's side there: on the ground, and across the ray."""
+    """East, north, up of sampled depths, and the pixel size there: on the ground, and across the ray."""
     found: PosedDepthMap = source.load()
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
@@ -167,7 +167,7 @@ def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
 
 
 def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "rows columns"]:
-    """Cells that enough photos see and that are not off by themselves."""
+    """Cells that enough photos see and that are not in small isolated parts."""
     columns, rows = cell.max(axis=0) + 1
     if rows * columns > MOST_CELLS:
         raise SplatpipeError("The photos' depths reach too far for a surface.", "Set a --boundary.")

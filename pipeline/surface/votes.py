@@ -1,7 +1,7 @@
-"""Photos' say about the heights in a tile's cells, and which of them is the top surface: by native kernels.
+"""Height votes of photos in a tile's cells, and the surface layers that follow from them, by native kernels.
 
-A photo's pixels are small planes. Where they cover a cell each of its surfaces is one vote, with an expected deviation;
-surfaces that votes of several photos agree on are layers, and a layer's height is their robust mean.
+A photo's pixels are small planes. Each surface of a photo that covers a cell is one vote, with an expected deviation;
+surfaces on which votes of several photos agree are layers, and a layer's height is their robust mean.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ LAYERS = 3  # surfaces above each other in a cell that are looked at
 
 @dataclass(frozen=True)
 class Layer:
-    """A surface that some cells may have, one row a cell.
+    """A candidate surface, one entry per cell.
 
     Attributes:
-        height: Of its middle vote, local metres; nan where a cell has none.
-        count: How many votes: photos.
-        cover: How much of the cell it covers, by the mean of its votes.
+        height: Height of its median vote, local metres; NaN where a cell has none.
+        count: Number of votes, i.e. photos.
+        cover: Share of the cell that it covers, the mean over its votes.
     """
 
     height: Float64[np.ndarray, " c"]
@@ -42,9 +42,9 @@ class Fit:
     """Heights of cells from all votes near them.
 
     Attributes:
-        height: Local metres; nan where there is none.
+        height: Local metres; NaN where there is none.
         sigma: Its expected deviation, metres.
-        photos: How many agree: votes, or photos that confirm one where those are more.
+        photos: How many photos agree: the votes, or the photos that confirm one of them if these are more.
     """
 
     height: Float64[np.ndarray, " c"]
@@ -53,12 +53,12 @@ class Fit:
 
 
 class HeightVotes:
-    """What photos found in a tile's cells; photos are to be added in one order.
+    """Height votes of photos in a tile's cells; photos must always be added in the same order.
 
     Args:
-        lattice: Whose cells.
-        tile: Which of them.
-        relief: Between which heights.
+        lattice: The lattice of the tile.
+        tile: The tile.
+        relief: Height range of the votes.
 
     Raises:
         ValueError: if the relief is higher than 13 km.
@@ -73,11 +73,11 @@ class HeightVotes:
         )
 
     def add(self, found: PosedDepthMap, window: PhotoWindow) -> None:
-        """A photo's votes: the same bits in any window, and in any tile.
+        """Add a photo's votes; bit-identical for any window and any tile.
 
         Args:
-            found: Its depths.
-            window: Where the tile may lie in it.
+            found: The photo's depths.
+            window: The window of the photo that may show the tile.
         """
         corners = (window.left, window.top, window.right, window.bottom)
         self._held.add(found.depth, found.confidence, native_camera(found.camera), corners)
@@ -93,7 +93,7 @@ class HeightVotes:
         """The robust mean of each cell's votes about a height (Tukey's biweight; Beaton and Tukey 1974).
 
         Args:
-            start: A height that most votes of the surface lie near; nan where there is none.
+            start: A height near most of the surface's votes; NaN where there is none.
         """
         fit = Fit(np.empty(self._cells), np.empty(self._cells), np.empty(self._cells, np.int32))
         self._held.fit(start, fit.height, fit.sigma, fit.photos)
@@ -101,7 +101,7 @@ class HeightVotes:
 
 
 def undecided(found: Sequence[Layer], least: int) -> Bool[np.ndarray, " c"]:
-    """Cells with several surfaces, or with one that few photos saw: photos that look through it are to be asked."""
+    """Cells with several surfaces, or with one that few photos saw, which need a check for photos that see through."""
     first = found[0]
     few = (first.count < least) & np.isfinite(first.height)
     several = np.isfinite(found[1].height) if len(found) > 1 else np.zeros(len(few), np.bool_)
