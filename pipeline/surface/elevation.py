@@ -1,8 +1,8 @@
-"""Elevations of walls: what is seen of a wall by parallel rays, and how far each place lies before or behind its plane.
+"""Elevations of walls: orthographic views, with the distance of each point in front of or behind the wall's plane.
 
-A wall is a sheet that stands. The surface model over it, with the nearest to the viewer as the topmost, tells the
-depths, the orthophoto the colours. What hangs before the wall beyond the relief is left out, and never smeared over it:
-a place that is hidden from photos by it is coloured by those that see past it, or by none.
+A wall is a vertical sheet. The surface model over it, with the surface nearest to the viewer as the topmost, gives the
+depths, and the orthophoto the colours. Objects in front of the wall beyond the height range are left out, and never
+smeared over it: areas that they hide are coloured from photos that see past them, or not at all.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Elevation:
-    """A wall seen from before it; its rasters lie on the sheet's lattice.
+    """A wall seen from the front; its rasters lie on the sheet's lattice.
 
     Attributes:
-        wall: Which.
-        sheet: Its frame: x from the wall's left end, y up as heights of the local frame, z towards the viewer, metres.
-        depth: Metres before the plane, nan where not known.
-        sigma: Expected deviation of each, metres.
+        wall: The wall.
+        sheet: Its frame: x from the wall's left end, y up as in the local frame, z towards the viewer, metres.
+        depth: Metres in front of the plane, NaN where unknown.
+        sigma: Expected deviation of each depth, metres.
         colour: Red, green, blue, alpha: 0 where there is no colour.
     """
 
@@ -61,11 +61,11 @@ class Elevation:
 
 
 def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
-    """The sheet of a wall: whole cells from end to end and from top to foot, what they are too long by on both sides.
+    """The sheet of a wall: whole cells from end to end and from top to foot, with any excess split between both sides.
 
     Args:
-        wall: Which.
-        cell_m: Side of a cell.
+        wall: The wall.
+        cell_m: Cell size, metres.
 
     Raises:
         SplatpipeError: if there would be too many cells.
@@ -87,12 +87,12 @@ def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
 
 @dataclass(frozen=True, eq=False)
 class ElevationPhotos:
-    """What elevations are drawn from.
+    """Inputs of elevations.
 
     Attributes:
         sources: The photos with their depths, local metres, always in the same order.
-        levels: By how much photos' light is multiplied.
-        threads: Tiles at a time.
+        levels: Exposure gains of the photos.
+        threads: Tiles in parallel.
     """
 
     sources: Sequence[PhotoSource]
@@ -101,13 +101,13 @@ class ElevationPhotos:
 
 
 def draw_elevation(wall: Wall, cell_m: float, photos: ElevationPhotos, progress: Progress) -> Elevation:
-    """Draw a wall; the same bits for any number of threads.
+    """Compute the elevation of a wall; bit-identical for any number of threads.
 
     Args:
-        wall: Which.
-        cell_m: Side of a pixel.
-        photos: All of them; those behind the wall are not asked.
-        progress: Told how many tiles are done, of how many.
+        wall: The wall.
+        cell_m: Pixel size, metres.
+        photos: All photos; those behind the wall are not used.
+        progress: Called with the number of finished tiles and of all tiles.
 
     Raises:
         SplatpipeError: as ``wall_sheet``.
@@ -140,7 +140,7 @@ def draw_elevation(wall: Wall, cell_m: float, photos: ElevationPhotos, progress:
 
 
 def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The median of each cell and those around it that are known: edges stay, single cells' errors go."""
+    """Median filter over known neighbours, which keeps edges and removes errors of single cells."""
     result = np.empty_like(depth)
     wide = np.pad(depth, 1, constant_values=np.nan)
     for top in range(0, len(depth), STRIP):
@@ -154,7 +154,7 @@ def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h 
 
 
 def _before(sheet: Sheet, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
-    """Photos that stand before a wall, in its sheet's frame, with their levels."""
+    """Photos in front of a wall, in its sheet's frame, with their exposure gains."""
     rows = [
         row for row, source in enumerate(photos.sources) if sheet.place(source.camera.centre())[2] > sheet.relief.high_m
     ]

@@ -1,4 +1,4 @@
-"""The drawing of an elevation: the picture at true size, outlines, levels, a title and a scale bar."""
+"""The drawing of an elevation: the image at true size, outlines, level marks, a title and a scale bar."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def elevation_drawing(elevation: Elevation, crs: MapCrs, zero_m: float, picture:
     """Draw an elevation: x from the wall's left end, y the height in the CRS's datum, metres.
 
     Args:
-        elevation: Which.
-        crs: Whose datum.
-        zero_m: As ``height_zero_m`` tells.
-        picture: Name of the picture's file.
+        elevation: The elevation.
+        crs: CRS with the vertical datum.
+        zero_m: Result of ``height_zero_m``.
+        picture: Name of the image file.
     """
     wall, sheet = elevation.wall, elevation.sheet
     lattice = sheet.lattice
@@ -60,7 +60,7 @@ def elevation_drawing(elevation: Elevation, crs: MapCrs, zero_m: float, picture:
 
 
 def _levels(low: float, high: float, scale: int) -> tuple[list[Stroke], list[Label]]:
-    """Marks of the foot's and the top's heights, at the left."""
+    """Level marks of foot and top, at the left."""
     mm = scale / 1000.0
     strokes, labels = [], []
     for height in (low, high):

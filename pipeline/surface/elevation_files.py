@@ -1,7 +1,7 @@
-"""Files of elevations: the picture, the depths, and `facades.json`, which tells where they lie and how good they are.
+"""Files of elevations: the image, the depths, and `facades.json` with their positions and accuracy.
 
 Files are in the wall's own metres: x from its left end, y the height in the run's vertical datum, both true lengths,
-which a map's grid stretches. The corners in `facades.json` are in the CRS.
+without the map grid's scale. The corners in `facades.json` are in the CRS.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ LIKELY = 0.95  # share of depths whose deviation is within the second one that i
 
 
 def height_zero_m(elevation: Elevation, crs: MapCrs) -> float:
-    """What heights in the CRS's datum are above the local ones at a wall, metres."""
+    """Height in the CRS's datum minus local height at a wall, metres."""
     low = np.array([[*elevation.wall.left, elevation.wall.low_m]])
     return float(crs.crs_from_local(low)[0, 2]) * crs.height_unit_m - elevation.wall.low_m
 
 
 def write_depth(path: Path, elevation: Elevation, zero_m: float) -> None:
-    """Write depths as a TIFF of float32: metres before the plane, towards the viewer.
+    """Write depths as a float32 TIFF: metres in front of the plane, towards the viewer.
 
     Args:
-        path: Where.
-        elevation: Whose.
-        zero_m: As ``height_zero_m`` tells.
+        path: Output file.
+        elevation: The elevation.
+        zero_m: Result of ``height_zero_m``.
 
     Raises:
         MachineError: if the disk is full or not writable.
@@ -76,11 +76,11 @@ def write_picture(path: Path, elevation: Elevation) -> None:
 
 
 def elevation_facts(elevation: Elevation, crs: MapCrs, files: dict[str, str]) -> dict[str, Any]:
-    """What `facades.json` tells of an elevation.
+    """The entry of an elevation in `facades.json`.
 
     Args:
-        elevation: Which.
-        crs: Of its corners.
+        elevation: The elevation.
+        crs: CRS of its corners.
         files: Names of its files beside the JSON, by ``depth``, ``picture``, ``dxf``, ``svg``.
     """
     wall, lattice = elevation.wall, elevation.sheet.lattice
@@ -111,9 +111,9 @@ def write_facades(path: Path, facts: Sequence[dict[str, Any]], crs: MapCrs) -> N
     """Write `facades.json`.
 
     Args:
-        path: Where.
-        facts: Of each elevation.
-        crs: Of the corners.
+        path: Output file.
+        facts: Entries of all elevations.
+        crs: CRS of the corners.
     """
     authority = crs.horizontal.to_authority(min_confidence=100)
     value = {
@@ -128,7 +128,7 @@ def write_facades(path: Path, facts: Sequence[dict[str, Any]], crs: MapCrs) -> N
 
 
 def _plane(elevation: Elevation, crs: MapCrs) -> dict[str, Any]:
-    """A place on the plane, and the compass direction (clockwise from the grid's north) that the wall faces."""
+    """A point on the plane, and the azimuth (clockwise from grid north) that the wall faces."""
     wall = elevation.wall
     foot = np.array([*((wall.left + wall.right) / 2.0), wall.low_m])
     before = foot + np.array([*wall.facing, 0.0])

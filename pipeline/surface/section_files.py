@@ -1,4 +1,4 @@
-"""Files of sections: CSV for calculations, DXF at true size, PNG to look at."""
+"""Files of sections: CSV for calculations, DXF at true size, PNG for viewing."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def write_section(folder: Path, name: str, section: Section, crs: MapCrs) -> dic
     """Write all files of a section.
 
     Args:
-        folder: Where.
-        name: Of the files, without ending.
-        section: Which.
-        crs: Of its coordinates.
+        folder: Output folder.
+        name: Base name of the files.
+        section: The section.
+        crs: CRS of its coordinates.
 
     Returns:
-        What is told of it: ``name``, ``line``, ``length_m``, ``share_with_height``, ``height_sigma_m`` (the middle one;
-        None where none is told), ``points``, and its files.
+        Its facts: ``name``, ``line``, ``length_m``, ``share_with_height``, ``height_sigma_m`` (the median; None if
+        unknown), ``points``, and its files.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -73,7 +73,7 @@ def write_section(folder: Path, name: str, section: Section, crs: MapCrs) -> dic
 
 
 def unit_key(unit_m: float) -> str:
-    """A unit of length as the end of a column's name."""
+    """A unit of length as the suffix of a column's name."""
     return UNIT_KEYS.get(unit_name(unit_m), f"{unit_m:.6g}m")
 
 
@@ -81,9 +81,9 @@ def section_drawing(name: str, section: Section, crs: MapCrs) -> Drawing:
     """Draw a section at true size: distances to the right, heights up, metres.
 
     Args:
-        name: For its title.
-        section: Which.
-        crs: Of its coordinates.
+        name: Name in the title.
+        section: The section.
+        crs: CRS of its coordinates.
     """
     up = section.height * crs.height_unit_m
     heights = np.concatenate([up[np.isfinite(up)], section.points[:, 1]])
@@ -119,7 +119,7 @@ def _grid(length_m: float, heights: tuple[float, float], step: float, scale: int
 
 
 def _unbroken(line: Float64[np.ndarray, "n 2"]) -> list[Float64[np.ndarray, "k 2"]]:
-    """Parts of a line without a gap, without points that lie straight between others."""
+    """Parts of a line between gaps, without collinear points."""
     known = np.isfinite(line[:, 1])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
     return [line[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 1]
@@ -137,7 +137,7 @@ def _write_points(path: Path, section: Section) -> None:
 
 
 def _write_table(path: Path, header: list[str], table: Float64[np.ndarray, "n k"]) -> None:
-    """Numbers with a row of names above; empty where one is not known."""
+    """Write numbers as CSV with a header row; unknown values are empty."""
     with whole_file(path) as aside, aside.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)

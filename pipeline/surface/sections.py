@@ -1,7 +1,7 @@
-"""Sections: the ground and all on it along a line, cut upright.
+"""Sections: vertical cuts through the ground and everything on it along a line.
 
-The surface model tells the topmost height at each place. Where depth maps are at hand, their points near the plane are
-told, too: walls and what overhangs have no place in a surface model.
+The surface model gives the topmost height at each place. If depth maps are available, their points near the plane are
+added: a surface model cannot represent walls and overhangs.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class Section:
 
     Attributes:
         line: Easting and northing of its start and its end, the CRS's unit.
-        distance_m: Of each place from the start, on the ground.
+        distance_m: Ground distance of each place from the start, metres.
         place: Eastings and northings.
-        height: The surface's, the CRS's unit; nan where there is none.
-        sigma_m: Expected deviation of each; nan where none is told.
-        points: Distances from the start and heights, both metres, of what photos see near the plane.
+        height: Heights of the surface, in the CRS's unit; NaN where there is none.
+        sigma_m: Expected deviation of each height, metres; NaN where unknown.
+        points: Distances from the start and heights, both in metres, of points that photos see near the plane.
     """
 
     line: Line
@@ -51,22 +51,22 @@ class Section:
 
     @property
     def length_m(self) -> float:
-        """From start to end."""
+        """Length from start to end, metres."""
         return float(self.distance_m[-1])
 
 
 def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence[DepthSource], threads: int) -> Section:
-    """Cut a surface model, and depth maps where there are any.
+    """Cut a section through a surface model, and through depth maps if there are any.
 
     Args:
-        surface: The model.
-        line: Start and end, the CRS's coordinates.
-        crs: The model's.
-        sources: Depths of the photos, local metres; none for the surface alone.
-        threads: Photos at a time.
+        surface: The surface model.
+        line: Start and end, in the CRS's coordinates.
+        crs: CRS of the surface model.
+        sources: Depths of the photos, local metres; empty for the surface alone.
+        threads: Photos in parallel.
 
     Raises:
-        SplatpipeError: if the line has no length, is absurdly long, or crosses nothing of the surface.
+        SplatpipeError: if the line has no length, is absurdly long, or does not cross the surface.
     """
     start, end = np.array(line[:2], np.float64), np.array(line[2:], np.float64)
     length = float(np.linalg.norm(end - start)) if np.isfinite([start, end]).all() else 0.0
@@ -95,7 +95,7 @@ def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence
 def _points(
     sources: Sequence[DepthSource], ends: Float64[np.ndarray, "2 3"], cell_m: float, threads: int
 ) -> Float64[np.ndarray, "k 2"]:
-    """Distance from the start and local height of what some photos see near the plane: a point a cell."""
+    """Distance from the start and local height of points that enough photos see near the plane: one per cell."""
     parts = [np.zeros((0, 2)), *ordered_map(partial(_photo_points, ends, cell_m), sources, threads)]
     every = np.concatenate(parts)
     cells, numbers = np.unique(np.floor(every / cell_m).astype(np.int64), axis=0, return_inverse=True)
@@ -106,7 +106,7 @@ def _points(
 
 
 def _photo_points(ends: Float64[np.ndarray, "2 3"], cell_m: float, source: DepthSource) -> Float64[np.ndarray, "k 2"]:
-    """Those of one photo, no two in a cell."""
+    """The points of one photo, at most one per cell."""
     found: PosedDepthMap = source.load()
     camera = found.camera
     way = (ends[1] - ends[0])[:2]
@@ -129,7 +129,7 @@ def _photo_points(ends: Float64[np.ndarray, "2 3"], cell_m: float, source: Depth
 def _raised(
     points: Float64[np.ndarray, "k 2"], ends: Float64[np.ndarray, "2 3"], crs: MapCrs
 ) -> Float64[np.ndarray, "k 2"]:
-    """With heights in the CRS's datum, metres."""
+    """Convert the points' heights to the CRS's datum, metres."""
     way = (ends[1] - ends[0]) / np.linalg.norm((ends[1] - ends[0])[:2])
     local = ends[0] + points[:, :1] * way
     local[:, 2] = points[:, 1]

@@ -1,4 +1,4 @@
-"""A finished surface model in its file, asked for heights window by window: along lines, and within rectangles."""
+"""Reads heights from a surface model's file window by window: along lines, and within rectangles."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ SIGMA_BAND = 2  # of `dsm_confidence.tif`, millimetres; 0 where there is none
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFile:
-    """A raster of heights, north up, with how far they may be off.
+    """A north-up raster of heights, with their expected deviations.
 
     Attributes:
         path: `dsm.tif`.
         confidence: `dsm_confidence.tif`, on the same grid; None where there is none.
-        lattice: The raster's cells, in the CRS's unit where others are in metres.
+        lattice: The raster's cells, in the CRS's unit, unlike other lattices, which are in metres.
     """
 
     path: Path
@@ -37,24 +37,24 @@ class SurfaceFile:
 
     @property
     def cell(self) -> float:
-        """Side of a cell, the CRS's unit."""
+        """Cell size, in the CRS's unit."""
         return self.lattice.cell_m
 
     def heights(self, part: Tile) -> Float64[np.ndarray, "h w"]:
-        """Heights of cells, the CRS's unit; nan where there are none, and outside."""
+        """Heights of cells, in the CRS's unit; NaN where there are none, and outside."""
         return _read(self.path, 1, part)
 
     def sigmas_m(self, part: Tile) -> Float64[np.ndarray, "h w"]:
-        """Expected deviations of heights, metres; nan where none is told."""
+        """Expected deviations of heights, metres; NaN where unknown."""
         if self.confidence is None:
             return np.full((part.height, part.width), np.nan)
         millimetres = _read(self.confidence, SIGMA_BAND, part)
         return np.where(millimetres > 0.0, millimetres / 1000.0, np.nan)
 
     def along(self, places: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-        """Heights (the CRS's unit) and their deviations (metres) of places that follow each other.
+        """Heights (in the CRS's unit) and expected deviations (metres) of consecutive places.
 
-        Between smooth cells heights are on a straight line; at a step they are the nearest cell's.
+        Heights are interpolated between smooth cells; at a step they are the nearest cell's.
 
         Args:
             places: Eastings and northings.
@@ -80,10 +80,10 @@ def open_surface(path: Path, confidence: Path | None = None) -> SurfaceFile:
 
     Args:
         path: A north-up GeoTIFF of heights.
-        confidence: As the run writes it beside.
+        confidence: `dsm_confidence.tif` of the same run; None if there is none.
 
     Raises:
-        SplatpipeError: if it is no such raster, or the two are not on one grid.
+        SplatpipeError: if it is not such a raster, or the two do not share a grid.
     """
     try:
         with gdal(path.parent), rasterio.open(path) as raster:
@@ -101,7 +101,7 @@ def open_surface(path: Path, confidence: Path | None = None) -> SurfaceFile:
 
 
 def _runs(cells: Float64[np.ndarray, "n 2"]) -> Iterator[slice]:
-    """Parts of a sequence of places, each within a window."""
+    """Split a sequence of places into runs that each fit into a window."""
     start = 0
     while start < len(cells):
         ahead = cells[start : start + WINDOW]
@@ -113,7 +113,7 @@ def _runs(cells: Float64[np.ndarray, "n 2"]) -> Iterator[slice]:
 
 
 def _read(path: Path, band: int, part: Tile) -> Float64[np.ndarray, "h w"]:
-    """Values of cells, nan where there are none, and outside of the raster."""
+    """Values of cells, NaN where there are none, and outside of the raster."""
     found = np.full((part.height, part.width), np.nan)
     with gdal(path.parent), rasterio.open(path) as raster:
         top, bottom = np.clip([part.row, part.row + part.height], 0, raster.height)

@@ -1,4 +1,4 @@
-"""`volumes.json`: what lies above and below a base inside each polygon of a boundary."""
+"""`volumes.json`: volumes above and below a base inside each polygon of a boundary."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ HOW = (
 
 
 def write_volumes(path: Path, facts: Sequence[Mapping[str, Any]], crs: MapCrs) -> None:
-    """Write what was measured.
+    """Write the measured volumes.
 
     Args:
-        path: Where.
-        facts: Of each polygon, as ``volume_facts`` tells them.
-        crs: The model's.
+        path: Output file.
+        facts: Results of ``volume_facts`` for each polygon.
+        crs: CRS of the surface model.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -37,12 +37,12 @@ def write_volumes(path: Path, facts: Sequence[Mapping[str, Any]], crs: MapCrs) -
 
 
 def volume_facts(number: int, name: str, volume: Volume) -> dict[str, Any]:
-    """A volume as JSON; the base's height is told in metres of the CRS's datum, at a place in the CRS's unit.
+    """A volume as JSON values; the base's height is in metres in the CRS's datum, its position in the CRS's unit.
 
     Args:
-        number: Of the polygon in its file, from 1 on.
-        name: The polygon's; empty for none.
-        volume: What lies in it.
+        number: Number of the polygon in its file, from 1.
+        name: Name of the polygon; empty for none.
+        volume: The volume in it.
     """
     base = volume.base
     kinds = {"cut": volume.cut, "fill": volume.fill, "net": volume.net}
