@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from frames import RenderCase, RenderOutcome
 
-# Largest differences of pictures, float32 against float64.
+# Largest differences of images, float32 against float64.
 PICTURES = {
     "colour": 5e-6,  # sums of some hundred rounded terms of size 1
     "alpha": 5e-6,
@@ -14,19 +14,19 @@ PICTURES = {
     "median_depth": 5e-5,  # one depth
 }
 RADII = 2e-4
-"""Relative and in pixels: a root of the covariance's eigenvalue."""
+"""Relative and in pixels: the root of an eigenvalue of the covariance."""
 GRADIENTS = 2e-5
 """L2 over all Gaussians, relative: sums over a hundred pixels, through divisions by 1 - alpha ≥ 0.01."""
 NO_GRADIENT = 1e-6
-"""What is smaller in all is rounding."""
+"""Smaller gradients are rounding."""
 FLIPPED = 4e-3
-"""Share of the pixels in which a rounding may decide whether a Gaussian at a threshold (1/255, 1e-4, a half) counts."""
+"""Share of the pixels where rounding may decide whether a Gaussian at a threshold (1/255, 1e-4, a half) counts."""
 FLIP = 0.02
-"""How far off such a pixel's colour may be: a step of alpha, 1/255, of colours up to four."""
+"""Largest error of such a pixel's colour: a step of alpha, 1/255, for colours up to four."""
 
 
 def flipped(ours: RenderOutcome, exact: RenderOutcome) -> np.ndarray:
-    """(h, w) where a picture is beyond its tolerance."""
+    """Return (h, w) where an image exceeds its tolerance."""
     beyond = [
         (np.abs(ours.pictures[name].astype(np.float64) - exact.pictures[name]) <= limit)
         for name, limit in PICTURES.items()
@@ -36,7 +36,7 @@ def flipped(ours: RenderOutcome, exact: RenderOutcome) -> np.ndarray:
 
 
 def without_flips(case: RenderCase, flips: np.ndarray) -> RenderCase:
-    """The case with nothing coming back from some pixels."""
+    """Return the case with the gradients of some pixels zeroed."""
     upstream = {
         name: np.where(flips[..., None] if value.ndim == 3 else flips, np.float32(0), value)
         for name, value in case.upstream.items()
@@ -45,7 +45,7 @@ def without_flips(case: RenderCase, flips: np.ndarray) -> RenderCase:
 
 
 def picture_complaints(ours: RenderOutcome, exact: RenderOutcome) -> list[str]:
-    """In what way pictures, radii and visible are not those of the definition."""
+    """List the differences of images, radii and visibility from the definition."""
     found = []
     flips = flipped(ours, exact)
     if flips.sum() > max(2, FLIPPED * flips.size):
@@ -65,7 +65,7 @@ def picture_complaints(ours: RenderOutcome, exact: RenderOutcome) -> list[str]:
 
 
 def gradient_errors(ours: RenderOutcome, exact: RenderOutcome) -> dict[str, float]:
-    """By parameter, relative in L2 over all Gaussians; not a number where one is not."""
+    """Return errors by parameter, relative in L2 over all Gaussians; NaN where a gradient is NaN."""
     return {
         name: float(
             np.linalg.norm(ours.gradients[name].astype(np.float64) - expected)
@@ -76,6 +76,6 @@ def gradient_errors(ours: RenderOutcome, exact: RenderOutcome) -> dict[str, floa
 
 
 def gradient_complaints(ours: RenderOutcome, exact: RenderOutcome, limit: float = GRADIENTS) -> list[str]:
-    """Which gradients are not those of the definition."""
+    """List the gradients that differ from the definition's."""
     errors = gradient_errors(ours, exact)
     return [f"gradient of {name}: {error:.1e}" for name, error in errors.items() if not error <= limit]

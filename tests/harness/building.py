@@ -29,7 +29,7 @@ _INCLUDE = re.compile(r'^#include "(.+)"', re.MULTILINE)
 
 
 def kernel_sources() -> list[Path]:
-    """All of the backend's sources."""
+    """Return all of the backend's sources."""
     return sorted((NATIVE / "cuda").glob("*.cu"))
 
 
@@ -43,17 +43,17 @@ def build_on_cpu(
 
     Args:
         sources: CUDA sources; None: the backend's own.
-        name: Of the library.
-        flags: For the compiler, after the usual ones.
-        changed: Other text for sources or headers in ``NATIVE``, by their paths there; what depends on them is compiled
-            with less optimisation, which takes half the time, fuses products into sums wherever it can, as nvcc does,
-            and ends the process where it does what is undefined.
+        name: Name of the library.
+        flags: Further compiler flags.
+        changed: Replacement text for sources or headers in ``NATIVE``, by their paths there; whatever depends on them
+            is compiled with less optimisation (half the time), with contraction of products and sums wherever possible,
+            as by nvcc, and with a trap on undefined behaviour.
 
     Returns:
         The shared library, ``lib<name>_on_cpu.so``.
 
     Raises:
-        AssertionError: with what the compiler said, if it does not compile.
+        AssertionError: with the compiler's output, if it does not compile.
     """
     KEPT.mkdir(mode=0o700, exist_ok=True)
     assert KEPT.stat().st_uid == os.getuid(), f"{KEPT} is somebody else's: what lies there would be run"
@@ -75,7 +75,7 @@ def build_on_cpu(
 
 
 def load(library: Path) -> ctypes.CDLL:
-    """The library, with the harness's own functions declared."""
+    """Load the library, with the harness's own functions declared."""
     loaded = ctypes.CDLL(str(library))
     loaded.harness_order.argtypes = [ctypes.c_int, ctypes.c_uint64]
     loaded.harness_order.restype = None
@@ -90,7 +90,7 @@ def load(library: Path) -> ctypes.CDLL:
 
 
 def _fused() -> tuple[str, ...]:
-    """Products fused into sums only where the source says so: the same bits as the C library's fmaf gives, sooner."""
+    """Return flags that fuse products into sums only where the source does: the bits of C's fmaf, faster."""
     has_fma = _CPU.exists() and "fma" in _CPU.read_text().split()
     return ("-ffp-contract=off", *(("-mfma",) if has_fma else ()))
 
@@ -100,7 +100,7 @@ def _digest(texts: Iterable[str]) -> str:
 
 
 def _copy_with(changed: Mapping[Path, str]) -> Path:
-    """A copy of the native sources in which some files have other text."""
+    """Return a copy of the native sources in which some files are replaced."""
     files = [path for path in sorted(NATIVE.rglob("*")) if path.suffix in _SOURCES]
     texts = {path: changed.get(path, path.read_text()) for path in files}
     assert changed.keys() <= texts.keys(), "no such source"
@@ -116,7 +116,7 @@ def _copy_with(changed: Mapping[Path, str]) -> Path:
 
 
 def _depends(source: Path, native: Path) -> set[Path]:
-    """A source and the headers that it includes, directly or not."""
+    """Return a source and the headers that it includes, directly or indirectly."""
     found, left = set(), [source]
     while left:
         path = left.pop()
@@ -130,7 +130,7 @@ def _depends(source: Path, native: Path) -> set[Path]:
 
 
 def _compile(source: Path, native: Path, options: tuple[str, ...]) -> Path:
-    """The object of a source, which depends on it, on its headers and on the options."""
+    """Compile a source to an object, cached by the source, its headers and the options."""
     texts = [path.read_text() for path in sorted(_depends(source, native))]
     built = KEPT / "objects" / f"{source.stem}-{_digest([source.name, *options, *texts])}.o"
     if not built.exists():
@@ -140,7 +140,7 @@ def _compile(source: Path, native: Path, options: tuple[str, ...]) -> Path:
 
 
 def _write(path: Path, arguments: list[str]) -> None:
-    """Run the compiler; others may build the same, so the file comes into being at once."""
+    """Run the compiler; the file appears atomically, since others may build the same one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.{os.getpid()}")
     done = subprocess.run(["c++", *arguments, "-o", str(beside)], capture_output=True, text=True, check=False)

@@ -1,6 +1,6 @@
 """The CUDA kernels' checks, for planted faults: the same that the kernels pass. Without torch.
 
-As a program, it makes the checks on each fault of a library in a process of its own: what is broken may crash.
+As a program, it runs the checks on each fault of a library in a process of its own, since faulty kernels may crash.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 
 PATIENCE_S = 60
-"""Far more than all checks of one fault take: what loops for ever is found, too."""
+"""Far longer than all checks of one fault: detects endless loops."""
 
 
 @dataclass(frozen=True)
 class ReferenceResult:
-    """By the definition: pictures and gradients of frames, a loss, draws, and pictures of a large frame."""
+    """Results by the definition: images and gradients of frames, a loss, draws, and images of a large frame."""
 
     frames: list[tuple[RenderCase, RenderOutcome]]
     loss: Loss
@@ -39,9 +39,9 @@ class ReferenceResult:
 
 
 def complaints(library: CudaLibrary, truth: ReferenceResult) -> Iterator[str]:
-    """In what way the kernels are not right, one after another; nothing if they are."""
+    """Yield what is wrong with the kernels; nothing if they are right."""
     harness = controls(library)
-    harness.harness_multiprocessors(1)  # so that blocks have several turns
+    harness.harness_multiprocessors(1)  # so that blocks take several turns
     firsts: list[RenderOutcome] = []
     for turn, order in enumerate(ORDERS):
         harness.harness_order(*order)
@@ -63,7 +63,7 @@ def complaints(library: CudaLibrary, truth: ReferenceResult) -> Iterator[str]:
 
 
 def first_complaint(library: CudaLibrary, truth: ReferenceResult) -> str:
-    """The first of ``complaints``, also where the kernels do not even run; empty if there is none."""
+    """Return the first of ``complaints``, including a failure to run at all; empty if there is none."""
     np.seterr(all="ignore")  # poison is signalling NaN
     try:
         return next(complaints(library, truth), "")
@@ -72,7 +72,7 @@ def first_complaint(library: CudaLibrary, truth: ReferenceResult) -> str:
 
 
 def in_a_process(library: CudaLibrary, truth: ReferenceResult, fault: int) -> str:
-    """``first_complaint`` with a fault alive, or how the process ended."""
+    """Return ``first_complaint`` with a fault active, or how the process ended."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -88,12 +88,12 @@ def in_a_process(library: CudaLibrary, truth: ReferenceResult, fault: int) -> st
 
 
 def main() -> None:
-    """Arguments: the library, the pickled truth, the number of faults. Prints what was found of each, none first."""
+    """Print the findings for each fault, no fault first. Arguments: library, pickled truth, number of faults."""
     library = CudaLibrary(Path(sys.argv[1]))
     truth = pickle.loads(Path(sys.argv[2]).read_bytes())
     print(json.dumps([in_a_process(library, truth, fault) for fault in range(int(sys.argv[3]) + 1)]))
 
 
 if __name__ == "__main__":
-    sys.modules["checking"] = sys.modules["__main__"]  # where the pickled classes say that they are
+    sys.modules["checking"] = sys.modules["__main__"]  # the module name in the pickled classes
     main()

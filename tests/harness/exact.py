@@ -14,7 +14,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 
 
 def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object) -> RenderCase:
-    """The case of a scene, with random gradients of all pictures."""
+    """Return the case of a scene, with random upstream gradients for all images."""
     rng = np.random.default_rng(seed)
     size, part = (camera.height, camera.width), camera.window
     upstream = {"colour": rng.normal(size=(*size, 3)), **{name: rng.normal(size=size) for name in GREY}}
@@ -48,7 +48,7 @@ def options_of(case: RenderCase) -> RenderOptions:
 
 
 def exact_outcome(case: RenderCase, backend: str = "reference", gradients: bool = True) -> RenderOutcome:
-    """What the definition gives in float64, or the CPU's kernels in float32."""
+    """Return the outcome by the definition in float64, or by the CPU's kernels in float32."""
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = {name: torch.from_numpy(case.rows[name]).to(dtype).requires_grad_(gradients) for name in PARAMETERS}
     probe = torch.zeros(case.count, 2, dtype=dtype, requires_grad=gradients)

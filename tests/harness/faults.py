@@ -8,18 +8,18 @@ from pathlib import Path
 from building import HARNESS, NATIVE, build_on_cpu, kernel_sources
 
 ALIVE = "FAULT"
-"""In a replacement: whether this fault is the one that is alive, so that one library has them all."""
+"""In a replacement: whether this fault is the active one, so that one library can contain all of them."""
 
 
 @dataclass(frozen=True)
 class KernelFault:
-    """One mistake.
+    """A mistake to plant.
 
     Attributes:
-        name: What is wrong with it.
-        file: From `native/cuda` on.
-        snippet: What stands in the file, exactly once.
-        instead: What is put there; the same as long as ``ALIVE`` is false.
+        name: Description of the mistake.
+        file: Path relative to `native/cuda`.
+        snippet: Original text, exactly once in the file.
+        instead: Replacement; equivalent as long as ``ALIVE`` is false.
     """
 
     name: str
@@ -294,10 +294,10 @@ FAULTS = (
 
 
 def planted() -> Path:
-    """The kernels with all faults in them, none of which is alive before ``harness_fault`` says its number, from 1.
+    """Return the kernels with all faults planted, none active until ``harness_fault`` sets its number, from 1.
 
     Raises:
-        AssertionError: if a snippet is not in its file exactly once.
+        AssertionError: if a snippet does not occur in its file exactly once.
     """
     texts: dict[Path, str] = {}
     for number, fault in enumerate(FAULTS, start=1):
@@ -307,5 +307,5 @@ def planted() -> Path:
         changed = texts.get(path, text)
         assert changed.count(fault.snippet) == 1, f"two faults in one place of {fault.file}: {fault.name}"
         texts[path] = changed.replace(fault.snippet, fault.instead.replace(ALIVE, f"(::harness::fault() == {number})"))
-    texts = {path: f'#include "device.h"\n{text}' for path, text in texts.items()}  # which knows the harness
+    texts = {path: f'#include "device.h"\n{text}' for path, text in texts.items()}  # which includes the harness
     return build_on_cpu([*kernel_sources(), HARNESS / "peek.cu"], "splat_cuda_with_faults", changed=texts)

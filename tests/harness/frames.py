@@ -31,7 +31,7 @@ ALIGNMENT = 256
 
 
 class Memory:
-    """Arrays as a device would have them: full of signalling NaN, with guards on both sides."""
+    """Arrays as on a device: filled with signalling NaN, with guards on both sides."""
 
     def __init__(self) -> None:
         self._all: list[tuple[str, np.ndarray, int, int]] = []
@@ -50,7 +50,7 @@ class Memory:
         return copy
 
     def overrun(self) -> list[str]:
-        """Arrays beside which something was written."""
+        """Return the arrays that something was written beside."""
         found = []
         for name, raw, begin, size in self._all:
             guards = np.concatenate([raw[begin - GUARD_BYTES : begin], raw[begin + size : begin + size + GUARD_BYTES]])
@@ -64,15 +64,15 @@ class Memory:
 
 @dataclass(frozen=True)
 class RenderCase:
-    """A view of some Gaussians, and what comes back from its pictures.
+    """A view of some Gaussians, and the upstream gradients of its images.
 
     Attributes:
         rows: Raw parameters by name, float32.
         pose: cam_from_world, (3, 4).
         intrinsics: fx, fy, cx, cy.
         size: Width and height, pixels.
-        window: Left, top, width and height of the whole picture of which this is a part; None: it is the whole.
-        upstream: dL/d(picture) by name: colour (h, w, 3), alpha, depth_sum, depth_square_sum (h, w).
+        window: Left, top, width and height within the whole image, if this is a window; None for the whole.
+        upstream: dL/d(image) by name: colour (h, w, 3), alpha, depth_sum, depth_square_sum (h, w).
     """
 
     rows: dict[str, np.ndarray]
@@ -110,14 +110,14 @@ class RenderCase:
 
 @dataclass(frozen=True)
 class RenderOutcome:
-    """What came out: pictures, radii and visible; gradients by parameter and of means2d; the frame's facts."""
+    """Outcome of a case: images, radii and visibility; gradients by parameter and of means2d; the frame's facts."""
 
     pictures: dict[str, np.ndarray]
     gradients: dict[str, np.ndarray]
     facts: tuple[int, int, int] = (0, 0, 0)
 
     def differs(self, other: RenderOutcome) -> list[str]:
-        """Names of what does not have the same bits; the number of chunks is no result."""
+        """Return the names of results that are not bit-identical; the number of chunks is not a result."""
         ours, theirs = self.pictures | self.gradients, other.pictures | other.gradients
         names = [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()]
         return names + [f"facts {self.facts} {other.facts}"] * (self.facts[:2] != other.facts[:2])
@@ -132,7 +132,7 @@ def rows_of(arrays: dict[str, np.ndarray]) -> SplatRows:
 
 
 class DeviceFrame:
-    """A case on the device, from forward on."""
+    """A case on the device, starting with the forward pass."""
 
     def __init__(self, library: CudaLibrary, case: RenderCase, capacity: int = 1 << 16, passes: int = 1) -> None:
         self.library, self.case, self.at = library, case, Memory()
@@ -183,7 +183,7 @@ class DeviceFrame:
 
 
 def run(library: CudaLibrary, case: RenderCase, capacity: int = 1 << 16, passes: int = 1) -> RenderOutcome:
-    """Forward and, where there is something to come back, backward; asserts that nothing was written beside."""
+    """Run forward and, if there are upstream gradients, backward; assert that nothing was written out of bounds."""
     frame = DeviceFrame(library, case, capacity, passes)
     pictures = frame.forward()
     gradients = {}

@@ -18,17 +18,17 @@ from building import build_on_cpu
 
 @functools.cache
 def library_on_cpu() -> CudaLibrary:
-    """All of the backend's sources, built once."""
+    """Return the library of all of the backend's sources, built once."""
     return CudaLibrary(build_on_cpu())
 
 
 def kernels_on_cpu() -> CudaKernels:
-    """For ``cuda.use_kernels``, with a forecast of its own."""
+    """Return kernels for ``cuda.use_kernels``, with their own forecast."""
     return CudaKernels(library_on_cpu(), torch.device("cpu"))
 
 
 class ShortOfMemory(CudaKernels):
-    """Kernels whose device has little memory for a frame, or for its backward pass."""
+    """Kernels on a device with little memory for a frame, or for its backward pass."""
 
     most_bytes, most_frame_bytes = 1 << 40, 1 << 40
 

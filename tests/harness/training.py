@@ -13,23 +13,23 @@ from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 
 LOSS = 1e-5
 LOSS_GRADIENT = 5e-5
-"""Relative, the gradient in L2; both as in test_loss.py."""
+"""Relative, the gradient in L2; as in test_loss.py."""
 STEP = 1e-4
-"""L2 of how far values and moments move, relative: that of the gradients they come from."""
+"""Relative L2 error of the change in values and moments: that of their gradients."""
 FLOAT = 2.0**-24
-"""And what is stored is rounded."""
+"""Rounding of the stored values."""
 OFFSETS = 1e-5
 """As in test_cuda_loss.py: the device's logarithm, cosine and exponential, of scales about one."""
 BETAS, EPSILON, COUNT = (0.9, 0.999), 1e-15, 7
 RATES = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": 2.5e-3}
 RATE_SH_REST = 2.5e-3 / 20
 SCALES = (-2.0, 0.5)  # to which log_scales are clamped
-KEY = (5, 600, 2)  # of the draws: seed, step, what for
+KEY = (5, 600, 2)  # of the draws: seed, step, purpose
 
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss of render and photo (h, w, 3), masked (h, w) where zero, of what is inner; its gradient by the render."""
+    """A loss of render and photo (h, w, 3) over an inner window where the mask (h, w) is not zero; its gradient."""
 
     render: np.ndarray
     photo: np.ndarray
@@ -57,7 +57,7 @@ class Loss:
 
 
 def step_complaints(library: CudaLibrary, case: RenderCase, exact: RenderOutcome) -> Iterator[str]:
-    """Of Adam's step (Kingma and Ba, ICLR 2015) fused with the backward pass, of the visible rows."""
+    """Check the fused backward pass and Adam step (Kingma and Ba, ICLR 2015) on the visible rows."""
     rng = np.random.default_rng(8)
     start = {"value": case.rows}
     start["mean"] = {name: (1e-2 * rng.normal(size=rows.shape)).astype(np.float32) for name, rows in case.rows.items()}
@@ -89,7 +89,7 @@ def step_complaints(library: CudaLibrary, case: RenderCase, exact: RenderOutcome
 
 
 def stepped(name: str, old: dict[str, np.ndarray], gradient: np.ndarray, seen: np.ndarray) -> dict[str, np.ndarray]:
-    """A parameter's values and moments after a step, in float64."""
+    """Return a parameter's values and moments after a step, in float64."""
     rows = seen.reshape(-1, *[1] * (gradient.ndim - 1))
     rate: float | np.ndarray = RATES[name]
     if name == "sh":
@@ -111,16 +111,16 @@ def stepped(name: str, old: dict[str, np.ndarray], gradient: np.ndarray, seen: n
 
 @dataclass(frozen=True)
 class Draws:
-    """Density control's numbers by ``KEY``.
+    """Density control's random numbers for ``KEY``.
 
     Attributes:
         uniform: The first ones, (n).
         rows: Gaussians that are split, (k).
-        log_scales: Of all, (m, 3).
-        quats: Of all, (m, 4).
-        offsets: Where their halves lie, (2 k, 3).
+        log_scales: Of all Gaussians, (m, 3).
+        quats: Of all Gaussians, (m, 4).
+        offsets: Offsets of the split halves, (2 k, 3).
         means: Places in the unit cube, (p, 3).
-        keys: Theirs on the Morton curve, (p).
+        keys: Morton codes of these places, (p).
     """
 
     uniform: np.ndarray

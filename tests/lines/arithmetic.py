@@ -22,7 +22,7 @@ class AddConfig(StageConfig):
     offset: int = 0
     """Added to the sum."""
     seed: int = 0
-    """Only there to be set."""
+    """Exists only to be set."""
 
 
 class CountConfig(StageConfig):
@@ -38,7 +38,7 @@ class CountConfig(StageConfig):
 
 class TellConfig(StageConfig):
     loud: bool = False
-    """In capitals."""
+    """Print in capitals."""
 
 
 class LineConfig(StageConfig):

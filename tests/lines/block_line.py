@@ -1,6 +1,7 @@
 """The pipeline's stages `blocks` and `train` on a given dataset, in a process of their own.
 
-Called as ``block_line.py SCENE OUT SHARD OPTIONS [THREADS]``: makes that shard, or with an empty name walks the line.
+Called as ``block_line.py SCENE OUT SHARD OPTIONS [THREADS]``: makes that shard, or with an empty name runs the
+pipeline.
 """
 
 import json
@@ -36,16 +37,16 @@ def make(
     until: str | None = None,
     show: Callable[[Event], None] = lambda event: None,
 ) -> Outcome:
-    """Make one shard of `train`, or all of it, and what comes before.
+    """Make one shard of `train`, or all of it, and everything before it.
 
     Args:
-        scene: Has what is given.
+        scene: Folder with the inputs.
         out: An OUT.
-        options: Of `blocks` and `train`.
+        options: Options of `blocks` and `train`.
         shard: Its name; empty for all.
-        threads: Of the worker.
+        threads: Threads of the worker.
         until: The last stage.
-        show: Takes the events.
+        show: Receives the events.
     """
     store = open_store(out, create=True)
     source = {name: Part(scene / path, path) for name, path in GIVEN.items()}
@@ -62,7 +63,7 @@ def make(
 
 
 def tell(event: Event) -> None:
-    """Say when a training goes."""
+    """Print when a training is running."""
     if event.kind == "progress" and "training" in str(event.data["what"]):
         print(event.stage, event.data["done"], flush=True)
 

@@ -100,7 +100,7 @@ LINE = (READ, DIVIDE, SUM, SHOW)
 
 @dataclass(frozen=True)
 class Forecaster:
-    """What the line takes, for where the whole program runs on it (`sharded_site`)."""
+    """The pipeline's cost, for tests in which the whole program runs it (`sharded_site`)."""
 
     config: LineConfig
     threads: int

@@ -29,7 +29,7 @@ OPTIONS = RenderOptions(sh_degree=0, near=0.1)
 
 
 def surface() -> Float64[np.ndarray, "n 3"]:
-    """Points on ground, roofs and walls, evenly."""
+    """Return points on ground, roofs and walls, evenly spaced."""
     x, y = np.meshgrid(np.arange(SPACING / 2, LENGTH, SPACING), np.arange(SPACING / 2, WIDTH, SPACING))
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     parts = []
@@ -45,7 +45,7 @@ def surface() -> Float64[np.ndarray, "n 3"]:
 
 
 def model(xyz: Float64[np.ndarray, "n 3"]) -> Gaussians:
-    """Opaque round Gaussians at points, grey, with a texture of their places."""
+    """Create opaque, round, grey Gaussians at points, with a texture by position."""
     found = Gaussians.empty(len(xyz), 0)
     found.means = torch.from_numpy(xyz).float()
     found.log_scales = torch.full((len(xyz), 3), math.log(0.6 * SPACING))
@@ -56,7 +56,7 @@ def model(xyz: Float64[np.ndarray, "n 3"]) -> Gaussians:
 
 
 def camera(name: str, centre: Float64[np.ndarray, " 3"], forward: Float64[np.ndarray, " 3"]) -> Camera:
-    """A camera whose horizontal edges are level; one that looks straight down has its top to the north."""
+    """Return a camera without roll; one that looks straight down has its top to the north."""
     forward = forward / np.linalg.norm(forward)
     aside = np.array([0.0, 1.0, 0.0]) if abs(forward[2]) > 0.999 else np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, aside)
@@ -68,7 +68,7 @@ def camera(name: str, centre: Float64[np.ndarray, " 3"], forward: Float64[np.nda
 
 
 def flight() -> list[Camera]:
-    """Straight down in strips, and obliquely from the south and the north."""
+    """Return cameras in nadir strips, and oblique ones from the south and the north."""
     found = []
     for x in np.arange(4.0, LENGTH, 8.0):
         places = [np.array([x, y, HEIGHT]) for y in np.arange(4.0, WIDTH, 8.0)]
@@ -81,7 +81,7 @@ def flight() -> list[Camera]:
 def observed(
     xyz: Float64[np.ndarray, "n 3"], cameras: list[Camera], coarse: Gaussians
 ) -> list[Int64[np.ndarray, " _"]]:
-    """Which points each camera sees: those at most half a metre behind the rendered depth."""
+    """Return the points that each camera sees: at most half a metre behind the rendered depth."""
     found = []
     for view in cameras:
         rows, pixels, depths = view.in_view(xyz)
@@ -92,18 +92,18 @@ def observed(
 
 
 def depth_of(coarse: Gaussians, grid: Camera) -> Float32[np.ndarray, "h w"]:
-    """The coarse model's."""
+    """Return the coarse model's depth."""
     return render_depth(coarse, grid, OPTIONS)
 
 
 def quarters(view: Camera) -> Windows:
-    """A photo cut into two rows and two columns."""
+    """Cut a photo into two rows and two columns."""
     x, y = (0, view.width // 2, view.width), (0, view.height // 2, view.height)
     return np.array([[x[i], y[j], x[i + 1], y[j + 1]] for j in (0, 1) for i in (0, 1)])
 
 
 def site_sights(coarse: Gaussians, points: Float64[np.ndarray, "p 3"], by_depth: bool = True) -> list[PhotoCoverage]:
-    """What the flight sees, by the coarse model's depth or by points alone."""
+    """Return what the flight sees, by the coarse model's depth or by points alone."""
     cameras = flight()
     rows = observed(points, cameras, coarse)
     return sights(cameras, rows, (lambda grid: depth_of(coarse, grid)) if by_depth else None)

@@ -21,7 +21,7 @@ TEXTURE = 640
 
 
 class Recorder:
-    """A Reporter that keeps what it is told."""
+    """A Reporter that records what it receives."""
 
     def __init__(self) -> None:
         self.warnings: list[str] = []
@@ -39,14 +39,14 @@ class Recorder:
 
 
 def camera() -> pycolmap.Camera:
-    """The true camera."""
+    """Return the true camera."""
     parameters = [FOCAL, WIDTH / 2, HEIGHT / 2, RADIAL]
     return pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=parameters)
 
 
 @cache
 def texture(seed: int) -> np.ndarray:
-    """(n, n, 3) noise of several octaves, nowhere alike."""
+    """Return (n, n, 3) noise of several octaves, without repetition."""
     rng = np.random.default_rng(seed)
     total = np.zeros((TEXTURE, TEXTURE, 3), np.float32)
     for cells in (10, 40, 160, 320):
@@ -56,7 +56,7 @@ def texture(seed: int) -> np.ndarray:
 
 
 def poses(count: int, step_deg: float = 9.0) -> list[np.ndarray]:
-    """4x4 cam_from_world of cameras on an arc that look into the corner at the origin; z is up."""
+    """Return 4x4 cam_from_world of cameras on an arc that look into the corner at the origin; z is up."""
     found = []
     for number in range(count):
         angle = math.radians(20 + step_deg * number)
@@ -73,7 +73,7 @@ def poses(count: int, step_deg: float = 9.0) -> list[np.ndarray]:
 
 
 def render(pose: np.ndarray, seed: int, lens: pycolmap.Camera | None = None) -> np.ndarray:
-    """The (h, w, 3) photo that the true camera (or another lens) takes of the planes x = 0, y = 0 and z = 0."""
+    """Render the (h, w, 3) photo of the planes x = 0, y = 0 and z = 0 by the true camera or another lens."""
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = np.ones((WIDTH * HEIGHT, 3))
     rays[:, :2] = (lens or camera()).cam_from_img(np.column_stack([x.ravel(), y.ravel()]))
@@ -95,7 +95,7 @@ def render(pose: np.ndarray, seed: int, lens: pycolmap.Camera | None = None) -> 
 
 
 def list_anew(inputs: Inputs) -> None:
-    """Make `ingest`'s list one of the photos as they lie there now."""
+    """Replace `ingest`'s list by one of the photos as they are now."""
     part = inputs["ingest.photos"]
     photos = load_photo_list(part).photos
     digests = [hashlib.sha256((inputs.photos_dir / photo.name).read_bytes()).hexdigest() for photo in photos]
@@ -104,11 +104,11 @@ def list_anew(inputs: Inputs) -> None:
 
 
 def write_capture(folder: Path, pictures: dict[str, np.ndarray], masks: dict[str, np.ndarray] | None = None) -> Inputs:
-    """Write photos and the parts that `ingest` would leave for them.
+    """Write photos and `ingest`'s output for them.
 
     Args:
-        folder: Where to.
-        pictures: (h, w, 3) RGB by name; all by one camera without a known focal length.
+        folder: Output folder.
+        pictures: (h, w, 3) RGB by name; all by one camera with unknown focal length.
         masks: (h, w) by name, 0 where ignored.
     """
     part, photos_dir = folder / "part", folder / "photos"
@@ -139,11 +139,11 @@ def write_capture(folder: Path, pictures: dict[str, np.ndarray], masks: dict[str
 
 
 def with_parts(inputs: Inputs, threads: int = 1, **parts: Path) -> Inputs:
-    """The same inputs and more: ``features__database=…`` is the part ``features.database``."""
+    """Return the inputs with further parts: ``features__database=…`` is the part ``features.database``."""
     more = {name.replace("__", "."): path for name, path in parts.items()}
     return Inputs({**inputs.parts, **more}, inputs.photos_dir, machine=Machine(threads=threads))
 
 
 def room(names: Sequence[str], seed: int = 0, step_deg: float = 9.0) -> dict[str, np.ndarray]:
-    """A photo for each name, along the arc."""
+    """Return a photo for each name, along the arc."""
     return {name: render(pose, seed) for name, pose in zip(names, poses(len(names), step_deg), strict=True)}

@@ -41,7 +41,7 @@ SCRIPT = """async ([bytes, type, times]) => {
 
 
 def decoded(browser: Browser, film: Path, times_s: list[float]) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """What Chromium says of a film (width, height, duration), and its pictures at some times, (h, w, 3) RGB."""
+    """Return Chromium's facts about a video (width, height, duration), and its frames at some times, (h, w, 3) RGB."""
     page = browser.new_page()
     try:
         kind = {".webm": "video/webm", ".mp4": "video/mp4"}[film.suffix]
@@ -54,5 +54,5 @@ def decoded(browser: Browser, film: Path, times_s: list[float]) -> tuple[dict[st
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
-    """Of 8-bit pictures, decibels."""
+    """Return the PSNR of 8-bit images, decibels."""
     return float(20.0 * np.log10(255.0) - 10.0 * np.log10(np.mean((one.astype(float) - other) ** 2)))

@@ -6,7 +6,7 @@ from typing import Any
 
 
 def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Both of a file's chunks."""
+    """Return both of a file's chunks."""
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
     length, kind = struct.unpack_from("<I4s", data, 12)
     assert kind == b"JSON" and length % 4 == 0
@@ -16,7 +16,7 @@ def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def packed(document: dict[str, Any], binary: bytes) -> bytes:
-    """A file of them."""
+    """Return a file with both chunks."""
     text = json.dumps(document).encode()
     text, binary = text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4)
     total = 28 + len(text) + len(binary)

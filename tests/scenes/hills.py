@@ -16,32 +16,32 @@ IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def placed(crs: str = "EPSG:25832+7837", vertical: str = "EPSG:7837", origin: Origin = GERMANY) -> Frame:
-    """A georeferenced frame."""
+    """Return a georeferenced frame."""
     return Frame("enu", IDENTITY, origin, vertical, crs=crs)
 
 
 def box(half_east: float, half_north: float, low: float = -10.0, high: float = 30.0) -> Array:
-    """A scene's box about the origin, metres."""
+    """Return a scene's box about the origin, metres."""
     return np.array([[-half_east, -half_north, low], [half_east, half_north, high]])
 
 
 def hill_grid(frame: Frame | None = None, gsd_m: float = 0.1) -> Grid:
-    """About 400 by 300 cells: of several of GDAL's blocks only where a test asks for smaller cells."""
+    """Return about 400 by 300 cells: they span several GDAL blocks only if a test requests smaller cells."""
     return make_grid(frame or placed(), box(20.0, 15.0), gsd_m)
 
 
 def hill(x: Array, y: Array) -> Array:
-    """Height above 100 at metres from the middle: a hill, and waves around it."""
+    """Return the height above 100 at metres from the centre: a hill, and waves around it."""
     return np.asarray(104.0 + 6.0 * np.exp(-(x**2 + y**2) / 80.0) + np.sin(x / 4.0) * np.cos(y / 5.0))
 
 
 def from_middle(grid: Grid, columns: Array, rows: Array) -> tuple[Array, Array]:
-    """Metres in the grid from its middle."""
+    """Return metres from the centre of the grid."""
     return (columns - grid.width / 2.0) * grid.cell, (grid.height / 2.0 - rows) * grid.cell
 
 
 def write_hill(path: Path, grid: Grid, hole: bool = True) -> None:
-    """Its heights as `dsm.tif`, without data in a square of 4 m beside the top, should there be a hole."""
+    """Write the heights as `dsm.tif`; with ``hole``, a square of 4 m beside the top has no data."""
     with raster_file(path, grid, HEIGHTS) as file:
         for tile in grid.tiles():
             columns, rows = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)

@@ -19,7 +19,7 @@ STRIPE_M = 1.2
 
 @dataclass(frozen=True, eq=False)
 class ExactDepths:
-    """What `mvs` would leave, without an error."""
+    """Depth maps in `mvs`'s form, without errors."""
 
     camera: Camera
     depth: NDArray[np.float32]
@@ -27,7 +27,7 @@ class ExactDepths:
 
 
 def photo_camera(name: str, eye: tuple[float, float, float], target: tuple[float, float, float]) -> Camera:
-    """A small camera at a place, looking at another; north is up where it looks straight down."""
+    """Return a small camera at a place, looking at another; north is up if it looks straight down."""
     forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     up = (0.0, 1.0, 0.0) if abs(forward[2]) > 0.99 else (0.0, 0.0, 1.0)
     right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
@@ -38,7 +38,7 @@ def photo_camera(name: str, eye: tuple[float, float, float], target: tuple[float
 
 
 def cameras() -> list[Camera]:
-    """Nine that look down, and eight around that look at the house."""
+    """Return nine nadir cameras, and eight around the house that look at it."""
     above = [(e, n, 20.0) for n in (-6.0, 0.0, 6.0) for e in (-7.0, 0.0, 7.0)]
     around = [(15.0 * np.cos(a), 15.0 * np.sin(a), 12.0) for a in np.arange(8) * np.pi / 4 + 0.2]
     down = [photo_camera(f"d{i}", place, (place[0], place[1], 0.0)) for i, place in enumerate(above)]
@@ -46,12 +46,12 @@ def cameras() -> list[Camera]:
 
 
 def roof_height(north: Array) -> Array:
-    """Of the roof's plane at a place."""
+    """Return the height of the roof's plane at a place."""
     return RIDGE_M - (RIDGE_M - EAVES_M) * np.abs(north) / ROOF[3]
 
 
 def true_height(east: Array, north: Array) -> Array:
-    """Of the topmost surface."""
+    """Return the height of the topmost surface."""
     height = np.zeros(np.shape(east))
     (tree_e, tree_n, tree_up), radius = TREE
     inside = radius**2 - (east - tree_e) ** 2 - (north - tree_n) ** 2
@@ -60,7 +60,7 @@ def true_height(east: Array, north: Array) -> Array:
 
 
 def edge_distance(east: Array, north: Array) -> Array:
-    """How far a place is from the next step in height: eaves or the tree's rim."""
+    """Return a place's distance from the nearest step in height: eaves or the tree's rim."""
     west, far, south, top = ROOF
     across = np.maximum(np.abs(east - (west + far) / 2) - (far - west) / 2, -np.inf)
     along = np.abs(north - (south + top) / 2) - (top - south) / 2
@@ -75,7 +75,7 @@ def _within(box: tuple[float, float, float, float], east: Array, north: Array) -
 
 
 def trace(origin: Array, ray: Array) -> tuple[Array, NDArray[np.int64]]:
-    """How many rays' lengths away the first surface is, infinite in the sky, and which it is."""
+    """Return the distance to the first surface in lengths of the ray, infinite in the sky, and which surface it is."""
     with np.errstate(divide="ignore", invalid="ignore"):
         hits = [(np.where(ray[2] < 0.0, -origin[2] / ray[2], np.inf), GROUND), *_walls(origin, ray)]
         slope = (RIDGE_M - EAVES_M) / ROOF[3]
@@ -115,14 +115,14 @@ def _rays(camera: Camera, parts: int) -> Array:
 
 
 def depths_of(camera: Camera) -> ExactDepths:
-    """True depths, 0 in the sky; each confirmed by four."""
+    """Return true depths, 0 in the sky; each confirmed by four."""
     depth, _ = trace(camera.centre(), _rays(camera, 1))
     known = np.isfinite(depth)
     return ExactDepths(camera, np.where(known, depth, 0.0).astype(np.float32), np.where(known, 4, 0).astype(np.uint8))
 
 
 def colours(kind: NDArray[np.int64], east: Array, north: Array) -> Array:
-    """Colours of surfaces, (..., 3) from 0 to 255: walls are red, and nothing else is; stripes on the rest."""
+    """Return the surfaces' colours, (..., 3) from 0 to 255: only walls are red; the others have stripes."""
     stripe = 0.5 + 0.5 * np.sin(2 * np.pi * (east + 0.6 * north) / STRIPE_M)
     bases = {
         NOTHING: (200.0, 220.0, 255.0),
@@ -136,7 +136,7 @@ def colours(kind: NDArray[np.int64], east: Array, north: Array) -> Array:
 
 
 def photo_of(camera: Camera, parts: int = 2) -> NDArray[np.uint8]:
-    """What the camera sees, each pixel the mean of some samples."""
+    """Return what the camera sees, each pixel the mean of several samples."""
     origin, ray = camera.centre(), _rays(camera, parts)
     depth, kind = trace(origin, ray)
     safe = np.where(np.isfinite(depth), depth, 0.0)
@@ -146,7 +146,7 @@ def photo_of(camera: Camera, parts: int = 2) -> NDArray[np.uint8]:
 
 
 def true_orthophoto(east: Array, north: Array) -> Array:
-    """Colours of the topmost surfaces."""
+    """Return the colours of the topmost surfaces."""
     inside_tree = (east - TREE[0][0]) ** 2 + (north - TREE[0][1]) ** 2 < TREE[1] ** 2
     kind = np.where(_within(ROOF, east, north), ROOF_SIDE, np.where(inside_tree, LEAVES, GROUND))
     return colours(kind, east, north)

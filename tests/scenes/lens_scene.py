@@ -13,12 +13,12 @@ from splatpipe.pipeline.sfm.lens_model import simplest
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 WIDTH, HEIGHT = 1200, 900
-TRACK = 9  # photos that would find a point if all had it in view
+TRACK = 9  # photos that would observe a point if it were in view of all
 
 
 @dataclass(frozen=True)
 class LensScene:
-    """A model with simple lenses, its view graph, and the lenses that the points were seen through."""
+    """A model with simple lenses, its view graph, and the true lenses."""
 
     model: pycolmap.Reconstruction
     verified: ViewGraph
@@ -26,12 +26,12 @@ class LensScene:
 
 
 def make_lens(model: str, params: Sequence[float], number: int = 1) -> pycolmap.Camera:
-    """A camera of the scenes' size."""
+    """Return a camera of the scenes' size."""
     return pycolmap.Camera(camera_id=number, model=model, width=WIDTH, height=HEIGHT, params=list(params))
 
 
 def look_from(centre: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
-    """Camera from world, (3, 4), of a camera that looks at a place."""
+    """Return the pose (camera from world, (3, 4)) of a camera that looks at a place."""
     forward = (at - centre) / np.linalg.norm(at - centre)
     side = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
@@ -42,7 +42,7 @@ def look_from(centre: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
 
 
 def orbit(count: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Oblique photos from two heights around a place, and some turned upright."""
+    """Return oblique poses from two heights around a place, some turned to portrait."""
     poses = []
     for k in range(count):
         angle, high = 2.0 * np.pi * k / count, k % 2
@@ -54,7 +54,7 @@ def orbit(count: int, rng: np.random.Generator) -> list[np.ndarray]:
 
 
 def strips(count: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Photos straight down from one height, in parallel strips of one direction."""
+    """Return nadir poses from one height, in parallel strips of one direction."""
     poses = []
     for k in range(count):
         centre = np.array([3.0 * (k % 6) - 7.5, 4.0 * (k // 6) - 6.0, 14.0]) + rng.normal(0.0, 0.1, 3)
@@ -70,7 +70,7 @@ def make_scene(
     points: int = 1000,
     noise_px: float = 0.5,
 ) -> LensScene:
-    """Project points through the lenses, in turn by photo, and adjust a model of simple ones to what is seen."""
+    """Project points through the lenses, assigned to photos in turn, and adjust a model of simple lenses to them."""
     rng = np.random.default_rng(seed)
     spread = [12.0, 10.0, 0.02] if flat else [11.0, 11.0, 3.0]
     places = rng.uniform(-1.0, 1.0, (points, 3)) * spread
@@ -112,6 +112,6 @@ def make_scene(
     )
     options = pycolmap.BundleAdjustmentOptions()
     options.ceres.solver_options.num_threads = 1
-    options.refine_focal_length = not flat  # which mapping holds where it is not told
+    options.refine_focal_length = not flat  # which mapping holds fixed if it is not set
     pycolmap.bundle_adjustment(model, options)
     return LensScene(model, verified, {lens.camera_id: lens for lens in lenses})

@@ -13,7 +13,7 @@ Found = TypeVar("Found")
 
 
 def wait_until(happened: Callable[[], Found], what: str = "it") -> Found:
-    """Ask again and again; the first answer that is true.
+    """Poll until the answer is true, and return it.
 
     Raises:
         AssertionError: naming what did not happen in ``PATIENCE_S``.

@@ -7,7 +7,7 @@ Array = NDArray[np.float64]
 
 
 def first_hits(origin: Array, directions: Array, corners: Array) -> Array:
-    """Distance to the first triangle (m, 3, 3) along each ray (n, 3); Möller and Trumbore 1997."""
+    """Return the distance to the first triangle (m, 3, 3) along each ray (n, 3); Möller and Trumbore 1997."""
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     from_a = origin - a
     q = np.cross(from_a, ab)

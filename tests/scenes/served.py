@@ -22,12 +22,12 @@ ADDRESS = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)")
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back.
+    """A server's response.
 
     Attributes:
-        status: 0 where the server closed without a word.
-        headers: By their names in small letters.
-        body: As it was sent.
+        status: 0 if the server closed the connection without a response.
+        headers: Headers by lower-case name.
+        body: The body, as sent.
     """
 
     status: int
@@ -37,12 +37,12 @@ class Answer:
 
 @dataclass(frozen=True)
 class Served:
-    """A server.
+    """A running server.
 
     Attributes:
         port: Its port.
         start: The page that it opens.
-        process: It.
+        process: The server's process.
     """
 
     port: int
@@ -56,14 +56,14 @@ class Served:
     def ask(
         self, target: str | bytes, *lines: str, method: str = "GET", host: str | None = "", body: bytes = b""
     ) -> Answer:
-        """Send one request and read all of the answer.
+        """Send one request and read the whole response.
 
         Args:
-            target: As it goes into the first line.
+            target: Request target, as it goes into the first line.
             lines: Further headers.
             method: The method.
-            host: Of the Host header; empty for the right one, None for none.
-            body: What follows.
+            host: Value of the Host header; empty for the right one, None for none.
+            body: Body of the request.
         """
         raw = target if isinstance(target, bytes) else target.encode("latin-1")
         headers = [f"Host: {host or f'127.0.0.1:{self.port}'}"] if host is not None else []
@@ -72,9 +72,9 @@ class Served:
         return self.send(head + body)
 
     def send(self, raw: bytes) -> Answer:
-        """Send bytes and read all that comes back."""
+        """Send bytes and read the whole response."""
         with socket.create_connection(("127.0.0.1", self.port), timeout=30) as connection:
-            with contextlib.suppress(OSError):  # refused before all of it was sent
+            with contextlib.suppress(OSError):  # rejected before all of it was sent
                 connection.sendall(raw)
             received = b""
             with contextlib.suppress(ConnectionResetError):
@@ -88,7 +88,7 @@ class Served:
 
 @contextlib.contextmanager
 def serving(out: Path, *options: object) -> Iterator[Served]:
-    """``splatpipe view OUT`` while the context lasts."""
+    """Run ``splatpipe view OUT`` while the context lasts."""
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", str(out), "--no-browser", *map(str, options)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
@@ -106,11 +106,11 @@ def serving(out: Path, *options: object) -> Iterator[Served]:
         try:
             process.communicate(timeout=PATIENCE_S)
         finally:
-            process.kill()  # nothing where it has ended
+            process.kill()  # no effect if it has ended
 
 
 def linked_copy(run: Path, target: Path) -> Path:
-    """A copy of a run that may go on: what a run replaces is a hard link, what it writes into is not."""
+    """Copy a run so that it can be continued: files are hard links unless a run writes into them."""
 
     def copy(source: str, place: str) -> None:
         (shutil.copy2 if Path(source).name in WRITTEN_INTO else os.link)(source, place)

@@ -14,7 +14,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.sky_mask import SkyPhoto, directions
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
-EYE = 2.0  # world units over the plain
+EYE = 2.0  # world units above the plain
 BLUE = ((0.35, 0.55, 0.9), (0.8, 0.88, 0.97))  # at the zenith, at the horizon
 OVERCAST = ((0.86, 0.87, 0.88), (0.93, 0.93, 0.93))
 UP = np.array([0.0, 0.0, 1.0])
@@ -37,7 +37,7 @@ HOUSES = (Block(-9.0, -2.0, 20.0, 5.0), Block(1.0, 6.0, 16.0, 3.0), Block(6.0, 1
 
 
 def look(heading_deg: float = 0.0, pitch_deg: float = 5.0, roll_deg: float = 0.0, x: float = 0.0) -> Camera:
-    """A camera on the plain; heading 0 looks along +y."""
+    """Return a camera on the plain; heading 0 looks along +y."""
     heading, pitch, roll = np.radians([heading_deg, pitch_deg, roll_deg])
     forward = np.array([np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)])
     level = np.array([np.cos(heading), -np.sin(heading), 0.0])
@@ -52,7 +52,7 @@ def look(heading_deg: float = 0.0, pitch_deg: float = 5.0, roll_deg: float = 0.0
 def trace(
     camera: Camera, blocks: Sequence[Block] = HOUSES, sky: tuple[tuple[float, ...], tuple[float, ...]] = BLUE
 ) -> tuple[SkyPhoto, np.ndarray]:
-    """The photo, and True where its rays hit nothing."""
+    """Return the photo, and a mask of the rays that hit nothing."""
     rays, origin = directions(camera), camera.centre()
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     zenith, horizon = np.array(sky)
@@ -83,7 +83,7 @@ def _paint(colour, nearest, distance, rays, origin, look):  # type: ignore[no-un
 
 
 def points_on(blocks: Sequence[Block] = HOUSES) -> np.ndarray:
-    """Triangulated points on the plain, and on the blocks that have texture."""
+    """Return triangulated points on the plain, and on the textured blocks."""
     random = np.random.default_rng(3)
     ground = random.uniform([-15.0, 4.0, 0.0], [15.0, 40.0, 0.0], (POINTS, 3))
     walls = [
@@ -103,7 +103,7 @@ HEADINGS = (-24.0, -15.0, -6.0, 4.0, 13.0, 22.0)
 
 
 def write_dataset(folder: Path, pitch_deg: float = 5.0) -> Path:
-    """A dataset of photos of the blocks, as `undistort` leaves it; the ground's points are seen by every camera."""
+    """Write a dataset of photos of the blocks, in `undistort`'s format; every camera sees the ground's points."""
     cameras = [
         replace(look(heading, pitch_deg, x=0.1 * heading), name=f"{i}.png") for i, heading in enumerate(HEADINGS)
     ]

@@ -1,6 +1,7 @@
 """The demo capture after an ideal structure from motion: exact cameras, noisy observations.
 
-Points lie on the true surface and are seen by every photo that they face, walls or not: for geometry that is no matter.
+Points lie on the true surface and are seen by every photo that they face, even through walls, which does not affect the
+geometry.
 """
 
 import json
@@ -36,7 +37,7 @@ MARK_PX = 0.3
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a control file before it is written."""
+    """A line of a control file, as fields."""
 
     name: str
     place: tuple[float, float, float]
@@ -45,7 +46,7 @@ class Row:
 
 
 def surface_points(count: int, seed: int = 0) -> tuple[Array, Array]:
-    """Places on the true surface within the site, evenly by area, and the surface's normals there."""
+    """Sample the true surface within the site, uniformly by area; return the places and the surface's normals."""
     triangles = true_surface()
     triangles = triangles[np.abs(triangles[:, :, :2]).max(axis=(1, 2)) < 40.0]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -62,7 +63,7 @@ def surface_points(count: int, seed: int = 0) -> tuple[Array, Array]:
 def true_model(
     photos: Sequence[str] | None = None, points: int = 900, seed: int = 0, flat: bool = False
 ) -> pycolmap.Reconstruction:
-    """Exact cameras and points, their features seen with noise, in the true world; or over flat ground alone."""
+    """Return a model of exact cameras and points with noisy features, in the true world; or over flat ground alone."""
     rng = np.random.default_rng(seed)
     places, normals = surface_points(points, seed)
     if flat:
@@ -96,7 +97,7 @@ def true_model(
 def adjusted(
     model: pycolmap.Reconstruction, focal: float | None = None, k1: float | None = None
 ) -> pycolmap.Reconstruction:
-    """What free bundle adjustment makes of a model; with a focal length and a distortion, these are held."""
+    """Return a model after free bundle adjustment; a given focal length or distortion is held fixed."""
     options = pycolmap.BundleAdjustmentOptions()
     options.ceres.solver_options.num_threads = 1
     held = focal is not None
@@ -114,7 +115,7 @@ def adjusted(
 
 
 def positions(kind: str, sigma: tuple[float, float], lift: float = 0.0) -> list[dict[str, Any]]:
-    """Records of ``positions.json``: the truth with its injected errors, ``gps`` or ``rtk``."""
+    """Return records of ``positions.json``: the truth with its injected errors, ``gps`` or ``rtk``."""
     records = []
     for truth in TRUTH["photos"]:
         stated = np.array(truth["centre_m"]) + np.array(truth[f"{kind}_error_m"])
@@ -126,7 +127,7 @@ def positions(kind: str, sigma: tuple[float, float], lift: float = 0.0) -> list[
 
 
 def rows(names: Sequence[str], photos: Sequence[str] | None = None, seed: int = 0) -> list[Row]:
-    """Marks of surveyed points, with noise."""
+    """Return noisy marks of surveyed points."""
     rng = np.random.default_rng(seed)
     found = []
     for name in names:
@@ -139,7 +140,7 @@ def rows(names: Sequence[str], photos: Sequence[str] | None = None, seed: int = 
 
 
 def gcp_list(lines: Sequence[Row], crs: str = "EPSG:32633") -> str:
-    """The text of ODM's file."""
+    """Return the text of ODM's file."""
     body = [
         f"{r.place[0]!r} {r.place[1]!r} {r.place[2]!r} {r.pixel[0]!r} {r.pixel[1]!r} {r.photo} {r.name}" for r in lines
     ]
@@ -149,7 +150,7 @@ def gcp_list(lines: Sequence[Row], crs: str = "EPSG:32633") -> str:
 def capture_parts(
     folder: Path, model: pycolmap.Reconstruction, records: list[dict[str, Any]], control: str
 ) -> dict[str, Path]:
-    """The parts that georef reads."""
+    """Return the parts that georef reads."""
     folder.mkdir(parents=True, exist_ok=True)
     moved = pycolmap.Reconstruction(model)
     rotation = pycolmap.Rotation3d(MODEL_FROM_WORLD.rotation)
@@ -177,5 +178,5 @@ def capture_parts(
 
 
 def moved_rows(lines: Sequence[Row], change: Callable[[Row], Row]) -> list[Row]:
-    """Every line changed."""
+    """Return every line, changed."""
     return [change(line) for line in lines]

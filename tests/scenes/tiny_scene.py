@@ -26,7 +26,7 @@ CAMERAS = 9
 GAUSSIANS = 150
 POINT_NOISE = 0.03  # world units; the model is two units across
 
-# No technique that is on by default: what a test of one technique alone begins with.
+# No technique that is on by default: the base for tests of a single technique.
 PLAIN: dict[str, object] = {
     "antialias": False,
     "background": "black",
@@ -38,12 +38,12 @@ PLAIN: dict[str, object] = {
 
 
 def plain(**options: object) -> TrainConfig:
-    """A training's configuration without them, but for the options given."""
+    """Return a training configuration without them, except for the given options."""
     return TrainConfig.model_validate(PLAIN | options)
 
 
 def resolver(**density: object) -> Callable[[TrainConfig, int], Schedule]:
-    """``resolve_schedule`` with other lengths and limits of density control, to be put into its place."""
+    """Return a replacement for ``resolve_schedule`` with other lengths and limits of density control."""
 
     def resolved(config: TrainConfig, footage: PhotoSizes = UNKNOWN) -> Schedule:
         schedule = resolve_schedule(config, footage)
@@ -54,7 +54,7 @@ def resolver(**density: object) -> Callable[[TrainConfig, int], Schedule]:
 
 @dataclass
 class Recorder:
-    """A Reporter that remembers."""
+    """A Reporter that records."""
 
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -75,7 +75,7 @@ class Recorder:
 
 
 def true_model(count: int = GAUSSIANS) -> Gaussians:
-    """Coloured blobs in a ball of radius 1 about the origin, in front of a wall of larger ones."""
+    """Return coloured blobs in a ball of radius 1 around the origin, in front of a wall of larger ones."""
     generator = torch.Generator().manual_seed(5)
     gaussians = Gaussians.empty(count, 3)
     gaussians.means = torch.randn(count, 3, generator=generator) * 0.6
@@ -92,7 +92,7 @@ def true_model(count: int = GAUSSIANS) -> Gaussians:
 
 
 def cameras(count: int = CAMERAS) -> list[Camera]:
-    """On an arc around the origin at a distance of 4, looking at it; names may have folders and blanks."""
+    """Return cameras on an arc of radius 4 around the origin, looking at it; some names have folders and blanks."""
     found = []
     for number, angle in enumerate(np.linspace(-0.6, 0.6, count)):
         centre = np.array([4.0 * np.sin(angle), 0.3 * np.cos(5.0 * angle), -4.0 * np.cos(angle)])
@@ -108,14 +108,14 @@ def cameras(count: int = CAMERAS) -> list[Camera]:
 
 
 def photograph(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """(h, w, 3) RGB, 8 bits."""
+    """Render (h, w, 3) RGB, 8 bits."""
     with torch.no_grad():
         colour = rasterizer.render(gaussians, camera, rasterizer.RenderOptions(sh_degree=gaussians.sh_degree)).colour
     return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).numpy()
 
 
 def write_model(folder: Path, views: list[Camera], xyz: np.ndarray, rgb: np.ndarray) -> None:
-    """Write a COLMAP model with PINHOLE cameras, one a view, every point seen in every view."""
+    """Write a COLMAP model with PINHOLE cameras, one per view, every point seen in every view."""
     model = pycolmap.Reconstruction()
     for number, view in enumerate(views, start=1):
         params = [view.fx, view.fy, view.cx, view.cy]
@@ -132,12 +132,12 @@ def write_model(folder: Path, views: list[Camera], xyz: np.ndarray, rgb: np.ndar
 
 
 def split_of(views: Sequence[View], every: int = 0, names: str = "") -> Split:
-    """Which of the views are trained on."""
+    """Return which of the views are trained on."""
     return split_views([view.camera.name for view in views], every, names)
 
 
 def split_part(dataset: Path, every: int = 0, names: str = "") -> dict[str, Path]:
-    """The part that `split` leaves of a dataset, in a file beside it."""
+    """Write the output of `split` for a dataset to a file beside it; return it as an input part."""
     text = split_of(load_views(dataset), every, names).to_json()
     path = dataset.parent / f"split-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
     path.write_text(text)
@@ -148,9 +148,9 @@ def write_dataset(folder: Path, masked: str = "", views: list[Camera] | None = N
     """Write the whole dataset.
 
     Args:
-        folder: Where.
-        masked: Name of a photo whose left half is spoilt and masked.
-        views: Cameras; the arc's without any.
+        folder: Output folder.
+        masked: Name of a photo whose left half is corrupted and masked.
+        views: Cameras; the arc's if None.
     """
     truth = true_model()
     views = cameras() if views is None else views

@@ -20,12 +20,12 @@ Pose = np.ndarray  # (3, 4) camera from world
 
 @dataclass(frozen=True)
 class Ring:
-    """Photos 1, 2, … around a place.
+    """Photos 1, 2, … around a centre.
 
     Attributes:
         poses: Camera from world, by image id.
         points: (m, 3).
-        rows: Of each photo, which point each keypoint shows.
+        rows: For each photo, the point that each keypoint shows.
         verified: Its view graph.
     """
 
@@ -42,9 +42,9 @@ class Ring:
 def make_ring(
     count: int = 24, reach: int = 5, points: int = 400, most: int = 60, prior: bool = True, one_spot: bool = False
 ) -> Ring:
-    """Photos that have matches with those up to ``reach`` places further on, ``most`` with each.
+    """Return photos that match those up to ``reach`` places further on, with ``most`` matches each.
 
-    They look inwards, or all outwards from one spot, past which nothing tells how far away things are.
+    They look inwards, or all outwards from one spot, where nothing determines distances.
     """
     rng = np.random.default_rng(7)
     places = rng.uniform(-1.0, 1.0, (points, 3)) * [6.0, 6.0, 3.0]
@@ -78,7 +78,7 @@ def make_ring(
 def model_of(
     ring: Ring, moved: Mapping[int, Pose] | None = None, focal: float = FOCAL, photos: Sequence[int] | None = None
 ) -> pycolmap.Reconstruction:
-    """A model without points: the ring's poses, or others."""
+    """Return a model without points, with the ring's poses or others."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(make_lens("SIMPLE_RADIAL", [focal, WIDTH / 2, HEIGHT / 2, 0.0]))
     for number in photos or sorted(ring.poses):
@@ -89,7 +89,7 @@ def model_of(
 
 
 def add_points(model: pycolmap.Reconstruction, ring: Ring, photos: Sequence[int], world: np.ndarray) -> None:
-    """The points that some photos see, under a similarity (3, 4) of the world, into a model."""
+    """Add the points that some photos see to a model, under a similarity (3, 4) of the world."""
     row_of = {number: {int(point): row for row, point in enumerate(ring.rows[number])} for number in photos}
     for index, point in enumerate(ring.points):
         seen = [(number, row_of[number][index]) for number in photos if index in row_of[number]]
@@ -99,7 +99,7 @@ def add_points(model: pycolmap.Reconstruction, ring: Ring, photos: Sequence[int]
 
 
 def moved(ring: Ring, photos: Sequence[int], about: np.ndarray, turn: np.ndarray, scale: float) -> dict[int, Pose]:
-    """The poses of some photos after the world around them was turned and scaled about a place."""
+    """Return the poses of some photos after turning and scaling the world around them about a place."""
     result = {}
     for number in photos:
         rotation = ring.poses[number][:, :3] @ turn.T
@@ -109,13 +109,13 @@ def moved(ring: Ring, photos: Sequence[int], about: np.ndarray, turn: np.ndarray
 
 
 def turn_up(degrees: float) -> np.ndarray:
-    """A rotation about the vertical."""
+    """Return a rotation about the vertical."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def with_matches(ring: Ring, wrong: Mapping[tuple[int, int], int], seed: int = 1) -> ViewGraph:
-    """The view graph with pairs whose matches are of things that only look alike."""
+    """Return the view graph with pairs whose matches only look alike."""
     rng = np.random.default_rng(seed)
     matches = dict(ring.verified.matches)
     for (i, j), count in wrong.items():
@@ -126,7 +126,7 @@ def with_matches(ring: Ring, wrong: Mapping[tuple[int, int], int], seed: int = 1
 
 
 def write_descriptors(ring: Ring, path: Path) -> None:
-    """Descriptors that find each point again, into a database that ``write_database`` wrote."""
+    """Write descriptors that match each point again into a database from ``write_database``."""
     rng = np.random.default_rng(11)
     of_point = rng.uniform(0.0, 1.0, (len(ring.points), 128)) ** 4
     of_point *= 512.0 / np.linalg.norm(of_point, axis=1, keepdims=True)
@@ -138,7 +138,7 @@ def write_descriptors(ring: Ring, path: Path) -> None:
 
 
 def write_database(verified: ViewGraph, path: Path, keep: Callable[[int, int], bool] = lambda i, j: True) -> None:
-    """The view graph as matching leaves it."""
+    """Write the view graph as matching does."""
     with pycolmap.Database.open(path) as database:
         for camera in verified.cameras.values():
             database.write_camera(camera, use_camera_id=True)

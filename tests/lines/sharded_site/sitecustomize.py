@@ -11,5 +11,5 @@ from splatpipe.pipeline.app.preflight import start  # noqa: E402
 from splatpipe.pipeline.engine import config  # noqa: E402
 
 config.load_preset = lambda name: {}
-start.require_memory = lambda request: None  # of a training, which this line has none of
+start.require_memory = lambda request: None  # of a training, which this pipeline does not have
 start.forecast_text = lambda request: ""
