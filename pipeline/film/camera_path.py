@@ -1,13 +1,13 @@
-"""Ways of a camera through a scene: upright, smooth in speed and turn, timed into the frames of a film.
+"""Camera paths through a scene: upright, smooth in speed and turn, timed into the frames of a film.
 
-A camera on its way is a place, a heading and a pitch, so that it cannot roll; looking down, where there is no horizon,
-it may lean aside as its photo did. A way along photos is the broken line
-through them, smoothed by a Gaussian; a way through keyframes is a spline that meets each of them: Catmull-Rom's with
-centripetal knots, which does not overshoot where places are unevenly far apart (Yuksel, Schaefer, Keyser:
-"Parameterization and Applications of Catmull-Rom Curves", 2011).
+A camera on a path has a position, a heading and a pitch, so that it cannot roll; looking down, where there is no
+horizon, it may lean sideways as its photo did. A path along photos is the polyline through them, smoothed by a
+Gaussian; a path through keyframes is a spline that passes through each of them: Catmull-Rom with centripetal knots,
+which does not overshoot at uneven spacing (Yuksel, Schaefer, Keyser: "Parameterization and Applications of Catmull-Rom
+Curves", 2011).
 
-Lengths of ways count moving and turning alike: moving by the distance of what is looked at is as much as turning by a
-radian. Along that length films go at an even speed, with a soft start and stop.
+Path lengths combine moving and turning: moving by the distance of what is viewed counts as much as turning by one
+radian. Films run at an even speed along that length, with a soft start and stop.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
-STEEP = math.radians(-60.0)  # looking down more steeply, a camera has no heading of its own: the horizon is far away
-TILTED = 0.1  # part of the mean view of cameras that look down, from which on it is ahead
-FEW = 0.2  # of the cameras: fewer that do not are no reason to turn the others
-FINE_STEPS, FINE_STEPS_A_PLACE = 4000, 10  # of a way, between which it is a line
-START_SHARE, START_S = 0.2, 1.0  # of a film's time, and at most, to come up to speed, and as long to stop
-SLOW = 0.5  # of the median speed: where a route's own is below, the film's follows it down
-REACH_SIGMAS = 4.0  # of the Gaussian that smooths
-LEAST_LENGTH = 1e-6  # of a way: below, nothing moves
+STEEP = math.radians(-60.0)  # steeper than this, a camera has no heading of its own: the horizon is too far away
+TILTED = 0.1  # minimum horizontal part of the mean view of nadir cameras to define what is ahead
+FEW = 0.2  # of the cameras: if fewer are oblique, the others do not take their headings
+FINE_STEPS, FINE_STEPS_A_PLACE = 4000, 10  # linear steps of a path, at least, and per position
+START_SHARE, START_S = 0.2, 1.0  # of a film's duration, and maximum seconds, to accelerate; the same to stop
+SLOW = 0.5  # of the median speed: below it the film slows down with the route
+REACH_SIGMAS = 4.0  # of the smoothing Gaussian
+LEAST_LENGTH = 1e-6  # of a path: below it nothing moves
 
 Doubles = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Places and directions on a way, in an upright frame: z is up.
+    """Positions and viewing directions along a path, in an upright frame: z is up.
 
     Attributes:
-        places: World units.
-        headings: Of the view, radians from x to y, without jumps by whole turns.
-        pitches: 0 level, -π/2 straight down, radians; beyond that it looks back between its feet.
-        leans: To the right out of the upright plane of heading and pitch, radians; 0 but for photos looking down.
+        places: Positions, world units.
+        headings: Radians from x to y, without jumps by full turns.
+        pitches: 0 level, -π/2 straight down, radians; beyond that the camera looks backwards.
+        leans: To the right out of the vertical plane of heading and pitch, radians; 0 except for nadir photos.
     """
 
     places: Float64[np.ndarray, "n 3"]
@@ -58,11 +58,11 @@ class Route:
         return Route(self.places[chosen], self.headings[chosen], self.pitches[chosen], self.leans[chosen])
 
     def values(self) -> Float64[np.ndarray, "n 6"]:
-        """Places, headings, pitches and leans side by side."""
+        """Positions, headings, pitches and leans side by side."""
         return np.column_stack((self.places, self.headings, self.pitches, self.leans))
 
     def directions(self) -> Float64[np.ndarray, "n 3"]:
-        """Unit vectors of the views."""
+        """Unit vectors of the viewing directions."""
         flat = np.cos(self.pitches)
         level = np.column_stack((flat * np.cos(self.headings), flat * np.sin(self.headings), np.sin(self.pitches)))
         return np.asarray(np.cos(self.leans)[:, None] * level + np.sin(self.leans)[:, None] * self.rights())
@@ -72,30 +72,30 @@ class Route:
         return np.column_stack((np.sin(self.headings), -np.cos(self.headings), np.zeros(len(self))))
 
     def steps(self, distance: float) -> Float64[np.ndarray, " m"]:
-        """Length from each to the next: moved distance over ``distance``, and turned radians, as one vector."""
+        """Length from each position to the next: the norm of (distance moved / ``distance``, radians turned)."""
         moved = np.linalg.norm(np.diff(self.places, axis=0), axis=1) / distance
         turned = angles_between(self.directions()[:-1], self.directions()[1:])
         return np.asarray(np.hypot(moved, turned))
 
 
 def route_of(values: Float64[np.ndarray, "n 6"]) -> Route:
-    """The opposite of ``Route.values``."""
+    """The inverse of ``Route.values``."""
     return Route(values[:, :3], values[:, 3], values[:, 4], values[:, 5])
 
 
 def angles_between(first: Float64[np.ndarray, "n 3"], second: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """Angles between unit vectors, radians, exact for small ones."""
+    """Angles between unit vectors, radians, accurate for small ones."""
     return np.asarray(2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(second - first, axis=1), 0.0, 1.0)))
 
 
 @dataclass(frozen=True)
 class FilmCamera:
-    """The pinhole camera of a film: principal point in the middle, square pixels.
+    """The pinhole camera of a film: central principal point, square pixels.
 
     Attributes:
         width: Pixels.
         height: Pixels.
-        focal_px: Focal length.
+        focal_px: Focal length, pixels.
     """
 
     width: int
@@ -104,26 +104,26 @@ class FilmCamera:
 
     @staticmethod
     def of_angle(width: int, height: int, angle_deg: float) -> FilmCamera:
-        """The lens that sees so many degrees along the picture's longer side."""
+        """The camera with a field of view of ``angle_deg`` along the image's longer side."""
         return FilmCamera(width, height, 0.5 * max(width, height) / math.tan(math.radians(0.5 * angle_deg)))
 
 
 def angle_of(cameras: Sequence[Camera]) -> float:
-    """What the median camera sees along its longer side, degrees."""
+    """Median field of view of the cameras along their longer side, degrees."""
     sizes = [(camera.width, camera.fx) if camera.width >= camera.height else (camera.height, camera.fy)
              for camera in cameras]  # fmt: skip
     return math.degrees(2.0 * math.atan(float(np.median([0.5 * size / focal for size, focal in sizes]))))
 
 
 def upright_route(cameras: Sequence[Camera], up: Float64[np.ndarray, " 3"]) -> Route:
-    """Where cameras stood and looked, without their roll.
+    """The route of cameras, without their roll.
 
-    One that looks down steeply takes its heading from those around it in the sequence; where hardly any does not, all
-    get the same heading, along the pictures' shorter sides, and the film is a map that slides by.
+    A nadir camera takes its heading from its neighbours in the sequence; if nearly all are nadir, all get the same
+    heading, along the images' shorter sides, and the film is a map that slides by.
 
     Args:
-        cameras: In the order of the way.
-        up: Against gravity, a unit vector in the cameras' world.
+        cameras: In path order.
+        up: Unit vector against gravity, in the cameras' world.
     """
     upright = rotation_to_up(up)
     places = np.array([camera.centre() for camera in cameras]) @ upright.T
@@ -141,7 +141,7 @@ def upright_route(cameras: Sequence[Camera], up: Float64[np.ndarray, " 3"]) -> R
 
 
 def _common_axis(axes: Float64[np.ndarray, "n 3"], ahead: Float64[np.ndarray, " 3"]) -> float:
-    """Azimuth of the mean of axes, radians, whatever their sense: it is rather ahead, or that of most axes."""
+    """Azimuth of the mean axis, radians, ignoring signs; its sign follows ``ahead``, or else most axes."""
     doubled = 2.0 * np.arctan2(axes[:, 1], axes[:, 0])
     azimuth = 0.5 * math.atan2(float(np.sin(doubled).sum()), float(np.cos(doubled).sum()))
     mean = np.array([math.cos(azimuth), math.sin(azimuth)])
@@ -154,7 +154,7 @@ def _common_axis(axes: Float64[np.ndarray, "n 3"], ahead: Float64[np.ndarray, " 
 def cameras_along(
     route: Route, lenses: FilmCamera | Sequence[FilmCamera], up: Float64[np.ndarray, " 3"]
 ) -> list[Camera]:
-    """The cameras of a way, level.
+    """The level cameras of a route.
 
     Args:
         route: In the upright frame of ``up``.
@@ -176,18 +176,18 @@ def cameras_along(
 
 
 def smoothed(route: Route, distance: float, width: float) -> tuple[Route, Doubles]:
-    """The broken line through a route, in many small steps, its corners rounded.
+    """The polyline through a route, in many small steps, with rounded corners.
 
-    By a Gaussian, applied once more to what it took away and added (Tukey's twicing): it rounds corners as well, and a
-    circle keeps its radius. The ends stay where they are.
+    Smoothed by a Gaussian that is applied again to the residual (Tukey's twicing): it rounds corners just as well, but
+    a circle keeps its radius. The ends stay fixed.
 
     Args:
-        route: At least two.
-        distance: Of what is looked at, world units: see ``Route.steps``.
-        width: The Gaussian's standard deviation, in lengths of the way.
+        route: At least two positions.
+        distance: Distance of what is viewed, world units: see ``Route.steps``.
+        width: Standard deviation of the Gaussian, in path lengths.
 
     Returns:
-        The way, and which of its steps each place of the route has become, counted with fractions.
+        The fine path, and the fractional step on it of each position of the route.
 
     Raises:
         UsageError: if nothing moves.
@@ -211,18 +211,18 @@ def smoothed(route: Route, distance: float, width: float) -> tuple[Route, Double
 
 
 def evenly_timed(route: Route, distance: float, frames: int, seconds: float) -> Doubles:
-    """Where on a fine route each frame of a film is: at a nearly even speed, with a soft start and a soft stop.
+    """Position of each frame of a film on a fine route: at a nearly even speed, with a soft start and stop.
 
-    Where the route slows down by itself, as a smoothed one does in sharp turns, the film slows down, too.
+    Where the route itself slows down, as a smoothed one does in sharp turns, the film slows down too.
 
     Args:
-        route: So fine that lines between its places do.
+        route: Fine enough for linear interpolation.
         distance: As for ``smoothed``.
-        frames: At least one.
-        seconds: That they last.
+        frames: Number of frames, at least one.
+        seconds: Duration.
 
     Returns:
-        In places of the route from the first, for ``sampled``.
+        Fractional indices into the route, for ``sampled``.
     """
     steps = route.steps(distance)
     along = np.append(0.0, np.cumsum(np.hypot(steps, SLOW * np.median(steps))))
@@ -232,24 +232,24 @@ def evenly_timed(route: Route, distance: float, frames: int, seconds: float) -> 
 
 
 def sampled(route: Route, at: Doubles) -> Route:
-    """A route between its places, along lines.
+    """A route interpolated linearly.
 
     Args:
-        route: Fine.
-        at: Which, in places from the first.
+        route: A fine route.
+        at: Fractional indices into the route.
     """
     return route_of(np.column_stack([np.interp(at, np.arange(len(route)), column) for column in route.values().T]))
 
 
 def soft_progress(share: Doubles, start: float) -> Doubles:
-    """How far a motion is at a share of its time: it comes up to speed along a smoothstep, and stops the same way.
+    """Progress of a motion at a share of its time, with smoothstep acceleration and deceleration.
 
     Args:
-        share: 0..1.
-        start: Of the time, to come up to speed: > 0, at most a half.
+        share: Share of the time, 0..1.
+        start: Share of the time to accelerate: > 0, at most a half.
     """
 
-    def begun(part: Doubles) -> Doubles:  # the integral of 3t² - 2t³, and from 1 on evenly
+    def begun(part: Doubles) -> Doubles:  # the integral of 3t² - 2t³, linear from 1
         ramp = np.clip(part, 0.0, 1.0)
         return np.asarray(ramp**3 - 0.5 * ramp**4 + np.maximum(part - 1.0, 0.0))
 
@@ -261,12 +261,12 @@ def soft_progress(share: Doubles, start: float) -> Doubles:
 def spline(
     values: Float64[np.ndarray, "n k"], knots: Float64[np.ndarray, " n"], at: Float64[np.ndarray, " m"]
 ) -> Float64[np.ndarray, "m k"]:
-    """Hermite's cubics through values, tangents from the neighbours; where two are the same it rests.
+    """Cubic Hermite spline through values, with tangents from the neighbours; at rest between two equal values.
 
     Args:
         values: At least two rows.
-        knots: Rising.
-        at: Where it is asked for, within the knots.
+        knots: Increasing.
+        at: Parameters to evaluate, within the knots.
     """
     chords = np.diff(values, axis=0)
     gaps = np.diff(knots)[:, None]
@@ -286,10 +286,10 @@ def spline(
 
 
 def centripetal_knots(route: Route, distance: float) -> Doubles:
-    """Knots for a spline through a route: roots of its lengths, rising.
+    """Knots for a spline through a route: cumulative square roots of its lengths, increasing.
 
     Args:
-        route: At least two.
+        route: At least two positions.
         distance: As for ``smoothed``.
 
     Raises:

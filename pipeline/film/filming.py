@@ -1,4 +1,4 @@
-"""Films and stills of a trained model: its way through the scene, what a picture shows, and how it is written."""
+"""Films and stills of a trained model: the scene, what an image shows, and how films are written."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
 
 What = Literal["colour", "depth", "normals"]
 ASPECT = 16.0 / 9.0
-SAMPLED = 8  # cameras of a way whose depths tell the range of all
-RANGE = (0.01, 0.99)  # quantiles of depth between which colours go from near to far
-LEAST_SIDE, MOST_SIDE = 16, 8192  # pixels of a picture
-ROWS_AT_ONCE = 256  # of a picture whose colours are made
+SAMPLED = 8  # cameras of a path that determine the depth range
+RANGE = (0.01, 0.99)  # quantiles of depth between which colours run from near to far
+LEAST_SIDE, MOST_SIDE = 16, 8192  # sides of an image, pixels
+ROWS_AT_ONCE = 256  # rows of an image that are coloured at a time
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
-    """What is filmed.
+    """The scene to film.
 
     Attributes:
         model: The splat, and its sky if it has one.
-        options: How it was trained to be rendered.
-        cameras: Of the photos, at the size of training.
-        capture: The same as a way is looked for through it.
+        options: Render options that it was trained with.
+        cameras: The photos' cameras, at training size.
+        capture: The capture's data for finding a path.
     """
 
     model: Model
@@ -54,7 +54,7 @@ class TrainedScene:
     capture: PhotoTrack
 
     def lens(self, size: tuple[int, int] | None) -> FilmCamera:
-        """The photos' angle on a picture of some size; else 16:9, as many pixels as in training, Full HD at most."""
+        """A camera of a given size with the photos' field of view; default: 16:9 at training size, at most Full HD."""
         if size is None:
             pixels = float(np.median([camera.width * camera.height for camera in self.cameras]))
             width = _even(math.sqrt(min(pixels, 1e6 * MOST_FILM_MEGAPIXELS) * ASPECT))
@@ -67,12 +67,12 @@ def _even(length: float) -> int:
 
 
 def open_scene(parts: Mapping[str, Path], threads: int, device: Device) -> TrainedScene:
-    """Read what training and cleaning left.
+    """Read the outputs of training and cleaning.
 
     Args:
         parts: `clean.model`, `train.rendering`, `train.sky` and `undistort.dataset`.
-        threads: That read photos, where these have to tell which way is up.
-        device: What it is rendered on.
+        threads: Number of threads that read photos, if these are needed to find the up direction.
+        device: The rendering device.
 
     Raises:
         StageError: if one is broken.
@@ -101,14 +101,14 @@ def _up(
 
 @dataclass(frozen=True, eq=False)
 class FrameRenderer:
-    """Makes the pictures of a scene.
+    """Renders the images of a scene.
 
     Attributes:
-        scene: What is shown.
-        what: Of it.
-        upright: Rotation from the model's frame to that in which normals are told.
-        scale: From the model's units to those in which depths are told.
-        depths: Nearest and farthest that have colours of their own, in those units.
+        scene: The scene.
+        what: What to show of it.
+        upright: Rotation from the model's frame to that of the normals.
+        scale: Factor from the model's units to those of the depths.
+        depths: Nearest and farthest depth of the colour range, in those units.
     """
 
     scene: TrainedScene
@@ -128,7 +128,7 @@ class FrameRenderer:
         return None
 
     def pixels(self, camera: Camera, values: Float[np.ndarray, "h w *k"] | None = None) -> Pixels:
-        """A picture to look at, (h, w, 3) RGB; of ``values`` where they are there already."""
+        """A viewable image, (h, w, 3) RGB; made from ``values`` if given."""
         values = self.values(camera) if values is None else values
         if values is None:
             return render_pixels(self.scene.model, camera, self.scene.options)
@@ -136,7 +136,7 @@ class FrameRenderer:
 
 
 def depth_range(pictures: FrameRenderer, cameras: Sequence[Camera]) -> tuple[float, float]:
-    """The depths that most of a way's pictures show, nearest and farthest."""
+    """The range of depths shown by most images of a path, nearest and farthest."""
     found = []
     for index in np.unique(np.linspace(0, len(cameras) - 1, min(SAMPLED, len(cameras))).round().astype(int)):
         values = pictures.values(reduced_camera(cameras[index], MOST_FILM_MEGAPIXELS))
@@ -149,7 +149,7 @@ def depth_range(pictures: FrameRenderer, cameras: Sequence[Camera]) -> tuple[flo
 
 
 def coloured_depth(depth: Float[np.ndarray, "h w"], depths: tuple[float, float]) -> Pixels:
-    """Depths as colours, even by ratio: red is near, blue far, black nothing; (h, w, 3) RGB."""
+    """Depths as colours on a log scale: red is near, blue is far, black is no surface; (h, w, 3) RGB."""
     nearest, farthest = depths
     steps = np.empty(depth.shape, np.uint8)
     for rows in _blocks(len(depth)):
@@ -161,7 +161,7 @@ def coloured_depth(depth: Float[np.ndarray, "h w"], depths: tuple[float, float])
 
 
 def coloured_normals(normals: Float[np.ndarray, "h w 3"]) -> Pixels:
-    """Normals as colours: red, green, blue grow with x, y, z; grey is nothing; (h, w, 3) RGB."""
+    """Normals as colours: red, green, blue grow with x, y, z; grey is no surface; (h, w, 3) RGB."""
     colours = np.empty(normals.shape, np.uint8)
     for rows in _blocks(len(normals)):
         colours[rows] = np.clip(127.5 * normals[rows] + 128.0, 0.0, 255.0)
@@ -169,16 +169,16 @@ def coloured_normals(normals: Float[np.ndarray, "h w 3"]) -> Pixels:
 
 
 def _blocks(rows: int) -> list[slice]:
-    """Rows of a picture that are worked on at once, so that what is between takes little memory."""
+    """Blocks of rows of an image, so that temporaries take little memory."""
     return [slice(start, start + ROWS_AT_ONCE) for start in range(0, rows, ROWS_AT_ONCE)]
 
 
 @dataclass(frozen=True)
 class FilmFile:
-    """Where a film goes, and how fast it runs.
+    """The file of a film, and its frame rate.
 
     Attributes:
-        path: A WebM or an MP4.
+        path: A WebM or MP4 file.
         fps: Frames per second.
     """
 
@@ -189,13 +189,13 @@ class FilmFile:
 def write_film(
     file: FilmFile, cameras: Sequence[Camera], picture: Callable[[Camera], Pixels], report: Reporter
 ) -> None:
-    """Render a way and write it.
+    """Render a path and write it as a film.
 
     Args:
-        file: Where to.
-        cameras: One a frame, all of one even size.
-        picture: Makes a frame.
-        report: Takes the progress.
+        file: The output file.
+        cameras: One per frame, all of the same even size.
+        picture: Renders a frame.
+        report: Receives progress.
 
     Raises:
         MachineError: if the file cannot be written.

@@ -1,4 +1,4 @@
-"""Affine maps of a picture's colours: what exposure and white balance do to it."""
+"""Affine maps of an image's colours, as exposure and white balance apply them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatpipe.pipeline.raster.isa import _native
 def affine_colour(picture: Float[Tensor, "h w 3"], affine: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
     """Every pixel's colour c becomes A c + b, with A the map's first three columns and b its last.
 
-    By kernels for float32 on the CPU and on CUDA devices, with the same bits every time; both arguments get gradients.
+    Uses kernels for float32 on the CPU and CUDA devices, bit-identical every time; both arguments get gradients.
     """
     kernels = kernels_of(picture.device)
     fits = kernels is not None or picture.device.type == "cpu"
@@ -26,7 +26,7 @@ def affine_colour(picture: Float[Tensor, "h w 3"], affine: Float[Tensor, "3 4"])
 
 
 class _AffineColour(torch.autograd.Function):
-    """torch's own product of pixels and a 3 × 3 matrix takes longer than the picture's whole render."""
+    """Kernels, because torch's product of pixels and a 3 × 3 matrix takes longer than the image's whole render."""
 
     @staticmethod
     def forward(ctx: Any, kernels: CudaKernels | None, picture: Tensor, affine: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The CUDA kernels with torch's memory and torch's stream; which tensors they take."""
+"""The CUDA kernels on torch's memory and stream, and which tensors they support."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from splatpipe.pipeline.raster.cuda_forecast import Forecast, most_pairs_of
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, load, why_not
 from splatpipe.pipeline.splat.upload import upload
 
-ALIGNMENT = 256  # of the memory that kernels are given
+ALIGNMENT = 256  # bytes, of memory passed to kernels
 
 
 class CudaKernels:
-    """The library on a device. Nothing waits for the device, and everything is in order on torch's current stream.
+    """The library on a device. Nothing synchronizes, and everything runs in order on torch's current stream.
 
     Args:
-        library: The loaded one.
-        device: Where the tensors are, the current CUDA device; the CPU for a library that runs there, in tests.
+        library: The loaded library.
+        device: The current CUDA device; the CPU for a library that runs there, in tests.
 
     Attributes:
         device: As given.
-        forecast: Of the room that frames need.
+        forecast: Forecast of frame allocations.
         facts: The device, as the library sees it.
     """
 
@@ -50,7 +50,7 @@ class CudaKernels:
         return int(torch.cuda.current_stream(self.device).cuda_stream) or None
 
     def empty(self, size_bytes: int) -> Tensor:
-        """Memory of torch's, not initialised, aligned as kernels want it.
+        """Uninitialized memory from torch, aligned for kernels.
 
         Raises:
             torch.OutOfMemoryError: if the device has no more.
@@ -59,10 +59,10 @@ class CudaKernels:
         return memory[-memory.data_ptr() % ALIGNMENT :]
 
     def at(self, tensor: Tensor | None) -> int | None:
-        """Where a tensor's memory is; None for none, and for one without any.
+        """Pointer to a tensor's memory; None for None and for an empty tensor.
 
         Raises:
-            ValueError: if that is nowhere a kernel may look.
+            ValueError: if kernels cannot access it.
         """
         if tensor is None:
             return None
@@ -71,19 +71,19 @@ class CudaKernels:
         return tensor.data_ptr() or None
 
     def rows(self, tensors: Sequence[Tensor]) -> SplatRows:
-        """Tensors in the order of ``PARAMETERS``, as the library takes them."""
+        """Tensors in the order of ``PARAMETERS`` in the form that the library takes."""
         return SplatRows(*map(self.at, tensors))
 
     def call(self, name: str, *arguments: object) -> None:
-        """A function of ``cuda_api.CALLS`` on the current stream, the last argument; errors as of ``CudaLibrary``."""
+        """Call a function of ``cuda_api.CALLS`` with the current stream as last argument; errors as ``CudaLibrary``."""
         self._library.call(name, *arguments, self.stream())
 
     def frame_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
-        """Memory of a frame from its render on."""
+        """Memory of a frame, from its render onward, bytes."""
         return self._library.size("splat_frame_bytes", ctypes.byref(shot), count, capacity)
 
     def back_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
-        """Memory of its backward pass, besides."""
+        """Additional memory of its backward pass, bytes."""
         return self._library.size("splat_back_bytes", ctypes.byref(shot), count, capacity)
 
     def photo_loss(
@@ -94,14 +94,14 @@ class CudaKernels:
         ssim_weight: float,
         inner: tuple[int, int, int, int] | None = None,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
-        """The loss, as a float32 on the device, and its gradient by the render.
+        """The loss, as a float32 on the device, and its gradient for the render.
 
         Args:
             render: Contiguous float32, like the photo.
-            photo: What it is compared with.
-            mask: (h, w) uint8, zero where a pixel does not count; None: all do.
-            ssim_weight: Share of 1 - SSIM.
-            inner: Left, top, right, bottom of what counts; None: all.
+            photo: The photo to compare with.
+            mask: (h, w) uint8, zero where a pixel does not count; None if all do.
+            ssim_weight: Weight of 1 - SSIM.
+            inner: Left, top, right, bottom of the part that counts; None for all.
         """
         height, width = render.shape[:2]
         gradient = torch.empty_like(render)
@@ -115,7 +115,7 @@ class CudaKernels:
         return value.to(torch.float32), gradient
 
     def affine_colour(self, affine: Float[Tensor, "3 4"], picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """The picture's colours through the map; both contiguous float32."""
+        """The image's colours with the map applied; both contiguous float32."""
         out = torch.empty_like(picture)
         pixels = picture.numel() // 3
         self.call("splat_affine_colour", self.at(affine), self.at(picture), pixels, self.at(out))
@@ -124,7 +124,7 @@ class CudaKernels:
     def affine_colour_backward(
         self, affine: Float[Tensor, "3 4"], picture: Float[Tensor, "h w 3"], upstream: Float[Tensor, "h w 3"]
     ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "3 4"]]:
-        """Gradients by the picture and by the map; all contiguous float32."""
+        """Gradients for the image and for the map; all contiguous float32."""
         gradient, by_affine = torch.empty_like(picture), torch.empty_like(affine)
         pixels = picture.numel() // 3
         size = self._library.size("splat_affine_bytes", pixels)
@@ -138,9 +138,9 @@ class CudaKernels:
         """One step in place over rows of float32 tensors.
 
         Args:
-            rows: What is stepped.
+            rows: The tensors to step.
             options: Beta 1, beta 2, epsilon and the step, counted from 1.
-            skipped: Added to: visible rows that were left out for their gradients.
+            skipped: Counter to which the visible rows skipped for their gradients are added.
 
         Raises:
             ValueError: for more tensors than one call takes.
@@ -150,7 +150,7 @@ class CudaKernels:
         widths = [rate.numel() for rate in rows.rates]
         ends = [sum(widths[: number + 1]) for number in range(len(widths))]
         rates = torch.cat([rate.to("cpu") for rate in rows.rates]) if widths else torch.empty(0)
-        rates = upload(rates, self.device)  # one copy, not one a tensor
+        rates = upload(rates, self.device)  # one copy, not one per tensor
         given = SplatAdam(tensors=len(widths), rows=len(rows.values[0]) if widths else 0)
         for number, end in enumerate(ends):
             given.widths[number] = widths[number]
@@ -176,13 +176,13 @@ class CudaKernels:
         log_scales: Float[Tensor, "n 3"],
         quats: Float[Tensor, "n 4"],
     ) -> Float[Tensor, "two_k 3"]:
-        """Two places within each parent, relative to its mean: the first of all, then the second of all.
+        """Two positions within each parent, relative to its mean: all first ones, then all second ones.
 
         Args:
-            draw: Seed, step and stream, as of ``train.draws``.
-            rows: The parents' in the model.
-            log_scales: The model's.
-            quats: The model's.
+            draw: Seed, step and stream, as in ``train.draws``.
+            rows: The parents' rows in the model.
+            log_scales: The model's log-scales.
+            quats: The model's quaternions.
         """
         out = torch.empty(2 * len(rows), 3, device=self.device)
         rows, log_scales, quats = rows.contiguous(), log_scales.contiguous(), quats.contiguous()
@@ -193,7 +193,7 @@ class CudaKernels:
     def morton(
         self, means: Float[Tensor, "n 3"], lowest: Sequence[float], size: Sequence[float]
     ) -> Int64[Tensor, " n"]:
-        """Places along a Morton curve through the box from ``lowest`` with sides of ``size``."""
+        """Morton codes in the box from ``lowest`` with sides of ``size``."""
         out = torch.empty(len(means), dtype=torch.int64, device=self.device)
         box = (ctypes.c_float * 3)(*lowest), (ctypes.c_float * 3)(*size)
         means = means.contiguous()
@@ -203,15 +203,15 @@ class CudaKernels:
 
 @dataclass(frozen=True, eq=False)
 class AdamRows:
-    """Tensors of the same rows, contiguous float32, with what a step of Adam takes.
+    """Tensors with common rows, contiguous float32, with everything that a step of Adam takes.
 
     Attributes:
-        values: Stepped in place, (rows, ...) each.
-        gradients: Of each.
+        values: Values to step in place, (rows, ...) each.
+        gradients: Gradient of each.
         means: First moments of each, changed in place.
         squares: Second moments of each, changed in place.
-        rates: Of each, (width,): one for every value of a row.
-        visible: (rows,) uint8, zero for what sits out; None: nothing does.
+        rates: Learning rates of each, (width,): one for every value of a row.
+        visible: (rows,) uint8, zero for rows to skip; None to step all.
     """
 
     values: Sequence[Tensor]
@@ -227,7 +227,7 @@ _ON_CPU: ContextVar[CudaKernels | None] = ContextVar("cuda_kernels_on_cpu", defa
 
 @contextmanager
 def use_kernels(kernels: CudaKernels | None) -> Iterator[None]:
-    """Give the CPU's float32 tensors to kernels that run there: the CUDA sources, built for tests."""
+    """Use kernels that run on the CPU (the CUDA sources, built for tests) for its float32 tensors."""
     token = _ON_CPU.set(kernels)
     try:
         yield
@@ -236,7 +236,7 @@ def use_kernels(kernels: CudaKernels | None) -> Iterator[None]:
 
 
 def kernels_of(device: torch.device) -> CudaKernels | None:
-    """What takes a device's float32 tensors; None: no CUDA kernels do."""
+    """The kernels for a device's float32 tensors; None if there are no CUDA kernels for it."""
     if device.type != "cuda":
         return _ON_CPU.get() if device.type == "cpu" else None
     return _on_cuda(torch.cuda.current_device() if device.index is None else device.index)
@@ -248,11 +248,11 @@ def _on_cuda(index: int) -> CudaKernels | None:
 
 
 def cuda_device(device: torch.device) -> CudaDevice | None:
-    """The device that kernels run on, None for the CPU's own."""
+    """The device that CUDA kernels run on; None for the CPU."""
     kernels = kernels_of(device)
     return None if kernels is None else kernels.facts
 
 
 def _words(*numbers: int) -> tuple[int, ...]:
-    """As 64 bits each, as train.draws takes them."""
+    """Each number reduced to 64 bits, as in ``train.draws``."""
     return tuple(number & (1 << 64) - 1 for number in numbers)

@@ -1,4 +1,4 @@
-"""The C interface of the CUDA kernels, `native/cuda/api.h`, for ctypes. What the fields mean is said there."""
+"""The C interface of the CUDA kernels, `native/cuda/api.h`, for ctypes. The fields are documented there."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from ctypes import POINTER, c_char, c_double, c_float, c_int32, c_int64, c_uint6
 from typing import Any
 
 ABI = 3
-"""Of the interface that is mirrored here, SPLAT_CUDA_ABI."""
+"""Version of the interface mirrored here, SPLAT_CUDA_ABI."""
 NO_KERNEL = -3
-"""SPLAT_NO_KERNEL: for this device in this binary."""
+"""SPLAT_NO_KERNEL: this binary has no kernel for the device."""
 ADAM_TENSORS = 8
-"""Tensors that one call of ``splat_adam`` takes."""
+"""Maximum number of tensors in one call of ``splat_adam``."""
 
 
 class SplatDevice(ctypes.Structure):
@@ -187,4 +187,4 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "splat_split_offsets": (*_DRAW, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p),
     "splat_morton": (c_void_p, c_int64, POINTER(c_float), POINTER(c_float), c_void_p, c_void_p),
 }
-"""Arguments of the functions that return a code: 0, or what is wrong."""
+"""Arguments of the functions that return a code: 0, or an error."""

@@ -1,4 +1,4 @@
-"""NVIDIA's driver and cards as the system shows them, whether or not CUDA works."""
+"""NVIDIA's driver and cards as reported by the system, whether or not CUDA works."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from ctypes import c_int32
 from pathlib import Path
 
 ROOT = Path("/")
-MOST_BYTES = 4096  # of the driver's file: some 200 are usual
+MOST_BYTES = 4096  # read of the driver's file: about 200 are usual
 NVML_VERSION_BYTES = 80  # NVML_SYSTEM_DRIVER_VERSION_BUFFER_SIZE
-RELEASE = re.compile(r"\b\d{3,4}\.\d{1,3}(\.\d{1,3})?\b")  # 580.65.06; years and times in the same line look otherwise
+RELEASE = re.compile(r"\b\d{3,4}\.\d{1,3}(\.\d{1,3})?\b")  # 580.65.06; years and times in the same line do not match
 CARDS = ("dev/nvidia[0-9]*", "proc/driver/nvidia/gpus/*", "usr/lib/wsl/lib/libcuda.so.1")  # the last: Windows' driver
-NVIDIA, DISPLAY = "0x10de", "0x03"  # the maker on the PCI bus, and how the classes of graphics cards begin
+NVIDIA, DISPLAY = "0x10de", "0x03"  # PCI vendor, and prefix of the classes of graphics cards
 
 
 def driver() -> tuple[int, int]:
-    """What the driver says when it starts, and the CUDA version that it knows (0 without a driver)."""
+    """The return code of the driver's initialization, and the CUDA version that it supports (0 without a driver)."""
     try:
         library = ctypes.CDLL("libcuda.so.1")
         version = c_int32()
@@ -28,10 +28,10 @@ def driver() -> tuple[int, int]:
 
 
 def driver_release(root: Path = ROOT) -> str:
-    """The driver's own version, e.g. "580.65.06"; "" where neither the kernel nor NVML tells.
+    """The driver's own version, e.g. "580.65.06"; "" if neither the kernel nor NVML reports it.
 
     Args:
-        root: Of the file system.
+        root: Root of the file system.
     """
     first = _begin(root / "proc" / "driver" / "nvidia" / "version").split("\n")[0]
     found = RELEASE.search(first) or RELEASE.search(_nvml_version())
@@ -39,10 +39,10 @@ def driver_release(root: Path = ROOT) -> str:
 
 
 def has_card(root: Path = ROOT) -> bool:
-    """Whether there is an NVIDIA graphics card, with or without a driver, as far as the system shows it.
+    """Whether the system reports an NVIDIA graphics card, with or without a driver.
 
     Args:
-        root: Of the file system.
+        root: Root of the file system.
     """
     if any(next(root.glob(pattern), None) for pattern in CARDS):
         return True
@@ -51,7 +51,7 @@ def has_card(root: Path = ROOT) -> bool:
 
 
 def _begin(path: Path) -> str:
-    """The first bytes of a file of the system's; "" if there is none."""
+    """The first bytes of a system file; "" if it does not exist."""
     try:
         with path.open("rb") as file:
             return file.read(MOST_BYTES).decode(errors="replace")
@@ -60,7 +60,7 @@ def _begin(path: Path) -> str:
 
 
 def _nvml_version() -> str:
-    """What NVML says, which is there under Windows' driver, too; "" without it."""
+    """The driver version from NVML, which also exists with Windows' driver; "" without NVML."""
     text = ctypes.create_string_buffer(NVML_VERSION_BYTES)
     with contextlib.suppress(OSError, AttributeError):
         library = ctypes.CDLL("libnvidia-ml.so.1")

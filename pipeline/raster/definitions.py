@@ -1,4 +1,4 @@
-"""What a render is, for every backend: its options, its outputs, and the constants of the rasterizer's definition."""
+"""The definition of a render for every backend: options, outputs and the rasterizer's constants."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 ALPHA_MAX = 0.99
-"""Cap on a pixel's alpha, so that 1 - alpha can be divided by."""
+"""Cap on a pixel's alpha, so that division by 1 - alpha is safe."""
 ALPHA_MIN = 1.0 / 255.0
-"""What contributes less to a pixel (an 8-bit step) is skipped."""
+"""Contributions below this (one 8-bit step) are skipped."""
 TRANSMITTANCE_MIN = 1e-4
 """The Gaussian that would take a pixel's transmittance below this is not blended, and ends the pixel."""
 MEDIAN_TRANSMITTANCE = 0.5
 """The median depth is that of the Gaussian that takes the transmittance down to this."""
 MEDIAN_SHIFT_MAX = 0.5
-"""Share of its centre's depth by which that may differ from it: what is so long is no surface."""
+"""Maximum difference of that depth from the Gaussian's centre, as a share: anything longer is not a surface."""
 BLUR_PX2 = 0.3
 """Added to the variances on screen: no Gaussian is thinner than about a pixel (EWA's low-pass filter)."""
 FRUSTUM_MARGIN = 0.3
-"""The projection's linearisation is held at the frustum plus this share of its half-width: it diverges outside."""
+"""The projection's linearization is clamped at the frustum plus this share of its half-width: it diverges outside."""
 PLANE_SIGMAS = 2.0
-"""A Gaussian that reaches the camera's plane with so many standard deviations is skipped: the linearisation spreads one
-that lies beside the picture over all of it."""
+"""A Gaussian that reaches the camera plane within this many standard deviations is skipped: the linearization would
+spread one that lies beside the image over all of it."""
 COMPENSATION_MIN = 2.5e-5
 """Floor of det(Σ') / det(Σ' + blur) in the anti-aliased variant; its root is the least opacity factor, 0.005."""
 QUAT_EPSILON = 1e-12
@@ -35,7 +35,7 @@ QUAT_EPSILON = 1e-12
 RADIUS_SIGMAS = 3.0
 """`Render.radii` are this many standard deviations along the longer axis on screen, as published."""
 
-# Beyond these a Gaussian is skipped like one with a NaN: nothing sensible lies there, and float32 overflows soon after.
+# Beyond these limits a Gaussian is skipped like one with a NaN: nothing useful lies there, and float32 soon overflows.
 MAX_SCREEN_PX = 1e7
 MAX_VARIANCE_PX2 = 1e12
 MAX_QUAT_NORM2 = 1e36
@@ -48,15 +48,15 @@ class RenderOptions:
     """How to render.
 
     Attributes:
-        sh_degree: Degree of the spherical harmonics that count, 0..3; at most what the Gaussians hold.
+        sh_degree: SH degree used, 0..3; at most the Gaussians' own.
         background: Red, green, blue behind everything, 0..1.
         antialias: Scale opacities by √(det Σ' / det(Σ' + 0.3 I)), floored: a Gaussian keeps its energy when the blur
             widens it ("Mip-Splatting", Yu et al. 2024, the 2D Mip filter).
         near: Gaussians nearer than this are skipped, world units along the view axis, > 0.
-        depth: Render depths, too; without, all are zeros and a render takes less time.
-        depth_origin: Depths are squared as their distance from it: float32 keeps little of the variance of a depth of
-            100 m else.
-        magnitudes: The probe's gradient sums the pixels' absolute values, x and y apart, which do not cancel.
+        depth: Also render depths; otherwise all are zero and a render is faster.
+        depth_origin: Squared depths are measured from it: otherwise float32 loses most of the variance of a depth of
+            100 m.
+        magnitudes: The probe's gradient sums the pixels' absolute values, separately in x and y, which do not cancel.
     """
 
     sh_degree: int
@@ -68,10 +68,10 @@ class RenderOptions:
     magnitudes: bool = False
 
     def for_depths(self) -> RenderOptions:
-        """The same view for its depths alone: what the rays through the pixels' centres meet.
+        """The same options for depths only: what the rays through the pixels' centres meet.
 
-        Not anti-aliased: a factor on opacity that stands for the part of a pixel's area that a small Gaussian covers
-        lets rays through what they hit, and the median depth then lies behind the surface.
+        Not anti-aliased: the opacity factor for the part of a pixel that a small Gaussian covers would let rays through
+        what they hit, and the median depth would lie behind the surface.
         """
         return replace(self, sh_degree=0, background=(0.0, 0.0, 0.0), antialias=False, depth=True)
 
@@ -82,13 +82,13 @@ class Render:
 
     Attributes:
         colour: Red, green, blue with the background, not clamped at 1.
-        alpha: 1 - the transmittance that is left.
-        depth_sum: Σ z α T, z along the view axis where the pixel's ray is deepest in the Gaussian, world units. Not its
-            centre's: a wall is made of Gaussians several pixels wide. Linear in the place on the screen, as by Zhang et
+        alpha: 1 - the remaining transmittance.
+        depth_sum: Σ z α T, z along the view axis where the pixel's ray peaks in the Gaussian, world units. Not its
+            centre's depth: a wall is made of Gaussians several pixels wide. Linear in screen position, as in Zhang et
             al., "RaDe-GS: Rasterizing Depth in Gaussian Splatting" (2024).
         depth_square_sum: Σ (z - depth_origin)² α T.
-        median_depth: That z of the Gaussian that takes T down to 0.5; 0 where none does. No gradient.
-        visible: Gaussians whose ellipse (alpha ≥ 1/255) reaches the picture.
+        median_depth: The z of the Gaussian that takes T down to 0.5; 0 where none does. No gradient.
+        visible: Gaussians whose ellipse (alpha ≥ 1/255) reaches the image.
         radii: Three standard deviations along the longer axis on screen, pixels; 0 where not visible. No gradient.
     """
 
@@ -102,10 +102,10 @@ class Render:
 
 
 def check(gaussians: Gaussians, camera: Camera, options: RenderOptions, means2d_probe: Tensor | None) -> None:
-    """Refuse what no backend renders.
+    """Reject arguments that no backend can render.
 
     Raises:
-        ValueError: if the picture has no pixel or too many, the Gaussians do not hold the SH degree, the near plane or
+        ValueError: if the image has no pixel or too many, the Gaussians lack the SH degree, the near plane or
             a focal length is not positive and finite, or the probe has the wrong shape.
     """
     if not (1 <= camera.width <= 65536 and 1 <= camera.height <= 65536):

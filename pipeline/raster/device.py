@@ -1,4 +1,4 @@
-"""What a model is rendered and trained on: the CPU's native kernels, or a CUDA device's."""
+"""The compute device for rendering and training: the CPU's native kernels, or a CUDA device's."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
 
 DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")
-COLUMNS = 8  # of float32 that are moved at a time: what a device reads of a row at least
-MOST = 0.9  # of the rows that stay at least, for the memory of the others to be left where it is
+COLUMNS = 8  # float32 columns moved at a time: a device reads at least that much of a row
+MOST = 0.9  # minimum share of rows kept for moving them in place, which does not free the others' memory
 SAME_BITS = "the same bits for one seed"
-CUBLAS_WORKSPACE = ("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # with which cuBLAS adds in one order, as its manual says
+CUBLAS_WORKSPACE = ("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # makes cuBLAS deterministic, according to its manual
 
 Note = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Device:
-    """Where the model is, and what computes on it.
+    """A compute device.
 
     Attributes:
         name: ``cpu`` or ``cuda``.
-        tensors: Where they lie.
+        tensors: The torch device of the tensors.
     """
 
     name: str
@@ -41,34 +41,34 @@ class Device:
 
     @property
     def kernels(self) -> str:
-        """The instruction set, or the architecture, device and driver: with others, the last bits differ."""
+        """The instruction set, or the architecture, device and driver: the last bits depend on these."""
         return rasterizer.kernels_name(self.tensors)
 
     def facts(self) -> dict[str, JSON]:
-        """What a manifest says of it."""
+        """The device's entries in a manifest."""
         told: dict[str, JSON] = {"device": self.name, "instruction_set": self.kernels, "mode": SAME_BITS}
         if self.tensors.type == "cuda":
             told["device_peak_memory_bytes"] = torch.cuda.max_memory_allocated(self.tensors)
         return told
 
     def wait(self) -> None:
-        """Until everything asked of the device is done; needed for nothing but clocks."""
+        """Wait until the device has finished all work; needed only for timing."""
         if self.tensors.type == "cuda":
             torch.cuda.synchronize(self.tensors)
 
     @contextmanager
     def memory_limit(self, limit_bytes: int) -> Iterator[None]:
-        """Let tensors take no more of the device's own memory, as long as this lasts.
+        """Limit the device memory used by tensors within the context.
 
         Args:
-            limit_bytes: The most; 0 for all of it.
+            limit_bytes: The limit; 0 for all of it.
         """
         if not limit_bytes:
             yield
             return
         kernels, on_cuda = kernels_of(self.tensors), self.tensors.type == "cuda"
         before = 0 if kernels is None else kernels.forecast.most_pairs
-        if kernels is not None:  # pairs get their share of the limit, not of the card
+        if kernels is not None:  # pairs get their share of the limit, not of the whole card
             kernels.forecast.most_pairs = min(before, most_pairs_of(limit_bytes))
         if on_cuda:
             whole = torch.cuda.get_device_properties(self.tensors).total_memory
@@ -83,12 +83,12 @@ class Device:
 
     @contextmanager
     def one_order(self) -> Iterator[None]:
-        """Let torch refuse whatever adds in another order each time; on the CPU nothing that is used does."""
+        """Make torch reject nondeterministic operations; on the CPU none that are used are nondeterministic."""
         if self.tensors.type != "cuda":
             yield
             return
         torch.use_deterministic_algorithms(True)
-        # Kernels write all of what they are given.
+        # Kernels write all of their outputs.
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
         try:
             yield
@@ -102,16 +102,16 @@ def cpu() -> Device:
 
 
 def choose_device(wanted: str, unfit: str = "", note: Note | None = None) -> Device:
-    """The device that is asked for; ``auto`` takes CUDA where it works.
+    """The requested device; ``auto`` takes CUDA if it works.
 
     Args:
         wanted: ``auto``, ``cpu`` or ``cuda``.
-        unfit: Why the work cannot be done on a CUDA device; empty where it can.
-        note: Is told why ``auto`` leaves a graphics card alone, where there is one.
+        unfit: Why the work cannot be done on a CUDA device; empty if it can.
+        note: Receives the reason why ``auto`` does not use an existing graphics card.
 
     Raises:
-        MachineError: for ``cuda`` where it does not work, with the reason.
-        UsageError: for another name, and for ``cuda`` where the work cannot be done there.
+        MachineError: for ``cuda`` if it does not work, with the reason.
+        UsageError: for an unknown name, and for ``cuda`` if the work cannot be done there.
     """
     if wanted not in DEVICES:
         raise UsageError(f'There is no device "{wanted[:20]}".', hint=f"Choose {', '.join(DEVICES)}.")
@@ -127,7 +127,7 @@ def choose_device(wanted: str, unfit: str = "", note: Note | None = None) -> Dev
         if note is not None and cuda_driver.has_card():
             note(f"computing on the CPU, not on the NVIDIA graphics card: {missing.reason} {missing.hint}".rstrip())
         return cpu()
-    # NVIDIA's containers round what is multiplied to TF32's 10 bits (TORCH_ALLOW_TF32_CUBLAS_OVERRIDE); a sky has more.
+    # NVIDIA's containers round factors to TF32's 10 bits (TORCH_ALLOW_TF32_CUBLAS_OVERRIDE), too few for the sky.
     torch.backends.cuda.matmul.allow_tf32 = False
     return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
 
@@ -139,7 +139,7 @@ def _why_not(unfit: str) -> cuda_library.NoCuda | None:
 
 
 def free_bytes(tensors: torch.device) -> int | None:
-    """How much more tensors may take of a device's own memory; None for the CPU."""
+    """Device memory still available for tensors, bytes; None for the CPU."""
     if tensors.type != "cuda":
         return None
     free, whole = torch.cuda.mem_get_info(tensors)
@@ -149,34 +149,34 @@ def free_bytes(tensors: torch.device) -> int | None:
 
 
 def take_rows(tensors: dict[str, Tensor], rows: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> None:
-    """Put rows of each tensor in its place, one after the other: two of the largest are never there at once twice.
+    """Replace each tensor by some of its rows, one tensor at a time, so that only one exists twice at a time.
 
     Args:
-        tensors: By name; changed.
+        tensors: Tensors by name; changed.
         rows: An index or a mask.
 
     Raises:
-        torch.OutOfMemoryError: if memory ends; some of the tensors have the rows, and the others do not.
-        MachineError: if it ends within a tensor, which is lost.
+        torch.OutOfMemoryError: if memory runs out; some tensors have the new rows and the others do not.
+        MachineError: if it runs out within a tensor, which is lost.
     """
     for name in tuple(tensors):
         tensors[name] = _taken(tensors, name, rows)
 
 
 def taken_in_place(tensor: Float[Tensor, "n ..."], rows: Int[Tensor, " m"]) -> Float[Tensor, "m ..."]:
-    """Rows of a tensor in its own memory, some columns at a time: at its cap, a model needs no second one.
+    """Select rows of a tensor in its own memory, some columns at a time: a model at its cap needs no second copy.
 
-    Never to be tried again where it fails midway: then some columns have the new rows and the others the old ones. So
-    that is no OutOfMemoryError, which a training answers, but one that ends it, without a checkpoint of what is left.
-    The CPU does without this: there rows are copied.
+    It cannot be retried after failing midway: some columns then have the new rows and the others the old ones. That
+    failure is therefore not an OutOfMemoryError, which training handles, but one that ends it without a checkpoint.
+    On the CPU rows are copied instead.
 
     Args:
         tensor: Contiguous; overwritten.
-        rows: No more than it has.
+        rows: At most as many as the tensor has.
 
     Raises:
-        torch.OutOfMemoryError: if memory is too short to begin; the tensor is as it was.
-        MachineError: if memory ends midway; the tensor is lost.
+        torch.OutOfMemoryError: if memory is too short to begin; the tensor is unchanged.
+        MachineError: if memory runs out midway; the tensor is lost.
     """
     flat = tensor.view(len(tensor), -1)
     for first in range(0, flat.shape[1], COLUMNS):
@@ -203,7 +203,7 @@ def _taken(tensors: dict[str, Tensor], name: str, rows: Tensor) -> Tensor:
     in_place = tensors[name].is_cuda and rows.dtype == torch.int64 and MOST * count <= len(rows) <= count
     try:
         return taken_in_place(tensors[name], rows) if in_place else tensors[name][rows]
-    except torch.OutOfMemoryError:  # old and new do not fit side by side: the old one waits in the host's memory
+    except torch.OutOfMemoryError:  # old and new do not fit side by side: move the old one to host memory
         device = tensors[name].device
         tensors[name] = tensors[name].cpu()
     return tensors[name][rows.cpu()].to(device)

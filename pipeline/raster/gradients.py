@@ -1,4 +1,4 @@
-"""Where the gradients of a training's backward pass go: to the optimiser, never to memory."""
+"""Passing the gradients of a training's backward pass to the optimizer without storing them."""
 
 from __future__ import annotations
 
@@ -15,44 +15,44 @@ if TYPE_CHECKING:
 
 
 class GradientBuffers:
-    """What a backward pass leaves for the optimiser.
+    """The unfinished part of a backward pass, for the optimizer.
 
-    Gradients of all Gaussians would take as much memory as the model, most of them zeros where a photo or a window
-    shows a part of it. So the pass stops at the screen and leaves the rest of it here for the optimiser, which does
-    it together with its step (``optim.Adam.step``).
+    Gradients of all Gaussians would take as much memory as the model, most of them zeros if a photo or window shows
+    only a part of it. So the pass stops at the screen and leaves the rest to the optimizer, which fuses it with its
+    step (``optim.Adam.step``).
 
     Attributes:
-        unfinished: What the last backward pass left for the optimiser.
+        unfinished: What the last backward pass left for the optimizer.
     """
 
     def __init__(self) -> None:
         self.unfinished: UnfinishedBackward | UnfinishedRender | None = None
 
     def take_unfinished(self) -> UnfinishedBackward | UnfinishedRender | None:
-        """What is left of the backward pass, once."""
+        """Return the unfinished pass and forget it."""
         unfinished, self.unfinished = self.unfinished, None
         return unfinished
 
 
 def can_wait(wanted: Sequence[bool], leaves: Sequence[bool], probe: Tensor | None) -> bool:
-    """Whether the parameters' gradients can be left to the optimiser: all are the model's own, but for the logits.
+    """Whether the gradients can be left to the optimizer: all parameters except the logits must be the model's own.
 
     Args:
-        wanted: Whether each has one, in the order of ``PARAMETERS``.
-        leaves: Whether each is the model's own.
-        probe: The render's.
+        wanted: Whether each parameter needs a gradient, in the order of ``PARAMETERS``.
+        leaves: Whether each is the model's own (an autograd leaf).
+        probe: The render's probe.
     """
     own = (leaf for name, leaf in zip(PARAMETERS, leaves, strict=True) if name != "opacity_logits")
     return all(wanted) and all(own) and (probe is None or probe.is_leaf)
 
 
 def add_gradients(parameters: Mapping[str, Tensor], gradients: Sequence[Tensor], logits_are_leaf: bool) -> None:
-    """Add what a backward pass gives to the parameters' gradients.
+    """Add the gradients of a backward pass to those of the parameters.
 
     Args:
-        parameters: Changed; what was rendered, or its first rows.
+        parameters: The rendered parameters, or their first rows; their gradients are changed.
         gradients: In the order of ``PARAMETERS``.
-        logits_are_leaf: False where the model's logits hold the derivative of the rendered ones for a gradient.
+        logits_are_leaf: False if the gradient of the model's logits is the derivative of the rendered logits.
     """
     for name, gradient in zip(PARAMETERS, gradients, strict=True):
         before, gradient = parameters[name].grad, gradient[: len(parameters[name])]

@@ -1,4 +1,4 @@
-"""The photometric loss of training, (1 - w) · L1 + w · (1 - mean SSIM), with its gradient by the render."""
+"""The photometric loss of training, (1 - w) · L1 + w · (1 - mean SSIM), with its gradient for the render."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Rectangle = tuple[int, int, int, int]
 """Left, top, right, bottom, pixels: columns left to right - 1 of rows top to bottom - 1."""
 
 SSIM_REACH_PX = SSIM_WINDOW // 2
-"""How far from its pixel a window of SSIM looks."""
+"""Reach of an SSIM window from its centre pixel."""
 
 MIN_SIDE_PX = SSIM_REACH_PX + 1
 """The smallest image whose border can be reflected by half a window."""
@@ -29,27 +29,27 @@ def photo_loss(
     mask: Bool[Tensor, "h w"] | None = None,
     inner: Rectangle | None = None,
 ) -> Float[Tensor, ""]:
-    """How far a render is from its photo: ``photo_loss_reference``, by kernels for float32 on the CPU and CUDA devices.
+    """The loss of ``photo_loss_reference``, with kernels for float32 on the CPU and CUDA devices.
 
-    The native one is within 5e-5 of the reference in float64 (the gradient within 2e-4, L2) and gives the same bits for
-    any number of threads. On a device the value stays there, and nobody waits for it.
+    The native kernel is within 5e-5 of the reference in float64 (the gradient within 2e-4, L2) and bit-identical for
+    any number of threads. On a device the value stays there, without synchronizing.
 
-    Of a part that was cut from larger pictures with ``SSIM_REACH_PX`` more on the sides where they go on, and ``inner``
-    without that, the loss is the whole's over those pixels: the losses of parts that share out a photo, weighted by how
-    many of their pixels count, add up to the photo's, and the gradients likewise.
+    For a window cut from a larger image with a margin of ``SSIM_REACH_PX`` on its inner sides, and ``inner`` without
+    that margin, the loss equals that of the whole image over those pixels: the losses of windows that tile a photo,
+    weighted by their counting pixels, add up to the photo's loss, and so do the gradients.
 
     Args:
         render: 0..1; the only argument that gets a gradient.
         photo: 0..1.
         ssim_weight: λ of 3D Gaussian splatting, 0..1.
-        mask: True where a pixel counts; None: everywhere. If none counts, the loss and its gradient are zero.
-        inner: What counts at most; windows look at everything all the same. None: all.
+        mask: True where a pixel counts; None for all. If none counts, the loss and its gradient are zero.
+        inner: Rectangle of pixels that may count; SSIM windows still see everything. None for all.
 
     Returns:
         A scalar, in the render's dtype.
 
     Raises:
-        ValueError: if the sizes differ, a side is under 6 pixels, or ``inner`` is empty or not within.
+        ValueError: if the sizes differ, a side is under 6 pixels, or ``inner`` is empty or not inside the image.
     """
     _check(render, photo, mask, inner)
     kernels = kernels_of(render.device)
@@ -68,11 +68,11 @@ def photo_loss_reference(
 ) -> Float[Tensor, ""]:
     """The loss by its definition: Kerbl et al., 3D Gaussian Splatting (SIGGRAPH 2023), eq. 7, with kornia's SSIM.
 
-    Masked pixels of the render are replaced by the photo's before any window sees them; means are over counting pixels.
+    Masked pixels of the render are replaced by the photo's before SSIM; means are over counting pixels.
 
     Args, returns and errors as ``photo_loss``, in any dtype and on any device.
     """
-    from kornia.metrics import ssim  # its import costs most of a second
+    from kornia.metrics import ssim  # importing it takes most of a second
 
     _check(render, photo, mask, inner)
     photo = photo.to(render.dtype)
@@ -91,7 +91,7 @@ def photo_loss_reference(
 
 
 class _PhotoLoss(torch.autograd.Function):
-    """The gradient comes with the value: both are made in one pass over the images."""
+    """Computes the value and its gradient in one pass over the images."""
 
     @staticmethod
     def forward(
@@ -117,7 +117,7 @@ class _PhotoLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[None, Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        if ctx.on_device:  # where looking at the factor is waiting for it
+        if ctx.on_device:  # where reading the factor would synchronize
             return None, gradient * upstream[0], None, None, None, None
         scale = float(upstream[0])
         return None, (gradient if scale == 1.0 else gradient * scale), None, None, None, None

@@ -1,4 +1,4 @@
-"""The rasterizer: one ``render`` over a slow torch definition and fast native kernels."""
+"""The rasterizer: one ``render`` for the slow torch reference and the fast native kernels."""
 
 from __future__ import annotations
 
@@ -43,26 +43,26 @@ def render(
 ) -> Render:
     """Render Gaussians as a camera sees them; differentiable with respect to every raw parameter.
 
-    The native backend gives the same bits for any number of threads, CUDA's on any number of runs on a device. A
-    Gaussian with anything that is not finite, or absurdly large on the screen, is skipped and has zero gradients.
+    The native backend is bit-identical for any number of threads, the CUDA backend for repeated runs on a device. A
+    Gaussian with non-finite values, or one absurdly large on the screen, is skipped and has zero gradients.
 
     Args:
-        gaussians: The scene, raw parameters; the activations are inside.
+        gaussians: The scene's raw parameters; activations are applied here.
         camera: The view, pinhole.
         options: SH degree, background, near plane, variant.
-        backend: ``native`` wants float32 on the CPU, ``cuda`` on a device; ``auto`` takes them where it can.
+        backend: ``native`` requires float32 on the CPU, ``cuda`` on a device; ``auto`` uses them where possible.
         means2d_probe: Zeros (n, 2) whose gradient becomes dL/d(centre on screen), pixels, for density control; with
             `options.magnitudes` the sum of its absolute values over the pixels.
-        buffers: Where the native backend's backward pass writes its gradients; fresh memory without. CUDA's leaves
-            them there for the optimiser to finish, the probe's too (see ``GradientBuffers``).
+        buffers: Where the backward pass defers its end to the optimizer, including the probe's gradient (see
+            ``GradientBuffers``); without them gradients are written as usual.
 
     Returns:
         Colour, alpha and depth of every pixel, and which Gaussians are visible.
 
     Raises:
-        ValueError: if an argument makes no sense, or a backend is asked for other tensors than it takes.
-        SplatpipeError: if the scene covers more pixels than memory or 32-bit indices hold.
-        torch.OutOfMemoryError: if a CUDA device's memory is short in training, which is where buffers are given.
+        ValueError: if an argument is invalid, or a backend gets tensors that it does not support.
+        SplatpipeError: if the scene covers more pixels than memory or 32-bit indices allow.
+        torch.OutOfMemoryError: if a CUDA device's memory is short in training, i.e. with ``buffers``.
     """
     check(gaussians, camera, options, means2d_probe)
     means = gaussians.means
@@ -78,10 +78,10 @@ def render(
 
 
 def kernels_name(device: torch.device) -> str:
-    """What computes on a device, as far as it may change the last bits: an instruction set, or a card with its driver.
+    """The part of a device that may change the last bits: an instruction set, or a card with its driver.
 
     Raises:
-        ValueError: if no kernels do.
+        ValueError: if there are no kernels for the device.
     """
     kernels = kernels_of(device)
     if kernels is not None:
@@ -92,14 +92,14 @@ def kernels_name(device: torch.device) -> str:
 
 
 def free_frames() -> None:
-    """Give back the memory that the CPU's kernels keep for renders to come; the next one takes it anew."""
+    """Free the memory that the CPU kernels keep for later renders; the next render allocates it again."""
     _native.free_frames()
 
 
 def set_threads(threads: int) -> None:
-    """Size the one pool that all native kernels share.
+    """Set the size of the thread pool that all native kernels share.
 
     Args:
-        threads: Threads that compute, the caller included; at least 1.
+        threads: Number of computing threads, including the caller; at least 1.
     """
     _native.set_threads(threads)
