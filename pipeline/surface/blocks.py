@@ -1,4 +1,4 @@
-"""Which blocks of voxels a surface lies in, so that no others are held; and voxels so large that memory suffices."""
+"""Sparse voxel blocks: only those near the surface are allocated, with voxels large enough to fit into memory."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.photo_set import PhotoSet, place_of
 from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, PosedDepthMap
 
-SIDE = 8  # voxels of a block: a surface fills smaller blocks better than open3d's usual 16
-BAND = 3.0  # voxels on either side of a surface that know how far off it is
-LEAST_PHOTOS = 2  # that have to see a surface in a block: each of their depths is confirmed by others already
-EVERY = 3  # pixels, of which one is looked at: blocks are wider
+SIDE = 8  # voxels per side of a block: a surface fills smaller blocks better than open3d's default of 16
+BAND = 3.0  # truncation distance on either side of the surface, in voxels
+LEAST_PHOTOS = 2  # photos that have to see a surface in a block: each of their depths is already confirmed by others
+EVERY = 3  # one pixel in this many is used per axis: blocks are wider
 LEAST_GROWTH = 1.05  # of voxels that were too small
 BITS = 21  # of a block's number along an axis: two million
 
@@ -25,7 +25,7 @@ Box = Float64[np.ndarray, "2 3"]  # least and largest east, north, up, metres: t
 
 
 def depths_in(box: Box, found: PosedDepthMap) -> Float32[np.ndarray, "h w"]:
-    """Depths of a photo that others confirm and that lie in a box; 0 elsewhere."""
+    """A photo's confirmed depths inside a box; 0 elsewhere."""
     sure = (found.confidence >= LEAST_CONFIRMED) & (found.depth > 0.0)
     row, column = np.nonzero(sure)
     xyz = _places(found, row, column)
@@ -44,9 +44,9 @@ class Blocks:
     """Cubes of voxels near a surface.
 
     Attributes:
-        low: East, north, up that they are counted from, metres.
-        voxel_m: Side of a voxel.
-        places: Of the blocks, in blocks from there: (3, n).
+        low: East, north, up of the origin of the block indices, metres.
+        voxel_m: Voxel size, metres.
+        places: Block indices from there: (3, n).
     """
 
     low: Float64[np.ndarray, " 3"]
@@ -54,19 +54,19 @@ class Blocks:
     places: Int64[np.ndarray, "3 n"]
 
     def centres(self) -> Float64[np.ndarray, "3 n"]:
-        """East, north, up of their middles."""
+        """East, north, up of the blocks' centres, metres."""
         return np.asarray(self.low[:, None] + (self.places + 0.5) * (SIDE * self.voxel_m))
 
 
 def surface_blocks(photos: PhotoSet, box: Box, voxel_m: float, most: int, threads: int) -> Blocks:
-    """Blocks that enough photos see a surface in, the same for any number of threads.
+    """Blocks in which enough photos see a surface; identical for any number of threads.
 
     Args:
-        photos: With their depths.
-        box: What of the world counts.
-        voxel_m: Side of a voxel; they are larger where there would be too many blocks.
-        most: Blocks at most.
-        threads: Photos at a time.
+        photos: Photos with their depths.
+        box: The part of the world to use.
+        voxel_m: Voxel size, metres; increased if there would be too many blocks.
+        most: Maximum number of blocks.
+        threads: Photos in parallel.
     """
     while True:
         keys, seen = np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -99,12 +99,12 @@ def visible_blocks(box: Box, voxel_m: float, found: PosedDepthMap) -> Keys:
 
 
 def keys_of(blocks: Int64[np.ndarray, "3 n"]) -> Keys:
-    """A whole number for each block."""
+    """An integer key for each block."""
     x, y, z = blocks + (1 << (BITS - 1))
     return np.asarray((x << (2 * BITS)) | (y << BITS) | z)
 
 
 def blocks_of(keys: Keys) -> Int64[np.ndarray, "3 n"]:
-    """What ``keys_of`` undoes."""
+    """The inverse of ``keys_of``."""
     mask = (1 << BITS) - 1
     return np.stack([keys >> (2 * BITS), (keys >> BITS) & mask, keys & mask]) - (1 << (BITS - 1))

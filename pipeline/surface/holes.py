@@ -12,17 +12,17 @@ STEP_CELLS = 3.0  # heights this many cells above the lowest around are another 
 def filled(
     height: Float64[np.ndarray, "h w"], cell_m: float, reach: int, upright: bool = False
 ) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Fill cells that have heights near by on three sides at least.
+    """Fill cells that have heights nearby on at least three sides.
 
     Args:
-        height: Metres, nan in holes.
-        cell_m: Side of a cell.
-        reach: Cells that are looked at on each side: wider holes stay.
+        height: Metres, NaN in holes.
+        cell_m: Cell size, metres.
+        reach: Cells searched on each side: wider holes stay.
         upright: Whether they are depths of a wall.
 
     Returns:
-        The heights, and which are new. What lies behind an edge is hidden rather than the edge itself, so a hole
-        between two surfaces takes the lower one's; on a wall, where photos look from all sides, the nearer one's.
+        The heights, and which are new. At an edge, the lower surface is more likely to be hidden, so a hole between two
+        surfaces gets the lower height; on a wall, where photos look from all sides, the nearer one.
     """
     rows, columns = np.nonzero(np.isnan(height))
     wide = np.pad(height, reach, constant_values=np.nan)
@@ -52,7 +52,7 @@ def filled(
 def _likest(
     value: Float64[np.ndarray, "4 n"], weight: Float64[np.ndarray, "4 n"], step_m: float
 ) -> Float64[np.ndarray, " n"]:
-    """Of the heights around each hole the one that the others are most like, near ones before far ones."""
+    """Of the heights around each hole, the one with most support from the others, weighted by nearness."""
     like = np.abs(value[:, None] - value[None]) <= step_m  # False for nan
     support = np.where(weight > 0.0, (like * weight[None]).sum(axis=1), -1.0)
     return np.asarray(np.take_along_axis(value, np.argmax(support, axis=0)[None], 0)[0])

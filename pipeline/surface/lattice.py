@@ -1,4 +1,4 @@
-"""Square cells on a plane, in metres, and the tiles that they are worked on in."""
+"""Square cells on a plane, in metres, and the tiles in which they are processed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Lattice:
     """Cells of one size, rows from north to south.
 
     Attributes:
-        east_m: Of the outer corner of the first row's first cell, metres along the rows.
-        north_m: Likewise, against the columns.
-        cell_m: Side of a cell.
+        east_m: East of the outer corner of the first row's first cell, metres along the rows.
+        north_m: North of that corner, metres against the columns.
+        cell_m: Cell size, metres.
         width: Columns.
         height: Rows.
     """
@@ -35,11 +35,11 @@ class Lattice:
             raise ValueError(f"a lattice of {self.width}×{self.height} cells of {self.cell_m} m")
 
     def tiles(self, side: int) -> Iterator[Tile]:
-        """All of it in tiles of so many cells a side at most, row by row."""
+        """All cells in tiles of at most ``side`` cells per side, row by row."""
         return tiled(self.height, self.width, side)
 
     def centres(self, tile: Tile) -> Float64[np.ndarray, "h w 2"]:
-        """East and north of the cells' centres, the same bits whatever the tile is."""
+        """East and north of the cells' centres, bit-identical for any tile."""
         columns = (np.arange(tile.column, tile.column + tile.width) + 0.5) * self.cell_m
         rows = (np.arange(tile.row, tile.row + tile.height) + 0.5)[:, None] * self.cell_m
         return np.stack(np.broadcast_arrays(self.east_m + columns, self.north_m - rows), axis=-1)
@@ -53,7 +53,7 @@ class Lattice:
     def cells(
         self, tile: Tile, east: Float64[np.ndarray, " n"], north: Float64[np.ndarray, " n"]
     ) -> Int64[np.ndarray, " n"]:
-        """Number of the tile's cell that each point lies in, row by row; -1 outside."""
+        """Index of the tile's cell that each point lies in, row by row; -1 outside."""
         across, down = self.places(east, north)
         column = np.floor(across).astype(np.int64) - tile.column
         row = np.floor(down).astype(np.int64) - tile.row

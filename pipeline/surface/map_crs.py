@@ -1,7 +1,8 @@
-"""The CRS that surveyors' files are in: plane, easting first, with its heights; and the exact way to it and back.
+"""The CRS of survey files: projected, easting first, with heights; and the exact transformation to it and back.
 
-It is the run's, but for two kinds that no raster should be in. Cells of degrees are no squares, and axes that point
-west (South Africa's Lo, Krovak's older form) turn a picture upside down: the UTM zone of the origin stands in for both.
+It is the run's CRS, except for two kinds that are unsuitable for rasters: in geographic CRSs cells are not square, and
+axes that point west (South Africa's Lo, Krovak's older form) turn an image upside down. The UTM zone of the origin
+replaces both.
 """
 
 from __future__ import annotations
@@ -45,15 +46,15 @@ UNIT_NAMES = {1.0: "metre", 0.3048: "foot", 1200.0 / 3937.0: "US survey foot"}
 
 @dataclass(frozen=True, eq=False)
 class MapCrs:
-    """A plane CRS and its heights.
+    """A projected CRS and its heights.
 
     Attributes:
-        horizontal: Two axes: easting and northing, or the frame's x and y where it lies nowhere.
-        vertical: CRS of the heights; None where no EPSG code tells it: of ellipsoidal, unknown and local heights.
-        heights: Their datum: ``ellipsoidal``, ``EPSG:n``, ``unknown``, or ``local`` of a frame without a place.
-        unit_m: Of eastings and northings.
-        height_unit_m: Of heights.
-        world: The way to the local frame; None where the two are one.
+        horizontal: Two axes: easting and northing, or x and y of a frame that is not georeferenced.
+        vertical: CRS of the heights; None without an EPSG code: for ellipsoidal, unknown and local heights.
+        heights: Their datum: ``ellipsoidal``, ``EPSG:n``, ``unknown``, or ``local`` without georeferencing.
+        unit_m: Metres per unit of eastings and northings.
+        height_unit_m: Metres per unit of heights.
+        world: Transformation to the local frame; None if the two are the same.
     """
 
     horizontal: pyproj.CRS
@@ -65,13 +66,13 @@ class MapCrs:
 
     @property
     def compound(self) -> pyproj.CRS:
-        """With the heights' CRS where there is one."""
+        """The compound CRS, or the horizontal one if there is no vertical CRS."""
         if self.vertical is None:
             return self.horizontal
         return CompoundCRS(f"{self.horizontal.name} + {self.vertical.name}", [self.horizontal, self.vertical])
 
     def described_heights(self) -> str:
-        """Datum and unit of the heights, for people."""
+        """Datum and unit of the heights, as text for users."""
         datum = HEIGHTS_FOR_PEOPLE.get(self.heights) or describe_vertical(self.heights)
         return f"{datum}, {unit_name(self.height_unit_m)}"
 
@@ -80,7 +81,7 @@ class MapCrs:
         return local.copy() if self.world is None else self.world.crs_from_local(local)
 
     def local_from_crs(self, coordinates: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """What ``crs_from_local`` undoes."""
+        """The inverse of ``crs_from_local``."""
         return coordinates.copy() if self.world is None else self.world.local_from_crs(coordinates)
 
 
@@ -88,7 +89,7 @@ def open_map(frame: Frame) -> MapCrs:
     """The CRS of a frame's files.
 
     Raises:
-        SplatpipeError: if the frame has no metres, or as ``open_world``.
+        SplatpipeError: if the frame is not metric, or as ``open_world``.
     """
     if frame.origin is None:
         if not frame.metres:
@@ -104,7 +105,7 @@ def open_map(frame: Frame) -> MapCrs:
 
 
 def unit_name(unit_m: float) -> str:
-    """A unit of length for people."""
+    """Name of a unit of length for users."""
     for known_m, name in UNIT_NAMES.items():
         if math.isclose(unit_m, known_m, rel_tol=SAME_UNIT):
             return name
@@ -112,7 +113,7 @@ def unit_name(unit_m: float) -> str:
 
 
 def _plane(world: World) -> World:
-    """The same world, read out in a plane CRS whose first axis does not point west."""
+    """The same world in a projected CRS whose first axis does not point west."""
     directions = [axis.direction for axis in world.crs.horizontal.axis_info[:2]]
     if not world.crs.is_geographic and "west" not in directions:
         return world
@@ -124,7 +125,7 @@ def _plane(world: World) -> World:
 
 
 def _horizontal(crs: Crs) -> pyproj.CRS:
-    """Its two axes, with its EPSG code where it has one: web readers know no CRS by its parameters."""
+    """The two horizontal axes, with the EPSG code if there is one: web readers do not accept parameters instead."""
     code = crs.text.removeprefix("EPSG:").partition("+")[0]
     if not code.isdecimal():
         return crs.horizontal.to_2d()
@@ -134,7 +135,7 @@ def _horizontal(crs: Crs) -> pyproj.CRS:
 
 
 def _vertical(heights: str, unit_m: float) -> pyproj.CRS | None:
-    """The CRS of heights in a unit: EPSG has one of NAVD88 for each of metre, foot and US survey foot."""
+    """The vertical CRS in a unit: for NAVD88, EPSG has one each for metre, foot and US survey foot."""
     if not heights.startswith("EPSG:"):
         return None
     stated = pyproj.CRS(heights)
@@ -150,6 +151,6 @@ def _vertical(heights: str, unit_m: float) -> pyproj.CRS | None:
 
 
 def _is_in(vertical: pyproj.CRS, unit_m: float) -> bool:
-    """Whether a CRS counts upwards in a unit."""
+    """Whether a vertical CRS has upward heights in a unit."""
     axis = vertical.axis_info[0]
     return axis.direction == "up" and math.isclose(axis.unit_conversion_factor, unit_m, rel_tol=SAME_UNIT)

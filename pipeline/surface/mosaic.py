@@ -1,9 +1,9 @@
-"""Which photo colours which cell: the best one, with seams where the photos look alike.
+"""Mosaicking: chooses the best photo for each cell, with seamlines where photos look alike.
 
-The best one costs least, averaged around each cell (Hosni et al., "Fast Cost-Volume Filtering", 2013); more where it
-shows something else than most, cars that drove on, what depths did not know. Then seams move, one colour of a
-chessboard after the other, to where both photos look alike, by the seam's cost of Kwatra et al. ("Graphcut Textures",
-2003), and colours are mixed over a few cells at seams.
+The best photo has the least cost, averaged around each cell (Hosni et al., "Fast Cost-Volume Filtering", 2013); the
+cost is higher where it differs from most others, e.g. for cars that drove on or objects missing from the depths. Then
+seams move, one chessboard colour after the other, to where both photos look alike, by the seam cost of Kwatra et al.
+("Graphcut Textures", 2003), and colours are blended over a few cells at seams.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Int16, UInt8, UInt16
 
 from splatpipe.pipeline.raster import _native
 
-KEPT = 8  # photos that a cell is coloured from: enough to tell what is odd
+KEPT = 8  # candidate photos per cell: enough to detect outliers
 MARGIN: int = _native.MOSAIC_MARGIN  # cells around a tile that its colours depend on
 
 
@@ -25,8 +25,8 @@ class Mosaic:
     """Cells coloured by photos.
 
     Attributes:
-        label: Number of the photo that colours it; -1 where none sees it.
-        colour: Of that photo, mixed at seams; black where none.
+        label: Index of the photo that colours each cell; -1 where none sees it.
+        colour: That photo's colour, blended at seams; black where there is none.
     """
 
     label: Int16[np.ndarray, "h w"]
@@ -34,11 +34,11 @@ class Mosaic:
 
 
 def keep_best(seen: Bool[np.ndarray, "n h w"], cost: UInt16[np.ndarray, "n h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Leave each cell the few photos of least cost that see it: the others would not colour it, and need not be read.
+    """Keep for each cell only the few cheapest photos that see it; the others need not be read.
 
     Args:
-        seen: Whether a photo sees a cell; changed.
-        cost: Of colouring it by the photo.
+        seen: Whether a photo sees a cell; changed in place.
+        cost: Cost of colouring the cell from the photo.
 
     Returns:
         How many photos saw each cell, at most 255.
@@ -54,13 +54,14 @@ def composed(
     colour: UInt8[np.ndarray, "n h w 3"],
     parity: int,
 ) -> Mosaic:
-    """Colour cells by photos: the same bits however cells are tiled, but for those within ``MARGIN`` of the rim.
+    """Colour cells from photos; bit-identical for any tiling, except within ``MARGIN`` of the rim.
 
     Args:
         seen: Whether a photo sees a cell.
-        cost: Of colouring it by the photo, told beside what it sees, too: what lies around a cell counts. Changed.
-        colour: Levelled; black where it does not see the cell.
-        parity: 0 or 1: colour of the first cell on the whole picture's chessboard.
+        cost: Cost of colouring the cell from the photo; also given where it does not see the cell, because a cell's
+            surroundings count. Changed in place.
+        colour: Levelled colours; black where the photo does not see the cell.
+        parity: 0 or 1: colour of the first cell on the whole image's chessboard.
     """
     shape = seen.shape[1:]
     made = Mosaic(np.empty(shape, np.int16), np.empty((*shape, 3), np.uint8))
@@ -71,7 +72,7 @@ def composed(
 def spread(
     colour: UInt8[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], wanted: Bool[np.ndarray, "h w"], cells: int
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Fill wanted cells from known ones around, cell by cell outwards, so many cells far.
+    """Extend colours from known into wanted cells, cell by cell outwards, up to a number of cells.
 
     Returns:
         The colours, and which cells have one now.

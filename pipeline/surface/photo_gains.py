@@ -1,4 +1,4 @@
-"""By how much photos' light is multiplied, so that they show the same alike."""
+"""Radiometric gains by which photos' light is multiplied so that they agree."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ OFFSET = 0.055 * 255.0
 
 @dataclass(frozen=True, eq=False)
 class PhotoGains:
-    """Of all photos.
+    """Gains of all photos.
 
     Attributes:
-        gain: By how much each photo's light is multiplied, a channel each.
-        shading: And across it: factors of ``across``, whose sum is the logarithm of what light is multiplied by.
-            Leaves are shaded otherwise than sand, so a channel each.
+        gain: Gain of each photo's light per channel.
+        shading: Coefficients of the terms of ``across`` per photo, whose sum is the logarithm of the gain across the
+            photo. Per channel, because leaves are shaded differently than sand.
     """
 
     gain: Float64[np.ndarray, "n 3"]
@@ -31,11 +31,11 @@ class PhotoGains:
 
     @staticmethod
     def plain(photos: int) -> PhotoGains:
-        """Photos as they are."""
+        """Gains that leave photos unchanged."""
         return PhotoGains(np.ones((photos, 3)), np.zeros((photos, SHADES, 3)))
 
     def of(self, numbers: list[int]) -> PhotoGains:
-        """Of some photos."""
+        """Gains of some photos."""
         return PhotoGains(self.gain[numbers], self.shading[numbers])
 
     def sampled(
@@ -46,17 +46,17 @@ class PhotoGains:
         seen: Bool[np.ndarray, " *n"],
         cell_m: float,
     ) -> UInt8[np.ndarray, " *n 3"]:
-        """Levelled colours of points in a photo, as ``photo_samples.sampled`` takes them.
+        """Levelled colours of points in a photo, sampled by ``photo_samples.sampled``.
 
         Args:
-            number: The photo's.
-            photo: With its pixels.
+            number: Index of the photo.
+            photo: The photo with its pixels.
             points: East, north, up.
             seen: Whether it sees them.
-            cell_m: Side of the points' cells.
+            cell_m: Size of the points' cells, metres.
 
         Raises:
-            ValueError: if the pixels are not of the photo's size.
+            ValueError: if the pixels do not have the photo's size.
         """
         source, pixels = photo
         colour = sampled(source, pixels, points, seen, cell_m, tone_curve(self.gain[number]))
@@ -78,7 +78,7 @@ class PhotoGains:
 def across(
     camera: Camera, column: Float64[np.ndarray, " n"], row: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "k n"]:
-    """Terms of a shading that is smooth across a photo: quadratic, of mean zero."""
+    """Terms of a smooth shading across a photo: quadratic, with mean zero."""
     x = np.clip(2.0 * column / camera.width - 1.0, -1.0, 1.0)
     y = np.clip(2.0 * row / camera.height - 1.0, -1.0, 1.0)
     return np.stack([x, y, x * x - 1.0 / 3.0, x * y, y * y - 1.0 / 3.0])

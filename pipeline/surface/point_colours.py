@@ -1,4 +1,4 @@
-"""Colours of points from all photos that see them, the finest ones before all; each photo is read once."""
+"""Colours of points from all photos that see them, weighted by resolution; each photo is read once."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ HELD_BYTES = 300 << 20  # of depths in memory
 
 
 def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> PhotoSet:
-    """Photos with their exposures levelled.
+    """Photos with levelled exposures.
 
     Args:
-        sources: Local metres, always in the same order.
-        cell_m: How fine they are to colour something.
-        threads: Photos at a time.
+        sources: Photos in local metres, always in the same order.
+        cell_m: Resolution at which they colour a product, metres.
+        threads: Photos in parallel.
     """
     photos = PhotoSet(sources, PhotoGains.plain(len(sources)), LruCache(HELD_BYTES))
     numbers = photos.with_depths()
@@ -40,7 +40,7 @@ def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> Ph
 
 
 def _some_places(found: PosedDepthMap, most: int) -> Float64[np.ndarray, "n 3"]:
-    """Some of what a photo shows, evenly."""
+    """Evenly sampled points of a photo's depths."""
     height, width = found.depth.shape
     step = max(1, int((height * width / most) ** 0.5))
     row, column = (grid.ravel() for grid in np.mgrid[step // 2 : height : step, step // 2 : width : step])
@@ -51,12 +51,12 @@ def _some_places(found: PosedDepthMap, most: int) -> Float64[np.ndarray, "n 3"]:
 
 @dataclass(frozen=True, eq=False)
 class _Offer:
-    """What one photo offers.
+    """Colours that one photo contributes.
 
     Attributes:
-        rows: Of the points that it sees.
-        colour: Theirs in it.
-        weight: How much they count.
+        rows: Rows of the points that it sees.
+        colour: Their colours in the photo.
+        weight: Their weights.
     """
 
     rows: Int64[np.ndarray, " k"]
@@ -67,13 +67,13 @@ class _Offer:
 def point_colours(
     photos: PhotoSet, pieces: SurfacePieces, cell_m: float, threads: int
 ) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """The mean colour of points in the photos that see them, and which are seen at all; black where not.
+    """Weighted mean colour of points over the photos that see them, and which are seen at all; black if unseen.
 
     Args:
-        photos: With their depths.
+        photos: Photos with their depths.
         pieces: The points.
-        cell_m: Side of the area whose colour a point has.
-        threads: Photos at a time.
+        cell_m: Size of the area whose colour a point gets, metres.
+        threads: Photos in parallel.
 
     Raises:
         ValueError: if depths or pixels do not fit their camera.
@@ -108,7 +108,7 @@ def _offer(photos: PhotoSet, pieces: SurfacePieces, cell_m: float, number: int) 
 def _seen(
     photos: PhotoSet, number: int, pieces: SurfacePieces, cell_m: float
 ) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-    """Rows of the points that a photo sees, and how much its colours count."""
+    """Rows of the points that a photo sees, and the weights of its colours."""
     camera = photos.sources[number].camera
     rows = np.flatnonzero(place_in(camera, *pieces.xyz).inside)
     if not rows.size:

@@ -1,8 +1,8 @@
-"""Sheets: planes of cells that things are drawn on, seen from above, whichever way the plane lies.
+"""Sheets: planes of cells on which rasters are computed, level for the ground and vertical for façades.
 
-The ground's is level, a façade's upright. Cameras are moved into the sheet's frame, and what is nearest to the viewer
-is the highest there. A large raster is drawn on many small sheets, so that each is as good as plane: of one that is
-100 m wide, the earth falls away by 0.2 mm at its border, and plumb lines lean by 1 in 100,000.
+Cameras are transformed into the sheet's frame, in which the surface nearest to the viewer is the highest. A large
+raster is computed on many small sheets, so that each is practically plane: at the border of a sheet 100 m wide, the
+earth's curvature amounts to 0.2 mm, and plumb lines lean by 1 in 100,000.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, MetricMap, PosedDepthMap
 from splatpipe.pipeline.surface.tiles import Tile, tiled
 
-SIDE = 2048  # cells of a sheet of the ground: four blocks of the files
+SIDE = 2048  # cells per side of a ground sheet: four blocks of the files
 
 
 @dataclass(frozen=True, eq=False)

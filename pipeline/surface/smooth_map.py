@@ -1,7 +1,8 @@
-"""A smooth map of space that is costly to compute, from a lattice of exact nodes: straight between them.
+"""Linear interpolation, between exact nodes on a lattice, of a smooth coordinate transformation that is costly.
 
-From local metres to a CRS and back, PROJ takes microseconds a point, and a surface model has a billion. Over a short
-way the two differ from a straight map by the earth's curvature alone, s² / 8R between nodes s apart: 0.05 mm for 50 m.
+From local metres to a CRS and back, PROJ takes microseconds per point, and a surface model has a billion points. Over
+short distances, the transformation is linear up to the earth's curvature, s² / 8R between nodes s apart: 0.05 mm for
+50 m.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ Points = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """A map of space as polynomials over squares: bilinear on the plane, straight in the height.
+    """A transformation as polynomials over squares: bilinear in plan, linear in height.
 
     Attributes:
-        low: Corner of the first square, and the height that terms count from.
-        step: A square's sides; 1 for heights.
-        squares: Of each square the eight terms of (1, x, y, xy, z, zx, zy, zxy) for the three coordinates.
+        low: Corner of the first square, and the reference height of the terms.
+        step: Sides of a square; 1 for heights.
+        squares: For each square, the eight coefficients of (1, x, y, xy, z, zx, zy, zxy) for the three coordinates.
     """
 
     low: Float64[np.ndarray, " 3"]
@@ -34,7 +35,7 @@ class SmoothMap:
     squares: Float64[np.ndarray, "rows columns 8 3"]
 
     def __call__(self, points: Points) -> Points:
-        """The map of points, nan of nan; beyond the lattice the squares at its rim go on."""
+        """Transform points; NaN stays NaN, and squares at the rim are extrapolated beyond the lattice."""
         found = np.empty_like(points)
         for start in range(0, len(points), CHUNK):
             found[start : start + CHUNK] = self._map(points[start : start + CHUNK])

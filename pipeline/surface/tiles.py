@@ -1,4 +1,4 @@
-"""Rectangles of a raster's cells: what is made, written and held in memory at a time."""
+"""Tiles: rectangles of a raster's cells that are computed, written and held in memory at a time."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class Tile:
         return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
 
     def grown(self, cells: int) -> Tile:
-        """The same with so many more cells on every side."""
+        """The tile extended by a number of cells on every side."""
         return Tile(self.row - cells, self.column - cells, self.height + 2 * cells, self.width + 2 * cells)
 
     @property
     def cells(self) -> int:
-        """How many."""
+        """Number of cells."""
         return self.height * self.width
 
     def halves(self) -> tuple[Tile, Tile]:
-        """Two parts, one after the other along the longer side: rows if they are as many as columns."""
+        """Split into two parts along the longer side; a square tile is split by rows."""
         if self.height >= self.width:
             upper = self.height // 2
             return replace(self, height=upper), replace(self, row=self.row + upper, height=self.height - upper)
@@ -46,12 +46,12 @@ class Tile:
 
 
 def tiled(height: int, width: int, side: int) -> Iterator[Tile]:
-    """All cells of a raster in tiles of so many a side at most, row by row.
+    """Divide a raster into tiles of at most ``side`` cells per side, row by row.
 
     Args:
         height: Rows of the raster.
-        width: Its columns.
-        side: Of a tile.
+        width: Columns of the raster.
+        side: Cells per side of a tile.
     """
     for row in range(0, height, side):
         for column in range(0, width, side):

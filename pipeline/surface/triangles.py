@@ -1,4 +1,4 @@
-"""Triangle meshes: one order for the same mesh, its pieces, its areas."""
+"""Triangle meshes: canonical order, connected pieces, areas and normals."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from scipy.sparse.csgraph import connected_components
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A surface.
+    """A triangle mesh.
 
     Attributes:
         vertices: East, north, up, metres.
-        triangles: Rows of three vertices each, counter-clockwise from outside.
+        triangles: Three vertex indices each, counter-clockwise seen from outside.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
     triangles: Int64[np.ndarray, "m 3"]
 
     def select(self, kept: Bool[np.ndarray, " m"]) -> TriangleMesh:
-        """Those triangles, with the vertices that they have."""
+        """The chosen triangles, with only the vertices that they use."""
         rows, triangles = np.unique(self.triangles[kept], return_inverse=True)
         return TriangleMesh(self.vertices[rows], triangles.reshape(-1, 3))
 
     def crosses(self) -> Float64[np.ndarray, "m 3"]:
-        """Normals of the triangles, twice their areas long."""
+        """Normals of the triangles, with length twice their areas."""
         a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
         return np.asarray(np.cross(b - a, c - a))
 
     def areas(self) -> Float64[np.ndarray, " m"]:
-        """Of the triangles, square metres."""
+        """Areas of the triangles, square metres."""
         return np.asarray(np.linalg.norm(self.crosses(), axis=1) / 2.0)
 
     def normals(self) -> Float64[np.ndarray, "n 3"]:
-        """Unit normals of the vertices: of the triangles around, by their areas; zero where there is none."""
+        """Unit normals of the vertices: area-weighted over adjacent triangles; zero where there are none."""
         crosses = self.crosses()
         total = np.zeros_like(self.vertices)
         for axis in range(3):
@@ -48,11 +48,11 @@ class TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class ColouredMesh:
-    """A surface with colours.
+    """A triangle mesh with vertex colours.
 
     Attributes:
-        mesh: It.
-        colours: Of the vertices: red, green, blue (sRGB).
+        mesh: The mesh.
+        colours: Colours of the vertices: red, green, blue (sRGB).
     """
 
     mesh: TriangleMesh
@@ -60,7 +60,7 @@ class ColouredMesh:
 
 
 def in_order(mesh: TriangleMesh) -> TriangleMesh:
-    """The same mesh, its vertices by place and its triangles by vertex, without those that are lines or points."""
+    """Sort vertices by position and triangles by vertex, and drop degenerate triangles."""
     order = np.lexsort(mesh.vertices.T[::-1])
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
@@ -76,11 +76,11 @@ def in_order(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def without_crumbs(mesh: TriangleMesh, least_m2: float) -> TriangleMesh:
-    """The mesh without pieces of less than that area, which hang together with nothing.
+    """The mesh without connected pieces below an area.
 
     Args:
-        mesh: It.
-        least_m2: Area of a piece that stays.
+        mesh: The mesh.
+        least_m2: Smallest area of a piece to keep, square metres.
     """
     size = len(mesh.vertices)
     sides = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]]])
