@@ -1,4 +1,4 @@
-"""Shared by all tests: where the real photos are, and a browser."""
+"""Shared by all tests: the location of the real photos, and a browser."""
 
 import fcntl
 import os
@@ -29,14 +29,14 @@ DEMO = (
     "ortho.gsd_m=0.3",
     "split.every=4",
 )
-WORKER = "PYTEST_XDIST_WORKER"  # set where tests run in several processes beside each other
+WORKER = "PYTEST_XDIST_WORKER"  # set where tests run in several parallel processes
 
 
 def pytest_configure() -> None:
-    """Hear Ctrl-C: a run of tests in the background has SIGINT ignored, and so would all that it starts."""
+    """Restore Ctrl-C: background test runs ignore SIGINT, and so would all their children."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if WORKER in os.environ:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: the other cores are other workers'
+        os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: the other cores belong to other workers
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -44,7 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run what asks for ``isa`` on each instruction set that this CPU has; kernels load only where they are tested."""
+    """Run tests that use ``isa`` on each instruction set of this CPU; kernels load only where they are tested."""
     if "isa" in metafunc.fixturenames:
         from splatpipe.pipeline.raster.isa import isa_names
 
@@ -53,7 +53,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """What the native kernels run on during a test, which may change that, and their threads, too."""
+    """Run the native kernels on an instruction set; restore it and the number of threads after the test."""
     from splatpipe.pipeline.raster import _native
 
     before, threads = _native.isa(), _native.threads()
@@ -65,7 +65,7 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture(scope="session")
 def captures(request: pytest.FixtureRequest) -> Path:
-    """The folder of real captures."""
+    """Return the folder of real captures."""
     folder = request.config.getoption("--captures")
     assert folder, "give the folder of real captures with --captures"
     return Path(folder)
@@ -73,7 +73,7 @@ def captures(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture
 def lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes find the small lines of `tests/lines`."""
+    """Let processes find the small pipelines of `tests/lines`."""
     folder = Path(__file__).parent / "lines"
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
 
@@ -94,14 +94,14 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Temporary, and the same for all workers of one run of the tests."""
+    """Return a temporary folder, the same for all workers of one test run."""
     folder = tmp_path_factory.getbasetemp()
     return folder.parent if WORKER in os.environ else folder
 
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """A real Chromium without a window, which draws WebGL2 in software; the tests that drive it fail without one."""
+    """Yield headless Chromium, which renders WebGL2 in software; tests that use it fail without one."""
     with sync_playwright() as playwright:
         path = shutil.which("chromium") or shutil.which("google-chrome")
         assert path, "the pages are tested in a real browser: apt install chromium"
@@ -111,14 +111,14 @@ def browser() -> Iterator[Browser]:
 
 @dataclass
 class WatchedPage:
-    """A page, with all that it asked for and complained of since it was opened."""
+    """A page, with all its requests and errors since it was opened."""
 
     page: Page
-    requests: list[str] = field(default_factory=list)  # addresses, the page itself and data: and blob: left out
-    errors: list[str] = field(default_factory=list)  # errors on the console, uncaught ones, failed requests
+    requests: list[str] = field(default_factory=list)  # addresses, except the page itself, data: and blob:
+    errors: list[str] = field(default_factory=list)  # console errors, uncaught errors, failed requests
 
     def open(self, address: str) -> None:
-        """Go to an address, and wait until its load event."""
+        """Open an address, and wait for its load event."""
         self.page.on("request", lambda request: self._asked(address, request.url))
         self.page.on("requestfailed", lambda request: self.errors.append(f"failed: {request.url[:200]}"))
         self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
@@ -132,7 +132,7 @@ class WatchedPage:
 
 @pytest.fixture
 def open_page(browser: Browser) -> Iterator[Callable[..., WatchedPage]]:
-    """``open_page(address, width=1440, height=900, touch=False)``: a page of a fresh profile, watched throughout."""
+    """Yield ``open_page(address, width=1440, height=900, touch=False)``: it opens a watched page in a fresh profile."""
     contexts = []
 
     def open_page(address: str, width: int = 1440, height: int = 900, touch: bool = False) -> WatchedPage:

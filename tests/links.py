@@ -1,8 +1,8 @@
 """``make develop``: installs splatpipe as links to its sources instead of copies of them.
 
-``.venv/links/splatpipe`` gets a link to each folder that a wheel would have a copy of, and a ``.pth`` names it: a plain
-path, which editors and type checkers follow, too. What is built, the kernels, comes from the wheel and goes to the
-sources; its metadata and commands are installed as they are, so that pip takes the links back like any other files.
+``.venv/links/splatpipe`` gets a link to each folder that a wheel would contain a copy of, and a ``.pth`` file names it:
+a plain path, which editors and type checkers follow, too. The compiled kernels are copied from the wheel to the
+sources; its metadata and commands are installed unchanged, so that pip uninstalls the links like any other files.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def main(wheel: Path) -> None:
         link.unlink(missing_ok=True)
         link.symlink_to(ROOT / source)
     for library in (LINKS / "splatpipe" / "pipeline" / "raster").glob("lib*.so"):
-        library.unlink()  # CUDA's, which this wheel may be without
+        library.unlink()  # CUDA's, which this wheel may lack
     with zipfile.ZipFile(wheel) as archive, tempfile.TemporaryDirectory() as scratch:
         for name in archive.namelist():
             if name.endswith(".so"):
@@ -49,7 +49,7 @@ def main(wheel: Path) -> None:
 
 
 def _write_thin_wheel(archive: zipfile.ZipFile, target: Path) -> None:
-    """The wheel's metadata with the path file instead of the package."""
+    """Write a wheel with the metadata, and the path file in place of the package."""
     members = {
         name: archive.read(name)
         for name in archive.namelist()

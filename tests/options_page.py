@@ -20,7 +20,7 @@ KINDS = {bool: "`true`, `false`", str: "text", int: "whole number", float: "numb
 
 
 def written() -> str:
-    """The whole page: what was written by hand above the mark, and the tables below it."""
+    """Return the whole page: the hand-written part above the mark, and the tables below it."""
     by_hand, mark, _ = PAGE.read_text(encoding="utf-8").partition(MARK)
     if not mark:
         raise ValueError(f"{PAGE} has no line {MARK}")
@@ -28,7 +28,7 @@ def written() -> str:
 
 
 def tables() -> str:
-    """A section for each stage with a row for each of its options, in Markdown."""
+    """Return a section for each stage with a row for each of its options, in Markdown."""
     presets = {name: resolve(LineConfig, [load_preset(name)]) for name in preset_names()}
     texts = dict(option_help(LineConfig))
     sections = []
@@ -51,12 +51,12 @@ def tables() -> str:
 
 
 def kind(field: FieldInfo) -> str:
-    """What an option takes, in words."""
+    """Describe in words the values that an option accepts."""
     return " or ".join(_kinds(field.annotation, field.metadata))
 
 
 def shown(value: Any) -> str:
-    """A value as it stands after ``--set``."""
+    """Format a value as after ``--set``."""
     if value == "":
         return "empty"
     if isinstance(value, float) and value.is_integer():
@@ -65,7 +65,7 @@ def shown(value: Any) -> str:
 
 
 def _kinds(annotation: Any, limits: Sequence[Any]) -> Iterator[str]:
-    """What a type takes, in words; limits are annotated-types' ``Ge``, ``Gt``, ``Le``, ``Lt``."""
+    """Describe in words what a type accepts; limits are annotated-types' ``Ge``, ``Gt``, ``Le``, ``Lt``."""
     origin = typing.get_origin(annotation)
     if origin is Annotated:
         inner, *inner_limits = typing.get_args(annotation)
@@ -88,7 +88,7 @@ def _limits(limits: Sequence[Any]) -> Iterator[str]:
 
 
 def main() -> int:
-    """Write the page; the exit code."""
+    """Write the page; return the exit code."""
     before, now = PAGE.read_text(encoding="utf-8"), written()
     PAGE.write_text(now, encoding="utf-8")
     sys.stdout.write(f"{PAGE.name}: {'as it was' if now == before else 'written'}\n")

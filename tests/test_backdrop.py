@@ -44,7 +44,7 @@ AREA = PlanArea(AXES, ((HALF,),))
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tiny scene's backdrop is a part of its inside, too."""
+    """The tiny scene's backdrop is also part of its inside."""
     monkeypatch.setattr(counted, "FEWEST", 5)
 
 

@@ -230,7 +230,7 @@ def test_a_captures_state_follows_from_its_tries_alone(
             log.end(ending)
     if tries:
         with call.tries_file("0001-house").open("ab") as file:
-            file.write(b'{"ended": {"exit_c')  # as a power cut leaves it
+            file.write(b'{"ended": {"exit_c')  # as after a power cut
     if ended:
         call.write_end(time.time(), 0, "")
     (house,) = BatchMonitor(call).state().captures

@@ -146,7 +146,7 @@ def test_without_scripts_the_browser_itself_refreshes_it(tmp_path: Path, browser
 
 
 def test_a_page_that_nobody_renews_says_so_itself(tmp_path: Path, open_page: Callable) -> None:
-    """After a power cut nobody writes that the batch ended: the reader's clock tells."""
+    """After a power cut the end of the batch is not recorded: the reader's clock reveals it."""
     path = tmp_path / "batch.html"
     write_page(batch(CaptureState("one", "running"), as_of_s=time.time() - STALE_S - 30.0), path)
     watched = open_page(path.as_uri())
@@ -233,7 +233,7 @@ def test_a_card_shows_a_render_and_before_there_is_one_a_photo(demo_run: Path, t
 
 
 def difference(small: Image.Image, path: Path) -> float:
-    """Mean grey values between a small picture and a large one."""
+    """Return the mean grey-value difference between a small image and a large one."""
     with Image.open(path) as large:
         again = large.convert("RGB")
     again.thumbnail((480, 480), Image.Resampling.BOX)

@@ -56,7 +56,7 @@ def run(name: str, dataset: Path, out: Path, *options: str) -> dict[str, Any]:
 
 
 def pairs_by_definition(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> int:
-    """One Gaussian after the other, from near to far, over whole pictures."""
+    """Blend one Gaussian after another, front to back, over whole images."""
     splats = project(gaussians.to(dtype=torch.float64), camera, options)
     order = torch.argsort(splats.depths, stable=True)
     splats = splats.select(order[visible_splats(splats, camera)[order]])

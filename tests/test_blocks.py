@@ -358,7 +358,7 @@ def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:
 
 
 class ModelSource:
-    """Makes models when they are asked for, and notes whether one that was made before is alive then."""
+    """Creates models on demand, and records whether an earlier one is still alive."""
 
     def __init__(self, models: Mapping[int, Gaussians]) -> None:
         self.models, self.order, self.alive = models, list[int](), 0

@@ -87,7 +87,7 @@ def part(out: Path, name: str) -> Path:
 
 
 def digests(out: Path) -> dict[str, str]:
-    """Of all that `blocks`, each shard and `train` left."""
+    """Return digests of everything that `blocks`, each shard and `train` wrote."""
     files = [path for path in out.glob("stages/*-*/**/*") if path.is_file() and path.name != "manifest.json"]
     return {
         path.relative_to(out / "stages").as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files

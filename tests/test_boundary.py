@@ -74,7 +74,7 @@ def written(folder: Path, value: Any) -> Path:
 
 
 def laid(folder: Path, value: Any, frame: Frame = FRAME, points: np.ndarray = POINTS) -> tuple[PlanArea, Notes]:
-    """In the world frame, once the model's says the same."""
+    """Return the result in the world frame, after checking that the model's frame agrees."""
     notes, out = Notes(), folder / "boundary.json"
     in_model = frame.world_from_model.inverse().apply(points)
     summary = lay_boundary(written(folder, value), frame, in_model, out, notes)

@@ -56,7 +56,7 @@ HOUSE = np.random.default_rng(4).uniform([-4, -4, 0], [4, 4, 6], (4000, 3))  # s
 
 
 def capture(cameras: list[Camera], solid: np.ndarray = HOUSE) -> PhotoTrack:
-    """Photos of a house of 8 × 8 × 6 metres; each sees the points in its picture on the side towards it."""
+    """Photos of a house of 8 × 8 × 6 metres; each sees the points in its image on the side facing it."""
     points = HOUSE @ TILT.T
     seen = []
     for camera in cameras:
@@ -86,7 +86,7 @@ def film(cameras: list[Camera], solid: np.ndarray = HOUSE) -> Route:
 
 
 def assert_smooth(route: Route) -> None:
-    """Speed and turn change by little from frame to frame, from standstill to standstill."""
+    """Speed and rotation change little from frame to frame, starting and ending at rest."""
     views = route.directions()
     moved = np.linalg.norm(np.diff(route.places, axis=0), axis=1)
     turned = angles_between(views[:-1], views[1:])
@@ -269,7 +269,7 @@ def test_an_orbit_is_a_level_circle_around_the_house_that_closes() -> None:
 
 
 def test_an_orbit_rises_over_what_is_in_its_way() -> None:
-    """A façade seen from one side; behind the house stands another as high."""
+    """A façade seen from one side; behind the house is another of the same height."""
     front = [photo((x, -14.0, 3.0), (x, 0, 3)) for x in np.linspace(-6, 6, 9)]
     other = np.random.default_rng(2).uniform([-8, 9, 0], [8, 20, 7], (8000, 3))
     solid = np.vstack((HOUSE, other))

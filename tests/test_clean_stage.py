@@ -64,7 +64,7 @@ def inputs_of(folder: Path, dataset: Path, model: Gaussians, threads: int = 1) -
 
 
 def test_floaters_go_and_the_rest_keeps_its_bits(dataset: Path, tmp_path: Path) -> None:
-    """The same with one thread and two, and the held-out photos are not looked at."""
+    """One and two threads give the same, and the held-out photos are not used."""
     truth = tiny_scene.true_model()
     both, recorder = Gaussians.concat([truth, floaters()]), tiny_scene.Recorder()
     left = []

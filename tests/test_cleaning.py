@@ -57,7 +57,7 @@ def scene() -> Gaussians:
 
 
 def camera(eye: tuple[float, float, float], name: str) -> Camera:
-    """One that looks at the middle of the scene."""
+    """Return a camera that looks at the scene's centre."""
     centre = np.array(eye)
     forward = np.array([0.0, 0.0, 0.7]) - centre
     forward /= np.linalg.norm(forward)
@@ -104,7 +104,7 @@ def planted(kind: str) -> Gaussians:
 
 
 def shares(cleaned: CleaningResult) -> tuple[float, float]:
-    """Of the planted that are found, and of the scene that is lost."""
+    """Return the shares of planted Gaussians found and of the scene lost."""
     real = len(scene())
     return 1.0 - float(cleaned.keep[real:].float().mean()), 1.0 - float(cleaned.keep[:real].float().mean())
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("isa")
 def gradients(
     height: int, width: int, dtype: torch.dtype, strided: bool = False
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """The mapped picture, and the gradients of a weighted sum of it by the picture and by the map."""
+    """Return the mapped image, and the gradients of a weighted sum of it by image and map."""
     generator = torch.Generator().manual_seed(height * 1000 + width)
     picture, weights = (torch.rand(height, width, 3, generator=generator).to(dtype) for _ in range(2))
     affine = (torch.eye(3, 4) + 0.3 * torch.randn(3, 4, generator=generator)).to(dtype).requires_grad_()

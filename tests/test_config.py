@@ -65,7 +65,7 @@ def test_every_option_has_a_help_text() -> None:
 
 
 def test_the_line_is_whole() -> None:
-    """Every part that is read is left by an earlier stage or named by an option; every stage has its section."""
+    """Every part read is written by an earlier stage or named by an option; every stage has its section."""
     known = {"source.photos"} | {file.part for stage in LINE for file in stage.files.values()}
     sections = set(option_names(LineConfig))
     for stage in LINE:

@@ -81,7 +81,7 @@ def test_the_slurm_job_hands_the_warning_on_waits_for_the_end_and_is_queued_agai
 
 
 def test_a_batch_of_a_user_without_home_and_name_has_both_below_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Snakemake asks for both at its start; those that there are stay."""
+    """Snakemake requires both at its start; existing ones are kept."""
     for name in ("HOME", "LOGNAME"):
         monkeypatch.delenv(name, raising=False)
     call = Call(Path("/out/.batch/call"))

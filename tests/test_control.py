@@ -62,7 +62,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Result:
-    """What georef left."""
+    """Return georef's output."""
 
     out: Path
     parts: dict[str, Path]

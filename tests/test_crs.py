@@ -157,7 +157,7 @@ def test_local_to_crs_and_back_at_a_kilometre(text: str, vertical: str) -> None:
 
 @pytest.mark.parametrize("text", CRSS)
 def test_georef_json_alone_leads_to_where_proj_leads_directly(text: str) -> None:
-    """By what the file says and PROJ, against PROJ's own way from the earth's centre; and back by our World."""
+    """Transform by the file and PROJ, compare with PROJ's direct geocentric transform, and invert by our World."""
     told = json.loads(json.dumps(georeference(frame(text), BOX)))
     local = far_points()
     earth = np.c_[local, np.ones(len(local))] @ np.array(told["exact_path"]["matrix"])[:3].T

@@ -15,7 +15,7 @@ from building import NATIVE, build_on_cpu, load
 
 
 def told(built_for: str) -> tuple[int, SplatDevice]:
-    """What a library compiled for some architectures, as nvcc lists them, says of the harness's device."""
+    """Return what a library compiled for some architectures, as nvcc lists them, reports for the harness's device."""
     library = load(build_on_cpu([NATIVE / "cuda" / "device.cu"], "device", flags=[f"-D__CUDA_ARCH_LIST__={built_for}"]))
     device = SplatDevice()
     return library.splat_device(0, ctypes.byref(device)), device

@@ -69,7 +69,7 @@ def forward_again(kernels: ctypes.CDLL) -> Iterator[None]:
 
 @dataclass
 class Scene:
-    """Splats on a picture, ``records`` (n, 12) float32, and their order from near to far."""
+    """Splats on an image, ``records`` (n, 12) float32, and their front-to-back order."""
 
     width: int
     height: int
@@ -91,7 +91,7 @@ class Scene:
 def random_scene(
     count: int, width: int, height: int, seed: int, opacity: tuple[float, float], log10_sigmas: tuple[float, float]
 ) -> Scene:
-    """Gaussians of all directions and proportions, some with their centres off the picture."""
+    """Gaussians of all orientations and proportions, some centred outside the image."""
     rng = np.random.default_rng(seed)
     angle, sigmas = rng.uniform(0.0, math.pi, count), 10.0 ** rng.uniform(*log10_sigmas, (2, count))
     cos, sin, long, short = np.cos(angle), np.sin(angle), sigmas[0] ** 2, sigmas[1] ** 2
@@ -126,7 +126,7 @@ class Answer:
 
 @cache
 def blend_exactly(name: str, depth: bool) -> tuple[Answer, dict[str, Tensor]]:
-    """The definition, in float64 over the whole picture, and its derivatives by automatic differentiation.
+    """The float64 definition over the whole image, and its derivatives by automatic differentiation.
 
     Returns:
         The answer, and the pictures' gradients that its sums belong to: zero where a rounding decides.
@@ -204,7 +204,7 @@ class Lists:
 
 
 def list_pairs(scene: Scene, chunk_tiles: int) -> Lists:
-    """Each tile's Gaussians, with some that do not reach it, in chunks of so many tiles."""
+    """Return each tile's Gaussians, including some that do not reach it, in chunks of several tiles."""
     s = {name: values.squeeze().numpy() for name, values in scene.exactly().items()}
     columns, rows = scene.tiles
     ranks = []
@@ -229,7 +229,7 @@ def list_pairs(scene: Scene, chunk_tiles: int) -> Lists:
 
 
 def by_tiles(scene: Scene, kept: NDArray) -> Tensor:
-    """What is kept of every pixel, tile by tile and warp by warp, as a picture."""
+    """Return the state kept per pixel, stored by tile and warp, as an image."""
     columns, rows = scene.tiles
     picture = kept.reshape(rows, columns, 4, 2, 4, 8).transpose(0, 2, 4, 1, 3, 5).reshape(rows * TILE, columns * TILE)
     return torch.from_numpy(picture[: scene.height, : scene.width].copy())
@@ -276,7 +276,7 @@ def blend(kernels: ctypes.CDLL, scene: Scene, gradients: dict[str, Tensor], how:
 
 
 def ends_of(scene: Scene, lists: Lists, ended_by: Tensor) -> Tensor:
-    """How many of its tile's pairs each pixel looked at before the one of a rank ended it."""
+    """Return how many of its tile's pairs each pixel processed before one of a given rank saturated it."""
     ends = torch.empty(scene.height, scene.width, dtype=torch.int32)
     for y in range(scene.height):
         for x in range(scene.width):

@@ -21,7 +21,7 @@ constexpr int kMaxThreads = 1024, kMaxWarps = kMaxThreads / kLanes;
 constexpr size_t kStackBytes = 128 << 10;  // a thread's; kernels keep a few hundred floats
 constexpr size_t kPage = 4096;
 constexpr size_t kGuardBytes = 64;         // beside every piece of shared memory
-constexpr size_t kSharedBytes = 48 << 10;  // what a block has on every GPU without asking
+constexpr size_t kSharedBytes = 48 << 10;  // available to a block on every GPU by default
 constexpr size_t kArenaBytes = 2 * kSharedBytes;
 constexpr int kCudaVersion = 13000;
 
@@ -105,7 +105,7 @@ const char* base_name(const char* path) {
     return slash ? slash + 1 : path;
 }
 
-// Keeps the first error only: what follows from it says less.
+// Keeps the first error only: later ones are consequences.
 __attribute__((format(printf, 2, 3))) void record(cudaError_t error, const char* format, ...) {
     if (last_error != cudaSuccess) return;
     last_error = error;
@@ -122,7 +122,7 @@ void fail(const char* format, Values... values) {
     record(cudaErrorLaunchFailure, format, values...);
 }
 
-// Leaves the block for good: its fibers are made anew.
+// Abandons the block: its fibers are recreated.
 void abandon() {
     Fiber here;
     here.go_to(host);
@@ -151,7 +151,7 @@ void finish_barrier() {
     for (int w = 0; w < block.warps; ++w) std::swap(block.warp[w].ready, block.warp[w].at_barrier);
 }
 
-// No thread can go on, and there are some that wait.
+// No thread can continue, and some are waiting.
 void explain_deadlock() {
     int ended = 0, barred = 0, waiting = 0;
     const Request* request = nullptr;
@@ -177,7 +177,7 @@ void explain_deadlock() {
              name_of(block.meeting.barrier), base_name(block.meeting.place.file), block.meeting.place.line, ended);
 }
 
-// From the thread that runs to the next that can; the host if there is none.
+// Switches to the next runnable thread; to the host if there is none.
 void go_on() {
     const int here = static_cast<int>(threadIdx.x);
     int warp = choose_warp(here / kLanes);
@@ -196,7 +196,7 @@ void go_on() {
     fibers[here].go_to(fibers[next]);
 }
 
-// What a fiber does, block after block.
+// The fiber's loop over blocks.
 void live() {
     for (;;) {
         block.body(block.context);
@@ -256,7 +256,7 @@ void run_block(unsigned number) {
     if (!block.failed) check_guards();
 }
 
-// A permutation of 0..count-1: a step that has no factor in common with the count.
+// A permutation of 0..count-1: a step coprime to the count.
 struct Permutation {
     uint64_t count, begin, step;
     explicit Permutation(uint64_t n) : count(n), begin(0), step(1) {
@@ -268,7 +268,7 @@ struct Permutation {
     uint64_t at(uint64_t i) const { return (begin + i * (step % count)) % count; }
 };
 
-// Whether all lanes of a request's mask ask for the same; told if not.
+// Whether all lanes of a request's mask agree; reports an error if not.
 bool agree(const Warp& warp, const Request& request) {
     const Request* other = differing(warp, request);
     if (!other) return true;
@@ -342,7 +342,7 @@ void run(const char* kernel, int64_t blocks, int threads, void (*body)(const voi
     const std::lock_guard<std::mutex> lock(one_at_a_time);
     block.kernel = kernel, block.body = body, block.context = context;
     block.threads = threads, block.warps = (threads + kLanes - 1) / kLanes;
-    if (last_error != cudaSuccess) return;  // as after a real error, nothing runs until it was asked for
+    if (last_error != cudaSuccess) return;  // as after a real error, nothing runs until the error is queried
     if (blocks < 1 || blocks > INT32_MAX || threads < 1 || threads > kMaxThreads) {
         record(cudaErrorInvalidConfiguration, "launched with %lld blocks of %d threads", static_cast<long long>(blocks),
                threads);

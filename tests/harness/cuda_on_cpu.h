@@ -1,4 +1,4 @@
-// As much of CUDA as the kernels use, for a C++ compiler and a CPU. Included by device.h where SPLAT_ON_CPU is set.
+// The subset of CUDA that the kernels use, for a C++ compiler and a CPU. Included by device.h where SPLAT_ON_CPU is set.
 //
 // Blocks run one after another, each thread of a block on a stack of its own, from one synchronisation to the next: in
 // an order that the test chooses, so that what a missing barrier leaves to chance differs from order to order. Shared
@@ -48,7 +48,7 @@ struct Request {
 
 HARNESS_LOCAL uint64_t at_warp(const Request& request, uint64_t value, int argument);
 HARNESS_LOCAL int at_barrier(Barrier barrier, int predicate, Place place);
-HARNESS_LOCAL int fault();  // which of the faults that a test planted in the sources is alive, 0: none
+HARNESS_LOCAL int fault();  // the active one of the faults planted in the sources, 0: none
 HARNESS_LOCAL void* shared(const void* site, size_t bytes, const char* name);
 HARNESS_LOCAL void run(const char* kernel, int64_t blocks, int threads, void (*body)(const void*), const void* context);
 
@@ -68,7 +68,7 @@ void launch(const char* name, void (*kernel)(Values...), int64_t blocks, int thr
         &context);
 }
 
-// A lane's value as it travels between lanes.
+// A lane's value while it is exchanged between lanes.
 template <class T>
 uint64_t pack(T value) {
     static_assert(sizeof(T) <= sizeof(uint64_t), "");

@@ -1,4 +1,4 @@
-// A thread of its own stack that others are switched to: in a few instructions, or where those are not known, slowly.
+// A thread with its own stack, switched to in a few instructions, or more slowly on unknown architectures.
 #pragma once
 
 #include <stddef.h>
@@ -14,7 +14,7 @@ namespace harness {
 namespace {
 
 #if !HARNESS_UCONTEXT
-// What a called function has to leave alone goes on the stack, and the other stack is taken.
+// Pushes the callee-saved registers, and switches to the other stack.
 extern "C" HARNESS_LOCAL void harness_switch(void** from, void* to);
 asm(R"(
     .text

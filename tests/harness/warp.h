@@ -1,4 +1,4 @@
-// A warp's lanes, what they wait for, and what its operations give them.
+// A warp's lanes, what they wait for, and the results of its operations.
 #pragma once
 
 #include "cuda_on_cpu.h"
@@ -43,7 +43,7 @@ uint32_t lanes_with(const Warp& warp, uint32_t mask, uint64_t value) {
     return with & mask;
 }
 
-// All lanes of a mask have met: what each gets. Lanes beside the mask may wait for something else.
+// The result for each lane once all lanes of a mask have met. Lanes outside the mask may wait for something else.
 void complete(Warp* warp, const Request& request) {
     const auto give = [&](auto&& result) {
         for (uint32_t left = request.mask; left; left &= left - 1) {
@@ -73,7 +73,7 @@ void complete(Warp* warp, const Request& request) {
     }
 }
 
-// What a lane of a request's mask asks for that is something else; null if all agree.
+// The request of a lane in the mask that differs from the others; null if all agree.
 const Request* differing(const Warp& warp, const Request& request) {
     if (warp.alike) return nullptr;
     for (uint32_t left = request.mask; left; left &= left - 1) {
@@ -83,7 +83,7 @@ const Request* differing(const Warp& warp, const Request& request) {
     return nullptr;
 }
 
-// Keeps what a lane asks for: once for all as long as they ask for the same.
+// Stores a lane's request: once for all lanes as long as they agree.
 void ask(Warp* warp, int lane, const Request& request) {
     if (warp->waiting == 0) {
         warp->asked = request, warp->alike = true;

@@ -1,7 +1,7 @@
-"""``make test-image``: builds the cpu image for real, without a container engine's daemon, and runs the demo in it.
+"""``make test-image``: builds the CPU image without a container engine's daemon, and runs the demo in it.
 
 It runs as an arbitrary user with a read-only root, no network, 64 MB of /dev/shm, photos mounted read-only and no HOME;
-it is stopped inside matching and inside training as ``docker stop`` would, and has to go on to the bits of an
+it is stopped during matching and during training as by ``docker stop``, and must resume to a result bit-identical to an
 undisturbed run.
 """
 
@@ -22,12 +22,12 @@ ROOT = Path(__file__).resolve().parents[2]
 WORK = ROOT / "build" / "image"
 GOAL_PULLED = 700e6  # bytes
 STOP_S = 5.0  # promised; docker stop kills after 10
-SAME = ("splat.ply", "cameras.json", "sparse.glb")  # of OUT; what has times in it differs
-STOPS = (("matches", 0.0), ("train", 300.0))  # where it is stopped: the stage, and how far in, in its own unit
+SAME = ("splat.ply", "cameras.json", "sparse.glb")  # in OUT; files with times in them differ
+STOPS = (("matches", 0.0), ("train", 300.0))  # where it is stopped: the stage and its progress, in its own unit
 
 
 def main() -> int:
-    """The exit code: 0 where all of it holds."""
+    """Run the test; return the exit code: 0 if everything holds."""
     parser = argparse.ArgumentParser(prog="make test-image", description=__doc__)
     parser.add_argument("--torch-index", default="", help="index of torch alone; empty for that of the rest")
     parser.add_argument("--no-build", action="store_true", help="take the image that the last call left")
@@ -48,7 +48,7 @@ def main() -> int:
 
 
 def show_sizes(tools: ImageTools, image: Image) -> None:
-    """Print how large it is, by package."""
+    """Print the image's size, by package."""
     pulled = pulled_bytes(tools, WORK / "pushed")
     groups = sizes(image.root)
     unpacked = sum(group.unpacked for group in groups)
@@ -61,7 +61,7 @@ def show_sizes(tools: ImageTools, image: Image) -> None:
 
 
 def check_contents(image: Image) -> None:
-    """What has to be in the image, and what must not."""
+    """Check what must be in the image, and what must not."""
     if image.entrypoint != ["splatpipe"]:
         raise Problem(f"Its ENTRYPOINT is {image.entrypoint}.")
     if image.user.partition(":")[0] in ("", "0", "root"):
@@ -77,7 +77,7 @@ def check_contents(image: Image) -> None:
 
 
 def run_demo(image: Image) -> None:
-    """The demo at preview, undisturbed and stopped twice; the same bits both times."""
+    """Run the demo at preview, undisturbed and stopped twice; the results must be bit-identical."""
     photos = ROOT / "demo" / "capture"
     outs = {name: WORK / name for name in ("undisturbed", "stopped")}
     for out in outs.values():
@@ -107,7 +107,7 @@ def run_demo(image: Image) -> None:
 
 
 def digests(out: Path) -> dict[str, str]:
-    """SHA-256 of what has no times in it; an artifact's name is the key of all that it was made from."""
+    """Return SHA-256 of the files without times in them; an artifact's name is the key of all its inputs."""
     files = [out / name for name in SAME] + sorted((out / "stages").glob("evaluate-*/views/*.png"))
     told = {file.relative_to(out).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
     return told | {folder.name: "" for folder in (out / "stages").iterdir() if (folder / "manifest.json").is_file()}

@@ -1,4 +1,4 @@
-"""Builds the image with buildah in a chroot: no daemon, no registry, a stand-in for the base made by debootstrap."""
+"""Builds the image with buildah in a chroot: no daemon, no registry; debootstrap makes a substitute for the base."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from dataclasses import dataclass
 from pathlib import Path
 
 TAG = "splatpipe:cpu"
-SUITE = "bookworm"  # Debian 12, as the base's name says
-CERT_INSIDE = "/etc/index-certificates.pem"  # beside Debian's own, which a package of the image writes
+SUITE = "bookworm"  # Debian 12, as in the base's name
+CERT_INSIDE = "/etc/index-certificates.pem"  # separate from Debian's own, which a package of the image writes
 DOCKERFILE = Path("docker") / "Dockerfile"
-DRIVERS = ("overlay", "vfs")  # the second works everywhere, and copies everything for every layer
+DRIVERS = ("overlay", "vfs")  # the second works everywhere, but copies all files for every layer
 TOOLS = ("buildah", "debootstrap", "runc")
 
 
 class Problem(Exception):
-    """Why the image is not what it has to be, or cannot be tried here."""
+    """The image does not meet its requirements, or cannot be tested here."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """An image, unpacked.
+    """An unpacked image.
 
     Attributes:
         root: Its file system.
         entrypoint: Its ENTRYPOINT.
         environment: ``NAME=value``.
-        user: As the image names it.
+        user: User named in the image.
         folder: Its WORKDIR.
-        labels: Its labels' names.
+        labels: Names of its labels.
     """
 
     root: Path
@@ -48,10 +48,10 @@ class Image:
 
 
 class ImageTools:
-    """buildah on a storage of its own.
+    """buildah with its own storage.
 
     Args:
-        storage: Where images and layers are kept.
+        storage: Folder for images and layers.
 
     Raises:
         Problem: if this machine lacks something.
@@ -71,7 +71,7 @@ class ImageTools:
                 break
 
     def buildah(self, *arguments: object, quiet: bool = True) -> str:
-        """What a buildah command printed; with ``quiet=False`` it goes to the terminal."""
+        """Run a buildah command and return its output; with ``quiet=False`` it goes to the terminal."""
         command = [*self._command, *map(str, arguments)]
         done = subprocess.run(command, stdout=subprocess.PIPE if quiet else None, text=True, check=False)
         if done.returncode:
@@ -79,12 +79,12 @@ class ImageTools:
         return (done.stdout or "").strip()
 
     def has(self, name: str) -> bool:
-        """Whether an image of that name is in the storage."""
+        """Whether the storage has an image of that name."""
         return name in self.buildah("images", "--format", "{{.Name}}:{{.Tag}}").split()
 
     @contextmanager
     def open_image(self) -> Iterator[Image]:
-        """The image that was built, unpacked; nothing of it stays mounted."""
+        """Yield the built image, unpacked; nothing stays mounted afterwards."""
         container = "splatpipe-test"
         if container in self.buildah("containers", "--format", "{{.ContainerName}}").split():
             self.buildah("rm", container)
@@ -143,7 +143,7 @@ def _make_base(tools: ImageTools, base: str, folder: Path) -> None:
 
 
 def _index(work: Path) -> list[object]:
-    """The package index as this machine's pip is told it, for the build alone: a secret, mounts, a certificate."""
+    """Return arguments that pass pip's package index to the build alone: a secret, mounts, a certificate."""
     listed = subprocess.run(
         [sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True, check=True
     ).stdout
@@ -166,7 +166,7 @@ def _index(work: Path) -> list[object]:
 
 
 def _folders(value: str) -> list[Path]:
-    """Folders of this machine that a setting names; of an index the one that its files lie in, too."""
+    """Return the local folders that a setting names; for an index, also the folder of its files."""
     words = value.split()
     folders = [Path(word) for word in words if word.startswith("/")]
     folders += [Path(word.removeprefix("file://")).parent for word in words if word.startswith("file:///")]

@@ -14,23 +14,23 @@ from pathlib import Path
 
 from building import Image, Problem
 
-USER = 54321  # in no passwd of the image
-SHM = "size=65536k"  # what Docker gives
+USER = 54321  # in no passwd file of the image
+SHM = "size=65536k"  # Docker's default
 DOCKER_KILLS_S = 10.0
-PATIENCE_S = 3600.0  # of a busy machine; a container that hangs ends the test
+PATIENCE_S = 3600.0  # for a busy machine; a hanging container fails the test
 LOOK_S = 0.1
-MEMORY = 4 << 30  # bytes that its control group allows
-PERIOD_US = 100_000  # of the control group that allows processors
+MEMORY = 4 << 30  # memory limit of its control group, bytes
+PERIOD_US = 100_000  # of the control group that limits processors
 DEVICES = ["nosuid", "noexec"]
 
 
 @dataclass(frozen=True)
 class Mounts:
-    """What the container is given.
+    """Folders mounted into the container.
 
     Attributes:
         photos: Read-only, at ``/photos``.
-        out: At ``/out``, the only place that it can write but ``/dev/shm``.
+        out: At ``/out``, the only writable place except ``/dev/shm``.
     """
 
     photos: Path
@@ -42,10 +42,10 @@ class ContainerEnd:
     """How a stopped container ended.
 
     Attributes:
-        code: Exit code; 137 where it had to be killed, as Docker does after ten seconds.
+        code: Exit code; 137 if it had to be killed, as Docker does after ten seconds.
         seconds: From the signal to the end.
-        progress: What the stage last told before.
-        told: The container's last words.
+        progress: The stage's last progress before the signal.
+        told: The container's last output.
     """
 
     code: int
@@ -55,12 +55,12 @@ class ContainerEnd:
 
 
 class Container:
-    """A container of an image, for one command after the other.
+    """A container of an image that runs one command after another.
 
     Args:
         image: The image.
         bundle: A folder for the runtime's configuration.
-        mounts: What it is given.
+        mounts: Its mounted folders.
     """
 
     def __init__(self, image: Image, bundle: Path, mounts: Mounts) -> None:
@@ -69,7 +69,7 @@ class Container:
         os.chown(mounts.out, USER, USER)
 
     def must_end(self, code: int, command: list[str], say: Callable[[str], None], cores: int = 0) -> str:
-        """Run a command to its end, with so many processors if not all; what it told.
+        """Run a command to its end, on ``cores`` processors (0: all); return its output.
 
         Raises:
             Problem: if it ends with another code.
@@ -85,7 +85,7 @@ class Container:
         return self._told()
 
     def stop_inside(self, command: list[str], stage: str, done: float) -> ContainerEnd:
-        """Run a command and send SIGTERM to it once a stage has done more than so much."""
+        """Run a command and send SIGTERM to it once a stage has passed a given progress."""
         before = sum(1 for _ in self._events())
         with self._running(command) as process:
             progress = self._await_progress(process, before, stage, done)
@@ -136,7 +136,7 @@ class Container:
                 process.wait(PATIENCE_S)
 
     def _config(self, command: list[str], cores: int) -> dict:
-        """As ``docker run --read-only --network none --user 54321:54321 --memory 4g -v …:/photos:ro -v …:/out``."""
+        """Return the configuration of ``docker run --read-only --network none --user 54321:54321 --memory 4g -v …``."""
         kinds = ("pid", "network", "ipc", "uts", "mount")
         resources: dict = {"memory": {"limit": MEMORY}}
         if cores:
@@ -146,7 +146,7 @@ class Container:
             "process": {
                 "terminal": False,
                 "user": {"uid": USER, "gid": USER},
-                "args": ["env", "-u", "HOME", *self._image.entrypoint, *command],  # runtimes put a HOME in
+                "args": ["env", "-u", "HOME", *self._image.entrypoint, *command],  # runtimes set HOME
                 "env": self._image.environment,
                 "cwd": self._image.folder,
                 "noNewPrivileges": True,

@@ -13,19 +13,19 @@ from building import TAG, ImageTools
 
 PACKAGES = Path("opt/splatpipe/lib")
 FOREIGN = ("gcc", "g++", "c++", "cc", "make", "cmake", "ninja", "node", "npm", "pip", "pip3", "pytest", "ruff", "mypy")
-SMALL = 3_000_000  # bytes; packages below that are told together
+SMALL = 3_000_000  # bytes; smaller packages are reported together
 CHUNK = 1 << 20
-GZIP_LEVEL = 6  # of registries
+GZIP_LEVEL = 6  # as in registries
 
 
 @dataclass(frozen=True)
 class Group:
-    """A package, or what belongs to none.
+    """A package, or the files that belong to none.
 
     Attributes:
-        name: What it is.
+        name: Its name.
         unpacked: Bytes of its files.
-        compressed: Bytes of them as gzip packs them.
+        compressed: Their size compressed with gzip.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Group:
 
 
 def pulled_bytes(tools: ImageTools, folder: Path) -> int:
-    """Bytes of the image's compressed layers, as a registry has them."""
+    """Return the bytes of the image's compressed layers, as in a registry."""
     shutil.rmtree(folder, ignore_errors=True)
     tools.buildah("push", "-q", TAG, f"oci:{folder}:latest")
     size = sum(path.stat().st_size for path in (folder / "blobs").rglob("*") if path.is_file())
@@ -43,7 +43,7 @@ def pulled_bytes(tools: ImageTools, folder: Path) -> int:
 
 
 def sizes(root: Path) -> list[Group]:
-    """An image's files by package, the largest first."""
+    """Group an image's files by package, the largest first."""
     packers: dict[str, list] = {}
     for path in sorted(root.rglob("*")):
         status = path.lstat()
@@ -62,7 +62,7 @@ def sizes(root: Path) -> list[Group]:
 
 
 def foreign_tools(root: Path) -> list[str]:
-    """Tools for building and testing that are on the image's PATH."""
+    """List tools for building and testing that are on the image's PATH."""
     places = [root / place for place in ("usr/bin", "bin", "usr/local/bin", "opt/splatpipe/bin")]
     return sorted({name for place in places for name in FOREIGN if (place / name).exists()})
 

@@ -1,4 +1,4 @@
-// Adam against its definition in float64, sparse and with gradients that are not finite.
+// Adam against its float64 definition, sparse and with non-finite gradients.
 #include "adam.h"
 
 #include <cmath>
@@ -52,7 +52,7 @@ std::vector<std::vector<float>> gradients_of(const State& state, int step, bool 
     return gradients;
 }
 
-// Which rows are seen: all, or some; empty for all.
+// Visible rows: all or some; empty for all.
 std::vector<std::uint8_t> seen_rows(int rows, bool sparse, int step) {
     Random random(static_cast<std::uint64_t>(step));
     std::vector<std::uint8_t> visible(sparse ? static_cast<std::size_t>(rows) : 0);
@@ -82,7 +82,7 @@ bool row_finite(const std::vector<std::vector<float>>& gradients, int row) {
     return true;
 }
 
-// The definition, value by value. Returns the largest difference of `got` from it.
+// Returns the largest difference of `got` from the definition, value by value.
 double worst_difference(const State& before, const State& got, int rows, int step, bool sparse, bool hostile,
                         std::int64_t* skipped) {
     const auto gradients = gradients_of(before, step, hostile);

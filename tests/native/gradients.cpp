@@ -13,8 +13,8 @@ namespace {
 constexpr float kStep = 8e-3f;
 constexpr double kTolerance = 1e-2;  // L2, relative
 
-// Splats larger than the picture, well inside the frustum and never opaque together: no threshold (1/255, 1e-4, a
-// clamp) is passed anywhere, so that every picture is smooth.
+// Splats larger than the image, well inside the frustum and never opaque together: no threshold (1/255, 1e-4, a
+// clamp) is crossed anywhere, so every image is smooth.
 Scene smooth_scene(int sh_count) {
     Scene scene = random_scene(11, 6, sh_count);
     Random random(12);

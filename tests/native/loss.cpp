@@ -86,7 +86,7 @@ void nothing_counts() {
     for (float value : gradient) check(value == 0.0f, "the gradient is zero");
 }
 
-// A render that is not finite (no such leaves the rasterizer) must not reach beyond its arrays either.
+// A non-finite render (the rasterizer never produces one) must not cause out-of-bounds access either.
 void hostile_pixels() {
     Pair pair = random_pair(30, 31, true);
     for (std::size_t i = 0; i < pair.render.size(); i += 97) pair.render[i] = i % 2 ? NAN : INFINITY;

@@ -1,4 +1,4 @@
-// PatchMatch: no byte beyond its pictures is touched, and the same bits for any number of threads.
+// PatchMatch: no out-of-bounds access to its images, and the same bits for any number of threads.
 #include "patch_match.h"
 
 #include <cstddef>

@@ -1,4 +1,4 @@
-// Whole renders, forward and backward: the same bits for any number of threads, whatever the numbers.
+// Whole renders, forward and backward: the same bits for any number of threads and any input.
 #include <atomic>
 #include <string>
 #include <thread>
@@ -16,7 +16,7 @@ struct Size {
 
 constexpr Size kSizes[] = {{1, 1}, {16, 16}, {17, 15}, {70, 53}, {3, 40}, {40, 3}};
 
-// Pictures finite, nothing unwritten, and the same bits with 1, 2 and 5 threads.
+// Images are finite and completely written, with the same bits on 1, 2 and 5 threads.
 void check_threads(const Scene& scene, const splat::View& view, bool depth, const std::string& what) {
     splat::set_threads(1);
     const Outcome alone = evaluate(scene, view, depth);
@@ -68,7 +68,7 @@ void many_gaussians() {
     check_threads(scene, view_of(120, 90, 1, {0}), true, "many");
 }
 
-// A frame keeps its memory: what a larger render left there must not show.
+// A frame reuses its memory: remains of a larger render must not show.
 void a_frame_is_used_again() {
     splat::set_threads(2);
     splat::RasterFrame frame;
@@ -81,7 +81,7 @@ void a_frame_is_used_again() {
         }
 }
 
-// Beside the picture, before the near plane, far from the origin: the cheap test rules out nothing that is visible.
+// Beside the image, before the near plane, far from the origin: the cheap test culls nothing visible.
 void candidates_are_all_that_is_visible() {
     const splat::ProjectKernels& kernels = SPLAT_KERNELS(project_kernels);
     for (const float log_scale : {-6.0f, -3.0f, -1.0f, 1.0f, 4.0f})

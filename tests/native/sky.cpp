@@ -1,4 +1,4 @@
-// Renders laid over the sky and their gradients: against the definition, and the same bits for any number of threads.
+// Renders composited over the sky and their gradients: against the definition, the same bits for any number of threads.
 #include "sky.h"
 
 #include <cmath>

@@ -1,4 +1,4 @@
-// Surfaces: no byte beyond depths, pixels and results is touched, whatever places and depths are asked for.
+// Surfaces: no out-of-bounds access to depths, pixels and results, for any places and depths.
 #include <cmath>
 #include <cstddef>
 #include <cstdint>

@@ -1,4 +1,4 @@
-// The pool: every index once, nesting, exceptions, several callers, and the number of threads changing meanwhile.
+// The pool: every index once, nesting, exceptions, several callers, and a changing number of threads.
 #include "threads.h"
 
 #include <atomic>

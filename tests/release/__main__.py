@@ -1,9 +1,9 @@
-"""``make release``: the wheel and the source distribution as users get them, in environments that have nothing else.
+"""``make release``: tests the wheel and the source distribution as users get them, in otherwise empty environments.
 
-The wheel is installed where there is neither compiler nor node, the source distribution is built where there is a
-compiler and no node. Each has to run the demo to the bits of the build tree, and to have its licences, its bill of
-materials and its types. What is built stays in ``build/release``. CUDA is left out (SPLATPIPE_CUDA=off): its kernels
-take long to compile.
+The wheel is installed where there is neither compiler nor node; the source distribution is built where there is a
+compiler but no node. Both must run the demo to the same bits as the build tree, and contain licences, bill of materials
+and types. The files stay in ``build/release``. CUDA is disabled (SPLATPIPE_CUDA=off), since its kernels take long to
+compile.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WORK = ROOT / "build" / "release"
 CONSTRAINTS = ROOT / "constraints.txt"
 VALIDATOR = "cyclonedx-python-lib[json-validation]"
-SHELL = ("sh", "env")  # all that a user's PATH has to have
+SHELL = ("sh", "env")  # all that a user's PATH must contain
 TOOLS = ("c++", "cc", "g++", "gcc", "ld", "as", "ar", "ranlib", "nm", "make", "uname", *SHELL)
 VALIDATE = (
     "import sys; from cyclonedx.schema import SchemaVersion\n"
@@ -34,11 +34,11 @@ VALIDATE = (
 
 
 class Problem(Exception):
-    """What is not as it has to be."""
+    """A requirement that is not met."""
 
 
 def main() -> int:
-    """The exit code: 0 where all of it holds."""
+    """Run the test; return the exit code: 0 if everything holds."""
     parser = argparse.ArgumentParser(prog="make release", description=__doc__)
     parser.add_argument("--torch-index", default="", help="index of torch alone; empty for that of the rest")
     parser.add_argument("--set", action="append", default=[], help="an option of the demo's runs, to make them shorter")
@@ -65,7 +65,7 @@ def main() -> int:
 
 
 def check_python(python: Path, name: str, sdist: Path, how: tuple[str, list[str], str]) -> None:
-    """Build both for a Python, look into the wheel, and run the demo with each."""
+    """Build both for a Python, inspect the wheel, and run the demo with each."""
     torch_index, sets, expected = how
     say(f"Python {name}")
     from_tree = build_wheel(python, ROOT, WORK / name / "wheel", os.environ["PATH"])
@@ -83,7 +83,7 @@ def check_python(python: Path, name: str, sdist: Path, how: tuple[str, list[str]
 
 
 def make_sdist() -> Path:
-    """The source distribution, which has the pages' scripts bundled."""
+    """Build the source distribution, which contains the pages' bundled scripts; return its path."""
     subprocess.run([sys.executable, ROOT / "pipeline/web/build.py"], check=True)
     subprocess.run(
         [sys.executable, "-m", "build", "--sdist", "--outdir", WORK, ROOT], check=True, stdout=subprocess.DEVNULL
@@ -94,7 +94,7 @@ def make_sdist() -> Path:
 
 
 def build_wheel(python: Path, source: Path, target: Path, path: str) -> Path:
-    """A wheel, built with nothing but what its own requirements bring and ``path`` has."""
+    """Build a wheel with nothing but its declared requirements and the programs in ``path``; return its path."""
     began = time.monotonic()
     environment = {**os.environ, "PATH": path, "SPLATPIPE_CUDA": "off"}
     command = [str(python), "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(target), str(source)]
@@ -106,7 +106,7 @@ def build_wheel(python: Path, source: Path, target: Path, path: str) -> Path:
 
 
 def make_environment(python: Path, target: Path, torch_index: str) -> Path:
-    """The Python of a fresh environment with what splatpipe needs, in the versions that were tested."""
+    """Create an environment with splatpipe's dependencies, in the tested versions; return its Python."""
     subprocess.run([str(python), "-m", "venv", target], check=True)
     clean = target / "bin" / "python"
     (torch,) = (line for line in CONSTRAINTS.read_text(encoding="utf-8").splitlines() if line.startswith("torch=="))
@@ -117,7 +117,7 @@ def make_environment(python: Path, target: Path, torch_index: str) -> Path:
 
 
 def check_wheel(wheel: Path, clean: Path) -> None:
-    """Licences, bill of materials, types, and that it installs and starts without tools."""
+    """Check licences, bill of materials, types, and that the wheel installs and starts without tools."""
     pip(clean, "install", str(wheel))
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
@@ -139,7 +139,7 @@ def check_wheel(wheel: Path, clean: Path) -> None:
 
 
 def check_bill(path: Path) -> None:
-    """CycloneDX's own validator takes it."""
+    """Validate the bill of materials with CycloneDX's own validator."""
     tools = WORK / "tools" / "bin" / "python"
     if not tools.exists():
         subprocess.run([sys.executable, "-m", "venv", WORK / "tools"], check=True)
@@ -148,7 +148,7 @@ def check_bill(path: Path) -> None:
 
 
 def run_demo(python: Path, out: Path, sets: Sequence[str], path: str) -> str:
-    """Run the demo; the digest of its splat."""
+    """Run the demo; return the digest of its splat."""
     began = time.monotonic()
     log = out.with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -164,7 +164,7 @@ def run_demo(python: Path, out: Path, sets: Sequence[str], path: str) -> str:
 
 
 def folder_of(names: Sequence[str]) -> str:
-    """A folder that has these programs of the machine and no other, to be a PATH."""
+    """Create a folder with only these programs of the machine, for use as PATH; return it."""
     folder = WORK / ("bin-tools" if "cc" in names else "bin")
     folder.mkdir(exist_ok=True)
     for name in names:
@@ -175,19 +175,19 @@ def folder_of(names: Sequence[str]) -> str:
 
 
 def contents(wheel: Path) -> list[str]:
-    """The names of a wheel's files."""
+    """Return the names of a wheel's files."""
     with zipfile.ZipFile(wheel) as archive:
         return sorted(archive.namelist())
 
 
 def pip(python: Path, *words: str) -> None:
-    """Call a Python's pip, with the versions that were tested."""
+    """Call a Python's pip, with the tested versions."""
     how = ["-q", "--disable-pip-version-check"]
     subprocess.run([str(python), "-m", "pip", words[0], *how, "-c", str(CONSTRAINTS), *words[1:]], check=True)
 
 
 def say(text: str) -> None:
-    """Tell whoever waits."""
+    """Print progress."""
     print(text, flush=True)
 
 

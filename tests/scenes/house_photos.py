@@ -16,11 +16,11 @@ from splatpipe.pipeline.surface.sources import DepthSource
 from splatpipe.pipeline.survey.frames import Frame
 
 GSD_M = 0.1
-SIDE_M = 10.0  # of what is made into clouds and meshes: the house, and lawn around it
+SIDE_M = 10.0  # of the area made into clouds and meshes: the house, and lawn around it
 
 
 def house_site() -> SiteExtent:
-    """A square about the house."""
+    """Return a square around the house."""
     return SiteExtent(
         GSD_M,
         -1.0,
@@ -33,15 +33,15 @@ def house_site() -> SiteExtent:
 
 
 def photos(noise_px: float = 0.0, wild: float = 0.0) -> list[PhotoSource]:
-    """Every other photo of the house.
+    """Return every other photo of the house.
 
     Args:
-        noise_px: Deviation of the depths' parallax, pixels, to a photo 5 m away.
-        wild: Share of depths that are nonsense, in squares of 5 × 5 pixels.
+        noise_px: Standard deviation of the depths' parallax, pixels, relative to a photo 5 m away.
+        wild: Share of depths that are grossly wrong, in squares of 5 × 5 pixels.
     """
     sources = []
     for number, camera in enumerate(cameras()):
-        if number % 2 and number < 9:  # those that look down overlap more than it takes
+        if number % 2 and number < 9:  # the nadir photos overlap more than needed
             continue
         exact, rng = _exact(number), np.random.default_rng(number)
         depth = exact.depth.astype(np.float64)
@@ -65,7 +65,7 @@ def _exact(number: int) -> ExactDepths:
 
 
 def surface_distances(points: Array) -> Array:
-    """From points to the nearest of the scene's surfaces, wherever photos may see it: exact but at edges."""
+    """Return the distances from points to the nearest surface that photos may see: exact except at edges."""
     east, north, up = points.T
     (tree, radius), slope = TREE, (RIDGE_M - 3.0) / ROOF[3]
     parts = [np.abs(up), np.abs(np.linalg.norm(points - np.array(tree), axis=1) - radius)]
@@ -80,13 +80,13 @@ def surface_distances(points: Array) -> Array:
 def run_surface(
     frame: Frame, sources: Sequence[PhotoSource], area: PlanArea | None = None, boundary: Path | None = None
 ) -> RunSurface:
-    """Photos as a run's, whose depths are as fine as they."""
+    """Return the photos as a run's, with depths at the photos' resolution."""
     depths = tuple(source.depths for source in sources if source.depths is not None)
     return RunSurface(frame, area, boundary, depths, tuple(sources), 1.0)
 
 
 class Recorder:
-    """A Reporter that keeps what it is told."""
+    """A Reporter that records what it receives."""
 
     def __init__(self) -> None:
         self.steps: list[tuple[float, float]] = []

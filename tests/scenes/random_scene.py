@@ -11,7 +11,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 
 
 def random_scene(seed: int, n: int = 60, sh_degree: int = 3, size: float = -1.5) -> Gaussians:
-    """Overlapping Gaussians before a camera at the origin, some outside its view, some behind it."""
+    """Return overlapping Gaussians in front of a camera at the origin, some outside its view, some behind it."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -23,7 +23,7 @@ def random_scene(seed: int, n: int = 60, sh_degree: int = 3, size: float = -1.5)
 
 
 def random_camera(seed: int, width: int = 70, height: int = 53) -> Camera:
-    """Turned and moved a little, with different focal lengths and the principal point off the centre."""
+    """Return a slightly turned and shifted camera, with different focal lengths and an off-centre principal point."""
     generator = torch.Generator().manual_seed(seed)
     a, b, c = (0.1 * torch.randn(3, generator=generator, dtype=torch.float64)).tolist()
     pose = np.eye(4)

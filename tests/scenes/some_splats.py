@@ -6,7 +6,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 
 
 def some_gaussians(count: int = 50, degree: int = 3, seed: int = 1, spread: float = 20.0) -> Gaussians:
-    """Gaussians about the origin, of sizes, opacities and colours that files must be able to hold."""
+    """Return Gaussians around the origin, with sizes, opacities and colours that files must be able to store."""
     generator = torch.Generator().manual_seed(seed)
     made = Gaussians.empty(count, degree)
     made.means = spread * torch.randn(count, 3, generator=generator)

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def main() -> int:
-    """The exit code: 0 where the record is right now."""
+    """Run the command; return the exit code: 0 if the record is right now."""
     parser = argparse.ArgumentParser(prog="make versions", description=__doc__)
     parser.add_argument("--since", metavar="COMMIT", help="compare with this commit instead of the last right one")
     parser.add_argument("--record", action="store_true", help="record what is there, without a comparison")

@@ -25,7 +25,7 @@ class StageSources:
 
 
 def present(root: Path) -> dict[str, StageSources]:
-    """What a tree's stages are, in the order of its line, read without importing it."""
+    """Return a tree's stages, in pipeline order, read without importing them."""
     sources = Sources(root)
     found = {}
     for node in ast.walk(ast.parse((root / LINE_FILE).read_text(encoding="utf-8"))):
@@ -37,7 +37,7 @@ def present(root: Path) -> dict[str, StageSources]:
 
 
 def _shards_entry(said: ast.expr | None) -> list[str]:
-    """The body of a stage's shards, where it has some."""
+    """Return the body of a stage's shards, if it has any."""
     if not isinstance(said, ast.Call):
         return []
     named = [keyword.value for keyword in said.keywords if keyword.arg == "entry"]
@@ -45,7 +45,7 @@ def _shards_entry(said: ast.expr | None) -> list[str]:
 
 
 def recorded(root: Path) -> dict[str, StageSources]:
-    """What the record says; nothing where there is none."""
+    """Return the recorded stages; empty if there is no record."""
     if not (root / RECORD_FILE).is_file():
         return {}
     table = tomllib.loads((root / RECORD_FILE).read_text(encoding="utf-8"))
@@ -53,18 +53,18 @@ def recorded(root: Path) -> dict[str, StageSources]:
 
 
 def write(root: Path, stages: Mapping[str, StageSources]) -> None:
-    """Write the record, a table a stage."""
+    """Write the record, one table per stage."""
     text = tomli_w.dumps({name: asdict(stage) for name, stage in stages.items()})
     (root / RECORD_FILE).write_text(HEAD + text, encoding="utf-8")
 
 
 def differing(now: Mapping[str, StageSources], before: Mapping[str, StageSources]) -> list[str]:
-    """The stages that are not the same in both, those that one lacks, too."""
+    """Return the stages that differ, including those that one of the two lacks."""
     return [name for name in {**now, **before} if now.get(name) != before.get(name)]
 
 
 def complaint(root: Path) -> str:
-    """What CI says where sources or versions are not the recorded ones; empty where they are."""
+    """Return CI's message if sources or versions differ from the record; otherwise empty."""
     names = differing(present(root), recorded(root))
     if not names:
         return ""

@@ -1,8 +1,8 @@
 """Runs stages of the tree in PYTHONPATH on an earlier run's output; a program for ``stage_comparison``.
 
-Each stage reads the parts that the earlier run left, whatever other stages leave now, so that what differs is its own
-doing. It takes a JSON object: ``earlier`` (that run's OUT), ``photos``, ``out``, ``threads``, ``stages`` (names), and
-writes ``out/rerun.json``: by stage its files' digests and whether an earlier artifact could be taken for its
+Each stage reads the parts from the earlier run, whatever the other stages write now, so that differences are its own.
+The input is a JSON object: ``earlier`` (that run's OUT), ``photos``, ``out``, ``threads``, ``stages`` (names). The
+output is ``out/rerun.json``: for each stage its files' digests and whether an earlier artifact could be taken for its
 own, or why it failed.
 """
 
@@ -49,7 +49,7 @@ def main(job: Mapping[str, Any]) -> None:
 
 
 def _taken(table: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a configuration is still taken; what is not has its default, and its stage another key."""
+    """Return the configuration without options that no longer exist; their stages get defaults and new keys."""
     taken: dict[str, Any] = {}
     for section, options in table.items():
         for option, value in options.items():
@@ -60,18 +60,18 @@ def _taken(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _unseen(_event: Event) -> None:
-    """Nobody watches."""
+    """Discard the event."""
 
 
 def _artifacts(out: Path) -> dict[str, Artifact]:
-    """What the earlier run left, by stage, in the order in which it was made."""
+    """Return the artifacts of the earlier run, by stage, in the order in which they were made."""
     manifests = {path.parent: json.loads(path.read_text("utf-8")) for path in (out / "stages").glob("*/manifest.json")}
     ordered = sorted(manifests.items(), key=lambda item: item[1]["finished_s"])
     return {manifest["stage"]: Artifact(folder, manifest) for folder, manifest in ordered}
 
 
 def _run(stage: Stage, runner: Runner, parts: dict[str, Part], artifacts: Mapping[str, Artifact]) -> dict[str, Any]:
-    """Run one stage; its parts join those that the earlier run left, and replace none."""
+    """Run one stage; its parts join those of the earlier run, but replace none."""
     line = replace(runner.line, stages=(stage,), source=parts)
     earlier = artifacts.get(stage.name)
     inputs = asdict(line.inputs_of(stage, parts))
@@ -89,7 +89,7 @@ def _run(stage: Stage, runner: Runner, parts: dict[str, Part], artifacts: Mappin
 
 
 def _asked(inputs: Mapping[str, Any], parts: Iterable[str]) -> dict[str, Any]:
-    """What a key is made of, but for what the parts that are read hold, and what an artifact has to have."""
+    """Return what a key is made of, except for the contents of the parts read, and what an artifact must have."""
     return {**inputs, "reads": sorted(inputs["reads"]), "parts": sorted(parts)}
 
 

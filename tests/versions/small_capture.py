@@ -8,17 +8,17 @@ from pathlib import Path
 
 from PIL import Image
 
-# An orbit of a house, and some photos that look straight down: more than are matched with each, so that the choice of
-# pairs shows.
+# An orbit of a house, and some nadir photos: more photos than are matched with each one, so that the choice of pairs
+# matters.
 NUMBERS = (*range(1, 17), 20, 24, 28, 32, 36, 40)
-OTHER_CAMERA = (13, 14, 15, 16, 20, 24)  # said to be of a camera that nobody knows, so that cameras are told apart
+OTHER_CAMERA = (13, 14, 15, 16, 20, 24)  # marked as from an unknown camera, so that cameras are distinguished
 MODEL, OTHER_MODEL = b"M3E\0", b"M3X\0"  # in EXIF
-ZOOMED = (24, 36, 40)  # said to be of a focal length 3 % longer, which is another setting of a lens
+ZOOMED = (24, 36, 40)  # marked with a focal length 3 % longer, a different zoom setting
 FOCAL, LONGER_FOCAL = struct.pack(">II", 1229, 100), struct.pack(">II", 1266, 100)  # millimetres, in EXIF
 MASKED = 5
 CONTROL = "gcp_list.txt"
 
-# Small, but with all that a run has: the whole takes some ten seconds of one core.
+# Small but complete: the whole takes some ten seconds on one core.
 CONFIG = """
 [features]
 extractor = "opencv-sift"
@@ -49,11 +49,11 @@ gsd_m = 0.3
 
 
 def write_capture(demo: Path, folder: Path) -> Path:
-    """Take photos of the demo capture with their control points, a mask and a second camera.
+    """Copy photos of the demo capture with their control points, a mask and a second camera.
 
     Args:
         demo: The demo capture.
-        folder: Where it goes.
+        folder: Output folder.
 
     Returns:
         The folder of the photos.

@@ -1,8 +1,8 @@
 """The sources that a stage's body reaches, and their digest.
 
-Reached is the module of the body and all that it imports of splatpipe, wherever the import stands, with the packages
-they lie in. A package counts with what lies in its folder besides Python: kernels, scripts, templates. Comments,
-docstrings and formatting of Python and C++ do not count.
+Reached are the module of the body and everything that it imports from splatpipe, wherever the import statement is, with
+their packages. A package includes the non-Python files in its folder: kernels, scripts, templates. Comments, docstrings
+and formatting of Python and C++ do not count.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from pathlib import Path
 from typing import Any
 
 PACKAGE = "splatpipe"
-NAMED_MODULE = re.compile(rf"{PACKAGE}(\.\w+)+(?=(:\w+)?$)")  # a module that is imported by its name in a string
+NAMED_MODULE = re.compile(rf"{PACKAGE}(\.\w+)+(?=(:\w+)?$)")  # a module imported by name from a string
 MADE_FOLDERS = ("dist", "node_modules", "__pycache__")
-UNCOUNTED = (".py", ".pyi", ".so", ".pyc", ".typed")  # Python's are read as modules, or say nothing of the answer
-RECORD = "versions.toml"  # lies in a package that all stages reach, and holds the digests
-UNSAID = ("ctx", "kind", "type_comment")  # of a syntax tree: they follow from the rest or from the formatting
+UNCOUNTED = (".py", ".pyi", ".so", ".pyc", ".typed")  # read as modules, or irrelevant to the results
+RECORD = "versions.toml"  # in a package that all stages reach, and contains the digests
+UNSAID = ("ctx", "kind", "type_comment")  # of a syntax tree: redundant, or formatting
 CPP = (".cpp", ".h", ".cu", ".cuh")
 CPP_PIECES = re.compile(r"""(?P<text>"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|//[^\n]*|/\*.*?\*/""", re.DOTALL)
 BLANKS = re.compile(r"(?<=\w)\s+(?=\w)|(?P<needless>\s+)")
 
 
 class Sources:
-    """The Python modules below a folder that has ``pipeline`` and ``stages``.
+    """The Python modules below a folder with ``pipeline`` and ``stages``.
 
     Args:
-        root: The folder: a checkout, or what was taken from one.
+        root: The folder: a checkout, or an export of one.
     """
 
     def __init__(self, root: Path) -> None:
         self._root = root
 
     def digest(self, *entries: str) -> str:
-        """sha256 (hex) of all that a stage's bodies reach.
+        """Return the sha256 (hex) of everything that a stage's bodies reach.
 
         Args:
-            entries: Its body and its shards', ``module:function``.
+            entries: The stage's body and its shards', ``module:function``.
         """
         pieces = []
         for module in sorted({each for entry in entries for each in self.reached(entry.partition(":")[0])}):
@@ -53,7 +53,7 @@ class Sources:
         return sha(pieces)
 
     def reached(self, module: str) -> set[str]:
-        """The module itself and all that it imports, directly or not; those that only type checkers import are not."""
+        """Return the module and all its direct and indirect imports, except those for type checkers only."""
         found: set[str] = set()
         ahead = {module}
         while ahead:
@@ -103,7 +103,7 @@ def _imports(text: str, package: str) -> set[str]:
 
 
 def _run_nodes(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes but those that only type checkers look at."""
+    """Yield all nodes except those for type checkers only."""
     yield node
     for child in ast.iter_child_nodes(node):
         if not (isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING")):
@@ -116,7 +116,7 @@ def _module_digest(text: str) -> str:
 
 
 def _shape(node: Any) -> Any:
-    """A syntax tree as JSON, the same in all versions of Python: what is empty is left out, and so are docstrings."""
+    """Return a syntax tree as JSON, the same in all Python versions: empty fields and docstrings are omitted."""
     if isinstance(node, ast.AST):
         fields = {name: value for name, value in ast.iter_fields(node) if name not in UNSAID}
         said = {name: _shape(value) for name, value in fields.items() if value is not None and value != []}
@@ -127,12 +127,12 @@ def _shape(node: Any) -> Any:
 
 
 def _is_docstring(node: Any) -> bool:
-    """A text that stands for itself: a docstring of a module, class, function, field or constant."""
+    """Whether a node is a bare string: the docstring of a module, class, function, field or constant."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 def data_digests(folder: Path) -> dict[str, str]:
-    """Digests of what lies in a package besides Python, by the names in there; packages in it have theirs."""
+    """Return digests of a package's non-Python files, by relative name; subpackages have their own."""
     return {name: _data_digest(path) for name, path in _data(folder)}
 
 
@@ -152,5 +152,5 @@ def _data_digest(path: Path) -> str:
 
 
 def sha(value: Any) -> str:
-    """sha256 (hex) of a JSON value."""
+    """Return the sha256 (hex) of a JSON value."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -17,17 +17,17 @@ from small_capture import CONFIG, write_capture
 from trees import Say, Tree, complete, git, take_commit, take_working
 
 HERE = Path(__file__).resolve().parent
-TOLD = 3  # files of other bits
-LOOKED_BACK = 20  # commits that changed the record; an engineer's branch has fewer
+TOLD = 3  # number of differing files that are reported
+LOOKED_BACK = 20  # commits that changed the record; a typical branch has fewer
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be done about a stage.
+    """What must be done about a stage.
 
     Attributes:
-        accepted: Its present version stands for its present sources.
-        why: In a few words.
+        accepted: Whether its present version stands for its present sources.
+        why: The reason, in a few words.
     """
 
     accepted: bool
@@ -38,9 +38,9 @@ class Comparison:
     """An earlier commit and the working folder side by side.
 
     Args:
-        checkout: The working folder, of git.
-        folder: Where both are worked with; what was in it is dropped, but for kernels that were built.
-        say: Takes what goes on.
+        checkout: The working folder, a git checkout.
+        folder: Working folder for both; its contents are dropped, except for built kernels.
+        say: Receives progress messages.
     """
 
     def __init__(self, checkout: Path, folder: Path, say: Say) -> None:
@@ -49,13 +49,13 @@ class Comparison:
             shutil.rmtree(folder / name, ignore_errors=True)
 
     def last_right(self, names: Sequence[str]) -> str:
-        """The newest commit whose record is right for stages: HEAD, or else one that changed the record."""
+        """Return the newest commit whose record is right for the stages: HEAD, or one that changed the record."""
         history = git(self._checkout, "rev-list", f"--max-count={LOOKED_BACK}", "HEAD", "--", str(RECORD_FILE))
         for commit in dict.fromkeys(["HEAD", *history.decode().split()]):
             try:
                 tree = take_commit(self._checkout, commit, self._folder / "before")
             except subprocess.CalledProcessError:
-                continue  # from before these folders
+                continue  # predates these folders
             before, then = recorded(tree.root), present(tree.root)
             shutil.rmtree(tree.path)
             if before and all(before.get(name) == then.get(name) for name in names):
@@ -65,7 +65,7 @@ class Comparison:
         )
 
     def verdicts(self, commit: str) -> dict[str, Verdict]:
-        """Compare with a commit: a verdict on each stage that is not the same there."""
+        """Compare with a commit: a verdict on each stage that differs there."""
         before = take_commit(self._checkout, commit, self._folder / "before")
         now = take_working(self._checkout, self._folder / "now")
         then, current = present(before.root), present(now.root)
@@ -90,7 +90,7 @@ class Comparison:
         threads = len(os.sched_getaffinity(0))
         self._say("running the line of that commit")
         options = ["--config", str(config), "--device", "cpu", "--threads", str(threads)]
-        for name in reversed(wanted):  # the last one needs most others, and what is there is reused
+        for name in reversed(wanted):  # the last one needs most others, and existing results are reused
             if not self._manifests(name):
                 _check(before.python("-m", before.command, "run", str(photos), str(earlier), *options, "--until", name))
         self._say(f"running the present {', '.join(wanted)} on what it left")
@@ -100,18 +100,18 @@ class Comparison:
         return result
 
     def _manifests(self, stage: str) -> list[Path]:
-        """What describes the artifact that the earlier run left, if it did."""
+        """Return the manifests of the artifact of the earlier run, if any."""
         return list((self._folder / "earlier" / "stages").glob(f"{stage}-*/manifest.json"))
 
     def _files(self, stage: str) -> dict[str, str]:
-        """The files that the earlier run left, with their digests."""
+        """Return the files of the earlier run, with their digests."""
         (path,) = self._manifests(stage)
         parts = json.loads(path.read_text(encoding="utf-8"))["parts"].values()
         return {file["path"]: file["sha256"] for part in parts for file in part["files"]}
 
 
 def _without_running(then: StageSources | None, now: StageSources) -> Verdict | None:
-    """The verdict that needs no run; None where one is needed."""
+    """Return the verdict if no run is needed; otherwise None."""
     if then is None:
         return Verdict(True, "is new")
     if now.version > then.version:

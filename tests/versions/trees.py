@@ -24,10 +24,10 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Tree:
-    """Sources as they are imported.
+    """Sources that can be imported.
 
     Attributes:
-        path: What PYTHONPATH is to have.
+        path: Value of PYTHONPATH.
         command: The module of the command line.
     """
 
@@ -36,11 +36,11 @@ class Tree:
 
     @property
     def root(self) -> Path:
-        """The folder that has ``pipeline`` and ``stages``."""
+        """Return the folder with ``pipeline`` and ``stages``."""
         return self.path / PACKAGE
 
     def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run Python so that ``splatpipe`` is this tree's; what it prints is kept for an error."""
+        """Run Python so that ``splatpipe`` is this tree's; its output is kept for error messages."""
         environment = {**os.environ, "PYTHONPATH": str(self.path), "PYTHONDONTWRITEBYTECODE": "1"}
         return subprocess.run(
             [sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False
@@ -48,12 +48,12 @@ class Tree:
 
 
 def git(checkout: Path, *arguments: str) -> bytes:
-    """What git says; an error where it fails."""
+    """Return git's output; raises if it fails."""
     return subprocess.run(["git", "-C", str(checkout), *arguments], capture_output=True, check=True).stdout
 
 
 def take_commit(checkout: Path, commit: str, folder: Path) -> Tree:
-    """The sources of a commit, without what is built from them."""
+    """Export the sources of a commit, without build products."""
     packed = git(checkout, "archive", commit, *FOLDERS)
     with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
         archive.extractall(folder / PACKAGE, filter="data")
@@ -61,7 +61,7 @@ def take_commit(checkout: Path, commit: str, folder: Path) -> Tree:
 
 
 def take_working(checkout: Path, folder: Path) -> Tree:
-    """The sources as they lie in the working folder, new files, too."""
+    """Copy the sources of the working folder, including new files."""
     listed = git(checkout, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--", *FOLDERS)
     for name in filter(None, listed.decode().split("\0")):
         if (checkout / name).is_file():
@@ -77,13 +77,13 @@ def _command(project: str) -> str:
 
 
 def complete(trees: Sequence[Tree], working: Tree, builds: Path, say: Say) -> None:
-    """Give trees their kernels and the pages' scripts: those that are installed, else newly built ones.
+    """Provide trees with their kernels and the pages' scripts: the installed ones, or newly built ones.
 
     Args:
         trees: The trees.
-        working: That of the working folder; what is installed was built from it.
-        builds: Where what had to be built is kept.
-        say: Takes what goes on.
+        working: The working folder's tree, from which the installation was built.
+        builds: Folder that keeps builds.
+        say: Receives progress messages.
     """
     installed = _installed()
     for tree in trees:
@@ -92,18 +92,18 @@ def complete(trees: Sequence[Tree], working: Tree, builds: Path, say: Say) -> No
         for library in (installed / KERNELS.parent if same else _build(tree, builds, say)).glob("_native*.so"):
             shutil.copy2(library, native)
         shutil.copytree(installed / PAGES / "dist", tree.root / PAGES / "dist")
-        _run([sys.executable, str(tree.root / PAGES / "build.py")])  # does nothing where dist/ is of these sources
+        _run([sys.executable, str(tree.root / PAGES / "build.py")])  # does nothing if dist/ matches these sources
 
 
 def _installed() -> Path:
-    """The folder of the ``splatpipe`` that this Python imports, which was built."""
+    """Return the folder of the ``splatpipe`` that this Python imports, which contains the build."""
     found = importlib.util.find_spec(f"{PACKAGE}.pipeline")
     assert found is not None and found.origin is not None
     return Path(found.origin).resolve().parent.parent
 
 
 def _build(tree: Tree, builds: Path, say: Say) -> Path:
-    """Build a tree's kernels, once; the folder that has them."""
+    """Build a tree's kernels, once; return their folder."""
     kernels = tree.root / KERNELS
     folder = builds / sha(data_digests(kernels))[:16]
     if any(folder.glob("_native*.so")):
@@ -116,7 +116,7 @@ def _build(tree: Tree, builds: Path, say: Say) -> Path:
         f"CMAKE_MAKE_PROGRAM={programs / 'ninja'}",
         f"Python_EXECUTABLE={sys.executable}",
         f"nanobind_DIR={nanobind}",
-        *filter(None, [os.environ.get("SKBUILD_CMAKE_DEFINE")]),  # where the Makefile has fetched Python's headers
+        *filter(None, [os.environ.get("SKBUILD_CMAKE_DEFINE")]),  # where the Makefile has downloaded Python's headers
     ]
     work = folder / "work"
     made = [str(programs / "cmake"), "-S", str(kernels), "-B", str(work), "-G", "Ninja"]
