@@ -1,4 +1,4 @@
-// The CPU rasterizer's driver: who computes what when, and who owns the memory. Not for kernel files.
+// The CPU rasterizer's driver: scheduling of the kernels, and ownership of memory. Not for kernel files.
 #pragma once
 
 #include <cstddef>
@@ -22,12 +22,12 @@
 
 namespace splat {
 
-// More pixel-tile pairs than 32-bit indices hold.
+// More Gaussian-tile pairs than 32-bit indices allow.
 struct TooManyPairs : std::runtime_error {
     TooManyPairs() : std::runtime_error("the Gaussians cover more tiles than 32-bit indices hold") {}
 };
 
-// Uninitialised memory that only grows, so that a training loop does not fault in fresh pages at every iteration.
+// Uninitialized memory that only grows, so that a training loop does not fault in fresh pages at every iteration.
 template <class T>
 class Buffer {
   public:
@@ -36,10 +36,10 @@ class Buffer {
     Buffer& operator=(const Buffer&) = delete;
     ~Buffer() { std::free(data_); }
 
-    // At least `count` elements; what was in it is lost where it grows. Throws std::bad_alloc.
+    // Room for at least `count` elements; the content is lost if it grows. Throws std::bad_alloc.
     T* reserve(int64_t count) {
         if (count > capacity_) grow(count);
-#if defined(__SANITIZE_ADDRESS__)  // sees a step beyond what was asked for, too
+#if defined(__SANITIZE_ADDRESS__)  // to detect accesses beyond the requested size too
         ASAN_UNPOISON_MEMORY_REGION(data_, static_cast<std::size_t>(count) * sizeof(T));
         ASAN_POISON_MEMORY_REGION(data_ + count, static_cast<std::size_t>(capacity_ - count) * sizeof(T));
 #endif
@@ -48,7 +48,7 @@ class Buffer {
     T* data() const { return data_; }
 
   private:
-    static constexpr std::size_t kLine = 64, kHugePage = 2 << 20;  // bytes, of the cache and of memory
+    static constexpr std::size_t kLine = 64, kHugePage = 2 << 20;  // bytes
 
     void grow(int64_t count) {
         std::free(data_);
@@ -58,7 +58,8 @@ class Buffer {
         const std::size_t unit = bytes < kHugePage ? kLine : kHugePage, size = (bytes + unit - 1) / unit * unit;
         data_ = static_cast<T*>(std::aligned_alloc(unit, size));
         if (!data_) throw std::bad_alloc();
-#if defined(__linux__)  // splats and slots are visited in all orders: with pages of 4 KiB the CPU looks up most of them
+#if defined(__linux__)  // splats and slots are accessed in random order: with 4 KiB pages most accesses would miss the
+                        // TLB
         if (unit == kHugePage) madvise(data_, size, MADV_HUGEPAGE);
 #endif
         capacity_ = static_cast<int64_t>(size / sizeof(T));
@@ -68,41 +69,41 @@ class Buffer {
     int64_t capacity_ = 0;
 };
 
-// The step of the optimiser that a backward pass ends with.
+// The optimizer step fused with the end of a backward pass.
 struct FrameStep {
     std::vector<AdamRows> tensors;  // means, log_scales, quats, opacity_logits, sh, without gradients
-    int64_t count;                  // of their rows, the rendered Gaussians' first: the others are left as they are
+    int64_t count;                  // rows, those of the rendered Gaussians first: the others are left unchanged
     AdamOptions options;
-    float log_scale_min, log_scale_max;  // of the rows that take part, afterwards
-    const float* logit_gain;             // (count,): of the rendered logits by those that are stepped; null: the same
-    int64_t* seen;                       // (visible()): the rows that take part, ascending; null: not wanted
-    float* means2d;                      // (visible(), 2): theirs, as of ParameterGradients
+    float log_scale_min, log_scale_max;  // clamps the stepped rows afterwards
+    const float* logit_gain;             // (count,): d(rendered logit) / d(stepped logit); null: 1
+    int64_t* seen;                       // (visible()): the stepped rows, ascending; null if not needed
+    float* means2d;                      // (visible(), 2): their gradients, as in ParameterGradients
 };
 
-// A view's rasterization, with what its backward pass needs. One render at a time.
+// A view's rasterization, with the data for its backward pass. One render at a time.
 class RasterFrame {
   public:
     // Renders; every pointer in `out` is written. Throws TooManyPairs, std::bad_alloc.
     void forward(const View& view, const Parameters& in, const Pictures& out, float* radii, uint8_t* visible);
 
-    // From the pictures of the last forward() call to the screen.
+    // From the images of the last forward() call to screen-space gradients.
     void blend_backward(const PictureGradients& gradients, bool magnitudes);
 
-    // From there to the parameters, which must be those of the forward() call: every row is written. Can be repeated.
+    // From there to the parameters, which must be those of the forward() call; writes every row. Can be repeated.
     void project_backward(const Parameters& in, const ParameterGradients& out);
 
-    // The same, and at once a step of Adam of the visible rows; nothing else is touched. Returns how many were left out
-    // for their gradients.
+    // The same, fused with a step of Adam of the visible rows; nothing else is changed. Returns the number of rows
+    // skipped for their gradients.
     int64_t step(const Parameters& in, const FrameStep& step);
 
     int64_t pairs() const { return pairs_; }
     int64_t visible() const { return visible_; }
 
-    // Pairs of a pixel and a splat blended into it, of the last forward() call. For benchmarks: slow.
+    // Number of pixel-splat pairs blended in the last forward() call. For benchmarks: slow.
     int64_t contributions() const;
 
   private:
-    // Of kCandidatesATask candidates; where their shares begin once they have been summed.
+    // Per kCandidatesATask candidates; after the prefix sum, where their shares begin.
     struct TaskCounts {
         int64_t visible, rows, pairs;
     };
@@ -114,7 +115,7 @@ class RasterFrame {
     void bin();
     void prefix_tiles(int chunks, int tiles);
 
-    const ProjectKernels* project_ = nullptr;  // of the last forward(), which lays out what the others read
+    const ProjectKernels* project_ = nullptr;  // of the last forward(), whose layout the other calls use
     const BlendKernels* blend_ = nullptr;
     View view_{};
     FrameData data_{};
@@ -137,10 +138,10 @@ class RasterFrame {
     Buffer<int32_t> pixel_end_;
 };
 
-// Frames are handed out and taken back, a few of them kept with their memory.
+// Frames are borrowed and returned; a few are kept with their memory.
 std::shared_ptr<RasterFrame> borrow_frame();
 
-// Gives back the memory of those that are kept.
+// Frees the memory of the frames kept.
 void free_frames();
 
 }  // namespace splat
