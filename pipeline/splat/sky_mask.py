@@ -1,9 +1,9 @@
-"""Where the sky is in photos of known cameras, without learned weights; when in doubt, no sky.
+"""Sky segmentation in photos with known cameras, without learned weights; when in doubt, no sky.
 
-A pixel is sky where all of this holds, each of which is known from photos and the sparse model alone: its surroundings
-are smooth; its colour is a sky's (bluish, or a bright grey); its ray does not point below the horizon; no triangulated
-point lies on its ray, whichever photos saw that; it is connected to the border of the picture that gravity has on top;
-and other photos that look the same way see sky there, too (a sky is the same from everywhere, a wall is not).
+A pixel is sky if all of these hold, which are known from photos and the sparse model alone: its surroundings are
+smooth; its colour is that of a sky (bluish, or a bright grey); its ray does not point below the horizon; no
+triangulated point of any photo lies on its ray; it is connected to the image's upper border with respect to gravity;
+and other photos that look in the same direction see sky, too (a sky is the same from everywhere, a wall is not).
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.upright import up_without_orientation
 
-WORK_MEGAPIXELS = 0.1  # at which photos are looked at: noise and distant texture are averaged away, edges stay
+WORK_MEGAPIXELS = 0.1  # resolution of the search: noise and distant texture are averaged out, edges stay
 SMOOTH_SLOPE = 0.03  # change of a channel over a pixel, of 1: haze and soft clouds are below, edges and leaves above
 BLUE_STEP = 0.03  # by which a bluish sky's blue is at least above its red and at most below its green
-CLEARLY_BLUE = 0.1  # blue over red, from which on it is no grey that shade or haze made bluish
+CLEARLY_BLUE = 0.1  # blue minus red from which it is not just grey made bluish by shade or haze
 LEAST_BLUE_LIGHT = 0.3  # of the blue of a sky, of 1
 LEAST_GREY_LIGHT = 0.75  # of the darkest channel of a grey one: clouds, haze, overexposed
 GREY_OUTSHINES = 0.7  # share of the rest of the picture: walls in the sun stand beside shade
@@ -42,24 +42,24 @@ GROW_WINDOW = 7
 DIRECTION_ROWS = 64  # of the grid of directions, elevation by azimuth: cells of 2.8°
 LEAST_WITNESSES = 2  # other photos that look the same way, before their word counts
 LEAST_AGREEMENT = 0.15  # of what they see that way: buildings rightly hide much of one's sky from another
-ROOF_COLUMNS = 72  # of azimuth, 5° each, in which it is asked whether something is above a region
+ROOF_COLUMNS = 72  # sectors of azimuth, 5° each, tested for something above a region
 ROOF_REACH_DEG = 5.0  # of azimuth around a point above: ceilings and lintels are smooth, their points far apart
-ROOF_MARGIN_DEG = 3.0  # from a region's top to such a point: the edge of a roof is no roof over the sky beside it
-ROOF_POINTS = 3  # so many make it sure: a wrong point, or a bird, is one
+ROOF_MARGIN_DEG = 3.0  # from a region's top to such a point: a roof's edge does not cover the sky beside it
+ROOF_POINTS = 3  # points needed: a single one may be wrong, or a bird
 MOST_ROOFED = 0.5  # of a region's pixels: a branch or a wire over the sky does not make it a wall
-OPEN_FROM_DEG = 5.0  # what looks higher than this sees over low walls and furniture
-LEAST_OPEN = 0.05  # of all that the photos see so high: under an open sky it is most, in a room a few patches
+OPEN_FROM_DEG = 5.0  # rays above this elevation pass over low walls and furniture
+LEAST_OPEN = 0.05  # sky's share of all that the photos see above it: most of it outdoors, a few patches in a room
 
 
 @dataclass(frozen=True)
 class SkyPhoto:
-    """A photo as the search sees it, at most ``WORK_MEGAPIXELS``.
+    """A reduced photo for the sky search, at most ``WORK_MEGAPIXELS``.
 
     Attributes:
-        camera: At the size of ``pixels``.
+        camera: Camera at the size of ``pixels``.
         pixels: RGB.
-        ignored: True where the user's mask leaves pixels out; None without a mask.
-        drawn: The sky, where the user drew it; None where it is to be found.
+        ignored: True where the user's mask excludes pixels; None without a mask.
+        drawn: Sky mask drawn by the user; None if the sky has to be detected.
     """
 
     camera: Camera
@@ -70,7 +70,7 @@ class SkyPhoto:
 
 @dataclass(frozen=True)
 class SkyMask:
-    """Where a photo shows the sky, an eighth of a byte a pixel.
+    """A photo's sky mask, one bit per pixel.
 
     Attributes:
         bits: ``np.packbits`` of the mask.
@@ -91,17 +91,17 @@ class SkyMask:
         return flat.reshape(self.shape).astype(bool)
 
     def emptied(self) -> SkyMask:
-        """One of the same size without sky."""
+        """A mask of the same size without sky."""
         return SkyMask(np.zeros_like(self.bits), self.shape)
 
     def any(self) -> bool:
-        """Whether there is sky at all."""
+        """Whether there is any sky."""
         return bool(self.bits.any())
 
 
 @dataclass(frozen=True)
 class SkyVotes:
-    """The cells of the grid of directions that a photo sees, and those of them that are sky to it."""
+    """The cells of the direction grid that a photo sees, and those that are sky in it."""
 
     seen: Int64[np.ndarray, " s"]
     sky: Int64[np.ndarray, " k"]
@@ -114,14 +114,14 @@ def find_skies(
     up: Float64[np.ndarray, " 3"],
     threads: int = 1,
 ) -> list[SkyMask]:
-    """The sky in each photo of a capture: as it is drawn, else found.
+    """The sky mask of each photo of a capture: drawn by the user, or else detected.
 
     Args:
-        cameras: Of the photos, in one world frame, of any size.
-        photo: Loads one of them; called from several threads.
-        points: Triangulated points in that frame; leave out those of few photos or a large error.
-        up: Against gravity, of ``up_of``.
-        threads: That load and search.
+        cameras: Cameras of the photos, in one world frame, of any size.
+        photo: Loads a photo by index; called from several threads.
+        points: Triangulated points in that frame, without those of few photos or with large errors.
+        up: Unit vector opposite to gravity, from ``up_of``.
+        threads: Number of threads that load and search.
     """
 
     def search(index: int) -> tuple[SkyMask, SkyVotes, bool]:
@@ -141,15 +141,15 @@ def find_skies(
 def roofed(
     camera: Camera, sky: Bool[np.ndarray, "h w"], points: Float64[np.ndarray, "m 3"], up: Float64[np.ndarray, " 3"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Regions of a sky with something above: a wall under its ceiling, a window under its lintel. Nothing is above sky.
+    """Regions of a sky mask with something above, such as a ceiling or a lintel, which therefore are not sky.
 
-    The points need not be in the picture: what is above a wall is mostly seen in other photos.
+    The points need not be in the image: anything above a wall is mostly seen in other photos.
 
     Args:
-        camera: Of the photo.
-        sky: What looks like sky in it.
+        camera: The photo's camera.
+        sky: Candidate sky mask.
         points: Triangulated points in the world.
-        up: Against gravity, as for ``find_sky``.
+        up: Unit vector opposite to gravity, as for ``find_sky``.
     """
     count, labels = cv2.connectedComponents(sky.astype(np.uint8), connectivity=4)
     result = np.zeros_like(sky)
@@ -178,7 +178,7 @@ def roofed(
 
 
 def is_open(votes: Sequence[SkyVotes]) -> bool:
-    """Whether enough of what a capture shows above the horizon is sky: outdoors nearly all is, in a room it is not.
+    """Whether a capture is outdoors: enough of what it shows above the horizon is sky.
 
     A few bright patches among hundreds of photos are walls, windows and lamps.
     """
@@ -190,13 +190,13 @@ def is_open(votes: Sequence[SkyVotes]) -> bool:
 def up_of(
     cameras: Sequence[Camera], photo: Callable[[int], SkyPhoto], points: Float64[np.ndarray, "m 3"], threads: int = 1
 ) -> Float64[np.ndarray, " 3"]:
-    """Unit vector against gravity, from the cameras alone: datasets hold no EXIF orientation.
+    """Unit vector opposite to gravity, from the cameras alone: datasets have no EXIF orientation.
 
     Args:
-        cameras: At least one.
-        photo: As for ``find_skies``; called only where the photos seem to be turned.
+        cameras: At least one camera.
+        photo: As for ``find_skies``; called only if the photos seem to be rotated.
         points: As for ``find_skies``.
-        threads: That load.
+        threads: Number of threads that load photos.
     """
     rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])
     centres = np.stack([camera.centre() for camera in cameras])
@@ -211,14 +211,14 @@ def up_of(
 def find_sky(
     photo: SkyPhoto, points_px: Float64[np.ndarray, "n 2"], up: Float64[np.ndarray, " 3"]
 ) -> Bool[np.ndarray, "h w"]:
-    """The sky in one photo, True where it is, by all but the agreement with other photos.
+    """Detect the sky in one photo by all criteria except the agreement with other photos; True is sky.
 
-    What the user's mask leaves out counts as looking like sky; rays, points and the top of the picture still decide.
+    Pixels excluded by the user's mask count as sky-coloured; rays, points and the upper border still decide.
 
     Args:
         photo: The photo.
-        points_px: Where triangulated points project to, seen in this photo or hidden in it, pixels of ``pixels``.
-        up: Against gravity, in the world; a unit vector.
+        points_px: Projections of triangulated points, visible in this photo or hidden, pixels of ``pixels``.
+        up: Unit vector opposite to gravity, in the world.
     """
     colour = photo.pixels.astype(np.float32) / np.float32(255.0)
     elevation = elevations_deg(photo.camera, up)
@@ -234,18 +234,18 @@ def find_sky(
 
 
 def elevations_deg(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "h w"]:
-    """Angle of each pixel's ray over the horizon, degrees."""
+    """Elevation of each pixel's ray above the horizon, degrees."""
     rays = directions(camera)
     sine = rays @ up / np.linalg.norm(rays, axis=2)
     return np.asarray(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
 
 
 def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
-    """Rays of pixels in the world, 1 long along the camera's axis.
+    """Rays of pixels in the world, with length 1 along the optical axis.
 
     Args:
         camera: The camera.
-        step: Only every so many pixels, from the first; the last one is the last pixel's or a little outside.
+        step: Spacing of the rays in pixels, from the first pixel; the last is at the last pixel or slightly outside.
     """
     x = (step * np.arange(-((1 - camera.width) // step) + 1) + 0.5 - camera.cx) / camera.fx
     y = (step * np.arange(-((1 - camera.height) // step) + 1) + 0.5 - camera.cy) / camera.fy
@@ -254,7 +254,7 @@ def directions(camera: Camera, step: int = 1) -> Float64[np.ndarray, "h w 3"]:
 
 
 def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarray, " 3"]) -> SkyVotes:
-    """What a photo says about directions: a cell is sky where most of what the photo sees of it is."""
+    """A photo's votes on directions: a cell is sky if most of the photo's pixels in it are."""
     cell = direction_cells(camera, up)
     cells = 2 * DIRECTION_ROWS * DIRECTION_ROWS
     count = np.bincount(cell.ravel(), minlength=cells)
@@ -262,7 +262,7 @@ def votes_of(camera: Camera, mask: Bool[np.ndarray, "h w"], up: Float64[np.ndarr
 
 
 def agreed(votes: Sequence[SkyVotes]) -> list[bool]:
-    """Whether each photo's sky is one; False where the others that look the same way see something else there."""
+    """Whether other photos confirm each photo's sky; False if those that look the same way see something else."""
     seen, sky = np.zeros((2, 2 * DIRECTION_ROWS * DIRECTION_ROWS))
     for vote in votes:
         seen[vote.seen] += 1.0
@@ -277,7 +277,7 @@ def agreed(votes: Sequence[SkyVotes]) -> list[bool]:
 
 
 def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Int64[np.ndarray, "h w"]:
-    """The cell of the grid of directions that each pixel looks at."""
+    """The cell of the direction grid for each pixel's ray."""
     rays = directions(camera)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     east, north = horizontal_axes(up)
@@ -291,7 +291,7 @@ def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Int64[np.n
 def azimuths_elevations_deg(
     rays: Float64[np.ndarray, "*n 3"], up: Float64[np.ndarray, " 3"]
 ) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
-    """Azimuths, from 0 to 360° from ``horizontal_axes``, and angles over the horizon, of rays of any length but 0."""
+    """Azimuths (0 to 360°, from ``horizontal_axes``) and elevations in degrees, of rays of any non-zero length."""
     east, north = horizontal_axes(up)
     level = np.hypot(rays @ east, rays @ north)
     azimuth = np.degrees(np.arctan2(rays @ north, rays @ east)) % 360.0
@@ -299,7 +299,7 @@ def azimuths_elevations_deg(
 
 
 def horizontal_axes(up: Float64[np.ndarray, " 3"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
-    """Two unit vectors that make a right-handed frame with ``up``; which ones is of no matter, but always the same."""
+    """Two unit vectors that form a right-handed frame with ``up``: arbitrary but deterministic."""
     axis = np.eye(3)[int(np.argmin(np.abs(up)))]
     east = np.cross(axis, up)
     east /= np.linalg.norm(east)
@@ -307,14 +307,14 @@ def horizontal_axes(up: Float64[np.ndarray, " 3"]) -> tuple[Float64[np.ndarray, 
 
 
 def _brighter(pixels: UInt8[np.ndarray, "h w 3"]) -> Float64[np.ndarray, " 2"]:
-    """Right half less left half, lower half less upper half, of the mean brightness."""
+    """Brightness gradient: mean of the right minus the left half, and of the lower minus the upper half."""
     light = pixels.mean(axis=2)
     rows, columns = light.mean(axis=1), light.mean(axis=0)
     return np.array([np.diff([half.mean() for half in np.array_split(line, 2)])[0] for line in (columns, rows)])
 
 
 def _slopes(colour: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Largest change over a pixel of any channel."""
+    """Largest gradient magnitude over the channels, per pixel."""
     along_x = cv2.Sobel(colour, cv2.CV_32F, 1, 0, ksize=3, scale=0.125, borderType=cv2.BORDER_REPLICATE)
     along_y = cv2.Sobel(colour, cv2.CV_32F, 0, 1, ksize=3, scale=0.125, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(np.hypot(along_x, along_y).max(axis=2), np.float32)
@@ -335,7 +335,7 @@ def _near_points(points_px: Float64[np.ndarray, "n 2"], shape: tuple[int, int]) 
 
 
 def _top(elevation: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels at the border over which gravity's up leads out of the picture; around the zenith where that is inside."""
+    """Border pixels over which up leads out of the image, and pixels around the zenith if it is inside."""
     down, right = np.gradient(elevation)
     steepness = TOP_COSINE * np.maximum(np.hypot(down, right), 1e-12)
     top = elevation > ZENITH_DEG
@@ -361,9 +361,9 @@ def _is_sky(
     near: Bool[np.ndarray, "h w"],
     ignored: Bool[np.ndarray, "h w"] | None,
 ) -> bool:
-    """Whether a smooth region is sky and no wall: almost no points within, and grey only where it outshines the rest.
+    """Whether a smooth region is sky and not a wall: almost no points inside, and grey only if brighter than the rest.
 
-    What counts is how far points are spread: a spire has many in one place.
+    It counts how widely points are spread: a spire has many in one place.
     """
     window = np.ones((2 * CORE_PX + 1, 2 * CORE_PX + 1), np.uint8)
     filled = np.pad(cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, window), 1)  # points made holes in it
@@ -383,7 +383,7 @@ def _is_sky(
 def _grown(
     sky: Bool[np.ndarray, "h w"], colour: Float32[np.ndarray, "h w 3"], clear: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """The sky up to the edges that the slope's window kept it from: neighbours of the colour of the sky close by."""
+    """Grow the sky towards edges, which the gradient's window keeps free, over pixels of the nearby sky's colour."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     for _ in range(GROW_STEPS):
         weight = sky.astype(np.float32)

@@ -1,9 +1,9 @@
-"""SPZ, the compressed splat file that viewers read most widely: written here, versions 3 and 2.
+"""Writer of SPZ, the compressed splat format that most viewers read; versions 3 and 2.
 
-Specification: the README of github.com/nianticlabs/spz. A 16-byte header and six arrays, one after another, all within
-one gzip stream: positions (24-bit fixed point), opacities, colours, logarithms of the scales (8 bits each), rotations
-(the smallest three components, 10 bits each; in version 2 x, y, z, 8 bits each) and spherical harmonics (8 bits). Its
-frame is x right, y up, z back.
+Specification: the README of github.com/nianticlabs/spz. A 16-byte header and six consecutive arrays, all in one gzip
+stream: positions (24-bit fixed point), opacities, colours, log scales (8 bits each), rotations (the smallest three
+components, 10 bits each; in version 2 x, y, z, 8 bits each) and spherical harmonics (8 bits). Its frame is x right, y
+up, z back.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 MAGIC = 0x5053474E  # "NGSP"
 VERSION = 3
 FIRST_THREE_VERSION = 2
-"""The one before, which CesiumJS reads in tiles: rotations in three bytes, off by up to a degree and more."""
+"""The previous version, which CesiumJS reads in tiles: rotations in three bytes, off by a degree and more."""
 ANTIALIASED = 1
-"""The header's flag: trained with opacities that allow for the blur on screen."""
+"""Header flag: trained with opacities that account for the screen-space blur."""
 SPZ_FROM_Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 """Rotation from a world with z up (east, north, up) to SPZ's y up."""
 RECORD_FIELD = b"sp"
-"""Names the record in gzip's extra field (RFC 1952, 2.3.1.1), which readers of SPZ pass over."""
+"""ID of the record in gzip's extra field (RFC 1952, 2.3.1.1), which SPZ readers skip."""
 POSITION_STEPS = 2**23 - 1
 LEAST_FRACTIONAL_BITS, MOST_FRACTIONAL_BITS = 12, 20  # the reference's: a quarter of a millimetre in metres
 FINEST_QUANTILE, STEPS_PER_SIZE = 0.05, 16.0  # nearly all Gaussians are as many steps large: finer ones are noise
@@ -57,25 +57,26 @@ def spz_bytes(
     version: int = VERSION,
     record: str = "",
 ) -> bytes:
-    """Code Gaussians, in an order of the file's own; the same bytes for the same Gaussians.
+    """Encode Gaussians, reordered for compression; deterministic.
 
-    A Gaussian far beyond all others is brought in along its ray from the origin and shrunk alike, so that it looks the
-    same from the scene and leaves the positions' 24 bits to the scene. Harmonics are rounded to steps of a power of two
-    that follow from how much of a picture a Gaussian makes, and Gaussians of the same steps lie together.
+    A Gaussian far beyond all others is moved in along its ray from the origin and scaled down by the same factor, so
+    that it looks the same from the scene and the 24 bits of positions are left to the scene. SH coefficients are
+    rounded to power-of-two steps according to a Gaussian's contribution to images, and Gaussians with the same step are
+    stored together.
 
     Args:
         gaussians: Finite; in the file's frame (y up: see ``SPZ_FROM_Z_UP``), about an origin near the scene.
-        antialias: Whether their opacities allow for the blur on screen.
-        sh_step: How coarse the harmonics of a Gaussian of middling weight are, in 1/128; None keeps all 8 bits.
-        turn: Rotation to the file's frame, where they are in another.
-        version: 3, or 2 for readers that know no other.
-        record: ASCII that the file carries along, at most 65,000 characters.
+        antialias: Whether their opacities account for the screen-space blur.
+        sh_step: SH step of a Gaussian of median weight, in 1/128; None keeps all 8 bits.
+        turn: Rotation to the file's frame, if they are in another.
+        version: 3, or 2 for readers that support no other.
+        record: ASCII record stored in the file, at most 65,000 characters.
 
     Returns:
-        The file.
+        The file's bytes.
 
     Raises:
-        ValueError: if a parameter is not finite, or of another version.
+        ValueError: if a parameter is not finite, or the version is another one.
     """
     if version not in (FIRST_THREE_VERSION, VERSION):
         raise ValueError(f"SPZ version {version} is not written")
@@ -104,8 +105,8 @@ def spz_bytes(
 def _gzip(parts: Iterable[bytes], record: str) -> bytes:
     """A gzip file (RFC 1952).
 
-    Of repetitions only those of one byte are looked for: in the harmonics' runs of nothing that finds more than any
-    level of deflate does, in an eighth of its time, and elsewhere there are none.
+    Only runs of a single byte are matched: on the zero runs of SH this compresses better than any level of deflate, in
+    an eighth of the time, and elsewhere there are no repetitions.
     """
     extra = b"" if not record else RECORD_FIELD + struct.pack("<H", len(record)) + record.encode("ascii")
     made = [b"\x1f\x8b\x08", bytes([4 if extra else 0]), b"\0\0\0\0\0\xff"]  # no time stamp, no system
@@ -119,7 +120,7 @@ def _gzip(parts: Iterable[bytes], record: str) -> bytes:
 
 
 def _fine_bits(log_scales: Float[torch.Tensor, "n 3"]) -> int:
-    """Fractional bits beyond which positions are finer than anybody sees."""
+    """Fractional bits beyond which positions are finer than visible."""
     if not len(log_scales):
         return LEAST_FRACTIONAL_BITS
     middling = np.sort(log_scales.numpy(), axis=1)[:, 1]
@@ -129,10 +130,10 @@ def _fine_bits(log_scales: Float[torch.Tensor, "n 3"]) -> int:
 
 
 def _sh_doublings(gaussians: Gaussians, sh_step: float | None) -> UInt8[np.ndarray, " n"]:
-    """How many times each Gaussian's harmonics' step of 1/128 is doubled.
+    """How many times each Gaussian's SH step of 1/128 is doubled.
 
-    Squared errors add up in a picture, so that the least bits are spent where step² times weight is the same for all;
-    the weight is opacity times size, which is wide of its share of the pixels where it is hidden, and near enough.
+    Squared errors add up in an image, so bits are spent best if step² times weight is the same for all. The weight is
+    opacity times size: wrong for the image share of hidden Gaussians, but good enough.
     """
     if sh_step is None or not len(gaussians):
         return np.zeros(len(gaussians), np.uint8)
@@ -147,7 +148,7 @@ def _sh_doublings(gaussians: Gaussians, sh_step: float | None) -> UInt8[np.ndarr
 def _order(
     alphas: UInt8[np.ndarray, "n 1"], sh: UInt8[np.ndarray, "n c"], doublings: UInt8[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " n"]:
-    """Gaussians of one step of harmonics, of about as many of them and of one opacity follow one another."""
+    """An order that groups Gaussians by SH step, by number of non-zero coefficients, and by opacity."""
     filled = (sh != SH_STEPS).sum(axis=1, dtype=np.int64) // SH_COUNTS
     key = (doublings.astype(np.int64) * 8 + filled) * 256 + alphas[:, 0]
     return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))
@@ -164,7 +165,7 @@ def _coded(
     doublings: UInt8[np.ndarray, " n"],
     version: int,
 ) -> tuple[UInt8[np.ndarray, ...], ...]:
-    """The file's arrays of some Gaussians."""
+    """The file's arrays for some Gaussians."""
     log_scales = gaussians.log_scales.numpy() + np.log(shrink).astype(np.float32)[:, None]
     return (
         _fixed_point(gaussians.means.numpy().astype(np.float64) * shrink[:, None], bits),
@@ -177,7 +178,7 @@ def _coded(
 
 
 def _range(means: Float64[np.ndarray, "n 3"], most_bits: int) -> tuple[int, Float64[np.ndarray, " n"]]:
-    """Fractional bits of the positions, and by how much each is brought in, 0..1."""
+    """Fractional bits of the positions, and the factor by which each Gaussian is moved in, 0..1."""
     distance = np.linalg.norm(means, axis=1)
     if not len(distance) or not distance.max() > 0.0:
         return most_bits, np.ones(len(means))
@@ -193,13 +194,13 @@ def _to_byte(values: Float32[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape
 
 
 def _fixed_point(means: Float64[np.ndarray, "n 3"], bits: int) -> UInt8[np.ndarray, "n 9"]:
-    """Little-endian, three bytes a coordinate, in two's complement."""
+    """Fixed-point positions: little-endian, three bytes per coordinate, two's complement."""
     steps = np.rint(means * 2.0**bits).clip(-POSITION_STEPS, POSITION_STEPS).astype("<i4")
     return np.ascontiguousarray(steps[:, :, None].view(np.uint8)[:, :, :3]).reshape(len(means), 9)
 
 
 def _smallest_three(quats: Float32[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
-    """Which of x, y, z, w is the largest, in the upper 2 bits, then sign and 9 bits of each other one, over √½."""
+    """Index of the largest of x, y, z, w in the upper 2 bits, then sign and 9 bits of each other one, over √½."""
     ordered = _normalized(quats)
     largest = np.abs(ordered).argmax(axis=1)
     rows = np.arange(len(ordered))
@@ -213,20 +214,20 @@ def _smallest_three(quats: Float32[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4
 
 
 def _first_three(quats: Float32[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 3"]:
-    """x, y, z of the one of both quaternions whose w is not negative, a byte each."""
+    """x, y, z of the quaternion with non-negative w, one byte each."""
     ordered = _normalized(quats)
     ordered *= np.where(ordered[:, 3:] < 0.0, -1.0, 1.0)
     return _to_byte(ordered[:, :3].astype(np.float32) * 127.5 + 127.5)
 
 
 def _normalized(quats: Float32[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
-    """Of length one, in the order x, y, z, w."""
+    """Unit quaternions in the order x, y, z, w."""
     ordered = quats[:, [1, 2, 3, 0]].astype(np.float64)
     return np.asarray(ordered / np.maximum(np.linalg.norm(ordered, axis=1, keepdims=True), 1e-30))
 
 
 def _harmonics(sh: Float32[np.ndarray, "n k 3"], doublings: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n k 3"]:
-    """Bytes about 128, each Gaussian's rounded to its steps."""
+    """SH bytes about 128, rounded to each Gaussian's step."""
     step = np.exp2(doublings.astype(np.float32))[:, None, None]
     return np.asarray(
         np.clip(np.rint(sh * (np.float32(SH_STEPS) / step)) * step + SH_STEPS, 0.0, 255.0).astype(np.uint8)

@@ -1,9 +1,9 @@
-"""PlayCanvas' streamed SOG: `lod-meta.json`, and folders of SOG pictures that it says what to find in.
+"""PlayCanvas' streamed SOG: `lod-meta.json`, and folders of SOG images that it indexes.
 
-The format is what splat-transform's writer makes and PlayCanvas' engine reads (splat-transform 2.7, playcanvas 2.23,
-both MIT): a tree of boxes whose leaves name, for each level of detail, a file and the run of its Gaussians that lies in
-the leaf. Level 0 is the finest; a level that is missing in a leaf is shown by the next finer one. Boxes and pictures
-are in the frame of a 3DGS PLY, y down.
+The format is that of splat-transform's writer and PlayCanvas' engine (splat-transform 2.7, playcanvas 2.23, both MIT):
+a tree of boxes whose leaves name, for each level of detail, a file and the range of its Gaussians in the leaf. Level 0
+is the finest; the next finer level replaces one that is missing in a leaf. Boxes and images are in the frame of a 3DGS
+PLY, y down.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from splatpipe.pipeline.splat.scene import Scene, SceneFacts
 LOD_META = "lod-meta.json"
 VERSION = 1
 FULL_FILE = 100_000
-"""Gaussians after which a level's next leaf begins another file: what is fetched at once stays some megabytes."""
+"""Gaussians after which a level's next leaf starts a new file: keeps downloads to a few megabytes."""
 _DIGITS = 7  # of a number in the tree: a float32's
 _LEVEL = re.compile(r"[0-9]+_[0-9]+", re.ASCII)  # level and number, as folders are called
 
 
 @dataclass(frozen=True, eq=False)
 class _Share:
-    """Gaussians of one node that lie in one of those below it."""
+    """The Gaussians of a node that lie in one of its descendants."""
 
     level: int
     node: LevelNode
@@ -50,7 +50,7 @@ class _Share:
 
 @dataclass(eq=False)
 class _Files:
-    """What is written: for each level the parts of the file that is being filled, and what the tree says of all."""
+    """Files being written: for each level the parts of the current file, and the entries for the tree."""
 
     folder: Path
     facts: SceneFacts
@@ -60,7 +60,7 @@ class _Files:
     begun: dict[int, int] = field(default_factory=dict)  # files of a level
 
     def add(self, level: int, part: Gaussians) -> dict[str, int]:
-        """Put a leaf's Gaussians of a level in its file; where that is."""
+        """Add a leaf's Gaussians of a level to its file; returns their location for the tree."""
         if level not in self.open:
             number = self.begun.get(level, 0)
             self.begun[level] = number + 1
@@ -84,18 +84,18 @@ class _Files:
             (folder / name).write_bytes(data)
 
     def close_all(self) -> None:
-        """Write what is left."""
+        """Write the remaining files."""
         for level in sorted(self.open):
             self.close(level)
 
 
 def write_streamed_sog(folder: Path, scene: Scene, root: LevelNode) -> None:
-    """Write `lod-meta.json` and its SOG folders; the same bytes for the same levels.
+    """Write `lod-meta.json` and its SOG folders; deterministic.
 
     Args:
-        folder: Made if it is not there; files of an earlier one are replaced or taken away, others stay.
-        scene: What the levels are of: its facts go into `lod-meta.json` under ``splatpipe``.
-        root: Of its levels, in its frame, with finite parameters.
+        folder: Created if missing; files of an earlier export are replaced or deleted, others stay.
+        scene: The scene of the levels; its metadata goes into `lod-meta.json` under ``splatpipe``.
+        root: Root of its levels of detail, in its frame, with finite parameters.
 
     Raises:
         ValueError: if a parameter is not finite.
@@ -123,7 +123,7 @@ def write_streamed_sog(folder: Path, scene: Scene, root: LevelNode) -> None:
 
 
 def _drop_earlier(folder: Path, named: Set[str]) -> None:
-    """Take away the folders of levels that no index names any more."""
+    """Delete folders of levels that the index no longer references."""
     for path in sorted(folder.iterdir()):
         if _LEVEL.fullmatch(path.name) and path.name not in named and (path / META).is_file():
             shutil.rmtree(path)
@@ -134,10 +134,10 @@ def _height(node: LevelNode) -> int:
 
 
 def _tree(node: LevelNode, above: Sequence[_Share], level: int, files: _Files) -> dict[str, Any]:
-    """What the tree says of a node, with the parts in it of those above, coarsest first.
+    """The tree's entry for a node, with the shares of its ancestors in it, coarsest first.
 
-    Levels are counted from the root down, but that the full model is level 0: a leaf nearer the root than others lacks
-    levels between, and not the coarsest, without which a reader would show nothing there.
+    Levels are counted from the root down, except that the full model is always level 0: a leaf nearer the root than
+    others lacks levels in between, and not the coarsest, without which a reader would show nothing there.
     """
     if not node.children:
         return _leaf([*above, _whole(node, 0)], files)
@@ -155,7 +155,7 @@ def _whole(node: LevelNode, level: int) -> _Share:
 
 
 def _divided(share: _Share, children: Sequence[LevelNode]) -> list[_Share]:
-    """A node's Gaussians, each to the child in the box of whose centres it lies, or to the nearest."""
+    """Assign a node's Gaussians to children: to the one whose box of centres contains it, or to the nearest."""
     means = share.node.gaussians.means.detach().to(torch.float64).numpy()[share.rows]
     outside, off = np.empty((2, len(children), len(means)))
     for k, child in enumerate(children):
@@ -180,14 +180,14 @@ def _leaf(shares: Sequence[_Share], files: _Files) -> dict[str, Any]:
 
 
 def _sorted(gaussians: Gaussians) -> Gaussians:
-    """Along a Morton curve: pictures of neighbours pack better."""
+    """Sort along a Morton curve: images of neighbours compress better."""
     lowest = gaussians.means.amin(0)
     keys = morton_keys(gaussians.means, lowest, gaussians.means.amax(0) - lowest)
     return gaussians.select(torch.argsort(keys, stable=True))
 
 
 def _box(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
-    """Around centres and one standard deviation, as PlayCanvas' are."""
+    """The box around centres ± one standard deviation, as in PlayCanvas."""
     moments = moments_of(gaussians)
     reach = np.sqrt(moments.covariances[:, [0, 3, 5]])
     return np.stack([(moments.means - reach).min(0), (moments.means + reach).max(0)])
