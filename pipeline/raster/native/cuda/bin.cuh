@@ -1,4 +1,4 @@
-// Which tile gets which splats: the plan of the view, and a chunk's pairs in order of depth.
+// Binning splats into tiles: the chunk plan of the view, and a chunk's pairs in order of depth.
 #pragma once
 
 #include "frame.h"
@@ -9,12 +9,12 @@
 namespace splat {
 namespace cuda {
 
-// What a thread counts or writes by itself; a splat with more is the whole warp's.
+// Maximum that a thread counts or writes by itself; a splat with more is handled by the whole warp.
 constexpr int kOwnRows = 4;
 constexpr uint32_t kOwnPairs = 16;
 
-// Where the chunk that starts at tile `first` ends: as many tiles as its pairs let in. No tile alone has more than
-// `capacity`, which is no less than the number of Gaussians.
+// End of the chunk that starts at tile `first`: as many tiles as its pairs allow. No single tile has more than
+// `capacity` pairs, which is at least the number of Gaussians.
 __device__ inline int chunk_end(const Job& job, int first) {
     const int64_t* pairs = job.at.tile_begin;
     const int64_t limit = pairs[first] + job.capacity;
@@ -46,7 +46,7 @@ struct PlanShared {
     ScanShared<int64_t> pairs;
 };
 
-// From differences to each tile's pairs, to where they begin, to chunks; by one block.
+// From differences to each tile's number of pairs, to their offsets, to chunks; by one block.
 __device__ inline void plan_phase(const Job& job) {
     SPLAT_SHARED(PlanShared, shared);
     int32_t carried_count = 0;
@@ -111,7 +111,7 @@ __device__ inline TileRun touched(const View& view, const Splat& splat, int row,
     return {begin, max(begin, end)};
 }
 
-// Of every `step`th row from the `first`th on.
+// Over every `step`th row, starting at `first`.
 __device__ inline uint32_t count_rows(const Job& job, const RowRun& rows, int first, int step, const TileRun& tiles) {
     if (first >= rows.count) return 0;
     const Splat splat = expand(job.at.records[rows.gaussian]);
@@ -128,7 +128,7 @@ __device__ inline RowRun rows_of_lane(const RowRun& rows, int lane) {
             __shfl_sync(kWholeWarp, rows.count, lane)};
 }
 
-// Pairs a rank in the chunk, summed up within each virtual block.
+// Number of pairs per rank in the chunk, prefix-summed within each virtual block.
 __device__ inline void count_pairs(const Job& job, int chunk) {
     SPLAT_SHARED(ScanShared<uint32_t>, shared);
     const TileRun tiles = tiles_of(job, chunk);
@@ -150,7 +150,7 @@ __device__ inline void count_pairs(const Job& job, int chunk) {
     }
 }
 
-// From the blocks' sums to where they begin; by one block.
+// From the blocks' sums to their offsets; by one block.
 __device__ inline void scan_pairs(const Job& job) {
     SPLAT_SHARED(ScanShared<uint32_t>, shared);
     const int64_t blocks = (job.at.header->visible + kScanBlock - 1) / kScanBlock;

@@ -1,7 +1,7 @@
-// Blending the tiles of a chunk: a block a tile, a warp a sub-block of 8 x 4 of its pixels, a lane a pixel.
+// Blending the tiles of a chunk: one block per tile, one warp per sub-block of 8 x 4 pixels, one lane per pixel.
 //
-// What a pixel does with a pair is what raster_blend.cpp does, step by step. A tile's pairs are staged in shared memory
-// a batch at a time, each with the sub-blocks that its ellipse touches: a warp visits no others.
+// A pixel processes a pair exactly as in raster_blend.cpp, step by step. A tile's pairs are staged in shared memory in
+// batches, each with the sub-blocks that its ellipse touches: a warp visits only these.
 #pragma once
 
 #include "frame.h"
@@ -13,16 +13,16 @@ constexpr int kSubWidth = 8, kSubHeight = 4;  // pixels
 constexpr int kBands = kTile / kSubHeight;    // rows of sub-blocks, of two each
 static_assert(kSubWidth * kSubHeight == kWarp && 2 * kSubWidth == kTile && 2 * kBands == kWarps, "a warp a sub-block");
 
-constexpr int kBlendBlocks = 4;  // that a multiprocessor should hold: 64 registers a thread, and nothing is spilled
+constexpr int kBlendBlocks = 4;  // per multiprocessor: 64 registers per thread, without spilling
 
-// Sub-blocks are looked for with an ellipse that is a little larger: where rounding in here and in log2_alpha disagree
-// on a pixel at the border, the pixel must have its say.
+// Sub-blocks are found with a slightly larger ellipse: if rounding here and in log2_alpha disagrees on a border pixel,
+// the pixel has to be visited.
 constexpr float kReachSlack = 1e-4f, kSlackPx = 1.0f / 32.0f;
 
 __device__ __forceinline__ float power_of_two(float x) {
 #if SPLAT_ON_CPU
     return exp2f(x);
-#else  // exp2f guards against denormals first: no alpha in here is one, 1/255 being the least that counts
+#else  // exp2f first guards against denormals, which no alpha here is: the smallest that counts is 1/255
     float y;
     asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
     return y;
@@ -79,8 +79,8 @@ __device__ __forceinline__ Place place_of(const View& view, const TileList& list
             static_cast<int64_t>(list.tile) * kTilePixels + thread, x < view.width && y < view.height};
 }
 
-// A batch of pairs as the pixels of a tile see them. Fields apart: each is read by a whole warp at once, and written by
-// neighbouring threads to neighbouring places.
+// A batch of pairs as seen by the pixels of a tile. Structure of arrays: each field is read by a whole warp at once,
+// and written by neighbouring threads to neighbouring addresses.
 template <int kBatch>
 struct Batch {
     static constexpr int kWords = kBatch / kWarp;
@@ -102,7 +102,7 @@ struct Whitened {
     __device__ __forceinline__ float log2_alpha(float u, float v) const { return fmaf(-u, u, fmaf(-v, v, shape.w)); }
 };
 
-// Where the pixel's ray is deepest in the Gaussian.
+// Depth at which the pixel's ray peaks in the Gaussian.
 __device__ __forceinline__ float depth_at(const float4& rest, float u, float v) {
     return fmaf(rest.z, u, fmaf(rest.w, v, rest.y));
 }
@@ -112,8 +112,8 @@ struct Ellipse {
     float x, y;  // centre
     float c, slope, inv_a, reach, half_y, rows_dy;
 
-    // What expand makes of a record, but by fast operations: each is off by a few units of the last place, which is
-    // little beside the slack, and exact ones would be much of the work on a pair.
+    // The same as expand, but with fast operations: each is off by a few units in the last place, which is small
+    // compared with the slack, while exact ones would be a large part of the work per pair.
     __device__ __forceinline__ Ellipse(const Record& s, const TileList& list) {
         const float tight = fmaxf(s.log2_opacity - kLog2AlphaMin, 0.0f);
         x = s.x - static_cast<float>(list.left) - 0.5f, y = s.y - static_cast<float>(list.top) - 0.5f;
@@ -158,7 +158,7 @@ __device__ __forceinline__ void stage(const Job& job, const TileList& list, int3
         stage_start(s, list, thread, batch);
         batch->rest[thread] = make_float4(s.blue, s.depth, s.depth_u, s.depth_v);
         const Ellipse ellipse(s, list);
-#pragma unroll 2  // all four at once take more registers than four blocks leave
+#pragma unroll 2  // unrolling all four takes more registers than four blocks allow
         for (int band = 0; band < kBands; ++band) touched |= ellipse.sub_blocks(band) << (2 * band);
     }
 #pragma unroll
@@ -225,7 +225,7 @@ __device__ __forceinline__ void blend_tile(const Job& job, const TileList& list,
     Canvas canvas;
     canvas.alive = at.inside, canvas.end = at.inside ? list.pairs : 0;
     for (int32_t from = 0; from < list.pairs; from += kThreads) {
-        if (!__syncthreads_or(canvas.alive)) break;  // a barrier as well: nobody reads the last batch any more
+        if (!__syncthreads_or(canvas.alive)) break;  // also a barrier: the last batch is no longer read
         stage(job, list, from, batch);
         __syncthreads();
         for (int word = 0; word < kWarps && __any_sync(kWholeWarp, canvas.alive); ++word) {
@@ -238,7 +238,7 @@ __device__ __forceinline__ void blend_tile(const Job& job, const TileList& list,
     put_pixel<kDepth>(job, at, canvas);
 }
 
-// The pictures of a chunk's tiles; kDepth where depths are rendered.
+// The images of a chunk's tiles; kDepth if depths are rendered.
 template <bool kDepth>
 __device__ void blend_tiles(const Job& job, int chunk) {
     SPLAT_SHARED(Batch<kThreads>, batch);

@@ -1,9 +1,9 @@
 // Blending the tiles of a chunk, backward: each pixel from its last contributor to its first, as raster_blend.cpp does.
 //
-// A warp takes a pair at a time, a lane a pixel. What the pair's gradient gets from the warp's pixels is summed by
-// shuffles, first along the rows of pixels, in each of which v is one number, so that its powers are not summed apart;
-// what it gets from the tile's warps is summed in shared memory, in their order, and goes to the pair's slot: no atomic
-// operation, so always the same bits.
+// A warp processes one pair at a time, one lane per pixel. The warp's contributions to the pair's gradient are summed
+// by shuffles, first along the rows of pixels, where v is constant, so that its powers need no separate sums; the
+// contributions of the tile's warps are summed in shared memory, in order, and written to the pair's slot: without
+// atomic operations, so always bit-identical.
 #pragma once
 
 #include "blend.cuh"
@@ -13,7 +13,7 @@ namespace cuda {
 
 constexpr int kColourValues = 9;  // a pair's gradients without those of depth and without magnitudes
 
-// Which values a pair's gradient has, and where they go in its slot.
+// The values of a pair's gradient, and their places in its slot.
 template <bool kDepth, bool kMagnitudes>
 struct Fields {
     static constexpr int kValues = kColourValues + (kDepth ? 3 : 0) + (kMagnitudes ? 2 : 0);
@@ -37,7 +37,7 @@ struct Fields {
         return kDepth ? (row_value == 6 ? kColourValues : kSlants) : kSizes + row_value - 6;
     }
 
-    // More pairs a batch are fewer barriers, but shared memory should leave room for other blocks.
+    // More pairs per batch need fewer barriers, but shared memory should leave room for other blocks.
     static constexpr int kBatch = kValues > kColourValues ? kWarp : 2 * kWarp;
 
     // The value of a slot's field, negative where it is zero.
@@ -49,9 +49,9 @@ struct Fields {
     }
 };
 
-// Sums each of kCount values over the lanes that are kOffset apart, half of it and so on until kEnd. At every level a
-// lane hands one half of its values to the lane opposite and keeps the other half. Each sum ends up in one lane of
-// those (see summed_by).
+// Sums each of kCount values over lanes kOffset apart, then half of that, and so on down to kEnd. At each level a lane
+// passes one half of its values to the opposite lane and keeps the other half. Each sum ends up in one of these lanes
+// (see summed_by).
 template <int kCount, int kOffset, int kEnd, int kSize>
 __device__ __forceinline__ float sum_halving(float (&values)[kSize], int lane) {
     if constexpr (kOffset == kEnd) {
@@ -73,7 +73,7 @@ __device__ __forceinline__ float sum_halving(float (&values)[kSize], int lane) {
     }
 }
 
-// The value whose sum a lane has in the end, negative where another lane has it as well.
+// The value whose sum a lane ends up with, negative if another lane has it as well.
 template <int kCount, int kOffset, int kEnd>
 __device__ __forceinline__ int summed_by(int lane) {
     if constexpr (kOffset == kEnd) {
@@ -132,7 +132,7 @@ __device__ __forceinline__ int32_t most_in_warp(int32_t value) {
     return value;
 }
 
-// Pairs from..to-1 of a tile, each by four threads, which look at a band of the tile each.
+// Pairs from..to-1 of a tile, each by four threads, one per band of the tile.
 template <int kBatch>
 __device__ __forceinline__ void stage_back(const Job& job, const TileList& list, int32_t from, int32_t to,
                                            Batch<kBatch>* batch, uint32_t* slots) {
@@ -186,7 +186,7 @@ __device__ __forceinline__ void blend_back(const Whitened& splat, const float4& 
 
 constexpr int kPowers = 3;  // of v: 0, 1 and 2
 
-// The pairs of a batch, from far to near, as far as this warp's pixels looked at them: `looked`, counted from the
+// The pairs of a batch, from far to near, as far as this warp's pixels processed them: `looked`, counted from the
 // first.
 template <bool kDepth, bool kMagnitudes>
 __device__ __forceinline__ void walk_back(const Place& at, int32_t from, int32_t looked, float depth_origin,
@@ -249,7 +249,7 @@ __device__ __forceinline__ void put_slots(const Job& job, const BackBatch<kDepth
     }
 }
 
-// Slots of the pairs from `last` on, which no pixel looked at.
+// Slots of the pairs from `last` on, which no pixel processed.
 template <int kFloats>
 __device__ __forceinline__ void clear_slots(const Job& job, const TileList& list, int32_t last) {
     const int thread = static_cast<int>(threadIdx.x), field = thread % kSlotThreads;
@@ -285,7 +285,7 @@ __device__ __forceinline__ void blend_tile_back(const Job& job, const TileList& 
     }
 }
 
-// Writes every slot of a chunk. kDepth where depths have a gradient, kMagnitudes where those are wanted; else zero.
+// Writes every slot of a chunk. kDepth if depths have a gradient, kMagnitudes if those are needed; else zero.
 template <bool kDepth, bool kMagnitudes>
 __device__ void blend_tiles_back(const Job& job, int chunk) {
     using Shared = BackBatch<kDepth, kMagnitudes>;
@@ -295,7 +295,7 @@ __device__ void blend_tiles_back(const Job& job, int chunk) {
         blend_tile_back(job, list_of(job, first, tile), &batch);
 }
 
-constexpr int kSumAhead = 8;  // slots on their way at a time: a Gaussian that covers the screen has thousands
+constexpr int kSumAhead = 8;  // slots in flight at a time: a Gaussian that covers the screen has thousands
 
 // Adds the slots of a chunk to the Gaussians' sums, one after another.
 template <bool kDepth>

@@ -1,4 +1,4 @@
-// A frame's forward pass and the way back to the screen: memory, kernels and what the host launches.
+// A frame's forward pass and its backward pass to the screen: memory, kernels and host launches.
 #include "../view.h"
 #include "bin.cuh"
 #include "blend.cuh"
@@ -11,10 +11,10 @@ namespace splat {
 namespace cuda {
 namespace {
 
-constexpr int64_t kMaxPairs = (int64_t{1} << 31) - kSortBlock;  // of a chunk: they are counted in 32 bits with a sign
+constexpr int64_t kMaxPairs = (int64_t{1} << 31) - kSortBlock;  // per chunk: they are counted in signed 32 bits
 constexpr int kDepthPasses = 32 / kDigitBits, kTilePasses = 16 / kDigitBits;
 static_assert(kDepthPasses % 2 == 0 && kTilePasses % 2 == 0, "what is sorted ends where it began");
-constexpr int kProjectBlocks = 3;  // a multiprocessor: worth the three words that are spilled for it
+constexpr int kProjectBlocks = 3;  // per multiprocessor: worth the three words spilled for it
 constexpr int kScatterBlocks = 3;  // with more, registers are spilled
 constexpr int64_t kTurns = 8;      // blocks a multiprocessor of work that is done in turns: what it holds at once
 
@@ -65,8 +65,8 @@ __global__ void __launch_bounds__(kThreads) plan_kernel(Job job) { plan_phase(jo
 
 __device__ inline bool is_chunk(const Job& job, int chunk) { return chunk < job.at.header->facts.chunks; }
 
-// The kernels of a chunk do nothing where it does not exist, and those that bin it nothing on the way back where the
-// lists of the forward pass are still there: where there was one chunk.
+// The kernels of a chunk do nothing if it does not exist, and its binning kernels do nothing in the backward pass if
+// the lists of the forward pass are still there, i.e. if there was one chunk.
 struct Turn {
     int chunk;
     bool back;
@@ -100,7 +100,7 @@ __global__ void __launch_bounds__(kThreads, kBlendBlocks) blend_kernel(Job job, 
     if (is_chunk(job, chunk)) blend_tiles<kDepth>(job, chunk);
 }
 
-// `only`: the chunk is left to rest_back unless it is the only one.
+// `only`: leave the chunk to rest_back unless it is the only one.
 template <bool kDepth, bool kMagnitudes>
 __global__ void __launch_bounds__(kThreads, kBlendBlocks) blend_back_kernel(Job job, int chunk, bool only) {
     if (is_chunk(job, chunk) && !(only && job.at.header->facts.chunks > 1))
@@ -130,7 +130,7 @@ __device__ SPLAT_ONCE void bin_chunk(const Job& job, int chunk) {
     __syncthreads();
 }
 
-// What nobody foresaw, by one block.
+// What exceeds the forecast, by one block.
 template <bool kDepth>
 __global__ void __launch_bounds__(kThreads, 1) rest_kernel(const __grid_constant__ Job job, int first) {
     for (int chunk = first; is_chunk(job, chunk); ++chunk) {
@@ -190,7 +190,7 @@ void launch_bin(const Job& job, const Turn& turn, SplatStream stream) {
     }
 }
 
-// A block a tile, as many as a chunk can have.
+// One block per tile, as many as a chunk can have.
 int64_t tile_blocks(const Job& job) { return job.tiles < kChunkTiles ? job.tiles : kChunkTiles; }
 
 template <bool kDepth>
@@ -202,7 +202,7 @@ void launch_chunks(const Job& job, int passes, SplatStream stream) {
     SPLAT_LAUNCH(rest_kernel<kDepth>, 1, stream, job, passes);
 }
 
-// Where one chunk is foreseen, nothing bins it again: if there were more after all, they are the rest.
+// If one chunk is forecast, nothing bins it again: any further chunks belong to the rest.
 template <bool kDepth, bool kMagnitudes>
 void launch_chunks_back(const Job& job, int passes, SplatStream stream) {
     const bool only = passes == 1;
@@ -242,7 +242,7 @@ int64_t lay_out(void* memory, int64_t count, int64_t tiles, int64_t capacity, Fr
     for (int i = 0; i < 2; ++i) at->pair_keys[i] = carver.take<uint16_t>(capacity);
     for (int i = 0; i < 2; ++i) at->pair_values[i] = carver.take<uint32_t>(capacity);
     at->owners = carver.take<uint32_t>(capacity);
-    // Once depths are sorted, nobody asks for their keys; before, there are no pairs. `capacity` is at least `count`.
+    // Depth keys are not needed after their sort, and before it there are no pairs. `capacity` is at least `count`.
     at->keys[0] = at->pair_values[0], at->keys[1] = at->pair_values[1];
     at->order[1] = reinterpret_cast<int32_t*>(at->owners);
     return carver.bytes();

@@ -1,4 +1,4 @@
-// The first phase of a frame: every Gaussian to its place on the screen, and how many pairs each tile will have.
+// The first phase of a frame: project every Gaussian to the screen, and count each tile's pairs.
 #pragma once
 
 #include "../splat_math.h"
@@ -9,13 +9,13 @@ namespace splat {
 namespace cuda {
 namespace {
 
-// A thread counts a splat's pairs in so many tile rows; in more, its warp does. Nearly all splats have fewer.
+// A thread counts a splat's pairs in up to this many tile rows, its warp does for more. Nearly all splats have fewer.
 constexpr int kRowsAThread = 8;
 
 constexpr int kRowsBits = 16;  // of FrameMemory::rows, for the number of rows
 constexpr uint32_t kRowsMask = (1u << kRowsBits) - 1;
 
-// The whole splat. Rounded alike wherever it is inlined, as find_span is: what counts pairs and what writes them agree.
+// The whole splat. Rounds identically wherever it is inlined, like find_span: counting and writing of pairs must agree.
 __device__ __forceinline__ Splat expand(const Record& r) {
     Splat s;
     s.x = r.x, s.y = r.y, s.a = r.a, s.b = r.b, s.c = r.c;
@@ -75,7 +75,7 @@ __device__ __forceinline__ lane::Vec3 colour_at(const View& view, const float* r
     return lane::colour_of(kDegree, sh, dir, basis);
 }
 
-// Each degree apart, so that the coefficients are in registers.
+// One specialization per degree, so that the coefficients are in registers.
 __device__ __forceinline__ lane::Vec3 colour_of(const View& view, const Parameters& in, int64_t i,
                                                 const lane::Vec3& mean) {
     float inv_length;
@@ -101,7 +101,7 @@ __device__ __forceinline__ uint32_t project_one(const Job& job, int64_t i, Recor
     const lane::Projection p = lane::project_lanes(view, lanes);
     uint32_t rows = 0, key = kCulled;
     float radius = 0.0f;
-    // Whether it is on the picture at all is known without its colour, most of what there is to read.
+    // Whether it is in the image is known without its colour, which is most of the data to read.
     if (p.usable && lane::make_splats(view, p, {0.0f, 0.0f, 0.0f}).visible) {
         const lane::SplatLanes s = lane::make_splats(view, p, colour_of(view, job.model, i, lanes.mean));
         if (s.visible) {

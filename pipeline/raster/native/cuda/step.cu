@@ -1,9 +1,9 @@
-// From what each Gaussian has on the screen to its parameters' gradients, and Adam's step with them at once.
+// From each Gaussian's screen-space gradients to those of its parameters, fused with a step of Adam.
 //
-// A thread finds a Gaussian's gradients and stages them in shared memory; then the block works off its rows tensor by
-// tensor, coalesced. Of spherical harmonics only the basis and the colour's gradient are staged: their product is the
-// gradient. With 16 coefficients, a step moves 59 floats and their two moments, in and out: 1,416 bytes a Gaussian that
-// is seen, 48 of gradients, and 192 that come from the cache a second time.
+// A thread computes a Gaussian's gradients and stages them in shared memory; then the block processes its rows tensor
+// by tensor, coalesced. For SH only the basis and the colour's gradient are staged: their product is the gradient. With
+// 16 coefficients, a step moves 59 floats and their two moments, in and out: 1,416 bytes per visible Gaussian, 48 of
+// gradients, and 192 that come from the cache a second time.
 #include "project.cuh"
 #include "step.cuh"
 
@@ -13,8 +13,9 @@ namespace {
 
 // A Gaussian's staged gradients.
 constexpr int kMeanAt = 0, kLogScaleAt = 3, kQuatAt = 6, kLogitAt = 10, kColourAt = 11, kBasisAt = 14;
-constexpr int kPlainFloats = kColourAt;                     // gradients of all but spherical harmonics
-constexpr int kStagedFloats = kBasisAt + lane::kMaxSh + 1;  // odd: threads that write their own rows meet no bank twice
+constexpr int kPlainFloats = kColourAt;  // gradients of all but spherical harmonics
+constexpr int kStagedFloats =
+    kBasisAt + lane::kMaxSh + 1;  // odd, to avoid bank conflicts between threads that write their own rows
 static_assert(kStagedFloats % 2 == 1, "");
 
 struct Staged {
@@ -142,7 +143,7 @@ __global__ void __launch_bounds__(kThreads, 2) gradient_kernel(const Job job, co
     }
 }
 
-// What a step wants beside the job, by value.
+// The other parameters of a step, by value.
 struct StepJob {
     SplatRows values, means, squares;
     float rates[5], rate_sh_rest;  // with their bias correction
@@ -192,7 +193,7 @@ __device__ __forceinline__ void step_tensors(const StepJob& step, const Staged& 
         [&](int column) { return column < 3 ? step.rates[4] : step.rate_sh_rest; });
 }
 
-// All rows, also those that did not step: density control may have made them smaller. NaN stays.
+// All rows, including those not stepped: density control may have made them smaller. NaN stays.
 __device__ __forceinline__ void clamp_log_scales(const StepJob& step, int64_t first, int rows) {
     float* log_scales = step.values.log_scales + 3 * first;
     for (int j = threadIdx.x; j < 3 * rows; j += kThreads) {
