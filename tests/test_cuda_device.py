@@ -67,7 +67,7 @@ def photo(width: int = WIDTH, height: int = HEIGHT) -> Tensor:
 
 
 def everything(model: Gaussians, where: torch.device, depth: bool, part: Rectangle = WHOLE) -> dict[str, Tensor]:
-    """Pictures, loss and gradients of a view or of a part of it, whose rim does not count; brought to the CPU."""
+    """Return images, loss and gradients of a view or a window of it, whose rim does not count; moved to the CPU."""
     left, top, right, bottom = part
     here, view = (slice(top, bottom), slice(left, right)), camera().cut(left, top, right - left, bottom - top)
     inner = None if part == WHOLE else (SSIM_REACH_PX, SSIM_REACH_PX, view.width - 2, view.height - 2)

@@ -41,7 +41,7 @@ def ending() -> RenderCase:
 
 
 def long() -> RenderCase:
-    """Over more tile rows than a thread takes on by itself; a part of a picture, at the limits of the whole."""
+    """More tile rows than one thread processes; a window of an image, at the limits of the whole."""
     scene = random_scene(13, 120, 0, size=-1.5)
     scene.log_scales[:, 0] += 2.0
     return case_of(scene, random_camera(13, 60, 180).cut(15, 10, 20, 150), depths=False, magnitudes=True)
@@ -58,7 +58,7 @@ def many() -> RenderCase:
 
 
 def many_tiles() -> RenderCase:
-    """More tiles than a digit of their sort tells apart."""
+    """More tiles than one digit of their radix sort distinguishes."""
     scene = random_scene(6, 60, 0, size=-2.0)
     scene.means[:, :2] *= 4.0
     return case_of(scene, random_camera(6, 290, 240)).changed(upstream={})
@@ -96,7 +96,7 @@ def draws() -> Draws:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """What was found with no fault alive, and with each."""
+    """Return the findings with no fault active, and with each."""
     frames = [(case, exact_outcome(case)) for case in (ending(), long(), many())]
     large = many_tiles()
     truth = ReferenceResult(frames, loss(), draws(), (large, exact_outcome(large, gradients=False)))

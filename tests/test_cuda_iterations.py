@@ -34,7 +34,7 @@ STEP_SHARE = 0.02
 
 @dataclass(frozen=True)
 class DeviceSetup:
-    """Where the kernels run, and how much of a scene they are given there.
+    """Where the kernels run, and how large a scene they get there.
 
     Attributes:
         kernels: None on a real device, which has its own.
@@ -84,7 +84,7 @@ def photo_of(camera: Camera) -> Tensor:
 def backward_at(
     place: DeviceSetup | None, given: DeviceSetup, options: RenderOptions
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The picture and every gradient, at a place or on the CPU."""
+    """Return the image and every gradient, on a device or on the CPU."""
     device = torch.device("cpu") if place is None else place.device
     with use_kernels(None if place is None else place.kernels):
         scene = given.scene.to(device).detach().clone().requires_grad_()

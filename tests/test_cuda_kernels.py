@@ -218,7 +218,7 @@ def test_each_tile_lists_what_touches_it_from_near_to_far(library: CudaLibrary, 
 
 
 def pixel_centres(case: RenderCase, tile: int) -> tuple[np.ndarray, np.ndarray]:
-    """x and y of a tile's pixels, those in the picture."""
+    """Return x and y of a tile's pixels inside the image."""
     width, height = case.size
     columns = math.ceil(width / TILE)
     left, top = tile % columns * TILE, tile // columns * TILE

@@ -1,4 +1,4 @@
-"""The CUDA library's mirror for ctypes, how it is loaded, and what is told where it cannot be used."""
+"""The CUDA library's ctypes declarations, how it is loaded, and the errors if it cannot be used."""
 
 import ctypes
 import os
@@ -150,7 +150,7 @@ print(found)
 
 @pytest.fixture(scope="module")
 def fake_driver(tmp_path_factory) -> Path:
-    """A folder with a driver's library that says what its environment tells it to."""
+    """A folder with a fake driver library that reports what its environment variables specify."""
     folder = tmp_path_factory.mktemp("driver")
     source = """
 #include <cstdlib>

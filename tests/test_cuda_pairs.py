@@ -29,11 +29,11 @@ NEAREST = 250
 
 @dataclass(frozen=True)
 class DeviceSetup:
-    """Where the kernels run, and how much they are given there.
+    """Where the kernels run, and how large a scene they get there.
 
     Attributes:
         kernels: With a forecast that knows the view.
-        size: Of the picture, pixels.
+        size: Size of the image, pixels.
         count: Gaussians.
         capacity: Pairs of a chunk.
     """

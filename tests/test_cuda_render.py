@@ -53,7 +53,7 @@ def kernels() -> CudaKernels:
 
 
 def weighted(rendered: Render) -> Tensor:
-    """A scalar that every picture with a gradient has a part in."""
+    """Return a scalar that depends on every image with a gradient."""
     generator = torch.Generator().manual_seed(1)
     pictures = (rendered.colour, rendered.alpha, rendered.depth_sum, rendered.depth_square_sum)
     terms = [(p * torch.randn(p.shape, generator=generator)).sum() for p in pictures if p.requires_grad]

@@ -1,7 +1,7 @@
 """The shipped CUDA library: one file with the C interface and nothing else, for every requested architecture.
 
 Whether there is one follows from SPLATPIPE_CUDA, as in `pipeline/raster/native/cuda/CMakeLists.txt`: CI asks for all.
-Where the build was to find out for itself, it says what it found.
+With ``auto``, the build records what it found.
 """
 
 import os
@@ -26,7 +26,7 @@ SYSTEM = re.compile(r"lib(stdc\+\+|gcc_s|c|m|dl|rt|pthread)\.so\.\d+|ld-linux.*"
 
 
 def devices_asked_for() -> set[int]:
-    """What SPLATPIPE_CUDA asks for; with ``auto``, what the last build told of itself."""
+    """Return what SPLATPIPE_CUDA requests; with ``auto``, what the last build recorded."""
     stamp = Path(sys.prefix) / ".cuda"  # what `make` built for last
     built = stamp.read_text().split()[:1] if stamp.exists() else []
     asked = os.environ.get("SPLATPIPE_CUDA") or "".join(built) or "auto"
@@ -39,7 +39,7 @@ def devices_asked_for() -> set[int]:
 
 
 def devices_told(text: str) -> set[int]:
-    """What a build says that it has made a library for: cuda.txt in its folder."""
+    """Return the architectures that a build recorded: cuda.txt in its folder."""
     built = re.fullmatch(r"with CUDA for ([\d ]+) \(nvcc .*\)\n", text)
     assert built or text.startswith("without CUDA: "), text
     return {int(device) for device in built[1].split()} if built else set()

@@ -39,7 +39,7 @@ def kernels() -> CudaKernels:
 
 @pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
-    """Where the kernels are found; on a real one, nothing may wait."""
+    """Where the kernels run; on a real device, nothing may wait."""
     if request.param == "harness":
         with use_kernels(kernels_on_cpu()):
             yield CPU

@@ -100,7 +100,7 @@ class Plan:
 
 
 def planned(library: CudaLibrary, counts: np.ndarray, capacity: int) -> Plan:
-    """The plan for tiles with so many pairs each."""
+    """Return the plan for tiles with given numbers of pairs."""
     at, tiles = Memory(), len(counts)
     differences = at.put("counts", np.diff(counts, prepend=0, append=0).astype(np.int32))
     begin, chunks = at.empty("begin", (tiles + 1,), np.int64), at.empty("chunks", (tiles + 1,), np.int32)

@@ -75,7 +75,7 @@ class StepSettings:
 
 @dataclass(frozen=True)
 class StepResult:
-    """Values and moments by name after a step, how many rows were left out, and dL/d(centre on screen)."""
+    """Return values and moments by name after a step, the number of skipped rows, and dL/d(centre on screen)."""
 
     arrays: dict[str, np.ndarray]
     skipped: int
@@ -149,7 +149,7 @@ def assert_same(ours: StepResult, expected: StepResult) -> None:
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("sh_degree", range(4))
 def test_gradients_agree_with_the_cpu(library: CudaLibrary, sh_degree: int, antialias: bool) -> None:
-    """Where fewer bands count than are stored, and where depths and magnitudes have a part."""
+    """With fewer SH bands active than stored, and with depths and magnitudes contributing."""
     case = small_case(sh_degree, 60, sh_degree=3, depths=antialias, magnitudes=sh_degree % 2 == 1)
     case = case.changed(sh_degree=sh_degree, antialias=antialias)
     ours, expected = run(library, case), exact_outcome(case, "native")
@@ -276,7 +276,7 @@ class Tensors:
         return Tensors(all_of(1.0), all_of(1e-2), all_of(1e-2), squares, rates)
 
     def on_cpu(self) -> tuple[list[np.ndarray], int]:
-        """Values and moments after the CPU's step, and rows left out."""
+        """Return values and moments after the CPU's step, and the skipped rows."""
         copies = [[torch.from_numpy(array.copy()) for array in group] for group in self._changed()]
         fixed = [[torch.from_numpy(array) for array in group] for group in (self.gradients, self.rates)]
         visible = None if self.visible is None else torch.from_numpy(self.visible)

@@ -29,7 +29,7 @@ OPTIONS = tiny_scene.plain(
     iterations=400, exposure="affine", antialias=True, robust=0.1, distortion_weight=0.05, dropout=0.2
 )
 LOOKS = [TrainingSize(1)] * 3 + [TrainingSize(0, 800)] * 9
-"""Whole photos, then windows: six of a photo, some of a masked one."""
+"""Whole photos, then windows: six per photo, some of a masked photo."""
 STEP_SHARE = 1e-3  # L2 of how far parameters move: 5e-6 here; a first step of Adam goes by a sign
 SCORE_RTOL = 1e-4  # L2 of the gradients on the screen, after as many steps
 

@@ -56,7 +56,7 @@ def stated(found: PositionList) -> np.ndarray:
 
 
 def camera_errors(frame: Frame, found: PositionList) -> np.ndarray:
-    """From what the frame says of each photo: its residual is the placed camera less the stated position."""
+    """Derived from the frame's residual of each photo: placed camera minus stated position."""
     assert frame.origin is not None
     residuals = np.array([frame.residuals["photos"][name] for name in NAMES])
     own = frame.origin.enu_from_geodetic(ORIGIN.geodetic_from_enu(stated(found))) + residuals

@@ -73,7 +73,7 @@ def sparse_points() -> np.ndarray:
 
 
 def write_room(folder: Path, cameras: list[Camera], masked_axis: int | None = None) -> Path:
-    """A dataset of the room, one wall masked in all photos if asked for."""
+    """Write a dataset of the room, with one wall masked in all photos if requested."""
     (folder / "images").mkdir(parents=True)
     for camera in cameras:
         cv2.imwrite(str(folder / "images" / camera.name), photograph(camera)[:, :, ::-1])
@@ -116,7 +116,7 @@ def points(room: Path, tmp_path_factory: pytest.TempPathFactory) -> DensePoints:
 
 @pytest.fixture(scope="module")
 def started(room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, bytes]:
-    """What the whole stage leaves with one thread."""
+    """Return the whole stage's output with one thread."""
     return initialized(room, tmp_path_factory.mktemp("started") / "out")
 
 

@@ -36,7 +36,7 @@ FRONT = Camera("front", 24, 16, 30.0, 30.0, 12.0, 8.0, np.eye(4))
 
 
 def layers(depths: tuple[float, ...], opacity: float) -> Gaussians:
-    """Flat sheets that fill the picture, each as opaque as given all over."""
+    """Return flat sheets that fill the image, each with a given uniform opacity."""
     gaussians = Gaussians.empty(len(depths), 0)
     gaussians.means = torch.tensor([[0.0, 0.0, depth] for depth in depths])
     gaussians.log_scales = torch.log(torch.tensor([[30.0 * depth, 30.0 * depth, 1e-6] for depth in depths]))

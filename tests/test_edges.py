@@ -12,7 +12,7 @@ EDGE = 30  # column where the roof truly ends
 def roof_over_lawn(
     wider: int, lawn: tuple[int, int, int] = GREEN, below: float = 16.0
 ) -> tuple[Float32[np.ndarray, "h w"], UInt8[np.ndarray, "h w 3"]]:
-    """Depths whose roof, 12 m away, ends so many pixels too late, and the photo."""
+    """Return depths whose roof, 12 m away, extends a given number of pixels too far, and the photo."""
     depth = np.full((40, 60), below, np.float32)
     depth[:, : EDGE + wider] = 12.0
     noise = np.random.default_rng(1).integers(-20, 21, (40, 60, 3))

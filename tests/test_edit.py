@@ -45,7 +45,7 @@ OUTPUT = OutputFile(Path("out.ply"), format_named("ply"))
 
 
 def edited(scene: Scene, *given: tuple[str, Any], local: bool = False) -> Scene:
-    """A scene after steps; the scene itself is left as it is."""
+    """Return a scene after edit steps; the input stays unchanged."""
     piece = Workpiece(Scene(scene.gaussians.clone(), scene.facts))
     for step in parse_steps(given, OUTPUT, local):
         step.apply(piece)
@@ -497,7 +497,7 @@ def splatpipe_edit(*arguments: object) -> dict[str, Any]:
 
 @pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
-    """A run's OUT, as far as an edit looks at it."""
+    """Create the parts of a run's OUT that an edit reads."""
     out = tmp_path / "run"
     (out / "stages").mkdir(parents=True)
     plain_ply.write(out / "splat.ply", Scene(true_model(), PLACED))

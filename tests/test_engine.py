@@ -255,7 +255,7 @@ def test_interrupt_ends_a_stage_that_ignores_signals(numbers: Path, out: Path) -
 
 
 def test_a_worker_that_is_asked_to_end_is_not_waited_for(numbers: Path, tmp_path: Path) -> None:
-    """Its stdin stays open: it ends for having been asked, and not when somebody loses patience."""
+    """Its stdin stays open: it ends because it was asked to, not because of a timeout."""
     machine, config = asdict(Machine("cpu", 1)), {"steps": 3000, "step_s": 0.1}
     told = {"parts": {}, "photos_dir": str(numbers), "out": str(tmp_path), "settings": {}, "summaries": {}}
     task = Task("count", "arithmetic:count", "arithmetic:CountConfig", config, machine=machine, **told)
@@ -441,7 +441,7 @@ def test_a_photo_that_cannot_be_read_is_for_ingest_to_name(numbers: Path, out: P
 
 
 def test_a_run_walks_to_every_deliverable_and_no_further_than_asked(numbers: Path, out: Path) -> None:
-    """Two stages that nobody reads: both are wanted, since both leave something for people."""
+    """Two stages whose outputs no stage reads: both run, since their outputs are for users."""
     side = replace(arithmetic.ADD, deliverables=("total",))
     stages = (arithmetic.READ, arithmetic.COUNT, arithmetic.TELL, side)
     request = replace(request_of(numbers, out), stages=(arithmetic.READ, side, *arithmetic.LINE[2:]))
@@ -494,7 +494,7 @@ def test_contents_are_what_the_last_run_made_and_nothing_that_contradicts_it(num
 
 
 def test_what_no_stage_ever_left_came_from_the_users_folder(numbers: Path, out: Path) -> None:
-    """As a reconstruction does, which takes the place of the stage that would have made it."""
+    """An external part, like a reconstruction, replaces the stage that would have produced it."""
     made = dict(walk(request_of(numbers, out))[0].artifacts)
     shutil.rmtree(made.pop("read").folder)
     assert open_run_folder(out, arithmetic.LINE).contents(None, {}).artifacts == made

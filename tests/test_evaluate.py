@@ -1,4 +1,4 @@
-"""evaluate: what it measures can be measured again from the PNGs it leaves, by others' code."""
+"""evaluate: its figures can be reproduced from the PNGs that it writes, with third-party code."""
 
 import json
 import math

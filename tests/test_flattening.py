@@ -78,7 +78,7 @@ def test_gradient_of_unevenness_agrees_with_finite_differences() -> None:
     rough = plane(1e-3, 0.0)[:6, :7] * (1.0 + 2e-3 * torch.rand(6, 7, generator=torch.Generator().manual_seed(2)))
 
     def value(depth_sum: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
-        """By hand; what a pixel is on the ground is no part of the gradient."""
+        """Computed by hand; a pixel's size on the ground is not differentiated."""
         inverse, ground = alpha / depth_sum, FRONT.fx * rough
         across = (inverse[:, :-2] + inverse[:, 2:] - 2.0 * inverse[:, 1:-1]) * ground[:, 1:-1]
         down = (inverse[:-2] + inverse[2:] - 2.0 * inverse[1:-1]) * ground[1:-1]

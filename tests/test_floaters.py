@@ -57,7 +57,7 @@ def blob(where: np.ndarray, size: float, opacity: float) -> Gaussians:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The points that lie in all four pictures, seen in each."""
+    """Return the points inside all four images, observed in each."""
     folder = tmp_path_factory.mktemp("floaters")
     xyz = places()
     pixels = [view.project(xyz) for view in cameras()]
@@ -152,7 +152,7 @@ def test_floater_that_passes_trainings_own_rule_is_still_called_out(dataset: Pat
 
 
 def test_light_that_a_veil_stops_is_what_its_gaussian_says(dataset: Path) -> None:
-    """A haze of which every pixel lets more than half through, so that no depth tells of it."""
+    """Haze that more than half of the light passes in every pixel, so no depth map shows it."""
     camera, sigma_px = cameras()[1], 0.6 * 130.0 / 2.0
     veil = blob(camera.centre()[None] + (0.0, 0.0, 2.0), 0.6, 0.3)
     xyz = np.array([[x, y, WALL] for x in (-0.8, 0.1, 1.3) for y in (-0.6, 0.4)])

@@ -53,7 +53,7 @@ def layout_of(these: StatedPoses) -> Layout:
 
 @pytest.mark.parametrize("step_m", [0.0, 8.0, 16.0, 24.0, 60.0])
 def test_footprints_of_nadir_photos_overlap_as_rectangles_do(step_m: float) -> None:
-    """40 m up a picture is 48 m wide; a grid of five rays tells the share to a fifth."""
+    """From 40 m up an image is 48 m wide; a grid of five rays resolves the share to a fifth."""
     found = overlaps(nadir(np.array([[0.0, 0.0, 40.0], [step_m, 0.0, 40.0]])), 10).get((0, 1), 0.0)
     assert found == pytest.approx(max(0.0, 1.0 - step_m / 48.0), abs=0.21)
     assert (found == 0.0) == (step_m == 60.0)

@@ -75,7 +75,7 @@ def containers() -> dict[str, bytes]:
 
 @pytest.mark.parametrize("kind", sorted(containers()))
 def test_damage_gets_past_check_sums(kind):
-    """What unpacks a container still does, and finds something else in it."""
+    """Damaged containers still unpack, with different contents."""
     container, generator, changed = containers()[kind], np.random.default_rng(0), 0
     whole = container_layers.layer_of(container, generator)
     assert whole is not None

@@ -121,7 +121,7 @@ def test_well_observed_point_beside_a_gaussian_refutes(observers: int, through: 
 
 
 def test_ground_before_the_foot_of_a_wall_is_not_judged() -> None:
-    """The wall's points end within a cell (pixels 220 to 240); what lies below them there may be nearer."""
+    """The wall's points end within a cell (pixels 220 to 240); below them, something may be nearer."""
     space = space_of(CAMERAS, wall(lowest=1.3))
     foot = float(wall(lowest=1.3)[:, 1].max()) * FOCAL / WALL + HEIGHT / 2
     assert 220.0 < foot < 235.0

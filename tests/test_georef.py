@@ -61,7 +61,7 @@ class Survey:
 
 
 def survey(centres: np.ndarray, sigma: tuple[float, float] = (1.5, 3.0), seed: int = 0, gimbal: bool = False) -> Survey:
-    """Nadir cameras with positions of the given accuracy."""
+    """Return nadir cameras with positions of the given accuracy."""
     rng = np.random.default_rng(seed)
     measured = centres + rng.normal(size=centres.shape) * [sigma[0], sigma[0], sigma[1]]
     names = [f"dji {i:03d} ä.jpg" for i in range(len(centres))]
@@ -256,7 +256,7 @@ def test_line_of_cameras_is_levelled_by_the_gimbal(tmp_path: Path) -> None:
 def test_positions_that_tell_nothing_leave_an_arbitrary_frame(
     tmp_path: Path, centres: np.ndarray, sigma: tuple[float, float], keep: int, reason: str
 ) -> None:
-    """The last: a mast of cameras looking down, whose heading nothing tells."""
+    """The last case: a vertical line of cameras looking down, whose heading is undetermined."""
     scene = survey(centres, sigma)
     scene.positions = scene.positions[:keep]
     frame, summary, warnings = georef(scene, tmp_path)

@@ -11,7 +11,7 @@ PATHS = ("tests/scenes", "tests/harness", "tests/lines", "tests/versions", "benc
 
 
 def file_of(module: str, importer: Path) -> Path | None:
-    """The source of one of our modules, as a file beside it or elsewhere imports it; None of anybody else's."""
+    """Return the source of one of our modules, as imported by a given file; None for third-party modules."""
     parts = module.split(".")
     if parts[0] == "splatpipe":
         stems = [ROOT.joinpath(*parts[1:])]
@@ -52,7 +52,7 @@ def whole_name(node: ast.ImportFrom, path: Path) -> str:
 
 
 def missing(path: Path, source: bytes) -> list[str]:
-    """The names of ours that a source imports and nobody defines."""
+    """Return the names that a source imports from our modules but that are not defined there."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if not isinstance(node, ast.ImportFrom):

@@ -59,7 +59,7 @@ class Notes:
 
 @dataclass
 class Result:
-    """What an ingest left."""
+    """Return the output of an ingest."""
 
     summary: Summary
     out: Path
@@ -105,7 +105,7 @@ def ingest(
 
 
 def picture(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """A smooth picture whose four corners differ, another for every seed."""
+    """Return a smooth image with four different corners, a different one for every seed."""
     x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
     wave = 0.1 * np.sin(6.0 * x * (seed + 1))
     return (np.stack([x, y, 0.5 + wave], axis=-1) * 250).astype(np.uint8)
@@ -348,7 +348,7 @@ def test_decoding_tells_when_a_photo_has_changed_since(folder: Path) -> None:
 
 
 def test_photo_replaced_in_silence_is_refused_by_the_stage_that_reads_it(folder: Path, tmp_path: Path) -> None:
-    """After ingest, before the keypoints: they would be those of another photo than the key says."""
+    """A photo replaced after ingest and before features: the keypoints would not match the key."""
     save(folder / "c.png", 3)
 
     def meddle(event: Event) -> None:
@@ -443,7 +443,7 @@ def test_parts_are_the_same_bits_elsewhere_and_with_more_threads(folder: Path, t
 
 
 def half_black(width: int, height: int) -> Image.Image:
-    """Black in the left half of the stored grid."""
+    """Return a mask that is black in the left half of the stored image."""
     mask = np.full((height, width), 255, np.uint8)
     mask[:, : width // 2] = 0
     return Image.fromarray(mask)

@@ -31,7 +31,7 @@ class Quiet:
 
 
 def write_dataset(folder: Path, points: np.ndarray, colours: np.ndarray) -> Path:
-    """A model with two cameras at z = −5 and the given points."""
+    """Return a model with two cameras at z = −5 and the given points."""
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 64, 48)
     model.add_camera_with_trivial_rig(camera)

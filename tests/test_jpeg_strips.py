@@ -58,7 +58,7 @@ def test_a_picture_of_one_strip_is_a_plain_file(tmp_path: Path) -> None:
 
 @dataclass
 class WatchedPhoto:
-    """A photo that keeps what it was asked for."""
+    """A photo that records requests."""
 
     pixels: np.ndarray
     asked: list[int] = field(default_factory=list)

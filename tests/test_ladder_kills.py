@@ -30,7 +30,7 @@ RUNGS = ("placing the remaining photos", "joining models", "matching", "more key
 
 
 def prepare(folder: Path) -> None:
-    """Photos, and what the stages before `sparse` left of them: with something for each rung to do."""
+    """Photos, and the output of the stages before `sparse`, with work for each rung."""
     names = [f"{number:02}.png" for number in range(1, WEAK + 1)]
     inputs = corner_photos.write_capture(folder, corner_photos.room(names, step_deg=6.0))
     prepared = folder / "photos" / "prepared"

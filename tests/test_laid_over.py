@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("isa")
 
 
 class RandomPicture:
-    """A picture of random numbers before random nodes.
+    """A random image in front of random nodes.
 
     Args:
         height, width: Its own.
@@ -48,7 +48,7 @@ class RandomPicture:
             self.behind = SkyLayer(BACKGROUND, elsewhere, mask | (rand(height, width) > 0.7), mask)
 
     def found(self, reference: bool = False) -> list[Tensor]:
-        """The picture, and the gradients of a weighted sum of it by colour, alpha and nodes."""
+        """Return the image, and the gradients of a weighted sum of it by colour, alpha and nodes."""
         leaves = [tensor.clone().requires_grad_() for tensor in (self.colour, self.alpha, self.nodes)]
         lay = laid_over_nodes_reference if reference else laid_over_nodes
         picture = lay(*leaves, self.behind)

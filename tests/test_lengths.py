@@ -1,4 +1,4 @@
-"""Lengths of trainings: what follows from the photos and their size, and what a given number makes of it."""
+"""Lengths of trainings: derived from the photos and their size, or from a given number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole line on a few photos of the demo capture: what it leaves, what it reuses, and what no kill can spoil."""
+"""The whole pipeline on a few photos of the demo capture: its outputs, reuse, and robustness against kills."""
 
 import hashlib
 import json

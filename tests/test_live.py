@@ -60,7 +60,7 @@ def wait_for_losses(out: Path) -> None:
 
 
 def shown(page: Page, name: str) -> np.ndarray:
-    """The picture that the page shows, as it came."""
+    """Return the image that the page shows, as received."""
     page.locator(f"#{name}:not([hidden])").wait_for()
     address = page.evaluate(f"document.getElementById('{name}').src")
     answer = page.request.get(address)
@@ -123,12 +123,12 @@ def choose(page: Page, number: int) -> None:
 
 
 def wait_for_picture(page: Page, shows: str, what: object) -> None:
-    """Wait until the page shows it: rendering takes its time on a busy machine."""
+    """Wait until the page shows it: rendering is slow on a busy machine."""
     page.wait_for_function(shows, arg=what, timeout=1000.0 * PATIENCE_S)
 
 
 def follow_the_curves(page: Page, points: int) -> None:
-    """The curves grow, on the page as in its data, and the time that is left is told."""
+    """The curves grow, on the page and in its data, and the remaining time is shown."""
     for _ in range(2):
         told = wait(page, lambda told, points=points: len(told["curves"]["loss"]) > points)
         points = len(told["curves"]["loss"])

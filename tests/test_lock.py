@@ -46,7 +46,7 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @contextmanager
 def holder(out: Path) -> Iterator[subprocess.Popen[str]]:
-    """Another process that holds the lock until it is told or killed."""
+    """Run another process that holds the lock until it is released or killed."""
     with subprocess.Popen(
         [sys.executable, "-c", HOLDS, str(out)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:

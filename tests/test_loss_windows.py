@@ -35,7 +35,7 @@ def pair(height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def parts(rows: tuple[int, ...], columns: tuple[int, ...]) -> list[tuple[Rectangle, Rectangle]]:
-    """What is cut from the picture, and what of that counts, in the cut's pixels."""
+    """Return the crop of the image, and its part that counts, in the crop's pixels."""
     found = []
     for (top, bottom), (left, right) in itertools.product(itertools.pairwise(rows), itertools.pairwise(columns)):
         cut = (
@@ -106,7 +106,7 @@ def test_native_parts_add_up_to_the_whole(isa, cut, masked):
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("inner", [(0, 0, 1, 1), (3, 4, 20, 21), (12, 0, 31, 9), (0, 25, 31, 29), (30, 28, 31, 29)])
 def test_native_is_the_reference_wherever_the_counting_pixels_lie(isa, inner, masked):
-    """Nearer to the picture's border than windows reach, too, where the picture is reflected."""
+    """Also closer to the image's border than the windows' radius, where the image is reflected."""
     render, photo, mask = pair(29, 31)
     weights = (0.2, mask if masked else None, inner)
     loss, gradient = of_whole(photo_loss_reference, render, photo, *weights)

@@ -376,7 +376,7 @@ def test_what_cannot_be_marked_is_told(gps_run: Path, tmp_path: Path) -> None:
 
 
 def test_three_points_make_a_frame_where_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
-    """Before that nothing is expected anywhere; then every other point is, to a few pixels. A wrong mark is told."""
+    """Before that no positions are predicted; then all others are, to a few pixels. Wrong marks are reported."""
     job = open_job(open_run_folder(gps_run, LINE), gps_run.parent / "points.csv")
     text = ControlText.begin(tmp_path / "gcp_list.txt", "EPSG:32633", False, NameFinder(job.photos))
     marking = Marking(replace(job, frame=None, positions=Positions({}, {}), text=text))
@@ -413,7 +413,7 @@ def beside(line: list[list[float]], pixel: list[float]) -> float:
 
 
 def test_found_targets_count_like_marks_and_are_never_written(gps_run: Path, tmp_path: Path) -> None:
-    """What somebody marks replaces what was found; what is taken away is found again; what is hidden is not."""
+    """A user's mark replaces a detection; a removed mark is detected again; a hidden one is not."""
     job = open_job(open_run_folder(gps_run, LINE), gps_run.parent / "points.csv")
     assert job.found == {}
     file = tmp_path / "gcp_list.txt"
@@ -447,7 +447,7 @@ def test_found_targets_count_like_marks_and_are_never_written(gps_run: Path, tmp
 
 @pytest.fixture(scope="module")
 def found_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demo with coordinates alone: its marks are targets that were found."""
+    """The demo with coordinates alone: its marks are detected targets."""
     home = tmp_path_factory.mktemp("found")
     shutil.copytree(capture_path(), home / "photos of a house")
     listed = [line.split() for line in (CAPTURE / "gcp_list.txt").read_text().splitlines()]

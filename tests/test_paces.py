@@ -18,7 +18,7 @@ def camera_at(centre: tuple[float, float, float]) -> Camera:
 
 
 def stepped(means: torch.Tensor, step: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
-    """How far each moves where the step is as given."""
+    """Return how far each Gaussian moves for a given step."""
     moved = means.clone()
     with by_distance(moved, rows, camera_at((1.0, 2.0, 3.0)), UNIT):
         moved += step

@@ -135,7 +135,7 @@ def test_what_residuals_do_not_show_is_common_to_all_positions() -> None:
 
 
 def test_altitude_that_drifts_does_not_tilt_the_model() -> None:
-    """A level flight whose receiver climbs by 100 m as it goes east: the cameras tell up, and the user is told why."""
+    """A level flight whose GPS heights drift by 100 m eastwards: up comes from the cameras, and the user learns why."""
     x, y = np.meshgrid(np.arange(9) * 10.0, np.arange(8) * 12.0, indexing="ij")
     y[1::2] = y[1::2, ::-1]
     centres = np.stack([x.ravel(), y.ravel(), np.full(72, 60.0)], axis=1)
@@ -170,7 +170,7 @@ def test_errors_of_all_sizes_are_not_searched_for_ever() -> None:
 
 
 def test_five_positions_keep_their_stated_accuracy() -> None:
-    """So few residuals may be small by chance: nobody is left out, and nothing is believed to be better than stated."""
+    """So few residuals may be small by chance: no photo is excluded, and no position is rated better than stated."""
     five = [0, 8, 16, 24, 36]
     model = cameras(CENTRES[five], TURNS[five])
     for seed in range(5):
@@ -181,7 +181,7 @@ def test_five_positions_keep_their_stated_accuracy() -> None:
 
 
 def test_flights_share_errors_besides_their_noise() -> None:
-    """Two flights, one 4 m off: the noise is told apart from that, and the offset is between them."""
+    """Two flights, one 4 m off: noise and offset are separated, and the frame's offset is between them."""
     rng = np.random.default_rng(3)
     group = np.repeat([0, 1], 20)
     target = CENTRES + rng.normal(size=(40, 3)) + np.where(group[:, None] == 1, [4.0, 0.0, 0.0], 0.0)

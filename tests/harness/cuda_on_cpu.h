@@ -1,4 +1,4 @@
-// The subset of CUDA that the kernels use, for a C++ compiler and a CPU. Included by device.h where SPLAT_ON_CPU is set.
+// The subset of CUDA that the kernels use, for a C++ compiler and CPU. Included by device.h where SPLAT_ON_CPU is set.
 //
 // Blocks run one after another, each thread of a block on a stack of its own, from one synchronisation to the next: in
 // an order that the test chooses, so that what a missing barrier leaves to chance differs from order to order. Shared
