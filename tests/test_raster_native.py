@@ -48,7 +48,7 @@ class RenderOutcome:
 def evaluate(
     scene: Gaussians, camera: Camera, options: RenderOptions, backend: str = "native", weight: Tensor | None = None
 ) -> RenderOutcome:
-    """Render and differentiate; ``weight`` (h, w) is multiplied to every picture's random weights."""
+    """Render and differentiate; every image's random weights are multiplied by ``weight`` (h, w)."""
     scene = scene.detach().clone().requires_grad_()
     probe = torch.zeros(len(scene), 2, dtype=scene.means.dtype, requires_grad=True)
     result = render(scene, camera, options, backend=backend, means2d_probe=probe)  # type: ignore[arg-type]
@@ -149,14 +149,14 @@ def test_contributing_pairs_are_those_of_the_reference() -> None:
     view = (np.ascontiguousarray(camera.cam_from_world, np.float64), size, intrinsics)
     how = (0, False, options.near, options.depth_origin, options.background)
     frame.forward(tuple(scene.tensors().values()), view, how, tuple(tensors))
-    # Every blended pair moves its pixel's alpha; the reference's alphas are found again one Gaussian at a time.
+    # Every blended pair changes its pixel's alpha; the reference's alphas are recomputed one Gaussian at a time.
     assert frame.contributing_pairs() == pytest.approx(
         blended_pairs(scene.to(dtype=torch.float64), camera, options), rel=2e-3
     )
 
 
 def blended_pairs(scene: Gaussians, camera: Camera, options: RenderOptions) -> int:
-    """Count by the definition: each Gaussian's own alpha picture, front to back."""
+    """Count by the definition: each Gaussian's own alpha image, front to back."""
     with torch.no_grad():
         depths = scene.means @ torch.from_numpy(camera.cam_from_world[2, :3].copy()) + camera.cam_from_world[2, 3]
         left, alive, count = torch.ones(camera.height, camera.width, dtype=torch.float64), None, 0

@@ -40,7 +40,7 @@ OPTIONS = RenderOptions(3, background=(0.3, 0.6, 0.2), near=0.2, depth_origin=3.
 
 
 def edgy_scene() -> Gaussians:
-    """With Gaussians beside the picture so large that they reach into it, beyond where their Jacobian is clamped."""
+    """With Gaussians beyond the image, past the clamp of their Jacobian, that are large enough to reach into it."""
     scene = random_scene(21, 80)
     scene.means[:30, :2] *= 3.0
     scene.log_scales[:30] += 1.3
@@ -48,7 +48,7 @@ def edgy_scene() -> Gaussians:
 
 
 def upstream_of(part: tuple[int, int, int, int]) -> dict[str, Tensor]:
-    """dL/d(each picture) of the whole, which looks at the part alone."""
+    """Return dL/d(each image) of the whole, nonzero only inside the window."""
     left, top, width, height = part
     generator = torch.Generator().manual_seed(9)
     weights = {}
@@ -147,7 +147,7 @@ def test_limits_of_the_part_alone_would_show(cuda, backend):
 
 
 def test_each_gaussian_that_reaches_a_pixel_is_visible_in_a_part():
-    """Of all the parts of one picture together it is seen what the whole sees."""
+    """All windows of an image together see the Gaussians that the whole sees."""
     camera, weights = random_camera(4, *SIZE), upstream_of((0, 0, *SIZE))
     whole, gradients = rendered(camera, weights, torch.float32)
     seen = torch.zeros_like(whole.visible)

@@ -208,7 +208,7 @@ def test_a_wrong_call_ends_with_its_code_and_no_traceback(demo_run: Path, argume
 
 
 def test_keyframes_of_the_world_are_found_in_the_models_frame(tmp_path: Path) -> None:
-    """The camera stands at its keyframe, its target is in the middle, and up in the world is up in the picture."""
+    """The camera is at its keyframe, its target is centred, and up in the world is up in the image."""
     world = Similarity(12.5, rotation_from_vector(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
     path = tmp_path / "path.json"
     path.write_text(json.dumps([{"position": [300, -80, 30], "target": [312, -86, 21], "fov_deg": 70}]))

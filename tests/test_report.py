@@ -50,7 +50,7 @@ def splatpipe(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def words(watched: object) -> str:
-    """All that a page says, its closed parts too, blanks made one."""
+    """Return a page's whole text, including closed parts, with whitespace collapsed."""
     return " ".join(watched.page.evaluate("document.body.textContent").split())  # type: ignore[attr-defined]
 
 
@@ -145,7 +145,7 @@ def test_held_out_photos_come_worst_first_and_the_slider_moves_the_cut(
 def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_places(
     finished: Path, open_page: Callable[..., object]
 ) -> None:
-    """The drawn mark and circle are as far apart as the residual says, in the cut-out's own pixels."""
+    """The drawn mark and circle are separated by the residual, in pixels of the crop."""
     watched = open_page((finished / "report.html").as_uri())
     inputs = read_report_inputs(finished)
     points = inputs.read("georef.control")["points"]
@@ -331,7 +331,7 @@ def test_a_finished_run_whose_artifact_is_damaged_is_not_told_as_one_that_was_as
 
 
 def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
-    """Change a part of an artifact, which stays whole."""
+    """Change a part of an artifact and keep the artifact valid."""
     told = json.loads(path.read_text())
     size = path.stat().st_size
     change(told)
@@ -341,7 +341,7 @@ def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
 
 
 def show_nothing_inside(told: dict[str, Any]) -> None:
-    """As evaluate leaves it where no held-out photo shows the inside of the boundary."""
+    """evaluate's output if no held-out photo shows the inside of the boundary."""
     told["whole"] = dict(told["mean"])
     for measures in (told["mean"], *told["per_view"]):
         measures.update(psnr=None, psnr_cc=None, ssim=None)

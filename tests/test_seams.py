@@ -105,7 +105,7 @@ def test_border_where_nothing_is_has_no_seam(splat: Gaussians, coarse: Gaussians
 
 
 def test_benchmark_finds_what_it_plants(demo_run: Path) -> None:
-    """On the demo, whose splat is its own model without blocks here: no alarm, and some of each kind found."""
+    """On the demo, whose splat also serves as the model without blocks: no alarm, and some of each kind found."""
     coarse = next((demo_run / "stages").glob("train-*/model.ply"))
     script = Path(__file__).parents[1] / "benchmarks" / "seams.py"
     command = [sys.executable, str(script), str(demo_run), str(coarse), "--blocks", "2", "--plant"]

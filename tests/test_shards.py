@@ -311,7 +311,7 @@ def test_shards_are_told_of_before_their_stage() -> None:
 
 
 def test_a_shard_takes_no_options_of_its_own(tmp_path: Path) -> None:
-    """Shards of different options would never be joined, and nobody would notice."""
+    """Shards of different options would never be merged, without any notice."""
     words = ["stage", "train", str(tmp_path), "--shard", "2", "--set", "train.iterations=9"]
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *words]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)

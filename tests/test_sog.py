@@ -41,7 +41,7 @@ def some_gaussians(count: int, sh_degree: int = 3, seed: int = 1) -> Gaussians:
 
 
 def decode(files: dict[str, bytes]) -> Table:
-    """Pixel by pixel as the specification's own code says (which counts a quaternion's components w, x, y, z)."""
+    """Decode pixel by pixel like the specification's own code (quaternion components in the order w, x, y, z)."""
     meta = json.loads(files["meta.json"])
     count = meta["count"]
 
@@ -211,7 +211,7 @@ def bundle(path: Path, files: dict[str, bytes], compression: int = zipfile.ZIP_S
 
 
 def flat_picture(width: int, height: int, lossless: bool = True) -> bytes:
-    """Small, whatever it says of its size."""
+    """A small file, whatever size it declares."""
     out = io.BytesIO()
     Image.new("RGBA", (width, height), (1, 2, 3, 255)).save(out, "WEBP", lossless=lossless)
     return out.getvalue()

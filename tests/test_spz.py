@@ -37,7 +37,7 @@ def some_gaussians(count: int = 40, degree: int = 3) -> Gaussians:
 
 
 def read(data: bytes) -> tuple[dict[str, int], dict[str, np.ndarray]]:
-    """One number after another, as the specification's README says."""
+    """Decode one number after another, as in the specification's README."""
     raw = gzip.decompress(data)
     magic, version, count, degree, bits, flags, _ = struct.unpack_from("<IIIBBBB", raw)
     assert magic == 0x5053474E

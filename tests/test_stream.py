@@ -149,7 +149,7 @@ def test_reduced_mask_loses_the_pixels_that_a_masked_one_touches_and_no_others(
 
 
 def touched(place: int, full: int, reduced: int) -> npt.NDArray[np.bool_]:
-    """Which pixels of a reduced line overlap pixel ``place`` of the full one; OpenCV leaves out 0.001 of a pixel."""
+    """Return the pixels of a reduced row that overlap pixel ``place`` of the full one; OpenCV ignores 0.001 px."""
     edges = np.arange(reduced + 1) * (full / reduced)
     return (edges[1:] > place + 1e-3) & (edges[:-1] < place + 1 - 1e-3)
 

@@ -256,7 +256,7 @@ def test_an_elevation_of_too_many_pixels_is_refused() -> None:
 
 
 class Quiet:
-    """A reporter that keeps what it is told."""
+    """A reporter that records what it receives."""
 
     def __init__(self) -> None:
         self.shares: list[float] = []

@@ -73,7 +73,7 @@ def test_noise_is_measured_as_it_is(sigma: float) -> None:
 
 
 def test_outliers_cannot_hide() -> None:
-    """6 % of nonsense leaves bias and NMAD alone, and fails the share."""
+    """6 % of gross errors hardly affect bias and NMAD, but fail the share."""
     found, rng = house()[0], np.random.default_rng(2)
     found[rng.random(found.shape) < 0.06] += 1.0
     row = judged(found)
@@ -203,7 +203,7 @@ def test_distances_to_triangles_are_exact() -> None:
 
 
 def test_distances_to_a_surface_are_those_to_its_nearest_triangle() -> None:
-    """Of what lies near it; farther off they may be too long, which no bound forgives, and never too short."""
+    """Exact near the surface; farther away distances may be too long, beyond any bound, but never too short."""
     rng = np.random.default_rng(6)
     triangles = rng.random((60, 1, 3)) * 4.0 + rng.normal(0.0, 0.4, (60, 3, 3))
     points = spread(triangles, 500, rng)[0] + rng.normal(0.0, 0.03, (500, 3))

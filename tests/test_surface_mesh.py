@@ -165,7 +165,7 @@ def test_few_triangles_are_left_as_they_are() -> None:
 
 
 def test_the_whole_mesh_or_how_to_get_it(tmp_path: Path) -> None:
-    """open3d is an extra: where it is not installed, it is said how it is; nothing else of this file needs it."""
+    """open3d is an extra: if it is missing, the error says how to install it; no other test here needs it."""
     task = MeshTask(run_surface(FRAME, photos(noise_px=0.1, wild=0.03)), house_site(), 2.0 * GSD_M, 4000, 1)
     if find_spec("open3d") is None:
         with pytest.raises(MachineError) as refused:

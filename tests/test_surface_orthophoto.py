@@ -105,7 +105,7 @@ def test_exposures_are_levelled() -> None:
 
 
 def test_dark_corners_are_levelled() -> None:
-    """Photos through a lens that takes half of the light in its corners."""
+    """Photos through a lens that loses half of the light in the corners."""
     plain = plain_album()
     sources = []
     for source in plain.sources:

@@ -45,7 +45,7 @@ def surface() -> Triangles:
 
 @pytest.fixture(scope="module")
 def truth(surface: Triangles) -> SceneTruth:
-    """Of photos that look through everything, which is quickly made: what hides what is told by other tests."""
+    """The truth with photos that see through everything, which is fast: occlusion is covered by other tests."""
     cameras = [camera.scaled(118, 88) for camera in depth_maps.true_cameras()[1]]
     sights = [TrueView(camera, np.full((88, 118), np.inf, np.float32)) for camera in cameras]
     return SceneTruth(surface, parts.parts_of(surface), sights)
@@ -249,7 +249,7 @@ def test_targets_are_found_where_they_are() -> None:
 
 
 def test_the_true_picture_falls_on_the_product_s_pixels(perfect: tuple[Raster, TruthGrid], tmp_path: Path) -> None:
-    """A picture whose colours say where they are, eastwards and southwards."""
+    """Return an image whose colours encode their position, east and south."""
     view = top_view(0.1)
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     linear = np.stack([x / view.width, y / view.height, np.full_like(x, 0.5)], axis=-1)

@@ -33,7 +33,7 @@ def grid_of(crs: str) -> Grid:
 
 
 def plain_file(path: Path, grid: Grid, bands: np.ndarray, nodata: float) -> None:
-    """As anybody's program writes it."""
+    """Write a file as third-party programs do."""
     size = {"width": grid.width, "height": grid.height, "count": len(bands), "dtype": bands.dtype, "nodata": nodata}
     with rasterio.open(path, "w", driver="GTiff", transform=grid.transform, crs=grid.crs.horizontal, **size) as file:
         file.write(np.where(np.isfinite(bands), bands, nodata).astype(bands.dtype))
@@ -112,7 +112,7 @@ def test_an_outline_cuts_cells(tmp_path: Path) -> None:
 
 
 def noise_of(seed: int, shape: tuple[int, int]) -> np.ndarray:
-    """Noise that neighbours share as the module says."""
+    """Return noise with the spatial correlation that the module assumes."""
     field = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(shape), (0, 0), SHARED_CELLS)
     return np.asarray(field * (NOISE_M * 2.0 * math.sqrt(math.pi) * SHARED_CELLS))  # of a blur of white noise
 

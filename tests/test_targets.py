@@ -155,7 +155,7 @@ def test_control_file_of_points_alone_takes_marks_later(tmp_path: Path) -> None:
 
 
 def test_demo_is_placed_by_its_targets_alone(demo_run: Path, tmp_path: Path) -> None:
-    """Every mark of the file taken away: what is found of the points lies where it is surveyed."""
+    """With all marks removed from the file, the detected points lie at their surveyed positions."""
     lines = [line.split() for line in (capture_path().parent / "gcp_list.txt").read_text().splitlines()]
     points = {fields[6]: fields[:3] for fields in lines[1:]}
     file = tmp_path / "control.csv"

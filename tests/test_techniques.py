@@ -27,7 +27,7 @@ import tiny_scene
 
 
 class Tint(Technique):
-    """Adds a red of its own to every picture, which it trains by hand, and writes down what is called."""
+    """Adds its own red to every image, trains it by hand, and records calls."""
 
     name = "tint"
 

@@ -34,7 +34,7 @@ MOST_OFF_M = 0.6e-3  # half a step of 1/2048 m along each axis, and float32 at 1
 
 
 def two_levels(spread: float = 20.0) -> tuple[Scene, LevelNode]:
-    """Two leaves below a root that stands for them."""
+    """Two leaves below a root that approximates them."""
     fine = some_gaussians(40, spread=spread)
     halves = [fine.select(fine.means[:, 0] < 0.0), fine.select(fine.means[:, 0] >= 0.0)]
     leaves = tuple(LevelNode(box_of(half), 0.0, half, ()) for half in halves)
@@ -66,7 +66,7 @@ def corners(tile: dict[str, Any]) -> np.ndarray:
 
 
 def local_means(path: Path) -> np.ndarray:
-    """Positions of a tile's SPZ file, placed by the glTF's node, turned from y up to z up as 3D Tiles says."""
+    """Return positions of a tile's SPZ file, placed by the glTF's node, rotated from y up to z up as in 3D Tiles."""
     document, binary = parts(path.read_bytes())
     (primitive,) = document["meshes"][0]["primitives"]
     spz = primitive["extensions"][BOTH[0]]["extensions"][BOTH[1]]

@@ -1,4 +1,4 @@
-"""The sky in training: found, learnt by direction, free of Gaussians, and the same bits however it was run."""
+"""The sky in training: detected, learned by direction, free of Gaussians, and bit-identical however it was run."""
 
 import hashlib
 import shutil

@@ -209,7 +209,7 @@ def test_the_depth_map_is_what_rays_hit(opened: OpenedRun, poses: Poses, surface
 def test_depth_errors_are_those_of_rays_that_hit_the_house(
     opened: OpenedRun, aligned: Similarity, surface: Float64[np.ndarray, "m 3 3"]
 ) -> None:
-    """The house with its annex, steps and eaves lies in a turned box: all of it counts, and no tree."""
+    """The house with annex, steps and eaves fits a rotated box: all of it counts, and no tree."""
     camera = opened.camera(opened.views[0])
     house = building_corners()
     errors, seen, gsd = depth_errors(opened, camera, aligned, (surface, house))

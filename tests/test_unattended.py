@@ -81,7 +81,7 @@ def mounted(folder: Path, *options: str) -> Iterator[bool]:
 
 @contextmanager
 def largest_file(size: int) -> Iterator[None]:
-    """What the kernel lets nobody here pass, workers neither: another way of having no room."""
+    """A file size limit enforced by the kernel, also for workers: another way of having no space."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

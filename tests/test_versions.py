@@ -37,7 +37,7 @@ def copy(tmp_path: Path) -> Path:
 
 
 def replace(file: Path, pattern: str, text: str) -> None:
-    """Replace the one place that a pattern finds."""
+    """Replace the single match of a pattern."""
     changed, count = re.subn(pattern, text, file.read_text(encoding="utf-8"), flags=re.MULTILINE)
     assert count == 1, f"{pattern} is in {file.name} {count} times"
     file.write_text(changed, encoding="utf-8")
@@ -103,7 +103,7 @@ def test_a_version_is_recorded_with_the_sources_that_it_stands_for(copy: Path) -
 
 
 def test_each_stage_is_compared_on_what_was_left_before(tmp_path: Path) -> None:
-    """One that leaves other bits has to be raised; one that reads these, and does the same as before, has not."""
+    """A stage with changed output needs a raised version; one that reads it but behaves as before does not."""
     checkout = copy_sources(tmp_path / "checkout")
     shutil.copy(ROOT / "pyproject.toml", checkout)
     git = ["git", "-c", "user.name=t", "-c", "user.email=t@t", "-C", str(checkout)]

@@ -22,7 +22,7 @@ WIDTH, HEIGHT = 322, 182  # even, and nothing that codecs like better
 
 
 def frames(count: int, width: int = WIDTH, height: int = HEIGHT) -> Iterator[np.ndarray]:
-    """A coloured texture that slides by; red, green and blue are told apart."""
+    """A moving coloured texture; red, green and blue are distinguishable."""
     noise = np.random.default_rng(0).integers(0, 255, (height + count, width + 2 * count, 3), dtype=np.uint8)
     texture = cv2.GaussianBlur(noise, (0, 0), 4.0).astype(np.float32)
     texture = (texture - texture.mean()) * 3.0 + np.array([190.0, 120.0, 60.0], np.float32)
@@ -89,7 +89,7 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path) -> None:
-    """A limit on file sizes stands for the full disk: OpenCV tells of neither."""
+    """A file size limit stands in for a full disk: OpenCV reports neither."""
     code = f"""
 import resource, signal, sys
 from pathlib import Path

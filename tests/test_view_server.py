@@ -43,7 +43,7 @@ def home(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     sky.mkdir(parents=True)
     (sky / "secret.txt").write_bytes(b"its own")
     (out / "deep").symlink_to(home / "elsewhere")
-    # And the viewer for web hosts, as it lies in OUT.
+    # The viewer for web hosts, as in OUT.
     for folder in (sky.parent, out):
         for name, content in WEB.items():
             (folder / "web" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -275,7 +275,7 @@ def test_files_come_whole_and_in_ranges_as_they_are(served: Served, home: Path) 
     for asked in (f"bytes={size}-", "bytes=-0", f"bytes={10**17}-{10**17 + 5}"):
         nothing = served.ask("/splat.ply", f"Range: {asked}")
         assert (nothing.status, nothing.body, nothing.headers["content-range"]) == (416, b"", f"bytes */{size}")
-    # What is no single range of bytes is no reason to send more than the file once (RFC 9110, 14.2).
+    # Anything but a single byte range must not cause more than one copy of the file to be sent (RFC 9110, 14.2).
     for asked in ("bytes=9-5", "bytes=a-b", "bytes=", "bytes=-", "lines=0-5", "bytes=0-1,3-4", "bytes=" + "0-," * 2000):
         assert (answer := served.ask("/splat.ply", f"Range: {asked}")).status == 200 and len(answer.body) == size
 

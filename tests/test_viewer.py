@@ -1,4 +1,4 @@
-"""viewer.html in a real browser: its picture, its places and lengths, its hands, and what it says where it cannot."""
+"""viewer.html in a real browser: rendering, measured positions and lengths, controls, and error messages."""
 
 import io
 import itertools
@@ -45,7 +45,7 @@ Opened = Callable[..., "Page"]
 
 @pytest.fixture
 def view(open_page: Callable) -> Iterator[Opened]:
-    """Open a page, wait for its first complete frame; in the end it has asked for nothing and complained of nothing."""
+    """Open a page and wait for its first complete frame; afterwards check that it made no requests and no errors."""
     pages = []
 
     def opened(path: Path, width: int = 640, height: int = 400, touch: bool = False) -> Page:

@@ -230,7 +230,7 @@ def with_a_car(number: int) -> TrainingPhoto:
 
 
 def visited(robust: RobustMask, photos: list[TrainingPhoto]) -> list[TrainingPhoto]:
-    """What each visit of a model that is the truth leaves of its photo."""
+    """Return what each visit keeps of a photo, for a model that equals the truth."""
     found = []
     for photo in photos:
         with torch.no_grad():
