@@ -2,7 +2,7 @@
 // forbids).
 //
 // A tile's pixels are kept in blocks of kLanes: 4 x 4 pixels with 16 lanes, 4 x 2 with 8, 4 x 1 with 4. Pair by pair,
-// the blocks that the splat touches are found from the chord of its ellipse in every row, and only they are worked on.
+// the blocks that the splat touches are found from the chord of its ellipse in every row, and only these are processed.
 #include "raster.h"
 #include "simd.h"
 
@@ -26,7 +26,7 @@ constexpr int row_of(int p) { return p / kLanes % kBlockRows * kBlockHeight + p 
 // Offsets of pixel centres from the tile's first: a pixel's is that of its lane in block 0 and that of its block.
 struct Offsets {
     alignas(64) float lane_x[kLanes], lane_y[kLanes], block_x[kBlocks], block_y[kBlocks];
-    // Rows as touched_blocks wants them: of each block row the first, then the second ones, and so on.
+    // Rows in the order of touched_blocks: the first row of each block row, then the second ones, and so on.
     alignas(64) float rows[kTile];
 };
 
@@ -50,7 +50,7 @@ SPLAT_INLINE TilePlace place_of(const View& view, int tile) {
     return {tile, left, top, width < kTile ? width : kTile, height < kTile ? height : kTile};
 }
 
-// A splat as a tile sees it. (u, v) of a pixel is a sum: most of a CPU's multipliers are wanted elsewhere.
+// A splat as seen by a tile. (u, v) of a pixel is a sum, because most of a CPU's multipliers are needed elsewhere.
 struct TileSplat {
     Floats b, c, u, v, log2_opacity;  // u, v: of the lanes in block 0
     alignas(64) float block_u[kBlocks], block_v[kBlocks];
@@ -73,7 +73,7 @@ struct TileSplat {
         const Floats u = u_of(block), v = v_of(block);
         return fnma(u, u, fnma(v, v, log2_opacity));
     }
-    // Where the pixels' rays are deepest in the Gaussian.
+    // Depths at which the pixels' rays peak in the Gaussian.
     SPLAT_METHOD Floats depth(const Splat& s, int block) const {
         return fma(fill(s.depth_u), u_of(block), fma(fill(s.depth_v), v_of(block), fill(s.depth)));
     }
@@ -173,9 +173,8 @@ __attribute__((noinline)) void end_pixels(Canvas* canvas, int block, uint32_t wh
 
 SPLAT_INLINE void add_to(float* sum, Floats weight, Floats value) { store(sum, fma(weight, value, load(sum))); }
 
-// Takes the next kCount blocks out of a mask. Work on several of them is written step by step side by side: one block
-// is a chain of some 25 dependent operations, of which a CPU's scheduler holds too few to find the next block's by
-// itself.
+// Takes the next kCount blocks out of a mask. Work on several of them is interleaved step by step: one block is a chain
+// of about 25 dependent operations, and a CPU's scheduler holds too few to overlap it with the next block by itself.
 template <int kCount>
 SPLAT_INLINE void take_blocks(BlockMask* blocks, int (&block)[kCount]) {
     for (int& b : block) b = __builtin_ctzll(*blocks), *blocks &= *blocks - 1;
@@ -208,7 +207,7 @@ SPLAT_INLINE void blend_blocks(const TileSplat& splat, const Splat& s, BlockMask
             add_to(canvas->depth_square + at, weight[k], from_origin * from_origin);
             const Floats half = fill(kMedianTransmittance);
             const Mask passes = both(blended[k], both(less(half, before[k]), at_most(after[k], half)));
-            if (any(passes)) {  // a Gaussian so long that its depth is far from its centre's is no surface
+            if (any(passes)) {  // a Gaussian so long that its depth is far from its centre's is not a surface
                 const Floats least = fill((1.0f - kMedianShiftMax) * s.depth),
                              most = fill((1.0f + kMedianShiftMax) * s.depth);
                 store(canvas->median + at, select(passes, min(max(depth, least), most), load(canvas->median + at)));
@@ -278,7 +277,7 @@ void put_pictures(const View& view, const TilePlace& at, const Canvas& canvas, c
 
 constexpr int kAhead = 4;  // pairs whose splat is fetched in advance
 
-// Masks of blocks as the backward pass finds them, little-endian.
+// Masks of blocks as the backward pass reads them, little-endian.
 SPLAT_INLINE void put_mask(uint8_t* masks, int64_t pair, BlockMask blocks) {
     __builtin_memcpy(masks + pair * kMaskBytes, &blocks, kMaskBytes);
 }
@@ -293,8 +292,8 @@ SPLAT_INLINE void walk(const FrameData& frame, const TilePlace& at, int32_t pair
     const int64_t first = frame.tile_begin[at.index];
     const int32_t* list = frame.pair_splat + first;
     uint8_t* masks = frame.pair_blocks + first * kMaskBytes;
-    // A pair's blocks are found before the one in front of it is blended: how many blocks that has is hard to predict
-    // for the CPU, which would otherwise wait for this long chain at every turn.
+    // A pair's blocks are found before the previous pair is blended: that pair's number of blocks is hard for the CPU
+    // to predict, and it would otherwise wait for this long chain at every turn.
     BlockMask touched = pairs ? touched_blocks(frame.splats[list[0]], at) : 0;
     for (int32_t pair = 0; pair < pairs && canvas->alive; ++pair) {
         if (pair + kAhead < pairs) __builtin_prefetch(frame.splats + list[pair + kAhead]);
@@ -371,7 +370,7 @@ void get_gradients(const View& view, const TilePlace& at, const PictureGradients
     }
 }
 
-// Returns the largest number of pairs that a pixel looked at.
+// Returns the largest number of pairs that a pixel processed.
 int32_t start_back(const View& view, const FrameData& frame, const TilePlace& at, const PictureGradients& in,
                    BackCanvas* canvas) {
     const float* left = frame.transmittance + static_cast<int64_t>(at.index) * kTilePixels;
@@ -502,7 +501,7 @@ int64_t count_contributions(const View& view, const FrameData& frame, int tile) 
     const TilePlace at = place_of(view, tile);
     const int64_t first = frame.tile_begin[tile];
     const int32_t* ends = frame.pixel_end + static_cast<int64_t>(tile) * kTilePixels;
-    int32_t last = 0;  // no pair behind it was looked at, nor has a mask
+    int32_t last = 0;  // no pair behind it was processed or has a mask
     for (int p = 0; p < kTilePixels; ++p) last = last > ends[p] ? last : ends[p];
     int64_t count = 0;
     for (int32_t pair = 0; pair < last; ++pair) {

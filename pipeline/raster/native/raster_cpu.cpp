@@ -13,10 +13,10 @@
 namespace splat {
 namespace {
 
-constexpr int64_t kGaussiansATask = 8192;   // of the search for candidates: some 20 µs
-constexpr int64_t kCandidatesATask = 1024;  // of the projection: some 100 µs
-constexpr int64_t kSplatsAChunk = 4096;     // of the binning, at least: each chunk has a counter a tile
-constexpr int64_t kKeysAChunk = 8192;       // of the sort, at least: each chunk has 2048 counters
+constexpr int64_t kGaussiansATask = 8192;   // in the search for candidates: about 20 µs
+constexpr int64_t kCandidatesATask = 1024;  // in the projection: about 100 µs
+constexpr int64_t kSplatsAChunk = 4096;     // in binning, at least: each chunk has one counter per tile
+constexpr int64_t kKeysAChunk = 8192;       // in the sort, at least: each chunk has 2048 counters
 constexpr int kAhead = 8;                   // splats fetched in advance
 constexpr int64_t kMaxPairs = std::numeric_limits<int32_t>::max();
 constexpr std::size_t kKeptFrames = 2;
@@ -25,7 +25,7 @@ int64_t divide_up(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
 int tile_count(const View& view) { return view.tiles_x * view.tiles_y; }
 
-// body(task, begin, end) in parallel for begin..end-1, at most `size` of them a task.
+// body(task, begin, end) in parallel for begin..end-1, at most `size` of them per task.
 template <class Body>
 void for_tasks(int64_t count, int64_t size, const Body& body) {
     parallel_for(divide_up(count, size),
@@ -59,8 +59,8 @@ void copy_row(const ParameterGradients& from, int64_t from_row, int sh_row, int6
     copy(to.opacity_logits, from.opacity_logits, 1), copy(to.sh, from.sh, sh_row), copy(to.means2d, from.means2d, 2);
 }
 
-// What is between gradients and their step: those by the logits that were rendered, and what density control wants, to
-// place `at` and what follows of it. Returns where the next go.
+// Between gradients and their step: applies the gain of the rendered logits, and writes the values for density control
+// from index `at` on. Returns the next index.
 int64_t end_gradients(const FrameStep& step, const int32_t* rows, int count, int64_t at, BackRows* back) {
     for (int i = 0; i < count; ++i) {
         if (rows[i] < 0) continue;
@@ -82,7 +82,7 @@ void hold_scales(const FrameStep& step, const int32_t* rows, int count) {
         }
 }
 
-// Rows that are stepped soon: a CPU does not foresee where they lie.
+// Prefetches rows that are stepped soon: a CPU cannot predict where they are.
 void fetch_moments(const AdamJob& job, const int32_t* rows, int count) {
     constexpr int kLineFloats = 16;
     for (int t = 0; t < job.tensor_count; ++t) {
@@ -173,7 +173,7 @@ int64_t RasterFrame::contributions() const {
     return count;
 }
 
-// The rows of Gaussians that may be visible, ascending; radii and visible say of all that they are not.
+// The rows of Gaussians that may be visible, ascending; radii and visible are first cleared for all.
 void RasterFrame::find_candidates(const Parameters& in, float* radii, uint8_t* visible) {
     const int64_t tasks = divide_up(in.count, kGaussiansATask);
     int64_t* counts = found_counts_.reserve(tasks);
@@ -208,7 +208,7 @@ void RasterFrame::project(const Parameters& in, float* radii, uint8_t* visible) 
     }
 }
 
-// Each splat's spans and slots, and the visible candidates in a row for the sort.
+// Each splat's spans and slots, and the visible candidates compacted for the sort.
 void RasterFrame::find_tiles() {
     if (rows_ > kMaxPairs) throw TooManyPairs();
     TaskCounts* tasks = tasks_.data();
@@ -262,8 +262,7 @@ void RasterFrame::sort_by_depth() {
     order_ = order;
 }
 
-// Lists of pairs, tile by tile in order of depth: a counting sort by tile of the splats in order of depth, in chunks as
-// above.
+// Lists of pairs per tile in order of depth: a counting sort by tile of the depth-ordered splats, in chunks as above.
 void RasterFrame::bin() {
     const int tiles = tile_count(view_);
     const int chunks = static_cast<int>(std::clamp<int64_t>(visible_ / kSplatsAChunk, 1, 2 * thread_count()));
@@ -295,7 +294,7 @@ void RasterFrame::bin() {
     });
 }
 
-// From each chunk's count a tile to where its first pair of the tile goes.
+// From each chunk's count per tile to the index of its first pair of the tile.
 void RasterFrame::prefix_tiles(int chunks, int tiles) {
     int64_t* tile_begin = data_.tile_begin = tile_begin_.reserve(tiles + 1);
     int32_t* cursors = cursors_.data();
@@ -309,7 +308,7 @@ void RasterFrame::prefix_tiles(int chunks, int tiles) {
 
 namespace {
 
-// Never destroyed: a frame may come back while the process ends.
+// Never destroyed: a frame may be returned while the process ends.
 std::mutex& shelf_mutex = *new std::mutex;
 std::vector<std::unique_ptr<RasterFrame>>& shelf = *new std::vector<std::unique_ptr<RasterFrame>>;
 

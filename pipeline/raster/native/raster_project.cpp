@@ -1,4 +1,4 @@
-// From Gaussians to splats and back, a Gaussian a lane. Compiled once per ISA (see isa.h for what that forbids).
+// From Gaussians to splats and back, one Gaussian per lane. Compiled once per ISA (see isa.h for what that forbids).
 #include "splat_math.h"
 
 namespace splat {
@@ -7,8 +7,8 @@ namespace {
 
 constexpr int kMaxShFloats = (kMaxSh * 3 + kLanes - 1) / kLanes * kLanes;  // a Gaussian, to whole vectors
 
-// The rows of a vector of candidates: pointers to the first, into the caller's arrays where they lie side by side, else
-// to copies, with zeros at the ragged end.
+// The rows of a vector of candidates: pointers into the caller's arrays if they are contiguous, else to copies, padded
+// with zeros at the end.
 struct Rows {
     const float *means, *log_scales, *quats, *opacity_logits, *sh;
     float copies[kLanes * (3 + 3 + 4 + 1 + kMaxSh * 3)];
@@ -44,7 +44,7 @@ SPLAT_INLINE void find_rows(const Parameters& in, const int32_t* rows, int valid
     found->opacity_logits = copied(in.opacity_logits, 1, 1, rows, valid, to + kLanes * 4);
 }
 
-// What of a row of SH is read: the coefficients that count, to whole vectors.
+// The part of a row of SH that is read: the coefficients in use, rounded up to whole vectors.
 SPLAT_INLINE int sh_floats_read(const View& view) {
     const int row = view.sh_count * 3, vectors = (sh_basis_size(view.sh_degree) * 3 + kLanes - 1) / kLanes * kLanes;
     return vectors < row ? vectors : row;
@@ -60,7 +60,7 @@ SPLAT_INLINE void find_sh(const View& view, const Parameters& in, const int32_t*
 
 constexpr int kLineFloats = 16;  // of the CPU's cache
 
-// Rows that are copied next: a CPU does not foresee where they lie.
+// Prefetches the rows that are copied next: a CPU cannot predict where they are.
 SPLAT_INLINE void fetch_rows(const View& view, const Parameters& in, const int32_t* rows, int valid) {
     if (side_by_side(rows, valid)) return;
     const int width = view.sh_count * 3, used = sh_floats_read(view);
@@ -98,7 +98,7 @@ SPLAT_INLINE void put_fields(const SplatLanes& s, float (*fields)[kLanes]) {
     for (int i = 0; i < kFields; ++i) store(fields[i], values[i]);
 }
 
-// What the test of candidates leaves room for: what is kept for nothing costs little, what is lost would be missed.
+// Slack of the candidate test: a false candidate costs little, a missed one would be an error.
 constexpr float kRounding = 1e-6f;  // of a point in the camera's frame, over the sum of what it is made of
 constexpr float kSurely = 1e3f;     // roundings that its depth has to have for its place to be known so well
 constexpr float kRoom = 1.01f;      // times an ellipse's half-axes
@@ -221,7 +221,7 @@ SPLAT_INLINE void sum_slots(const FrameData& frame, int64_t i, float (*sums)[kLa
     for (int f = 0; f < kFloats; ++f) sums[f][lane] = sum[f];
 }
 
-// dL/d(SH), in place of the coefficients.
+// dL/d(SH), written over the coefficients.
 SPLAT_INLINE void put_sh_gradient(const View& view, const Floats* basis, const Vec3& dcolour, Floats* sh) {
     const int count = sh_basis_size(view.sh_degree);
     for (int k = 0; k < count; ++k)
@@ -231,7 +231,7 @@ SPLAT_INLINE void put_sh_gradient(const View& view, const Floats* basis, const V
 
 SPLAT_INLINE void put_rows(const LanesGradient& d, Floats* sh, int sh_row, Mask touched,
                            const ParameterGradients& out) {
-    const auto seen = [&](Floats v) { return only(touched, v); };  // what is not seen may be NaN
+    const auto seen = [&](Floats v) { return only(touched, v); };  // invisible ones may be NaN
     store_rgb(out.means, seen(d.mean.x), seen(d.mean.y), seen(d.mean.z));
     store_rgb(out.log_scales, seen(d.log_scale.x), seen(d.log_scale.y), seen(d.log_scale.z));
     Floats quats[kLanes] = {seen(d.qw), seen(d.qx), seen(d.qy), seen(d.qz)};
@@ -248,7 +248,7 @@ SPLAT_INLINE ParameterGradients rows_from(const ParameterGradients& out, int sh_
             out.opacity_logits + first, out.sh + sh_row * first,    out.means2d + 2 * first};
 }
 
-// With or without the gradient of depths, each compiled apart: the one without is rounded as if there were no other.
+// With or without the gradient of depths, compiled separately: the one without rounds as if there were no other.
 template <bool kDepth>
 SPLAT_INLINE void project_backward_of(const View& view, const Parameters& in, int64_t begin, int64_t end,
                                       const FrameData& frame, bool magnitudes, const ParameterGradients& out) {

@@ -1,4 +1,4 @@
-// Adam's step of tensors that share their rows, for what is trained beside the Gaussians.
+// A step of Adam for tensors with common rows, for the side models.
 #include "../adam.h"
 #include "frame.h"
 #include "step.cuh"
@@ -22,7 +22,7 @@ struct AdamStep {
     float inverse_root_correction;
 };
 
-// Finds which of a block's rows step; counts those that would but for their gradients. Its barriers are all that a
+// Determines which of a block's rows step, and counts those skipped for their gradients. Its barriers are all that a
 // block's turns need.
 __device__ __forceinline__ bool find_stepping(const SplatAdam& adam, int64_t first, int rows, AdamShared* shared) {
     const int thread = threadIdx.x;

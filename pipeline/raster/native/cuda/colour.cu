@@ -1,4 +1,4 @@
-// Affine maps of a picture's colours, and back; a thread a pixel.
+// Affine maps of an image's colours, forward and backward; one thread per pixel.
 #include "../colour.h"
 #include "api.h"
 #include "frame.h"
@@ -8,7 +8,7 @@ namespace splat {
 namespace cuda {
 namespace {
 
-constexpr int kPixels = 8;  // of a thread, backward: a block's sums are worth its pixels
+constexpr int kPixels = 8;  // per thread, backward: amortizes a block's sums
 constexpr int64_t kBlockPixels = kPixels * kThreads;
 
 struct Affine {
@@ -21,7 +21,7 @@ struct AffineSums {
 
 using DoubleSums = WarpSums<double>;
 
-// out = map of in. The map lies on the device, for it is trained.
+// out = map of in. The map is in device memory because it is trained.
 __global__ void map_colours(const float* map, const float* in, int64_t pixels, float* out) {
     const int64_t pixel = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
     if (pixel >= pixels) return;
@@ -33,7 +33,7 @@ __global__ void map_colours(const float* map, const float* in, int64_t pixels, f
     }
 }
 
-// dL/d(in) by the linear part's transpose, and what the block's pixels add to dL/d(map).
+// dL/d(in) by the linear part's transpose, and the block's contribution to dL/d(map).
 __global__ void map_colours_back(const float* map, const float* in, const float* upstream, int64_t pixels,
                                  float* gradient, Affine* parts) {
     SPLAT_SHARED(AffineSums, warps);
@@ -65,7 +65,7 @@ __global__ void map_colours_back(const float* map, const float* in, const float*
     parts[blockIdx.x].of[threadIdx.x] = total;
 }
 
-// The blocks' parts in a fixed order. One block.
+// Sums the blocks' parts in a fixed order. One block.
 __global__ void add_maps(const Affine* parts, int blocks, float* map_gradient) {
     SPLAT_SHARED(DoubleSums, sums);
     for (int k = 0; k < kAffine; ++k) {

@@ -1,5 +1,4 @@
-// Density control's own kernels: the random numbers of train/draws.py, the places of a split's halves, and places on a
-// Morton curve.
+// Density control's kernels: the random numbers of train/draws.py, the positions of a split's halves, and Morton codes.
 #include <math.h>
 
 #include "api.h"
@@ -51,7 +50,7 @@ __device__ inline Vector cross(const Vector& a, const Vector& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-// By a quaternion (w, x, y, z), which need not be a unit one: v + 2 u x (u x v + w v) for |q| = 1.
+// Rotation by a quaternion (w, x, y, z), not necessarily normalized: v + 2 u x (u x v + w v) for |q| = 1.
 __device__ inline Vector rotated(const float* quat, const Vector& v) {
     const float square = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
     const float norm = fmaxf(sqrtf(square), kLeastNorm), w = quat[0] / norm;
@@ -61,7 +60,7 @@ __device__ inline Vector rotated(const float* quat, const Vector& v) {
     return {v.x + 2.0f * turned.x, v.y + 2.0f * turned.y, v.z + 2.0f * turned.z};
 }
 
-// Two places within each parent: a thread a child, whose number names the draws.
+// Two positions within each parent: one thread per child, whose index selects the random numbers.
 __global__ void draw_splits(uint64_t key, const int64_t* rows, int64_t count, const float* log_scales,
                             const float* quats, float* out) {
     const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
@@ -75,7 +74,7 @@ __global__ void draw_splits(uint64_t key, const int64_t* rows, int64_t count, co
     out[3 * i] = offset.x, out[3 * i + 1] = offset.y, out[3 * i + 2] = offset.z;
 }
 
-// Bits of a number, two zeros between each two.
+// The bits of a number with two zeros between neighbours.
 __device__ inline uint64_t spread(uint64_t bits) {
     bits = (bits | bits << 32) & 0x001f00000000ffffu;
     bits = (bits | bits << 16) & 0x001f0000ff0000ffu;
@@ -89,7 +88,7 @@ struct Box {
     float cells[3];  // a world unit
 };
 
-// The first axis has the lowest bit; what is no number lies at the lowest end.
+// The first axis has the lowest bit; NaN maps to the lowest cell.
 __global__ void find_morton(const float* means, int64_t count, const Box box, int64_t* keys) {
     const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
     if (i >= count) return;

@@ -1,10 +1,10 @@
-// What this library is, what the device is, and what went wrong.
+// Library and device information, and error texts.
 #include "api.h"
 #include "device.h"
 
 namespace {
 
-// Architectures that this was compiled for; of the last there is PTX, too, which newer devices compile for themselves.
+// Architectures that this was compiled for; the last one also has PTX, which newer devices compile themselves.
 bool has_kernels_for(int architecture) {
 #if defined(__CUDA_ARCH_LIST__)
     constexpr int kBuilt[] = {__CUDA_ARCH_LIST__};  // 100 * major + 10 * minor
@@ -53,7 +53,7 @@ int32_t splat_device(int32_t device, SplatDevice* out) {
     cudaDeviceProp properties;
     const cudaError_t error = cudaGetDeviceProperties(&properties, device);
     if (error) {
-        cudaGetLastError();  // it was told; the next call starts without it
+        cudaGetLastError();  // clears the error, which has been reported
         return error;
     }
     out->architecture = 10 * properties.major + properties.minor;

@@ -1,5 +1,5 @@
-// What the kernels stand on: CUDA, or with SPLAT_ON_CPU the harness of tests/harness, which runs the same sources on a
-// CPU with threads in adversarial orders.
+// The kernels' platform: CUDA, or with SPLAT_ON_CPU the harness of tests/harness, which runs the same sources on a CPU
+// with threads in adversarial orders.
 //
 // Rules that keep both true: blocks are one-dimensional, of kThreads threads; shared memory is declared by
 // SPLAT_SHARED, never cleared by itself; kernels are launched by SPLAT_LAUNCH; warp operations name the whole warp.
@@ -15,8 +15,8 @@
 #else
 #include <cuda_runtime.h>
 #define SPLAT_SHARED(Type, name) __shared__ Type name
-#define SPLAT_UNROLL _Pragma("unroll")  // a loop over an array that is to lie in registers
-#define SPLAT_ONCE __noinline__         // a function that is compiled once for all kernels that call it
+#define SPLAT_UNROLL _Pragma("unroll")  // for a loop over an array that has to be in registers
+#define SPLAT_ONCE __noinline__         // for a function compiled once for all kernels that call it
 #define SPLAT_LAUNCH(kernel, blocks, stream, ...) \
     kernel<<<static_cast<unsigned>(blocks), splat::cuda::kThreads, 0, static_cast<cudaStream_t>(stream)>>>(__VA_ARGS__)
 #endif
@@ -24,7 +24,7 @@
 namespace splat {
 namespace cuda {
 
-constexpr int kThreads = 256;  // of every block
+constexpr int kThreads = 256;  // threads per block
 constexpr int kWarp = 32;
 constexpr int kWarps = kThreads / kWarp;
 constexpr unsigned kWholeWarp = 0xffffffffu;

@@ -14,7 +14,7 @@ struct alignas(16) Four {
 
 __device__ __forceinline__ bool is_aligned(const float* p) { return (reinterpret_cast<uintptr_t>(p) & 15) == 0; }
 
-// Of the `left` floats that are there, the first four; the others come out as zero.
+// The first four of the `left` available floats; missing ones are zero.
 __device__ __forceinline__ Four get_four(const float* p, int left) {
     if (left >= 4 && is_aligned(p)) return *reinterpret_cast<const Four*>(p);
     Four four;

@@ -1,8 +1,8 @@
 // The photometric loss and its gradient, by the formulas of loss_math.h: a kernel from the pictures to the gradient's
 // three maps and the sums, one block that adds the sums up, and a kernel from the maps to the gradient.
 //
-// A block has a tile of the image. Each blur goes down the columns first, from global memory with the sums of a
-// thread's rows in registers, then along the rows through shared memory. RGB stays interleaved: a row's taps are 3
+// Each block processes a tile of the image. Each blur goes down the columns first, from global memory with the sums of
+// a thread's rows in registers, then along the rows through shared memory. RGB stays interleaved: a row's taps are 3
 // floats apart.
 #include "../loss_math.h"
 #include "api.h"
@@ -22,7 +22,7 @@ constexpr int kRows = kTileRows / (kThreads / kColumnThreads);  // of a thread
 constexpr int kValues = kTileRows * kRowFloats;
 static_assert(kReach <= kColumnThreads && kTileRows % (kThreads / kColumnThreads) == 0, "all columns have a thread");
 
-// What a tile's pixels add.
+// A tile's contribution.
 struct LossPart {
     float l1, dissimilarity;
     int counting;
@@ -53,7 +53,7 @@ __device__ Tile tile_of(const LossJob& job, int64_t block) {
     return {static_cast<int>(block) / job.tiles_x * kTileRows, static_cast<int>(block) % job.tiles_x * kTileCols};
 }
 
-// Values of a tile's rows and what its windows reach left and right.
+// Values of a tile's rows, including the reach of its windows left and right.
 template <int kPlanes>
 struct Blurred {
     float of[kPlanes][kTileRows][kReach];
@@ -61,7 +61,7 @@ struct Blurred {
 
 __device__ inline bool is_masked(const LossJob& job, int64_t pixel) { return job.mask && !job.mask[pixel]; }
 
-// Pixel's value of a channel in both pictures; where the pixel does not count, the render has the photo's.
+// A pixel's value of a channel in both images; where the pixel does not count, the render takes the photo's.
 struct Pair {
     float render, photo;
 };
@@ -119,7 +119,7 @@ struct MapsShared {
     WarpSums<int> counts;
 };
 
-// The three maps, and each tile's part of the sums. A block a tile.
+// The three maps, and each tile's part of the sums. One block per tile.
 __global__ void __launch_bounds__(kThreads, 3) make_maps(const LossJob job) {
     SPLAT_SHARED(MapsShared, shared);
     const Tile tile = tile_of(job, blockIdx.x);
@@ -157,7 +157,7 @@ __global__ void __launch_bounds__(kThreads, 3) make_maps(const LossJob job) {
 
 using DoubleSums = WarpSums<double>;
 
-// The tiles' parts in a fixed order: the loss, and what the gradient is scaled by. One block.
+// Sums the tiles' parts in a fixed order: the loss, and the scale of the gradient. One block.
 __global__ void add_parts(const LossJob job, double ssim_weight, double* value) {
     SPLAT_SHARED(DoubleSums, sums);
     double l1 = 0.0, dissimilarity = 0.0, counting = 0.0;
@@ -177,7 +177,7 @@ __global__ void add_parts(const LossJob job, double ssim_weight, double* value) 
 
 struct GradientShared {
     Blurred<3> maps;
-    float taps[kRadius + 1];  // where they are chosen at run time: a kernel's arguments would be copied for that
+    float taps[kRadius + 1];  // local, because indexing a kernel's arguments at run time would copy them
 };
 
 // The maps' transposed blur down the columns; kInside: away from the image's upper and lower border.
@@ -223,7 +223,7 @@ __device__ inline float blur_back_along(const LossJob& job, const float* taps, c
     return sum;
 }
 
-// From the maps to the gradient. A block a tile.
+// From the maps to the gradient. One block per tile.
 __global__ void __launch_bounds__(kThreads, 4) make_gradient(const LossJob job) {
     SPLAT_SHARED(GradientShared, shared);
     if (threadIdx.x == 0)

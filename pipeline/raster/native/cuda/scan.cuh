@@ -6,12 +6,12 @@
 namespace splat {
 namespace cuda {
 
-constexpr int kScanItems = 8;  // a thread's, of an array: few turns, each of which waits for memory
+constexpr int kScanItems = 8;  // per thread, for an array: few turns, since each waits for memory
 
 __device__ inline int lane_index() { return static_cast<int>(threadIdx.x) % kWarp; }
 __device__ inline int warp_index() { return static_cast<int>(threadIdx.x) / kWarp; }
 
-// The sum of the lanes up to this one, itself included.
+// Inclusive prefix sum over the lanes.
 template <class T>
 __device__ inline T warp_inclusive(T value) {
     for (int step = 1; step < kWarp; step *= 2) {
@@ -26,7 +26,7 @@ struct ScanShared {
     T warps[kWarps];
 };
 
-// The sum of the block's threads before this one; in `total`, of all.
+// Exclusive prefix sum over the block's threads; `total` gets the sum of all.
 template <class T>
 __device__ inline T block_exclusive(T value, ScanShared<T>* shared, T* total) {
     const T inclusive = warp_inclusive(value);
@@ -64,7 +64,7 @@ __device__ inline void write_items(T* values, int64_t begin, int64_t count, cons
     }
 }
 
-// By one block: each value becomes the sum of those before it. Returns the sum of all.
+// Exclusive prefix sum in place by one block. Returns the total.
 template <class T>
 __device__ inline T scan_array(T* values, int64_t count, ScanShared<T>* shared) {
     T carry = 0;

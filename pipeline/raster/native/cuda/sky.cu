@@ -1,4 +1,4 @@
-// A render laid over the sky: what is behind is interpolated bilinearly from nodes some pixels apart.
+// Compositing a render over the sky, which is interpolated bilinearly from nodes some pixels apart.
 #include "api.h"
 #include "device.h"
 #include "sums.cuh"
@@ -7,7 +7,7 @@ namespace splat {
 namespace cuda {
 namespace {
 
-constexpr int kMostStep = 8;  // pixels from node to node: a node's pixels, (2 step - 1)^2 of them, have a thread each
+constexpr int kMostStep = 8;  // maximum node spacing, pixels: each of a node's (2 step - 1)^2 pixels has a thread
 static_assert((2 * kMostStep - 1) * (2 * kMostStep - 1) <= kThreads, "a block a node");
 
 struct Colour {
@@ -20,7 +20,7 @@ __device__ inline Colour at_node(const float* nodes, const SplatSky& sky, int ro
     return {{node[0], node[1], node[2]}};
 }
 
-// What is behind a pixel, less what the render has there.
+// The colour behind a pixel, minus the render's background.
 __device__ inline Colour added(const SplatSky& sky, int64_t pixel) {
     const int row = static_cast<int>(pixel / sky.width), column = static_cast<int>(pixel % sky.width);
     const float* nodes = sky.elsewhere && !sky.around[pixel] ? sky.elsewhere : sky.nodes;
@@ -61,7 +61,7 @@ struct NodeShared {
     WarpSums<float> sums;
 };
 
-// What a node has from the pixels that it is mixed into, where the sky is sure. A block a node.
+// A node's gradient from the pixels that it contributes to, where the sky is certain. One block per node.
 __global__ void add_nodes(const SplatSky sky, const float* upstream, float* node_gradient) {
     SPLAT_SHARED(NodeShared, shared);
     const int side = 2 * sky.step - 1, t = static_cast<int>(threadIdx.x);

@@ -1,7 +1,7 @@
-// A pass of a stable radix sort, in three phases: count each block's digits, sum them up over the blocks, scatter.
+// A pass of a stable radix sort, in three phases: count each block's digits, prefix-sum them over the blocks, scatter.
 //
-// The order of equal digits is that of the keys: a virtual block has kSortBlock keys in a row, a warp of it a row of
-// these, and a warp takes kWarp at a time.
+// Equal digits keep the order of the keys: a virtual block has kSortBlock consecutive keys, each of its warps a
+// consecutive part of these, and a warp takes kWarp at a time.
 #pragma once
 
 #include "frame.h"
@@ -17,14 +17,14 @@ template <class Key, class Value>
 struct SortPass {
     const Key* keys_from;  // kCulled ones are left out
     Key* keys_to;
-    const Value* values_from;  // null: a key's value is its place
+    const Value* values_from;  // null: a key's value is its index
     Value* values_to;
     int64_t count;           // of keys
-    const int32_t* counted;  // the same where only the device knows, else null
+    const int32_t* counted;  // the same if only known on the device, else null
     int shift;               // of the digit
     uint32_t* table;         // (kDigits, blocks)
     uint32_t* digit_sums;    // (kDigits)
-    int32_t* kept;           // how many keys were not left out, null where nobody asks
+    int32_t* kept;           // number of keys not left out; null if not needed
 };
 
 template <class Key, class Value>
@@ -66,7 +66,7 @@ __device__ void count_digits(const SortPass<Key, Value>& pass) {
     }
 }
 
-// A digit's counts become the places of each block's first one among those of the digit; by a warp a digit.
+// Turns a digit's counts into the offset of each block's first one among those of the digit; one warp per digit.
 template <class Key, class Value>
 __device__ void scan_digits(const SortPass<Key, Value>& pass) {
     const int64_t blocks = sort_blocks(keys_of(pass));
@@ -76,7 +76,7 @@ __device__ void scan_digits(const SortPass<Key, Value>& pass) {
     }
 }
 
-// Lanes with the same digit as this one, of those that have any.
+// Lanes with the same digit as this one, among those that have a digit.
 __device__ inline unsigned lanes_alike(uint32_t digit, bool has) {
     unsigned alike = __ballot_sync(kWholeWarp, has);
     for (int bit = 0; bit < kDigitBits; ++bit) {
@@ -89,8 +89,8 @@ __device__ inline unsigned lanes_alike(uint32_t digit, bool has) {
 
 struct ScatterShared {
     uint16_t warps[kWarps][kDigits];  // a warp's digits counted; then the place in the block of the first of them
-    uint32_t shift[kDigits];          // from a place in the block, sorted by this digit, to one among all
-    uint32_t staged[kSortBlock];      // the block in order, so that neighbours are written together
+    uint32_t shift[kDigits];          // from an index in the block, sorted by this digit, to a global one
+    uint32_t staged[kSortBlock];      // the block in order, for coalesced writes
     ScanShared<uint32_t> scan;
 };
 static_assert(kSortBlock < 1 << 16, "places in the block are 16 bits");
@@ -135,7 +135,7 @@ __device__ inline void rank_items(const SortPass<Key, Value>& pass, int64_t coun
     }
 }
 
-// From counts to places: a thread a digit. Returns how many keys the block keeps.
+// From counts to offsets: one thread per digit. Returns the number of keys that the block keeps.
 template <class Key, class Value>
 __device__ inline uint32_t place_digits(const SortPass<Key, Value>& pass, int64_t block, int64_t blocks,
                                         ScatterShared* shared) {
@@ -144,7 +144,7 @@ __device__ inline uint32_t place_digits(const SortPass<Key, Value>& pass, int64_
     for (int warp = 0; warp < kWarps; ++warp) count += shared->warps[warp][digit];
     uint32_t place = block_exclusive(count, &shared->scan, &kept);
     const uint32_t first = block_exclusive(pass.digit_sums[digit], &shared->scan, &all);
-    shared->shift[digit] = first + pass.table[digit * blocks + block] - place;  // may wrap: so will its sum
+    shared->shift[digit] = first + pass.table[digit * blocks + block] - place;  // may wrap, and so will the sum
     for (int warp = 0; warp < kWarps; ++warp) {
         const uint32_t of_warp = shared->warps[warp][digit];
         shared->warps[warp][digit] = static_cast<uint16_t>(place);

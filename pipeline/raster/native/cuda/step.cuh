@@ -1,4 +1,4 @@
-// Adam's step of rows, coalesced over a block's rows whatever their width. For step.cu and adam.cu.
+// A step of Adam for rows, coalesced over a block's rows whatever their width. For step.cu and adam.cu.
 #pragma once
 
 #include "../adam_math.h"
@@ -51,7 +51,7 @@ __device__ __forceinline__ void count_skipped(int64_t* skipped) {
     atomicAdd(reinterpret_cast<unsigned long long*>(skipped), 1ull);
 }
 
-// Whether a value is finite: what is not differs from itself once multiplied by zero.
+// Whether a value is finite: a non-finite value times zero is NaN, which differs from itself.
 __device__ __forceinline__ bool is_finite(float x) { return x * 0.0f == 0.0f; }
 
 }  // namespace

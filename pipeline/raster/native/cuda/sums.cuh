@@ -1,4 +1,4 @@
-// Sums that come out with the same bits always: over a block, and over what blocks left, in their order.
+// Bit-reproducible sums: over a block, and over the blocks' partial sums, in order.
 #pragma once
 
 #include "device.h"
@@ -6,7 +6,7 @@
 namespace splat {
 namespace cuda {
 
-// Where a block's warps leave their sums. T: int, float or double.
+// Partial sums of a block's warps. T: int, float or double.
 template <class T>
 struct WarpSums {
     T of[kWarps];
