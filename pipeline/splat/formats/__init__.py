@@ -1,6 +1,6 @@
-"""Splat files: a module a format, each with ``read(path) -> Scene`` or ``write(path, scene)``, and their names.
+"""Splat file formats: one module per format with ``read(path) -> Scene`` or ``write(path, scene)``, and their names.
 
-Light to import: the modules are loaded when they are asked for.
+Light to import: the modules are loaded on demand.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SplatFormat:
-    """A format of one file, or one folder, that holds a splat and no more.
+    """A format of one file or folder that only contains a splat.
 
     Attributes:
-        name: As people ask for it.
-        file: What a run's is called, below `OUT/export/`.
-        module: In this package.
-        writer: The module's function that writes it.
-        reads: Whether the module's ``read`` is to be asked for it: formats may share one.
-        exact: Whether every number comes back as it was, quaternions of any length, too.
+        name: Name for users.
+        file: File name in a run's `OUT/export/`.
+        module: Module in this package.
+        writer: Name of the module's function that writes it.
+        reads: Whether the module's ``read`` is used for this format: formats may share one.
+        exact: Whether a round trip preserves every number, including the lengths of quaternions.
     """
 
     name: str
@@ -38,7 +38,7 @@ class SplatFormat:
 
     @property
     def ending(self) -> str:
-        """Of the files' names, from the first dot on; empty for a folder."""
+        """File name suffix, from the first dot; empty for a folder."""
         return "".join(self.file.partition(".")[1:])
 
     def write(self, path: Path, scene: Scene) -> None:
@@ -65,7 +65,7 @@ SPLAT_FORMATS = (
 
 
 def format_named(name: str) -> SplatFormat:
-    """The format of that name.
+    """The format with a given name.
 
     Raises:
         UsageError: if there is none.

@@ -13,9 +13,9 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 MOST_EXPANSION = 10.0
-"""Splats hardly compress: SPZ to a third, with harmonics of zero to a sixth. What grows more is made to fill memory."""
+"""Splats hardly compress: SPZ to a third, with zero SH to a sixth. A file that expands more is a decompression bomb."""
 FREE_BYTES = 1 << 25
-"""What a file of any size may expand to: of little or uniform content it may be small indeed."""
+"""Expansion allowed for files of any size: with little or uniform content, they may be very small."""
 MOST_LOG_SCALE, MOST_COORDINATE = 40.0, 1e18  # float32 holds the squares of what is smaller
 _READ_BYTES = 1 << 16
 _AGAIN = "Copy or export it again."
@@ -49,12 +49,12 @@ def read_whole(path: Path) -> bytes:
 
 
 def read_exactly(path: Path, file: BufferedIOBase, count: int) -> bytes:
-    """The next bytes of a file, all of them.
+    """Read exactly the next bytes of a file.
 
     Args:
-        path: For the error.
-        file: Where to read on.
-        count: How many: at most what is held in memory at a time, never a header's say.
+        path: For the error message.
+        file: The open file.
+        count: Number of bytes; bounded by what fits in memory, never taken unchecked from a header.
 
     Raises:
         SplatpipeError: if the file ends before, or cannot be read.
@@ -66,16 +66,16 @@ def read_exactly(path: Path, file: BufferedIOBase, count: int) -> bytes:
 
 
 def check_expansion(path: Path, expanded_bytes: int, stored_bytes: int, most: float = MOST_EXPANSION) -> None:
-    """Refuse what would take far more memory than its file is worth, before any is taken.
+    """Refuse a file that would take far more memory than its size justifies, before any is allocated.
 
     Args:
-        path: For the error.
-        expanded_bytes: What a header promises.
-        stored_bytes: What there is of it.
-        most: Times that splats of the format may grow.
+        path: For the error message.
+        expanded_bytes: Size that the header states.
+        stored_bytes: Size of the stored data.
+        most: Largest expansion factor for the format.
 
     Raises:
-        SplatpipeError: if it promises more than that.
+        SplatpipeError: if the header states more than that.
     """
     if expanded_bytes > FREE_BYTES + most * stored_bytes:
         raise SplatpipeError(
@@ -85,14 +85,14 @@ def check_expansion(path: Path, expanded_bytes: int, stored_bytes: int, most: fl
 
 
 def check_values(path: Path, gaussians: Gaussians) -> None:
-    """Refuse Gaussians that nothing can be computed with.
+    """Refuse Gaussians with unusable values.
 
     Args:
-        path: For the error.
-        gaussians: As read.
+        path: For the error message.
+        gaussians: The Gaussians read.
 
     Raises:
-        SplatpipeError: if a value is no number, or so large that float32 cannot hold its square.
+        SplatpipeError: if a value is not a number, or so large that its square overflows float32.
     """
     if not all_finite(gaussians):
         bad = torch.nonzero(~gaussians.finite())
@@ -113,17 +113,17 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
 
 
 def all_finite(gaussians: Gaussians) -> bool:
-    """Whether all parameters are numbers; quicker than asking which."""
+    """Whether all parameters are finite; faster than finding which."""
     tensors = [tensor.detach() for tensor in gaussians.tensors().values() if tensor.numel()]
     return all(bool(torch.isfinite(torch.stack(torch.aminmax(tensor))).all()) for tensor in tensors)
 
 
 class InflatedFile:
-    """A gzip stream read on and on, in memory that its reader sets and no file can raise.
+    """Sequential reader of a gzip stream, with memory bounded by the caller and not by the file.
 
     Args:
-        path: For errors.
-        file: Where the stream begins.
+        path: For error messages.
+        file: Positioned at the start of the stream.
     """
 
     def __init__(self, path: Path, file: BufferedIOBase) -> None:
@@ -145,7 +145,7 @@ class InflatedFile:
         return data
 
     def at_most(self, count: int) -> bytes:
-        """The next bytes; fewer where the stream ends, whose check sum is then known to be right.
+        """The next bytes; fewer at the stream's end, after verifying its checksum.
 
         Raises:
             SplatpipeError: if the stream is cut off or damaged.

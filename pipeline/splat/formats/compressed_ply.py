@@ -1,10 +1,9 @@
-"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, relative to the ranges of each 256, and 45 more
-for harmonics of degree 3.
+"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes per Gaussian, and 45 more for SH of degree 3.
 
 Layout: the readers of github.com/playcanvas/engine and splat-transform. ``chunk`` has the least and largest positions,
-logarithms of scales and colours of each 256 of ``vertex``; positions and scales are coded in 11, 10 and 11 bits,
-rotations by their smallest three components in 10 each, colours and opacities in 8, harmonics (``sh``) within ±4 in 8.
-Viewers take it for y down, as they do a PLY.
+log scales and colours of every 256 rows of ``vertex``, which are coded relative to these; positions and scales have 11,
+10 and 11 bits, rotations 10 for each of their smallest three components, colours and opacities 8, and SH (``sh``)
+within ±4 has 8. Viewers assume y down, as for a PLY.
 """
 
 from __future__ import annotations
@@ -51,11 +50,11 @@ _ALPHA_END = 0.25 / 255.0
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write it y down, as viewers take it, in an order of its own.
+    """Write a scene y down, as viewers assume, reordered for precision.
 
     Args:
-        path: The file; replaced if it is there.
-        scene: What to write.
+        path: The file; replaced if it exists.
+        scene: The scene.
 
     Raises:
         ValueError: if a value is not finite.
@@ -80,10 +79,10 @@ def write(path: Path, scene: Scene) -> None:
 
 
 def read(path: Path) -> Scene:
-    """Read one; without a record of ours it is taken for y down and for nowhere on the earth.
+    """Read a file; without a record of ours it is assumed to be y down and not georeferenced.
 
     Raises:
-        SplatpipeError: if the file is missing, cut off, no compressed PLY, or has values that are not numbers.
+        SplatpipeError: if the file is missing, truncated, not a compressed PLY, or has values that are not numbers.
     """
     with open_file(path) as file:
         layout = _layout(path, read_ply_header(path, file))
@@ -119,8 +118,8 @@ class _Part:
     """Rows of a fixed length.
 
     Attributes:
-        row: numpy's structured type of one.
-        offset_bytes: Where they begin.
+        row: numpy's structured type of one row.
+        offset_bytes: Offset of the first row.
     """
 
     row: np.dtype[np.void]
@@ -129,13 +128,13 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where things are in a file that has room for all of them.
+    """Layout of a file, checked against its size.
 
     Attributes:
-        count: Gaussians.
-        degree: Of their harmonics.
-        parts: Chunks, vertices, and harmonics if there are any.
-        comments: Of the header.
+        count: Number of Gaussians.
+        degree: SH degree.
+        parts: Chunks, vertices, and SH if there is any.
+        comments: Comments of the header.
     """
 
     count: int
@@ -184,7 +183,7 @@ def _degree_of(path: Path, sh: PlyElement, count: int) -> int:
 
 
 def _coded(piece: Gaussians) -> tuple[bytes, ...]:
-    """Rows of chunks, of vertices and of harmonics of some Gaussians, the first of which starts a chunk."""
+    """Encoded rows of chunks, vertices and SH for some Gaussians, the first of which starts a chunk."""
     colours = piece.sh[:, 0] * C0 + 0.5
     log_scales = piece.log_scales.clamp(-_MOST_LOG_SCALE, _MOST_LOG_SCALE)
     ranges, unit = [], []
@@ -211,7 +210,7 @@ def _coded(piece: Gaussians) -> tuple[bytes, ...]:
 def _within_chunks(
     values: Float32[np.ndarray, "n 3"],
 ) -> tuple[Float32[np.ndarray, "c 3"], Float32[np.ndarray, "c 3"], Float64[np.ndarray, "n 3"]]:
-    """Each chunk's least and largest values, and where between them each value is."""
+    """Each chunk's least and largest values, and all values scaled between them to 0..1."""
     count = len(values)
     columns = np.pad(values.T, ((0, 0), (0, -count % CHUNK)), mode="edge").reshape(3, -1, CHUNK)
     least, most = columns.min(axis=2), columns.max(axis=2)
@@ -230,7 +229,7 @@ def _packed(unit: Float64[np.ndarray, "n c"], bits: tuple[int, ...]) -> UInt32[n
 
 
 def _smallest_three(quats: Float32[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]:
-    """Which of w, x, y, z is the largest, in the upper 2 bits, then the others in order, 10 bits each."""
+    """Index of the largest of w, x, y, z in the upper 2 bits, then the others in order, 10 bits each."""
     unit = quats.astype(np.float64)
     unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-30)
     largest = np.abs(unit).argmax(axis=1)
@@ -241,7 +240,7 @@ def _smallest_three(quats: Float32[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n
 
 
 def _fill(gaussians: Gaussians, start: int, rows: list[np.ndarray]) -> None:
-    """Decode the chunks, vertices and harmonics of some Gaussians into those from ``start`` on."""
+    """Decode the chunks, vertices and SH of some Gaussians into those from ``start`` on."""
     chunks, vertices = rows[0], rows[1]
     part = slice(start, start + len(vertices))
     with np.errstate(invalid="ignore"):  # a signalling NaN in a cast: reported in the end
@@ -303,7 +302,7 @@ def _from_smallest_three(words: np.ndarray) -> Float64[np.ndarray, "n 4"]:
 
 
 def _harmonics(steps: UInt8[np.ndarray, "n c"]) -> Float32[np.ndarray, "n c"]:
-    """The middle of each step, but for the first and the last."""
+    """SH values: the middle of each step, except for the first and the last."""
     table = (np.arange(256) + 0.5) / 256.0
     table[[0, -1]] = 0.0, 1.0
     return np.asarray(((table - 0.5) * (2.0 * _SH_REACH)).astype(np.float32)[steps])

@@ -1,4 +1,4 @@
-"""Splat files of any format: recognised by their content, written by what they are called."""
+"""Splat files of any format: recognised by content for reading, and by name for writing."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def read_scene(path: Path) -> Scene:
         path: A file, or the folder of a 3DGS model.
 
     Returns:
-        The splat, in the axes that the file has, its quaternions as they are there.
+        The splat, in the file's axes, with unchanged quaternions.
 
     Raises:
-        SplatpipeError: if it is not there, none of the formats, or broken.
+        SplatpipeError: if it is missing, of an unknown format, or broken.
     """
     found = format_of_content(path)
     try:
@@ -40,10 +40,10 @@ def read_scene(path: Path) -> Scene:
 
 
 def format_of_content(path: Path) -> SplatFormat:
-    """The format that a file or folder has.
+    """Detect the format of a file or folder.
 
     Raises:
-        SplatpipeError: if it is not there, or none that can be read.
+        SplatpipeError: if it is missing, or of no readable format.
     """
     if path.is_dir():
         name = "model" if (path / "point_cloud").is_dir() else "sog" if (path / "meta.json").is_file() else ""
@@ -69,14 +69,14 @@ def _name_of_file(path: Path) -> str:
 
 
 def format_of_name(path: Path, asked: str | None = None) -> SplatFormat:
-    """The format that a file is to be written in.
+    """The format in which to write a file.
 
     Args:
-        path: What it is called; the longest ending that fits counts, and a name without any is a folder.
-        asked: The format's name, where somebody gave it.
+        path: Output path; the longest matching suffix counts, and a name without one is a folder.
+        asked: Name of the format, if given explicitly.
 
     Raises:
-        UsageError: if there is none of that name or ending.
+        UsageError: if no format has this name or suffix.
     """
     if asked is not None:
         return format_named(asked)
@@ -92,16 +92,16 @@ def format_of_name(path: Path, asked: str | None = None) -> SplatFormat:
 
 
 def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> None:
-    """Write a splat in the axes that the format's readers expect, its quaternions of unit length unless it is exact.
+    """Write a splat in the axes that the format's readers expect, with unit quaternions unless the format is exact.
 
     Args:
-        path: Where: it is there whole or as before. A folder must be new or empty.
-        scene: What to write; finite.
-        kind: Its format; None for the one that the name ends in.
+        path: Output path, replaced atomically. A folder must be new or empty.
+        scene: The scene; finite.
+        kind: The format; None to choose it by suffix.
 
     Raises:
-        UsageError: if the name ends in no format's ending, or a folder has something in it.
-        SplatpipeError: if the format cannot hold it.
+        UsageError: if the name has no known suffix, or a folder is not empty.
+        SplatpipeError: if the format cannot store the scene.
         MachineError: if it cannot be written.
     """
     kind = format_of_name(path) if kind is None else kind
@@ -127,7 +127,7 @@ def _sync_file(path: Path) -> None:
 
 
 def in_unit_quats(scene: Scene) -> Scene:
-    """The same splat, its other parameters shared, with quaternions of unit length; one of no length is no rotation."""
+    """The scene with unit quaternions, sharing other parameters; a zero quaternion becomes the identity."""
     quats = scene.gaussians.quats.detach().clone()
     for start in range(0, len(quats), _ROWS_AT_ONCE):
         rows = quats[start : start + _ROWS_AT_ONCE]

@@ -1,8 +1,8 @@
-"""GLB: binary glTF with `KHR_gaussian_splatting`, not compressed, y up.
+"""GLB: binary glTF with `KHR_gaussian_splatting`, uncompressed, y up.
 
 Specification: Khronos, "KHR_gaussian_splatting" (ratified): points whose attributes are rotations (x, y, z, w), linear
-scales, opacities and spherical harmonics in the order and with the signs of 3D Gaussian splatting. What files say of
-place and edits is the string `splatpipe` in `asset.extras`.
+scales, opacities and spherical harmonics in the order and with the signs of 3D Gaussian splatting. Position on the
+earth and edits are in the string `splatpipe` in `asset.extras`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _ARRAY_BUFFER, _POINTS = 34962, 0
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write it y up, in bounded memory.
+    """Write a scene y up, in bounded memory.
 
     Args:
-        path: The file; replaced if it is there.
-        scene: What to write.
+        path: The file; replaced if it exists.
+        scene: The scene.
 
     Raises:
         SplatpipeError: if it is empty, larger than a GLB can be (4.3 GB), or a Gaussian is larger than float32 holds.
@@ -60,10 +60,10 @@ def write(path: Path, scene: Scene) -> None:
 
 
 def read(path: Path) -> Scene:
-    """Read one, y up; without a record of ours it lies nowhere on the earth.
+    """Read a file, y up; without a record of ours it is not georeferenced.
 
     Raises:
-        SplatpipeError: if the file is missing, cut off, no splat, damaged, or asks for what is not read.
+        SplatpipeError: if the file is missing, truncated, not a splat, damaged, or requires something unsupported.
     """
     with open_file(path) as file:
         container = open_container(path, file)
@@ -82,7 +82,7 @@ def _record(document: Mapping[str, Any]) -> str | None:
 
 @dataclass(frozen=True)
 class _Column:
-    """An attribute as it is written; every row is a multiple of 4 bytes."""
+    """An attribute to write; its rows are multiples of 4 bytes."""
 
     name: str
     kind: str
@@ -127,7 +127,7 @@ def _turned(gaussians: Gaussians, turn: torch.Tensor) -> Gaussians:
 
 
 def _bounds(gaussians: Gaussians, turn: torch.Tensor) -> Float32[np.ndarray, "2 3"]:
-    """Least and largest of the positions as they are written, to the bit, as validators ask for."""
+    """Bit-exact minimum and maximum of the positions as written, as validators require."""
     lowest, highest = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
     for piece in gaussians.pieces(ROWS_AT_ONCE):
         means = multiply_rows(turn, piece.means.double()).float().numpy()
@@ -138,7 +138,7 @@ def _bounds(gaussians: Gaussians, turn: torch.Tensor) -> Float32[np.ndarray, "2 
 def _document(
     columns: list[_Column], starts: list[int], count: int, bounds: Float32[np.ndarray, "2 3"], record: str
 ) -> dict[str, Any]:
-    """glTF's JSON of columns one after another."""
+    """The glTF JSON for consecutive columns."""
     views = [
         {"buffer": 0, "byteOffset": start, "byteLength": count * column.row_bytes, "target": _ARRAY_BUFFER}
         for column, start in zip(columns, starts, strict=False)

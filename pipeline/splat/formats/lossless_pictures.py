@@ -1,4 +1,4 @@
-"""Pictures whose pixels are data: lossless WebP written; WebP and PNG of anybody read, their sizes checked first."""
+"""Images whose pixels are data: writes lossless WebP; reads untrusted WebP and PNG after checking their sizes."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _AGAIN = "Copy or export it again."
 
 
 def webp_of_pixels(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
-    """Lossless WebP of pixels of 3 or 4 numbers, colours under no opacity among them."""
+    """Encode pixels of 3 or 4 channels as lossless WebP, preserving colours of transparent pixels."""
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "WEBP", lossless=True, quality=_QUALITY, method=_METHOD, exact=True)
     return file.getvalue()
 
 
 def pixels_of_picture(path: Path, name: str, data: bytes, least: int, most: int) -> UInt8[np.ndarray, "h w 4"]:
-    """Decode a picture, but not one that is larger than needed.
+    """Decode an image within size limits.
 
     Args:
-        path: The splat, for errors.
-        name: The picture, for errors.
-        data: Its file.
-        least: Pixels that there have to be.
-        most: Pixels that there may be.
+        path: The splat, for error messages.
+        name: The image, for error messages.
+        data: The encoded image.
+        least: Minimum number of pixels.
+        most: Maximum number of pixels.
 
     Raises:
-        SplatpipeError: if it has fewer or more, is broken, or no WebP or PNG.
+        SplatpipeError: if it has fewer or more pixels, is broken, or is neither WebP nor PNG.
     """
     size = _size(data)
     if size is None:
@@ -54,7 +54,7 @@ def pixels_of_picture(path: Path, name: str, data: bytes, least: int, most: int)
 
 
 def _size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that a header states: what a decoder takes memory for.
+    """Width and height in a header, for which a decoder would allocate memory.
 
     Source: RFC 9649 (WebP image format), sections 2.5 to 2.7; PNG specification, third edition, 11.2.1.
     """

@@ -1,4 +1,4 @@
-"""The folder that 3DGS trainers leave of a model: `point_cloud/iteration_N/point_cloud.ply`, cameras and settings.
+"""The model folder that 3DGS trainers write: `point_cloud/iteration_N/point_cloud.ply`, cameras and settings.
 
 Layout: the reference implementation of "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (Kerbl et al.,
 SIGGRAPH 2023). Viewers take the newest iteration.
@@ -23,11 +23,11 @@ _SETTINGS = (
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write the folder: the splat as ``plain_ply`` writes it, and `cfg_args`.
+    """Write the folder: the splat as in ``plain_ply``, and `cfg_args`.
 
     Args:
-        path: The folder; made if it is not there.
-        scene: What to write.
+        path: The folder; created if missing.
+        scene: The scene.
 
     Raises:
         ValueError: if a value is not finite.

@@ -1,4 +1,4 @@
-"""The 3DGS PLY with header comments that say where the splat lies, for people and, as a record, for programs."""
+"""The 3DGS PLY with header comments on the splat's frame, for people and, as a record, for programs."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, read_splat_hea
 from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record
 
 RECORD = "splatpipe "
-"""Begins the comment that is the record."""
+"""Prefix of the comment with the record."""
 _AXES: dict[Axes, str] = {"z up": "z up", "y up": "y up", "y down": "y down (−y is up)"}
 
 
 def write(path: Path, scene: Scene, comments: Sequence[str] = ()) -> None:
-    """Write it as a survey wants it: z up where it lies on the earth or has metres; else as viewers take it, y down.
+    """Write a scene z up if it is georeferenced or metric, as in surveying; else y down, as viewers assume.
 
-    Nothing is turned that has those axes already.
+    A scene that has these axes already is not turned.
 
     Args:
-        path: The file; replaced if it is there.
-        scene: What to write.
+        path: The file; replaced if it exists.
+        scene: The scene.
         comments: Further header comments, one line each.
 
     Raises:
@@ -33,7 +33,7 @@ def write(path: Path, scene: Scene, comments: Sequence[str] = ()) -> None:
 
 
 def write_for_viewers(path: Path, scene: Scene) -> None:
-    """Write it y down, as viewers take a PLY.
+    """Write a scene y down, as viewers assume for a PLY.
 
     Raises:
         ValueError: if a value is not finite.
@@ -47,18 +47,18 @@ def _write(path: Path, scene: Scene, comments: Sequence[str] = ()) -> None:
 
 
 def header_comments(facts: SceneFacts) -> list[str]:
-    """Comments of a PLY's header that keep a splat's facts, for people and for ``facts_of_comments``."""
+    """Header comments with a splat's metadata, for people and for ``facts_of_comments``."""
     return [*frame_comments(facts), f"{RECORD}{facts.record()}"]
 
 
 def facts_of_comments(comments: Sequence[str]) -> SceneFacts:
-    """What a PLY's header says; without a record of ours y down, as viewers take it, and nowhere on the earth."""
+    """Metadata from a PLY's comments; without a record of ours, y down, as viewers assume, and not georeferenced."""
     record = next((text.removeprefix(RECORD) for text in comments if text.startswith(RECORD)), None)
     return facts_of_record(record, SceneFacts("y down", antialias=MIP_COMMENT in comments))
 
 
 def frame_comments(facts: SceneFacts) -> list[str]:
-    """Header comments that tell people what a splat's frame is."""
+    """Header comments that describe a splat's frame to people."""
     comments = [MIP_COMMENT] if facts.antialias else []
     place = facts.place
     if place is None:
@@ -77,7 +77,7 @@ def frame_comments(facts: SceneFacts) -> list[str]:
 
 
 def read(path: Path) -> Scene:
-    """Read one; without a record of ours it is taken for y down, as viewers do, and for nowhere on the earth.
+    """Read a file; without a record of ours it is assumed to be y down, as in viewers, and not georeferenced.
 
     Raises:
         SplatpipeError: as ``read_splat``.

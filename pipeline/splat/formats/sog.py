@@ -1,10 +1,10 @@
-"""SOG, PlayCanvas' compressed splat: a ZIP of meta.json and lossless WebP pictures, or the same as a folder.
+"""SOG, PlayCanvas' compressed splat: a ZIP of meta.json and lossless WebP images, or the same as a folder.
 
-Specification: "The SOG Format" (developer.playcanvas.com), version 2. Where it and PlayCanvas' own programs differ,
-the programs hold: the frame is the PLY's (viewers take −y for up), the omitted component of a quaternion is counted
-w, x, y, z.
+Specification: "The SOG Format" (developer.playcanvas.com), version 2. Where it differs from PlayCanvas' own programs,
+we follow the programs: the frame is the PLY's (viewers take −y as up), and the index of a quaternion's omitted
+component counts w, x, y, z.
 
-For who builds files of several of them, without a file of its own::
+To embed SOGs in other files, without writing one::
 
     encode_sog(gaussians: Gaussians, antialias=False, record="", in_order=False) -> SogImages
     SogImages.meta: dict, .images: dict[str, bytes], .files() -> dict[str, bytes]  # with meta.json
@@ -37,11 +37,11 @@ _AGAIN = "Copy or export it again."
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write it, bundled, turned to y down.
+    """Write a scene as a bundle, turned to y down.
 
     Args:
-        path: The file; replaced if it is there.
-        scene: What to write.
+        path: The file; replaced if it exists.
+        scene: The scene.
 
     Raises:
         ValueError: if a value is not finite.
@@ -56,13 +56,13 @@ def write(path: Path, scene: Scene) -> None:
 
 
 def read(path: Path) -> Scene:
-    """Read one; without a record of ours it is taken for y down, as viewers do, and for nowhere on the earth.
+    """Read a file; without a record of ours it is assumed to be y down, as in viewers, and not georeferenced.
 
     Args:
-        path: A `.sog`, a `meta.json` beside its pictures, or their folder.
+        path: A `.sog`, a `meta.json` beside its images, or their folder.
 
     Raises:
-        SplatpipeError: if it is missing, damaged, of another version, or made to fill memory.
+        SplatpipeError: if it is missing, damaged, of another version, or a decompression bomb.
     """
     source = path / META if path.is_dir() else path
     with open_file(source) as file:
@@ -95,7 +95,7 @@ def _read_bundle(path: Path) -> Scene:
 
 
 def _check_directory(path: Path) -> None:
-    """Refuse a ZIP whose list of files alone would take seconds and memory."""
+    """Refuse a ZIP whose directory alone would take seconds and much memory."""
     with open_file(path) as file:
         size = file.seek(0, 2)
         file.seek(max(0, size - _END_BYTES - _MOST_COMMENT_BYTES))
@@ -126,7 +126,7 @@ def _read_folder(path: Path) -> Scene:
 
 
 def _is_plain(name: str) -> bool:
-    """Whether it names a file in the same folder, on any system."""
+    """Whether a name is a file in the same folder, on any system."""
     return name.isprintable() and name not in ("", ".", "..") and not set(name) & set("/\\:") and len(name) < 256
 
 
@@ -136,7 +136,7 @@ def _files(part: dict[str, Any]) -> list[str]:
 
 
 def _scene(decoder: SogDecoder) -> Scene:
-    """With our record, which may be an object or a string."""
+    """The scene with our record, which may be an object or a string."""
     found = decoder.meta.get(RECORD)
     record = found if isinstance(found, str | None) else json.dumps(found)
     otherwise = SceneFacts(AXES, antialias=decoder.meta.get("antialias") is True)

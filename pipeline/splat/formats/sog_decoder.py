@@ -1,4 +1,4 @@
-"""Gaussians of a SOG's meta.json and pictures, from anybody."""
+"""Decodes Gaussians from a SOG's untrusted meta.json and images."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ _AGAIN = "Copy or export it again."
 
 @dataclass(frozen=True)
 class SogDecoder:
-    """One SOG.
+    """Decoder of one SOG.
 
     Attributes:
-        path: For errors.
-        meta: What its meta.json says.
-        load: A picture's bytes by its name, at most so many.
-        stored_bytes: All that there is of it.
+        path: For error messages.
+        meta: Contents of its meta.json.
+        load: Returns an image's bytes by name, up to a maximum size.
+        stored_bytes: Total size of its files.
     """
 
     path: Path
@@ -48,10 +48,10 @@ class SogDecoder:
     stored_bytes: int
 
     def gaussians(self) -> Gaussians:
-        """Decode it.
+        """Decode all Gaussians.
 
         Raises:
-            SplatpipeError: if it is of another version, damaged, or made to fill memory.
+            SplatpipeError: if it has another version, is damaged, or is a decompression bomb.
         """
         self._check_version()
         count, bands = self._whole(self.meta, "count", 0, 1 << 31), 0

@@ -1,7 +1,7 @@
-"""SPZ: versions 1 to 3 (a gzip stream) and 4 (a header and zstd streams) are read, 3 and 2 written; see ``splat.spz``.
+"""SPZ: reads versions 1 to 3 (a gzip stream) and 4 (a header and zstd streams), writes 3 and 2; see ``splat.spz``.
 
-Specification: README.md and src/cc/load-spz.cc of github.com/nianticlabs/spz. The record of what a splat is lies in
-gzip's extra field, which is no part of what SPZ's readers see.
+Specification: README.md and src/cc/load-spz.cc of github.com/nianticlabs/spz. Our record is in gzip's extra field,
+which SPZ readers do not see.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ AXES: Axes = "y up"
 HALF_VERSION, ZSTD_VERSION = 1, 4  # positions in half floats; zstd streams
 HAS_EXTENSIONS = 2
 COORDINATES_EXTENSION = 0xADBE0003
-"""SPZ_ADOBE_coordinate_system, which says that a file's axes are others."""
+"""SPZ_ADOBE_coordinate_system, which declares other axes."""
 RIGHT_UP_BACK = 4
 _ROWS = 1 << 16
 _HEADER, _ZSTD_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 _TABLE_ENTRY = struct.Struct("<QQ")
 _MOST_EXTENSION_BYTES = 1 << 16
 _MOST_WINDOW_BYTES = 1 << 26
-"""That a zstd stream may keep in memory: writers' highest levels keep 8 MB of streams as large."""
+"""Largest zstd window: for streams of such size, writers' highest levels use 8 MB."""
 _MOST_GZIP_HEADER_BYTES = 12 + 65_535
 _HAS_EXTRA_FIELD = 4
 _ALPHA_END = 0.25 / 255.0
-"""Stands for an opacity coded as 0, and this below 1 for one coded as 1, of which there are no logits."""
+"""Replaces an opacity coded as 0, and 1 minus this one coded as 1, whose logits would be infinite."""
 _AGAIN = "Copy or export it again."
 
 
@@ -67,8 +67,8 @@ def write(path: Path, scene: Scene) -> None:
     """Write version 3, y up.
 
     Args:
-        path: The file; replaced if it is there.
-        scene: What to write.
+        path: The file; replaced if it exists.
+        scene: The scene.
 
     Raises:
         ValueError: if a value is not finite.
@@ -78,7 +78,7 @@ def write(path: Path, scene: Scene) -> None:
 
 
 def write_version_2(path: Path, scene: Scene) -> None:
-    """Write version 2, which older readers and CesiumJS want: its rotations are coarse.
+    """Write version 2, which older readers and CesiumJS need; its rotations are coarse.
 
     Raises:
         ValueError: if a value is not finite.
@@ -94,10 +94,10 @@ def _write(path: Path, scene: Scene, version: int) -> None:
 
 
 def read(path: Path) -> Scene:
-    """Read one; without a record of ours it is taken for y up, as specified, and for nowhere on the earth.
+    """Read a file; without a record of ours it is assumed to be y up, as specified, and not georeferenced.
 
     Raises:
-        SplatpipeError: if the file is missing, cut off, damaged, no SPZ, or of a kind that cannot be read.
+        SplatpipeError: if the file is missing, truncated, damaged, not an SPZ, or of an unsupported kind.
     """
     with open_file(path) as file:
         start = file.read(_MOST_GZIP_HEADER_BYTES)
@@ -115,12 +115,12 @@ def read(path: Path) -> Scene:
 
 
 class _ZstdStream:
-    """A zstd stream within a file, read on and on; one of them after another.
+    """Sequential reader of a zstd stream in a file; streams are read one after another.
 
     Args:
-        path: For errors.
+        path: For error messages.
         file: The file.
-        offset: Where the stream begins.
+        offset: Start of the stream, bytes.
     """
 
     def __init__(self, path: Path, file: BufferedReader, offset: int) -> None:
@@ -164,11 +164,11 @@ class _Packed:
 
     Attributes:
         version: 1 to 4.
-        count: Gaussians, for which the file has room.
-        degree: Of their harmonics.
-        fractional_bits: Of the positions.
-        flags: Of the header.
-        streams: Where each array comes next: all from one, or each from its own.
+        count: Number of Gaussians, checked against the file's size.
+        degree: SH degree.
+        fractional_bits: Fractional bits of the positions.
+        flags: Flags of the header.
+        streams: Stream of each array: the same for all, or one each.
     """
 
     version: int
@@ -179,7 +179,7 @@ class _Packed:
     streams: Sequence[InflatedFile | _ZstdStream] = ()
 
     def widths(self) -> list[int]:
-        """Bytes a Gaussian of each array."""
+        """Bytes per Gaussian in each array."""
         position = 6 if self.version == HALF_VERSION else 9
         rotation = 3 if self.version <= FIRST_THREE_VERSION else 4
         return [position, 1, 3, 3, rotation, 3 * (coefficient_count(self.degree) - 1)]
@@ -230,7 +230,7 @@ def _zstd_streams(path: Path, file: BufferedReader) -> _Packed:
 
 
 def _check_end(path: Path, packed: _Packed) -> None:
-    """Read on to the check sums, which lie behind the last array; extensions may come before."""
+    """Read up to the checksums after the last array; extensions may come before them."""
     rest = b"".join(stream.at_most(_MOST_EXTENSION_BYTES + 1) for stream in packed.streams[-1:])
     if len(rest) > _MOST_EXTENSION_BYTES:
         raise SplatpipeError(f"{path} holds more than its header says.", hint=_AGAIN)
@@ -239,7 +239,7 @@ def _check_end(path: Path, packed: _Packed) -> None:
 
 
 def _check_coordinates(path: Path, extensions: bytes) -> None:
-    """Refuse a file whose extensions say that its axes are others than specified."""
+    """Refuse a file whose extensions declare axes other than those specified."""
     at = 0
     while at + 8 <= len(extensions):
         kind, size = struct.unpack_from("<II", extensions, at)
@@ -263,7 +263,7 @@ def _record(start: bytes) -> bytes | None:
 
 
 def _decoded(packed: _Packed) -> Gaussians:
-    """Read the arrays, some rows at a time."""
+    """Read and decode the arrays in pieces."""
     gaussians = Gaussians.empty(packed.count, packed.degree)
     for i, (stream, width) in enumerate(zip(packed.streams, packed.widths(), strict=False)):
         for start in range(0, packed.count if width else 0, _ROWS):
@@ -294,7 +294,7 @@ def _put(gaussians: Gaussians, part: slice, array: int, data: UInt8[np.ndarray, 
 
 
 def _positions(data: UInt8[np.ndarray, "n w"], packed: _Packed) -> Float32[np.ndarray, "n 3"]:
-    """Of three bytes each, little-endian in two's complement; version 1 has half floats."""
+    """Positions from three bytes per coordinate, little-endian two's complement; version 1 has half floats."""
     if packed.version == HALF_VERSION:
         return np.asarray(np.ascontiguousarray(data).view("<f2").astype(np.float32))
     parts = data.reshape(len(data), 3, 3).astype(np.int32)
@@ -304,14 +304,14 @@ def _positions(data: UInt8[np.ndarray, "n w"], packed: _Packed) -> Float32[np.nd
 
 
 def _first_three(data: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
-    """Unit quaternions of x, y, z in a byte each."""
+    """Unit quaternions (w, x, y, z) from x, y, z in one byte each."""
     xyz = data / 127.5 - 1.0
     w = np.sqrt(np.maximum(1.0 - (xyz * xyz).sum(axis=1, keepdims=True), 0.0))
     return _unit(np.concatenate([w, xyz], axis=1))
 
 
 def _smallest_three(data: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
-    """Unit quaternions of the three smallest of x, y, z, w: see ``splat.spz``."""
+    """Unit quaternions (w, x, y, z) from the three smallest of x, y, z, w: see ``splat.spz``."""
     words = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
     parts = words[:, None] >> np.array([20, 10, 0])
     size = (parts & ROTATION_STEPS) * (np.sqrt(0.5) / ROTATION_STEPS)
