@@ -41,7 +41,7 @@ def ablate(dataset: Path, work: Path, *options: str) -> tuple[int, dict[str, Any
 
 
 def tables(output: str) -> str:
-    """Of a call's output, without the facts about the machine below."""
+    """Return the tables in a call's output, without the facts about the machine below."""
     return output[: output.index("cpu: ")]
 
 

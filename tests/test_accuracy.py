@@ -51,7 +51,7 @@ def cameras() -> list[Camera]:
 
 
 def points_on_the_wall() -> np.ndarray:
-    """In the model's frame."""
+    """Return points on the wall, in the model's frame."""
     return np.random.default_rng(3).uniform([-0.7, -0.5, 0.0], [0.7, 0.5, 0.0], (6, 3)) @ TURN.T
 
 
@@ -74,7 +74,7 @@ def control(
 
 @pytest.fixture
 def parts(tmp_path: Path) -> dict[str, Path]:
-    """georef's, of the wall."""
+    """Return georef's parts for the wall."""
     save_frame(Frame("enu", WORLD_FROM_MODEL, Origin(47.8, 13.5, 500.0)), tmp_path / "frame.json")
     (tmp_path / "accuracy.json").write_text('{"gsd_m": 0.7, "tables": {"gps": null}}')
     rewrite(tmp_path / "control.json", control(cameras(), points_on_the_wall()))

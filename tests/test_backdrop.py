@@ -119,7 +119,7 @@ def test_initialize_spends_points_inside_and_tells_the_sparse_ones(inputs: Input
 
 
 def test_outside_density_control_keeps_to_the_backdrops_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where all ask to be cloned, the inside grows to the cap's rest and the outside to its share."""
+    """If all Gaussians qualify for cloning, the outside grows to its share and the inside to the rest of the cap."""
     monkeypatch.setattr(scheduled, "GRADIENT", 1e-12)
     config = tiny_scene.plain(iterations=40, max_gaussians=400)
     views = tiny_scene.cameras()

@@ -68,7 +68,7 @@ def events(out: Path) -> dict[str, bytes]:
 
 
 def test_what_fails_stops_no_other_and_what_is_finished_is_not_touched(tmp_path: Path) -> None:
-    """One broken, one of wrong options, one without a folder; the same again; one added, one changed, one gone."""
+    """One broken capture, one with wrong options, one without a folder; a rerun; then one added, changed, removed."""
     captures, out = tmp_path / "captures", tmp_path / "out"
     link(captures / "house", demo()[:2])
     broken = link(captures / "broken", [])
@@ -296,7 +296,7 @@ def test_a_folder_of_any_name_is_one_word_of_the_workflows_command(tmp_path: Pat
 
 
 class Plain(str):
-    """What Snakemake puts in by ``:q``."""
+    """A string that Snakemake inserts with ``:q``."""
 
     def __format__(self, _form: str) -> str:
         return str(self)

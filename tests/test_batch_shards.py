@@ -47,7 +47,7 @@ def batch(listed: Path, out: Path, *more: str, **variables: str) -> subprocess.C
 
 
 def test_captures_run_in_shards_and_one_that_is_killed_costs_its_own_job_alone(tmp_path: Path) -> None:
-    """Their number is known when the stage that counts them has run; afterwards before anything runs."""
+    """Their number is known once the stage that counts them has run; in later runs, before anything runs."""
     listed, out = captures(tmp_path), tmp_path / "night"
     told = batch(listed, out, "--dry-run")
     assert told.returncode == 0 and "sum_shard" not in told.stderr and "checkpoint divide:" in told.stderr

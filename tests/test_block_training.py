@@ -82,7 +82,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SiteParts:
 
 
 def surveyed(site: SiteParts, config: TrainConfig = CONFIG, window: int = WINDOW) -> SiteParts:
-    """The same with what its blocks look at, kept as the stage `blocks` does."""
+    """Return the site with its blocks' views, stored as by the stage `blocks`."""
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     points, tracks = load_points_and_tracks(site.dataset)
@@ -227,7 +227,7 @@ def test_killed_block_goes_on_with_other_threads_and_ends_with_the_same_bits(
 def test_memory_of_the_process_does_not_end_a_blocks_growth(
     site: SiteParts, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As where one process trained other blocks before."""
+    """As if the process had trained other blocks before."""
     monkeypatch.setattr(memory, "resident_bytes", lambda: 10**15)
     recorder = tiny_scene.Recorder()
     limited = CONFIG.model_copy(update={"max_memory_bytes": 2_000_000_000})
@@ -268,7 +268,7 @@ def test_interrupt_leaves_a_checkpoint(site: SiteParts, tmp_path: Path) -> None:
 
 
 def sights_of(site: SiteParts) -> list[PhotoCoverage]:
-    """What the photos that are trained on see."""
+    """Return what the training photos see."""
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     _, tracks = load_points_and_tracks(site.dataset)

@@ -287,7 +287,7 @@ def test_masked_pixels_are_no_work(coarse: Gaussians, sparse: Float64[np.ndarray
 def test_surroundings_leave_the_blocks_photos_as_they_are(
     coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
-    """What a block draws, trained and frozen, looks in its photos like the whole; thinned, nearly so."""
+    """A block's Gaussians, trained and frozen, look like the whole in its photos; thinned, nearly so."""
     partition = divided(seen, sparse, 4)
     views = block_views(partition, seen, sparse, building_site.quarters)
     cuts = [building_site.quarters(sight.camera) for sight in seen]

@@ -49,7 +49,7 @@ SHARDS = ("train.1", "train.2", "train.3")
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What comes before blocks: a dataset of 30 photos, its split, the initial Gaussians."""
+    """Write the inputs of `blocks`: a dataset of 30 photos, its split, the initial Gaussians."""
     folder = tmp_path_factory.mktemp("scene")
     return prepared(building_site.write_dataset(folder / "dataset"), 8)
 

@@ -86,7 +86,7 @@ def laid(folder: Path, value: Any, frame: Frame = FRAME, points: np.ndarray = PO
 
 
 def winding(points: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """By the sum of the angles under which the edges are seen: another definition than the area's."""
+    """Return winding numbers by summing the angles that the edges subtend: independent of the area's definition."""
     to_ring = ring[None] - points[:, None, :2]
     angles = np.arctan2(to_ring[..., 1], to_ring[..., 0])
     turns = np.diff(np.concatenate([angles, angles[:, :1]], axis=1), axis=1)
@@ -309,7 +309,7 @@ def test_the_command_lines_file_is_the_option_and_set_has_the_last_word() -> Non
 
 @pytest.fixture(scope="module")
 def stated() -> tuple[Position, ...]:
-    """What some photos of the demo state of their places."""
+    """Return the stated positions of some of the demo's photos."""
     names = [f"DJI_00{number:02d}.JPG" for number in (1, 8, 16, 24)]
     checked = [check_photo(Candidate(name, capture_path() / name), PictureLimits(320, 10**8)) for name in names]
     return read_positions([photo for photo in checked if isinstance(photo, CheckedPhoto)]).positions

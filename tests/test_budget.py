@@ -304,7 +304,7 @@ def trained(scene: Path, out: Path, plan: TrainingPlan, monkeypatch: pytest.Monk
 
 @pytest.fixture
 def plan(scene: Path, tmp_path: Path) -> TrainingPlan:
-    """One of a budget, with fewer iterations than it has time for."""
+    """Return the plan of a budget with time for more iterations than it has."""
     (tmp_path / "first").mkdir()
     train.run(TrainConfig(iterations=60), make_inputs(scene), tmp_path / "first", tiny_scene.Recorder())
     made = read_plan(tmp_path / "first")

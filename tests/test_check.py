@@ -61,12 +61,12 @@ def changed(path: Path, change: Picture) -> None:
 
 
 def shaken(pixels: np.ndarray) -> np.ndarray:
-    """By 4 px along x."""
+    """Blur by 4 px along x."""
     return np.mean([np.roll(pixels, shift, axis=1) for shift in range(4)], axis=0)
 
 
 def darker(pixels: np.ndarray) -> np.ndarray:
-    """By 1.5 EV in linear light, by a plain gamma of 2.2."""
+    """Darken by 1.5 EV in linear light, with a plain gamma of 2.2."""
     return 255.0 * ((pixels / 255.0) ** 2.2 * 2.0**-1.5) ** (1 / 2.2)
 
 

@@ -76,7 +76,7 @@ def cameras() -> list[Camera]:
 
 
 def photos(pictures: bool) -> TrainingPhotos:
-    """Of the scene as it is."""
+    """Return photos of the original scene."""
 
     def picture(index: int) -> tuple[Pixels, Mask | None]:
         with torch.no_grad():
@@ -87,7 +87,7 @@ def photos(pictures: bool) -> TrainingPhotos:
 
 
 def planted(kind: str) -> Gaussians:
-    """What does not belong to the scene."""
+    """Return Gaussians that do not belong to the scene."""
     rng = np.random.default_rng(3)
     air = np.stack([rng.uniform(-3, 3, 40), rng.uniform(-3, 3, 40), rng.uniform(2.6, 3.4, 40)], axis=1)
     if kind == "single":

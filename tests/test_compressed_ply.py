@@ -34,7 +34,7 @@ def bits(word: int, shift: int, count: int) -> float:
 
 
 def by_the_letter(path: Path) -> dict[str, np.ndarray]:
-    """As PlayCanvas' reader does it: a vertex after another, each with the ranges of its chunk."""
+    """Decode like PlayCanvas' reader: vertex by vertex, each with the ranges of its chunk."""
     elements = {element.name: element.data for element in plyfile.PlyData.read(path, mmap=False)}
     found: dict[str, list[list[float]]] = {name: [] for name in ("means", "log_scales", "colours", "alphas", "quats")}
     for i, vertex in enumerate(elements["vertex"]):
@@ -154,7 +154,7 @@ def test_none_and_equal_gaussians_are_written(tmp_path: Path) -> None:
 
 
 def written_by_others(path: Path, colours: bool, byte_order: str = "<", swap: bool = False) -> None:
-    """By plyfile: without colours as older writers, in the other byte order, its elements in any order."""
+    """Write with plyfile: without colours like older writers, in the other byte order, with elements swapped."""
     ranges = [f"{end}_{name}" for name in ("x", "scale_x", "r") for end in ("min", "max")][: 6 if colours else 4]
     names = [r[:-1] + c for r in ranges for c in (("x", "y", "z") if r[-1] == "x" else ("r", "g", "b"))]
     chunk = np.zeros(1, [(name, "f4") for name in names])

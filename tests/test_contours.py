@@ -35,7 +35,7 @@ def in_metres(grid: Grid, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_lines(path: Path) -> tuple[dict[str, object], list[np.ndarray], dict[str, np.ndarray]]:
-    """What GDAL of pyogrio reads: its meta data, the lines and the attributes."""
+    """Return what pyogrio's GDAL reads: metadata, lines and attributes."""
     meta, _, shapes, columns = pyogrio.raw.read(path)
     return meta, [line_of(shape) for shape in shapes], dict(zip(meta["fields"], columns, strict=True))
 

@@ -246,7 +246,7 @@ class Blend:
 
 
 def blend(kernels: ctypes.CDLL, scene: Scene, gradients: dict[str, Tensor], how: Blend) -> tuple[Answer, Lists]:
-    """By the kernels; memory that they are to write holds NaN before."""
+    """Blend with the kernels; their output memory holds NaN beforehand."""
     lists = list_pairs(scene, how.chunk_tiles)
     floats = DEPTH_SLOT_FLOATS if how.depth else SLOT_FLOATS
     size, pixels = (scene.height, scene.width), scene.tiles[0] * scene.tiles[1] * TILE * TILE

@@ -155,7 +155,7 @@ def test_operations_of_warps_and_blocks_give_what_cuda_defines(examples):
 
 
 def operations_of_warp(values: np.ndarray, warp: int) -> list[list[int]]:
-    """By the definitions in CUDA's programming guide, lane by lane."""
+    """Return the results by the definitions in CUDA's programming guide, lane by lane."""
     v = [int(x) for x in values[warp * WARP : (warp + 1) * WARP]]
     lanes = range(WARP)
     every = [int(x) for x in values]

@@ -24,7 +24,7 @@ from on_cpu import kernels_on_cpu
 TILE_PX = 16
 OPACITY = 0.05
 NEAREST = 250
-"""Of the Gaussians, which end every pixel: 0.95^250 is far below the 1e-4 at which it does."""
+"""Number of nearest Gaussians, enough to saturate every pixel: 0.95^250 is far below the limit of 1e-4."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def section(library: Path, name: str) -> bytes:
 
 
 def strangers(library: Path) -> list[str]:
-    """What a library exports beside the C interface, and what it needs beside the system."""
+    """Return a library's exports apart from the C interface, and its dependencies apart from the system's."""
     interface = set(re.findall(r"^SPLAT_API .*?(splat_\w+)\(", API.read_text(), re.MULTILINE))
     missing = [f"{name} is missing" for name in interface - exports(library)]
     return sorted([*(exports(library) - interface), *missing, *(n for n in needed(library) if not SYSTEM.fullmatch(n))])

@@ -113,7 +113,7 @@ def planned(library: CudaLibrary, counts: np.ndarray, capacity: int) -> Plan:
 
 
 def chunks_of(counts: np.ndarray, capacity: int) -> list[int]:
-    """As many tiles in each chunk as go in."""
+    """Return the chunks, each with as many tiles as fit."""
     begins, pairs = [0], 0
     for tile, count in enumerate(counts.tolist()):
         if tile - begins[-1] == CHUNK_TILES or pairs + count > capacity:
@@ -185,7 +185,7 @@ def scene(count: int, size: tuple[int, int], scales: tuple[float, float], seed: 
 
 @dataclass(frozen=True)
 class Lists:
-    """What a frame of one chunk has in its memory."""
+    """Memory contents of a frame of one chunk."""
 
     records: np.ndarray  # (n, 12)
     order: np.ndarray  # (visible)
@@ -223,7 +223,7 @@ def lists_of(library: CudaLibrary, case: RenderCase, capacity: int = 1 << 14) ->
 
 
 def furthest(record: np.ndarray, dy_first: float, dy_last: float, sign: int) -> float:
-    """How far right (or left) of its centre an ellipse reaches between two rows, by a search of a concave function."""
+    """Return an ellipse's reach right (or left) of its centre between two rows, by search on a concave function."""
     a, b, c, reach = (*record[2:5], record[5] - LOG2_ALPHA_MIN)
 
     def offset(dy: float) -> float:

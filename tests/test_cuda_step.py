@@ -51,7 +51,7 @@ def small_case(seed: int = 3, count: int = 300, sh_degree: int = 3, **settings: 
 
 
 def rates_of(coefficients: int) -> list[torch.Tensor]:
-    """As the CPU's Adam wants them, one for each value of a row."""
+    """Return learning rates in the form of the CPU's Adam, one for each value of a row."""
     sh = torch.full((coefficients * 3,), SH_REST)
     sh[:3] = RATES["sh"]
     widths = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
@@ -60,7 +60,7 @@ def rates_of(coefficients: int) -> list[torch.Tensor]:
 
 @dataclass(frozen=True)
 class StepSettings:
-    """How to step, and from which moments."""
+    """Settings of a step, and its initial moments."""
 
     sparse: bool = True
     gain: np.ndarray | None = None
@@ -117,7 +117,7 @@ def fused_step(library: CudaLibrary, case: RenderCase, how: StepSettings) -> Ste
 
 
 def separate_step(library: CudaLibrary, case: RenderCase, how: StepSettings) -> StepResult:
-    """The same by the device's gradients and the CPU's Adam."""
+    """Take the same step with the device's gradients and the CPU's Adam."""
     made = run(library, case)
     gradients = {name: made.gradients[name].copy() for name in PARAMETERS}
     rows = {name: case.rows[name].copy() for name in PARAMETERS}
@@ -285,7 +285,7 @@ class Tensors:
         return [tensor.numpy() for group in copies for tensor in group], skipped
 
     def on_device(self, library: CudaLibrary, unaligned: bool = False) -> tuple[list[np.ndarray], int]:
-        """The same by ``splat_adam``."""
+        """Take the same step with ``splat_adam``."""
         memory, skipped = Memory(), np.zeros(1, np.int64)
         copies = [[put(memory, "changed", array, unaligned) for array in group] for group in self._changed()]
         adam = self.arguments(copies, skipped)

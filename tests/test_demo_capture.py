@@ -192,7 +192,7 @@ def test_truth_is_the_generators_flight() -> None:
 
 @pytest.mark.parametrize("lens", [BrownLens(), brown_lens(), brown_lens().scaled(0.25)])
 def test_the_generators_lenses_are_colmaps_and_undone(lens: BrownLens) -> None:
-    """What a pixel's ray is rendered by is the inverse of what COLMAP sees it at; truth.json names COLMAP's model."""
+    """The generator's pixel rays are the inverse of COLMAP's projection; truth.json names COLMAP's model."""
     camera = pycolmap.Camera(**lens.colmap())
     x, y = np.meshgrid(np.linspace(0.0, lens.width, 13), np.linspace(0.0, lens.height, 10))
     rays = lens.undistort((x.ravel() - lens.cx) / lens.f, (y.ravel() - lens.cy) / lens.f)

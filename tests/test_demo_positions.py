@@ -37,7 +37,7 @@ def photos() -> list[CheckedPhoto]:
 
 
 def with_rtk(photo: CheckedPhoto) -> CheckedPhoto:
-    """As the receiver with corrections would have written it."""
+    """Return the photo as an RTK receiver would have tagged it."""
     gps = Gps(*RTK["positions"][photo.name])
     tags = {f"drone-dji:{key}": value for key, value in RTK["xmp"].items()}
     return replace(photo, exif=replace(photo.exif, gps=gps), xmp={**photo.xmp, **tags})

@@ -65,7 +65,7 @@ def whitewashed(camera: Camera) -> np.ndarray:
 
 
 def sparse_points() -> np.ndarray:
-    """On the walls, near the corner."""
+    """Return points on the walls, near the corner."""
     rng = np.random.default_rng(2)
     points = rng.uniform(0.0, SPARSE_M, size=(300, 3))
     points[np.arange(300), np.arange(300) % 3] = 0.0

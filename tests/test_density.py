@@ -56,7 +56,7 @@ def test_published_score_is_the_norm_of_the_loss_by_the_place_on_screen() -> Non
     gaussians, weights = scene(1, dtype=torch.float64), picture(2)
 
     def loss(right: float, down: float) -> float:
-        """With the one Gaussian moved by pixels, which moving the principal point does."""
+        """Return the loss with the single Gaussian shifted in pixels, by shifting the principal point."""
         camera = replace(CAMERA, cx=CAMERA.cx + right, cy=CAMERA.cy + down)
         colour = rasterizer.render(gaussians, camera, rasterizer.RenderOptions(0, near=0.2), backend="reference").colour
         return float((colour * weights).sum())

@@ -96,7 +96,7 @@ def test_dropout_asks_the_device_for_nothing() -> None:
 
 
 def test_meta_tensors_fail_where_somebody_waits_or_mixes() -> None:
-    """What the tests above stand on."""
+    """The assumption of the tests above."""
     tensor = torch.empty(3, device=META)
     for waits in (lambda: float(tensor[0]), lambda: bool((tensor > 0).any()), lambda: tensor[tensor > 0]):
         with pytest.raises((RuntimeError, NotImplementedError)):

@@ -293,7 +293,7 @@ def test_a_commit_cut_between_its_renames_is_finished(numbers: Path, out: Path) 
 
 
 def test_what_changed_while_a_stage_read_it_becomes_no_artifact(numbers: Path, out: Path) -> None:
-    """Its key would say that it was made from what was there before."""
+    """Its key would claim that it was made from the earlier contents."""
     changed = (numbers / "b.txt").read_text()
 
     def meddle(event: Event) -> None:
@@ -392,7 +392,7 @@ def test_how_a_run_and_its_stages_ended_is_in_the_events(numbers: Path, out: Pat
 def test_a_failure_for_the_photos_lasts_as_long_as_they_do(
     numbers: Path, out: Path, meddled: str, lasting: bool
 ) -> None:
-    """Of a folder that was gone for a while, or was still being written, the next run may think otherwise."""
+    """If a folder was temporarily missing or still being written, the next run may succeed."""
     for path in numbers.glob("*.txt"):
         path.unlink()
     (numbers / "none.csv").write_text("")

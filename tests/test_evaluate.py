@@ -48,7 +48,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
 
 
 def held_out(inputs: Inputs, every: int, names: str = "") -> Inputs:
-    """The same with others held out."""
+    """Return the inputs with other photos held out."""
     part = tiny_scene.split_part(inputs["undistort.dataset"], every, names)
     return replace(inputs, parts={**inputs.parts, **part})
 

@@ -40,7 +40,7 @@ FEW = 30  # iterations: enough to see it work
 
 
 def picture(depth: torch.Tensor, alpha: float = 0.9) -> Render:
-    """Of one surface at such depths."""
+    """Return the render of one surface at given depths."""
     full, none = torch.full_like(depth, alpha), torch.zeros(0)
     return Render(torch.zeros(*depth.shape, 3), full, alpha * depth, alpha * depth**2, depth, none.bool(), none)
 
@@ -119,7 +119,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """What the stage reads, of a model with its true colours whose surfaces were shaken."""
+    """Return the stage's inputs for a model with true colours and perturbed surfaces."""
     folder = tmp_path_factory.mktemp("trained")
     dataset = tiny_scene.write_dataset(folder / "dataset")
     model = tiny_scene.true_model()

@@ -119,7 +119,7 @@ def checked() -> list[CheckedPhoto]:
 
 
 def test_the_demo_is_matched_wherever_photos_truly_show_the_same_points(checked: list[CheckedPhoto]) -> None:
-    """By the metadata alone, with their noise; the truth is which surveyed points each photo shows, and from where."""
+    """Uses the noisy metadata alone; the truth is which surveyed points each photo shows, and from where."""
     truth = json.loads((Path(capture_path()).parent / "truth.json").read_text())
     photos = [Photo(each.name, each.sha256, each.width, each.height, 0) for each in checked]
     entries = positions_json(read_positions(checked))["positions"]

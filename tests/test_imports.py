@@ -36,7 +36,7 @@ def bound(nodes: Iterable[ast.AST]) -> Iterator[str]:
 
 @cache
 def names_of(path: Path) -> frozenset[str]:
-    """What can be imported from a source of ours."""
+    """Return the names that can be imported from one of our sources."""
     names = set(bound(ast.parse(path.read_bytes()).body))
     if path.name == "__init__.py":
         names |= {each.stem for each in path.parent.iterdir()}

@@ -29,7 +29,7 @@ FAST = FeaturesConfig(extractor="opencv-sift", max_features=1500)
 
 
 def matched(inputs: Inputs, folder: Path) -> MappingInput:
-    """What `features` and `matches` leave of a capture."""
+    """Return the output of `features` and `matches` for a capture."""
     recorder = corner_photos.Recorder()
     for stage in ("features", "matches", "scratch"):
         (folder / stage).mkdir(parents=True)
@@ -50,7 +50,7 @@ def matched(inputs: Inputs, folder: Path) -> MappingInput:
 
 
 def thinned(capture: MappingInput, keep: Callable[[int, int], bool], name: str) -> MappingInput:
-    """The same capture with only some of its verified pairs."""
+    """Return the capture with only some of its verified pairs."""
     target = capture.scratch / f"{name}.db"
     with pycolmap.Database.open(capture.database) as source, pycolmap.Database.open(target) as database:
         for camera in source.read_all_cameras():
@@ -201,7 +201,7 @@ def test_models_that_share_nothing_but_chance_stay_apart(
 def test_a_photo_of_another_place_is_not_placed(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
-    """What it shows by chance matches nothing, but for a poster that hangs in the room as well."""
+    """Nothing in it matches except a poster that also hangs in the room."""
     before = found_without(room, whole, {8})
     generator = np.random.default_rng(0)
     count = len(before.verified.keypoints[8])

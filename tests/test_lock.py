@@ -247,7 +247,7 @@ def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> N
 
 
 def test_a_shard_made_on_another_machine_shuts_out_who_wants_it_or_all(out: Path) -> None:
-    """Where that machine's locks are not seen."""
+    """On a file system where that machine's locks are invisible."""
     name = f"{LOCK_FILE}.train.1"
     with at_work_elsewhere(out, name) as over:
         with pytest.raises(UsageError, match=r"node7.* is making train.1"), locked_shard(out, "train.1"):

@@ -78,7 +78,7 @@ def marking(gps_run: Path) -> Iterator[tuple[Served, Path]]:
 
 
 def state(page: Page) -> Any:
-    """What the page shows, once nothing is on its way any more."""
+    """Return what the page shows, once no request is pending."""
     assert page.evaluate("splatpipe.mark.settled()") == 0
     return page.evaluate("splatpipe.mark.state()")
 

@@ -69,7 +69,7 @@ def out(tmp_path: Path) -> Path:
 
 
 def told(out: Path) -> Any:
-    """What the page carries."""
+    """Return the data embedded in the page."""
     return json.loads((out / "viewer.html").read_bytes().partition(BEGIN)[2].partition(END)[0])
 
 

@@ -189,7 +189,7 @@ def test_ms_ssim_of_a_small_image_takes_the_scales_that_fit():
 
 
 def numpy_gmsd(x: np.ndarray, y: np.ndarray) -> float:
-    """As the authors' code on values of 0 to 255."""
+    """Return GMSD like the authors' code, which uses values from 0 to 255."""
 
     def magnitude(rgb: np.ndarray) -> np.ndarray:
         grey = 255 * (rgb @ np.array([0.299, 0.587, 0.114]))

@@ -74,7 +74,7 @@ def test_upright_photos_are_of_the_same_camera_by_exif_and_of_the_same_lens_wher
 
 
 def test_exif_of_another_size_is_scaled_and_said_so() -> None:
-    """As of photos that somebody reduced, or cropped, without telling their EXIF."""
+    """As for photos that were resized or cropped without updating their EXIF."""
     plane = {"model": "unheard of", "focal_plane_px_per_mm": 1000.0, "width": 4000, "height": 3000}
     photos = [photo("a.jpg", (1600, 1200), **plane), photo("b.jpg", (1600, 900), **plane), photo("c.jpg", **plane)]
     groups, index = group_cameras(photos)

@@ -23,7 +23,7 @@ def parameters(n: int, coefficients: int = 16) -> dict[str, torch.Tensor]:
 
 
 def set_gradients(tensors: dict[str, torch.Tensor], step: int) -> None:
-    """The same for the same step, of all magnitudes."""
+    """Set gradients of all magnitudes, reproducible for a step."""
     generator = torch.Generator().manual_seed(1000 + step)
     for tensor in tensors.values():
         scale = 10.0 ** torch.randint(-12, 2, (1,), generator=generator)

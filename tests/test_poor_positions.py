@@ -57,7 +57,7 @@ def placed(model: SparseModel, places: np.ndarray) -> tuple[Frame, PositionFit]:
 
 
 def errors_of(frame: Frame, model: SparseModel) -> dict[str, float]:
-    """By the names under which the frame states them."""
+    """Return the errors, under the frame's names for them."""
     assert frame.origin is not None
     found = PLACE.enu_from_geodetic(frame.origin.geodetic_from_enu(frame.world_from_model.apply(model.centres)))
     off = found.mean(axis=0) - MODEL_FROM_WORLD.inverse().apply(model.centres).mean(axis=0)

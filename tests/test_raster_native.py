@@ -64,7 +64,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Arguments:
-    """Of ``evaluate_exactly``, to find its answer again: three instruction sets ask for each."""
+    """Arguments of ``evaluate_exactly``, to cache its result: three instruction sets request each."""
 
     tensors: bytes
     camera: str

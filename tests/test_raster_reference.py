@@ -28,7 +28,7 @@ def camera(width: int = 15, height: int = 11, focal: float = 40.0, **changes: ob
 
 
 def gaussian(position: list[float], sigma: float, opacity: float, rgb: list[float]) -> Gaussians:
-    """One isotropic Gaussian of one colour, float64."""
+    """Return a single isotropic Gaussian of one colour, float64."""
     one = Gaussians.empty(1, 0, torch.float64)
     one.means[0] = torch.tensor(position)
     one.log_scales[:] = math.log(sigma)
@@ -38,7 +38,7 @@ def gaussian(position: list[float], sigma: float, opacity: float, rgb: list[floa
 
 
 def draw(gaussians: Gaussians, view: Camera, **options: object) -> Render:
-    """By the reference."""
+    """Render with the reference."""
     return render(gaussians, view, RenderOptions(gaussians.sh_degree, **options), backend="reference")
 
 

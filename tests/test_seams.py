@@ -31,7 +31,7 @@ def splat() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def coarse(splat: Gaussians) -> Gaussians:
-    """The same scene as another training has it: places, sizes and colours are a little off everywhere."""
+    """Return the scene as from another training: positions, sizes and colours differ slightly everywhere."""
     generator = torch.Generator().manual_seed(6)
     noise = torch.randn(len(splat), 7, generator=generator)
     return replace(

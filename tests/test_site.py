@@ -86,7 +86,7 @@ def hosted(folder: Path) -> Iterator[Host]:
 
 @pytest.fixture(scope="module")
 def model() -> Gaussians:
-    """In the world frame."""
+    """Return the model in the world frame."""
     many = tiny_scene.true_model(COUNT)
     many.log_scales -= 0.9
     return many.transformed(1.0, torch.from_numpy(UP_FROM_DOWN), torch.zeros(3, dtype=torch.float64))
@@ -120,7 +120,7 @@ def nodes_of(site: Path) -> list[dict]:
 
 
 def replaced(site: Path, folder: Path, name: str, content: bytes) -> None:
-    """The same site elsewhere, with one file of another content."""
+    """Copy the site elsewhere, with one file's content replaced."""
     for file in (site / "web").iterdir():
         if file.name != name:
             (folder / file.name).symlink_to(file)
@@ -128,7 +128,7 @@ def replaced(site: Path, folder: Path, name: str, content: bytes) -> None:
 
 
 def picture(page: Page) -> np.ndarray:
-    """As it is now."""
+    """Return a screenshot of the page."""
     page.evaluate("() => splatpipe.showInterface(false)")
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
 

@@ -30,7 +30,7 @@ Table = dict[str, npt.NDArray[np.float64]]
 
 
 def some_gaussians(count: int, sh_degree: int = 3, seed: int = 1) -> Gaussians:
-    """Of all sizes and colours, in a box of 20 units."""
+    """Return Gaussians of all sizes and colours, in a box of 20 units."""
     generator = torch.Generator().manual_seed(seed)
     gaussians = Gaussians.empty(count, sh_degree)
     for name, scale in (("means", 10.0), ("log_scales", 1.0), ("quats", 1.0), ("opacity_logits", 2.0), ("sh", 0.2)):

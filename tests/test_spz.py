@@ -186,7 +186,7 @@ FACTS = SceneFacts("y up", True, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:577
 
 
 def version_4(data: bytes, degree: int = 3, extensions: bytes = b"", flags: int = 0) -> bytes:
-    """The same arrays by the letter of version 4: a plain header, a table of sizes, a zstd stream an array."""
+    """Return the same arrays strictly in version 4: a plain header, a table of sizes, one zstd stream per array."""
     raw = gzip.decompress(data)
     _, _, count, _, bits, kept, _ = struct.unpack_from("<IIIBBBB", raw)
     streams, table, at = [], [], 16

@@ -63,7 +63,7 @@ def made_noisy() -> Heights:
 
 
 def errors(made: Heights, lattice: Lattice = LATTICE) -> tuple[np.ndarray, np.ndarray]:
-    """How much too high each cell is, and which are clear of steps."""
+    """Return each cell's height error, and which cells are clear of steps."""
     east, north = np.moveaxis(lattice.centres(made.tile), -1, 0)
     return made.height - true_height(east, north), edge_distance(east, north) > 2 * lattice.cell_m
 

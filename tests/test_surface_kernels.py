@@ -47,7 +47,7 @@ def votes(window: PhotoWindow = WHOLE, tile: Tile = TILE) -> HeightVotes:
 
 
 def places() -> Points:
-    """On the true surface of the tile's cells, and some nowhere."""
+    """Return points on the true surface in the tile's cells, and some off it."""
     east, north = np.moveaxis(LATTICE.centres(TILE), -1, 0)
     up = true_height(east, north)
     up[5, 7:9] = np.nan
@@ -55,7 +55,7 @@ def places() -> Points:
 
 
 def everything() -> list[np.ndarray]:
-    """What all kernels find."""
+    """Return the results of all kernels."""
     made, points = votes(), places()
     layers = made.layers()
     fit = made.fitted(layers[0].height)

@@ -56,7 +56,7 @@ def levels(album: OrthoInput) -> PhotoGains:
 
 @cache
 def album() -> OrthoInput:
-    """The same with exposures levelled."""
+    """Return the input with exposures equalised."""
     return replace(plain_album(), levels=levels(plain_album()))
 
 

@@ -49,7 +49,7 @@ def house(folder: Path) -> SurfaceFile:
 
 
 def line_of(*local: float) -> tuple[float, float, float, float]:
-    """From and to, in the CRS."""
+    """Return the start and end of a line in the CRS."""
     ends = grid().crs.crs_from_local(np.array([[*local[:2], 0.0], [*local[2:], 0.0]]))
     return tuple(ends[:, :2].ravel().tolist())
 

@@ -31,7 +31,7 @@ def model() -> SparseModel:
 
 
 def finds(names: Sequence[str] = NAMES, kind: str = QUADRANT, noise_px: float = 0.1) -> list[TargetFind]:
-    """What photos show of points; coded ones have the numbers of their names."""
+    """Return detections of points; coded ones have the IDs in their names."""
     rng = np.random.default_rng(1)
     found = []
     for name in names:
@@ -57,7 +57,7 @@ def named(found: Sequence[TargetFind], positions: Similarity | None, names: Sequ
 
 
 def assert_true(marks: TargetMarks, least: int) -> None:
-    """So many points have marks, and each mark is of its own point."""
+    """Assert that at least ``least`` points have marks, and that each mark is on its own point."""
     pixels = marks.pixels()
     assert len(pixels) >= least
     for name, seen in pixels.items():

@@ -46,7 +46,7 @@ BLACK = (0.0, 0.0, 0.0)
 
 @pytest.fixture(autouse=True)
 def one_torch_thread() -> Iterator[None]:
-    """As in training: many threads on small tensors cost more than they bring."""
+    """Use one thread as in training: on small tensors more threads cost more than they gain."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

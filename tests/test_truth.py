@@ -195,7 +195,7 @@ def test_no_true_surface_is_called_free_and_most_of_the_air_is(
 
 
 def test_the_depth_map_is_what_rays_hit(opened: OpenedRun, poses: Poses, surface: Float64[np.ndarray, "m 3 3"]) -> None:
-    """From low, with ground that reaches behind the camera, and from straight above."""
+    """From near the ground, which extends behind the camera, and from straight above."""
     generator = np.random.default_rng(0)
     for view in (opened.views[0], opened.views[-1]):
         camera = replace(opened.camera(view), cam_from_world=poses[view.camera.name])

@@ -53,7 +53,7 @@ def walk(request: Request, show: Callable[[Event], object] = lambda event: None)
 
 
 def events(out: Path) -> list[Event]:
-    """What is logged; every line is an event."""
+    """Return the logged events; every line is one."""
     found = [parse_event(line) for line in (out / "events.jsonl").read_bytes().split(b"\n")[:-1]]
     assert None not in found
     return [event for event in found if event is not None]

@@ -240,7 +240,7 @@ def test_points_that_leave_the_frame_are_dropped(tmp_path: Path) -> None:
 
 
 def test_a_text_model_without_observations_keeps_its_points(tmp_path: Path) -> None:
-    """As Metashape and RealityScan export it."""
+    """As exported by Metashape and RealityScan."""
     source = make_camera("OPENCV")
     inputs = corner_photos.write_capture(tmp_path / "in", dict.fromkeys(["x/A.png", "x/B.png"], blobs(source)))
     write_model(tmp_path / "model", source, ["a.jpg", "sub\\b.png"], text=True, tracks=False)

@@ -96,7 +96,7 @@ def state(page: Page) -> dict:
 
 
 def away(page: Page) -> float:
-    """From the camera to the scene's middle."""
+    """Return the distance from the camera to the scene's centre."""
     centre = np.array(page.evaluate("() => splatpipe.facts.centre"))
     return float(np.linalg.norm(np.array(state(page)["position"]) - centre))
 

@@ -174,7 +174,7 @@ def test_a_gaussian_in_one_window_has_the_score_that_the_whole_photo_gives_it(ma
 
 
 def halves(photo: TrainingPhoto, level: int) -> TrainingPhoto:
-    """The same photo at another size."""
+    """Return the photo at another size."""
     size = (photo.camera.width * level, photo.camera.height * level)
     colour = photo.colour.repeat_interleave(level, 0).repeat_interleave(level, 1)
     return TrainingPhoto(photo.camera.scaled(*size), colour, None)
@@ -240,7 +240,7 @@ def visited(robust: RobustMask, photos: list[TrainingPhoto]) -> list[TrainingPho
 
 
 def left_out(photos: list[TrainingPhoto]) -> Tensor:
-    """What the windows of a photo leave out of it, each inside."""
+    """Return the pixels inside each window that are left out of the loss."""
     whole = photos[0].camera.whole()
     found = torch.zeros(whole.height, whole.width, dtype=torch.bool)
     for photo in photos:

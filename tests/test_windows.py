@@ -107,7 +107,7 @@ def test_windows_of_photos_of_several_sizes_are_seen_equally_often() -> None:
 
 
 def rounds_of(visits: Visits) -> dict[int, int]:
-    """How many visits each round has, by the iteration that ends it."""
+    """Return the number of visits in each round, by the iteration that ends it."""
     seen = {iteration: visits.at(iteration).round for iteration in range(1, len(visits) + 1)}
     return {iteration: count for iteration, count in seen.items() if count}
 
