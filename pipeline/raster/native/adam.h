@@ -1,4 +1,4 @@
-// Adam (Kingma and Ba, ICLR 2015) over tensors that share their rows, one a Gaussian: compiled once per ISA.
+// Adam (Kingma and Ba, ICLR 2015) over tensors with common rows, one per Gaussian; compiled once per ISA.
 #pragma once
 
 #include <cstdint>
@@ -7,8 +7,8 @@
 
 namespace splat {
 
-constexpr int kAdamBlock = 16;      // rows worked off at once, a multiple of any vector's lanes
-constexpr int kAdamTaskRows = 256;  // rows of a call at most: their gradients stay in the cache between two looks
+constexpr int kAdamBlock = 16;      // rows processed at once, a multiple of any vector's lanes
+constexpr int kAdamTaskRows = 256;  // maximum rows per call: their gradients stay in the cache between two passes
 constexpr int kAdamWidth = 64;      // floats a row of one tensor, at most
 constexpr int kAdamTensors = 8;     // tensors of a call, at most
 

@@ -1,4 +1,4 @@
-// Adam's step of a value, for kernel files: of the CPU, where values come in vectors, and of CUDA, one by one.
+// Adam's step for a value, for kernel files: on the CPU, where values are vectors, and on CUDA, one by one.
 #pragma once
 
 #if defined(__CUDACC__) || SPLAT_ON_CPU

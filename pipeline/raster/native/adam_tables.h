@@ -6,7 +6,7 @@
 
 namespace splat {
 
-// The job, and the tables that it points into: they hold as long as this does.
+// The job and the tables that it points into, which live as long as this object.
 class AdamTables {
   public:
     // At most kAdamTensors tensors.

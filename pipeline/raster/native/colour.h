@@ -1,4 +1,4 @@
-// A picture's colours through one affine map, and back: a chunk's kernels, compiled once per ISA.
+// Applying an affine map to an image's colours, forward and backward: a chunk's kernels, compiled once per ISA.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,7 @@
 namespace splat {
 
 constexpr int kAffine = 12;                     // floats: three rows of red, green, blue and one
-constexpr std::int64_t kColourChunk = 1 << 14;  // pixels of a call at most; their sums are taken in float
+constexpr std::int64_t kColourChunk = 1 << 14;  // maximum pixels per call; their sums are taken in float
 
 struct ColourKernels {
     // out = map of in; (pixels, 3) floats each.

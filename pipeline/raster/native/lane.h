@@ -1,4 +1,4 @@
-// What simd.h is to a CPU's kernels, for code in which a thread has one Gaussian: a lane is a float.
+// The counterpart of simd.h for code in which a thread has one Gaussian: a lane is a float.
 #pragma once
 
 #include "cuda/device.h"
@@ -9,7 +9,7 @@
 #if SPLAT_ON_CPU
 #define SPLAT_UNROLL
 #else
-#define SPLAT_UNROLL _Pragma("unroll")  // so that what is indexed stays in registers
+#define SPLAT_UNROLL _Pragma("unroll")  // so that indexed arrays stay in registers
 #endif
 
 namespace splat {

@@ -12,7 +12,7 @@
 namespace splat {
 
 constexpr int kPatchMostViews = 16;
-constexpr float kPatchWorst = 2.0f;  // cost of what no photo can tell
+constexpr float kPatchWorst = 2.0f;  // cost of a plane that no photo constrains
 
 // A photo to compare with.
 struct PatchView {
@@ -44,7 +44,7 @@ struct PatchKernels {
     void (*improve)(const PatchJob& job, int row, int colour, int iteration);
 };
 
-// Works off rows on the pool's threads; the same bits for any number of them.
+// Processes rows on the pool's threads; bit-identical for any number of them.
 // `job.chosen` is its own.
 void patch_match(PatchJob job, int iterations);
 

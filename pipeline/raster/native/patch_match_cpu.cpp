@@ -2,8 +2,8 @@
 //
 // Planes spread over a chessboard, from the best of eight places around a pixel (Xu and Tao, "Multi-Scale Geometric
 // Consistency Guided Multi-View Stereo", CVPR 2019). A plane's cost is one minus the correlation of the pixel's
-// surroundings with what a photo shows there, weighted by likeness and nearness to the pixel (Bleyer et al.,
-// "PatchMatch Stereo", BMVC 2011); of the photos the two most alike count, against occlusion.
+// neighbourhood with what a photo shows there, weighted by similarity and proximity to the pixel (Bleyer et al.,
+// "PatchMatch Stereo", BMVC 2011); only the two most similar photos count, against occlusion.
 #include "patch_match.h"
 #include "simd.h"
 
@@ -12,11 +12,11 @@ namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
 constexpr int kSamples = 32;                 // of a round window: 6 x 6, two pixels apart, without the corners
-constexpr int kLooked = 4;                   // photos that a pixel's planes are tried in: those most alike before
+constexpr int kLooked = 4;                   // photos in which a pixel's planes are tried: the most similar ones so far
 constexpr int kBest = 2;                     // photos that count
 constexpr int kNoView = 255;                 // in the place of a photo's number
-constexpr float kUnlike = 1.2f;              // cost above which a photo tells no more: it shows something else
-constexpr float kNoise2 = 1.5f * 1.5f;       // of grey values: contrast below it is not taken for likeness
+constexpr float kUnlike = 1.2f;              // cost above which a photo is uninformative: it shows something else
+constexpr float kNoise2 = 1.5f * 1.5f;       // of grey values: contrast below it does not count as similarity
 constexpr float kPerGrey = 0.047f;           // of a weight's logarithm to base two
 constexpr float kPerPixel2 = 0.028f;         // the same, by squared distance
 constexpr float kNearest = 1e-6f;            // homogeneous: what is nearer is behind

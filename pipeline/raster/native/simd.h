@@ -276,7 +276,7 @@ SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) 
     out[3] = (d[0] + d[2]) + (d[1] + d[3]);
 }
 SPLAT_INLINE float sum_lanes(Floats a) { return (a[0] + a[2]) + (a[1] + a[3]); }
-// Whole numbers in ±2^22, where these are wanted; larger ones come back as they are.
+// Rounds to whole numbers in ±2^22; larger values are returned unchanged.
 SPLAT_INLINE Floats nearest(Floats a) {
     const Floats magic = fill(12582912.0f);  // 1.5 · 2^23
     const Floats size = select(a < 0.0f, -a, a);
@@ -343,9 +343,9 @@ SPLAT_INLINE Ints fill_int(int32_t x) { return Ints{} + x; }
 SPLAT_INLINE Floats magnitude(Floats x) { return as_floats(as_ints(x) & fill_int(0x7fffffff)); }
 SPLAT_INLINE Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
 
-// 2^x for x in [-126, 127]; elsewhere anything at all comes out. What x is above a whole number goes into a polynomial,
-// minimax of the relative error, and the number to the exponent. AVX-512 has instructions for both, but they take the
-// multipliers' time; sums, integers and permutations do not.
+// 2^x for x in [-126, 127]; undefined elsewhere. The fraction of x goes into a polynomial, minimax in the relative
+// error, and the whole number into the exponent. AVX-512 has instructions for both, but they occupy the multipliers;
+// sums, integers and permutations do not.
 #if SPLAT_ISA_AVX512
 // x is the nearest sixteenth and a rest: 2^(i/16) from a table, 2^rest from a polynomial of degree 2 (4e-7).
 template <int kCount>

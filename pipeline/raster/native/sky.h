@@ -1,4 +1,4 @@
-// A render laid over the sky, and back: a band's kernels, compiled once per ISA.
+// Compositing a render over the sky, forward and backward: a band's kernels, compiled once per ISA.
 //
 // What is behind a pixel is interpolated bilinearly between nodes some pixels apart, as cuda/sky.cu does.
 #pragma once

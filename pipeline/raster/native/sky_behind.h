@@ -1,11 +1,11 @@
-// A whole render laid over the sky, and back: threads around the kernels. Not for kernel files.
+// Compositing a whole render over the sky, forward and backward: threads around the kernels. Not for kernel files.
 #pragma once
 
 #include "sky.h"
 
 namespace splat {
 
-// Whether a job's nodes reach the last pixel, and it has what else it needs.
+// Whether a job is valid: its nodes reach the last pixel and nothing else is missing.
 bool is_sound(const SkyJob& job);
 
 // To `out`, (height, width, 3).

@@ -1,8 +1,8 @@
-// The mathematics of one Gaussian's projection, its colour, and their derivatives, a Gaussian a lane. For kernel files:
-// of the CPU, where lanes are vectors, and of CUDA, where a lane is a float.
+// The mathematics of a Gaussian's projection and colour and their derivatives, one Gaussian per lane. For kernel files:
+// on the CPU, where values are vectors, and on CUDA, where a lane is a float.
 //
-// Σ' = B Bᵀ + 0.3 I with the 2 x 3 matrix B = J W R S: its rows are all that is kept, and det(B Bᵀ) = |row0 x row1|²
-// (Cauchy-Binet) does not cancel.
+// Σ' = B Bᵀ + 0.3 I with the 2 x 3 matrix B = J W R S: only its rows are kept, and det(B Bᵀ) = |row0 x row1|²
+// (Cauchy-Binet) has no cancellation.
 #pragma once
 
 #include "raster.h"
@@ -36,7 +36,7 @@ struct Lanes {
     Floats qw, qx, qy, qz, logit;
 };
 
-// All that the derivative wants to know again.
+// Intermediate values for the derivative.
 struct Projection {
     Vec3 point;                      // camera frame
     Floats inv_z, ratio_x, ratio_y;  // ratios clamped
@@ -175,7 +175,7 @@ SPLAT_INLINE Vec3 sh_direction_gradient(int degree, const Vec3& d, const Floats*
     return g;
 }
 
-// What comes back for a splat, per lane.
+// Screen-space gradients of a splat, per lane.
 struct SplatGradient {
     Floats s, su, sv, suu, suv, svv;  // sums over pixels of s = dL/d(ln alpha), times moments of (u, v)
     Vec3 colour;
@@ -217,7 +217,7 @@ SPLAT_INLINE void rows_gradient(const Projection& p, const SplatGradient& in, Fl
     *drow1 = two * (gxy * p.row0 + gyy * p.row1) + s_sharp * cross(p.normal, p.row0);
 }
 
-// What the slant of the depth adds: at a pixel d from the centre it is z + cᵀ Q d, with Q = Σ'⁻¹ and c = (zx, zy). With
+// Contribution of the depth slope: at offset d from the centre the depth is z + cᵀ Q d, Q = Σ'⁻¹, c = (zx, zy). With
 // y = Q Σ g d = Aᵀ Σ g (u, v) / k and the slope q = Q c: dL/dc = y, dL/d(centre) = -q Σ g, dL/dΣ' = -(q yᵀ + y qᵀ) / 2.
 struct SlantGradient {
     Vec3 row0, row1, row2;
@@ -234,7 +234,7 @@ SPLAT_INLINE SlantGradient slant_gradient(const Projection& p, const SplatGradie
             y_x * p.row0 + y_y * p.row1, zero - in.depth * q_x, zero - in.depth * q_y};
 }
 
-// The derivative of project_lanes, the mean's share through the colour apart. `magnitudes` is as in ParameterGradients.
+// The derivative of project_lanes, without the mean's share through the colour. `magnitudes`: as in ParameterGradients.
 template <bool kDepth>
 SPLAT_INLINE LanesGradient project_lanes_backward(const View& view, const Projection& p, const SplatGradient& in,
                                                   bool magnitudes) {
@@ -318,7 +318,7 @@ SPLAT_INLINE Vec3 colour_backward(const View& view, int degree, const Vec3& mean
     return inv_length * (ddir - dot(dir, ddir) * dir);
 }
 
-// What a splat is on the screen: Splat's fields in the order of the struct, and what else the projection tells.
+// A splat on the screen: Splat's fields in order of the struct, and other results of the projection.
 struct SplatLanes {
     Floats x, y, a, b, c, log2_opacity;
     Vec3 colour;

@@ -1,8 +1,8 @@
-// The surface model and the orthophoto: what their kernels share. World: local east, north, up in metres, or the axes
-// of a sheet that things are drawn on; heights are towards the viewer.
+// Shared by the kernels of the surface model and the orthophoto. World: local east, north, up in metres, or the axes of
+// a drawing sheet; heights are towards the viewer.
 //
-// Sums and products are never fused here (-ffp-contract=off): the same bits on every instruction set, and in every
-// window, tile and vector's lane.
+// Sums and products are never fused here (-ffp-contract=off): bit-identical on every instruction set, and in every
+// window, tile and vector lane.
 #pragma once
 
 #include <cstdint>
@@ -21,10 +21,10 @@ struct SurfaceCamera {
 struct DepthPicture {
     SurfaceCamera camera;
     const float* depth;              // (height, width)
-    const std::uint8_t* confidence;  // (height, width); null where nobody asks
+    const std::uint8_t* confidence;  // (height, width); null if not needed
 };
 
-// Cells of a lattice, rows from north to south, and between which heights things count.
+// Cells of a lattice, rows from north to south, and the range of heights that count.
 struct CellTile {
     double east, north;  // of the lattice's first corner
     double cell;         // side

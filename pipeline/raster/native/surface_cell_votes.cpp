@@ -9,15 +9,16 @@
 namespace splat {
 namespace {
 
-constexpr double kSigmaPixels = 0.7;   // of a height that one photo's depths give, at a right angle to the ray
-constexpr double kLeastSine = 0.2;     // of a ray's angle against the ground: flatter ones count as if they were not
-constexpr double kSpan = 3.0;          // heights within so many of their deviations from each other are one surface
+constexpr double kSigmaPixels =
+    0.7;                            // standard deviation of a height from one photo's depths, perpendicular to the ray
+constexpr double kLeastSine = 0.2;  // of a ray's angle against the ground: flatter ones count as if they were not
+constexpr double kSpan = 3.0;       // heights within this many deviations of each other are one surface
 constexpr double kWeightUnit = 256.0;  // weights are whole numbers of its parts
 constexpr double kMostWeight = 1 << 30;
 constexpr int kFullyConfirmed = 4;    // more photos that confirm a depth add no weight
 constexpr int kLeastVotes = 2;        // photos that have to agree,
 constexpr double kLeastShare = 0.25;  // and of the weight of the cell's best surface
-constexpr int kRounds = 3;            // of the robust mean: it stands still after two
+constexpr int kRounds = 3;            // of the robust mean: it has converged after two
 constexpr double kBiweight = 2.5;     // deviations beyond which a vote counts nothing
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 

@@ -1,4 +1,4 @@
-// Heights of cells by many photos' depths: each photo's votes, surfaces that several agree on, and a robust mean.
+// Heights of cells from many photos' depths: each photo's votes, surfaces that several agree on, and a robust mean.
 #pragma once
 
 #include <cstddef>
@@ -9,7 +9,7 @@
 
 namespace splat {
 
-constexpr int kSurfaceLayers = 3;  // surfaces above each other in a cell that are looked at
+constexpr int kSurfaceLayers = 3;  // stacked surfaces considered per cell
 
 // A height that a photo found in a cell.
 struct Vote {
@@ -18,7 +18,7 @@ struct Vote {
     std::int32_t weight;     // how much it counts
     std::int32_t cell;       // of the tile
     std::uint16_t cover;     // how much of the cell it covers, in parts of kCoverUnit
-    std::uint8_t confirmed;  // by how many other photos at most
+    std::uint8_t confirmed;  // maximum number of confirming photos
 };
 
 // Surfaces that enough photos agree on, from the top: (kSurfaceLayers, cells).
@@ -30,7 +30,7 @@ struct LayerPlanes {
 
 // Robust means of cells.
 struct FitPlanes {
-    double* height;  // NaN where there is none
+    double* height;  // NaN if there is none
     double* sigma;
     std::int32_t* photos;  // that agree: votes, or photos that confirm one where those are more
 };

@@ -10,8 +10,8 @@ namespace splat {
 
 constexpr int kMostHalved = 6;  // times: a photo 64 times finer than the cells is softened no further
 
-// The way from a pinhole's pixels to a photo's: columns and rows of the photo at every `step` pixels of the pinhole's,
-// straight between.
+// The mapping from a pinhole's pixels to a photo's: columns and rows of the photo at every `step` pixels of the
+// pinhole's, linear in between.
 struct Lens {
     double step;
     int rows, columns;    // at least 2
@@ -43,12 +43,12 @@ struct ColourKernels {
     void (*read)(const Photo& photo, int row, int left, int count, std::uint32_t* out);
     // Means of two by two pixels, of two rows of twice `count`.
     void (*halve)(const std::uint32_t* upper, const std::uint32_t* lower, int count, std::uint32_t* out);
-    // Colours of the places for which the photo was halved so often.
+    // Colours of the places for which the photo was halved this often.
     void (*sample)(const Halved& part, std::int64_t count, const double* column, const double* row,
                    const std::int8_t* times, std::uint8_t* colour);
 };
 
-// Colours of places that are seen; black elsewhere. The same bits whatever else is asked for at once.
+// Colours of visible places; black elsewhere. Bit-identical whatever else is requested in the same call.
 void sample_photo(const Photo& photo, const Places& places, double cell, const std::uint8_t* seen,
                   std::uint8_t* colour);
 

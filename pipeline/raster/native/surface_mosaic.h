@@ -1,4 +1,4 @@
-// Which photo colours which cell: the best one, with seams where the photos look alike. Whole numbers decide, so that
+// Which photo colours which cell: the best one, with seams where the photos look alike. Costs are integers, so that
 // tiles agree where they overlap.
 #pragma once
 
@@ -58,7 +58,7 @@ struct MosaicKernels {
     void (*slide)(const std::uint16_t* met, const std::uint16_t* left, int count, std::int32_t* sums);
     // Sums of `2 * radius + 1` columns in a row.
     void (*across)(const std::int32_t* sums, int radius, int count, std::int32_t* out);
-    // What photos cost more that show something else than most: cars that drove on, what depths did not know.
+    // Extra cost of photos that differ from most: cars that moved, objects missing in the depths.
     void (*compare)(const LikenessRow& row);
     // Averages of costs, and of each cell the first photo with the least one.
     void (*choose)(const std::int32_t* totals, const std::uint8_t* seen, int photo, int count, std::uint16_t* average,

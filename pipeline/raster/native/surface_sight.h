@@ -1,4 +1,4 @@
-// What a photo says about places: whether it sees them, and what it costs to colour them by it.
+// Visibility of places in a photo, and the cost of colouring them from it.
 #pragma once
 
 #include <cstdint>
@@ -18,11 +18,11 @@ struct Places {
 constexpr std::uint8_t kSeen = 1;     // it sees the place
 constexpr std::uint8_t kThrough = 2;  // it sees something behind it
 constexpr std::uint8_t kMixed = 4;    // it sees it, but a nearer surface lies in the next pixel
-constexpr std::uint8_t kUnknown = 8;  // it looks there, but has no depth: it may see it
+constexpr std::uint8_t kUnknown = 8;  // it covers the place but has no depth there: it may see it
 
-constexpr std::uint16_t kHidden = 4000;  // cost of a photo that does not see a place; and no cost is higher
+constexpr std::uint16_t kHidden = 4000;  // cost of a photo that does not see a place; the maximum cost
 
-// How near two photos' depths of one place have to be.
+// How close two photos' depths of one place have to be.
 struct Agreeing {
     double share;     // of the depth;
     double pixels;    // far away as much of it as moves the place so far in the other photo,

@@ -1,4 +1,4 @@
-// Pixels of depths as small planes, and the heights that they give cells.
+// Depth pixels as small planes, and the heights of cells from them.
 #pragma once
 
 #include <cstdint>

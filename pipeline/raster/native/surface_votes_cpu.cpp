@@ -9,7 +9,7 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr float kSamePixels = 10.0f;  // depths that differ by more than so many pixels' widths are not one surface
+constexpr float kSamePixels = 10.0f;  // depths that differ by more than this many pixel widths are not one surface
 constexpr double kSteepest = 3.0;     // rise over run; steeper is a wall, whose height at a place says nothing
 constexpr double kCovered = 0.75;     // of a cell: pixels further apart than that are divided
 constexpr int kWidest = 4;            // cells from a pixel's centre to its edge; a larger one says too little
@@ -75,8 +75,8 @@ bool place(const HeightRow& job, const RowRay& ray, Block* block) {
 
 SPLAT_INLINE Floats size(Floats v) { return max(v, fill(0.0f) - v); }  // NaN stays
 
-// How inverse depths grow from a pixel to the next one in a direction, by least squares over pairs of pixels on both
-// sides that lie in one plane with it; from one side alone at a surface's rim; NaN where there is no neighbour.
+// Slope of inverse depths per pixel in a direction, by least squares over pairs of pixels on both sides that lie in one
+// plane with it; one-sided at a surface's rim; NaN if there is no neighbour.
 SPLAT_INLINE void slope(const HeightRow& job, const Block& block, float same, bool is_down, float* out) {
     const int offset = block.first - job.left + kSlopeReach;
     const auto row = [&](int down, int right) { return job.inverses[kSlopeReach + down] + offset + right; };

@@ -64,7 +64,7 @@ class Pool {
     explicit Pool(int workers) {
         try {
             for (int i = 0; i < workers; ++i) workers_.emplace_back([this] { work(); });
-        } catch (...) {  // no more threads to be had
+        } catch (...) {  // no more threads available
             end();
             throw;
         }
@@ -83,14 +83,14 @@ class Pool {
         wake_.notify_all();
         job.take_part();
         std::unique_lock<std::mutex> lock(mutex_);
-        job_ = nullptr;  // who has not woken by now need not any more
+        job_ = nullptr;  // workers that have not woken by now are no longer needed
         done_.wait(lock, [this] { return busy_ == 0; });
     }
 
   private:
     void work() {
         FlushDenormals flush;
-        inside_job = true;  // what a task starts runs on its own thread
+        inside_job = true;  // nested calls run on this thread
         uint64_t seen = 0;
         std::unique_lock<std::mutex> lock(mutex_);
         while (true) {
@@ -136,7 +136,7 @@ void forget_pool_in_child() {
     inside_job = false;
 }
 
-// A pool of so many workers, or null if there are no threads to be had. Call with pool_mutex held.
+// A pool of the given number of workers, or null if no threads are available. Call with pool_mutex held.
 Pool* pool_of(int workers) {
     if (pool && pool->workers() == workers) return pool;
     delete pool;
@@ -156,7 +156,7 @@ void run_job(Job& job) {
         std::lock_guard<std::mutex> lock(*pool_mutex, std::adopt_lock);
         if (Pool* helpers = pool_of(workers)) helpers->run(job);
     }
-    job.take_part();  // what nobody has done yet
+    job.take_part();  // whatever is left
     inside_job = before;
 }
 

@@ -16,9 +16,9 @@ void set_threads(int threads);
 int thread_count();
 
 // Run task(context, i) for i in 0..count-1 and return when all are done. Indices are handed out one by one, so make
-// each worth some 10 µs. On every thread denormals are flushed to zero for the while; the caller's mode is restored. A
-// nested call, and a call while another thread is inside, runs on the calling thread alone. The first exception is
-// thrown again here, once no thread is inside any more.
+// each worth about 10 µs. During the call denormals are flushed to zero on every thread; the caller's mode is restored.
+// A nested call, and a call while another thread is inside, runs on the calling thread alone. The first exception is
+// rethrown here once no thread is inside any more.
 void run_parallel(int64_t count, TaskFunction task, void* context);
 
 // The same for a callable: parallel_for(n, [&](int64_t i) {...}).
@@ -30,7 +30,7 @@ static inline void parallel_for(int64_t count, const Callable& body) {
     run_parallel(count, &Call::run, const_cast<Callable*>(&body));
 }
 
-// Flushes denormals to zero on this thread while it lives: they cost a factor of seven in narrow Gaussians' tails.
+// Flushes denormals to zero on this thread during its lifetime: they cost a factor of seven in narrow Gaussians' tails.
 class FlushDenormals {
   public:
     FlushDenormals();

@@ -10,7 +10,7 @@ constexpr int kMaxPixels = 65536;  // along a side: tiles are counted in 16 bits
 constexpr int kMaxShDegree = 3;
 constexpr int kMaxShCount = (kMaxShDegree + 1) * (kMaxShDegree + 1);
 
-// Null, or the name of what makes no sense.
+// Null, or the name of the invalid argument.
 inline const char* find_view(const SplatShot& shot, View* view) {
     if (shot.width < 1 || shot.height < 1 || shot.width > kMaxPixels || shot.height > kMaxPixels) return "size";
     if (shot.left < 0 || shot.top < 0 || shot.whole_width - shot.left < shot.width ||
@@ -34,7 +34,7 @@ inline const char* find_view(const SplatShot& shot, View* view) {
         view->translation[row] = static_cast<float>(pose[4 * row + 3]);
         view->centre[row] = static_cast<float>(centre);
     }
-    // Of the whole picture, so that a part of it shows what the whole shows there.
+    // Uses the whole image, so that a window renders exactly as in the whole.
     const double cx = shot.cx + shot.left, cy = shot.cy + shot.top;
     const double margin_x = kFrustumMargin * 0.5 * shot.whole_width,
                  margin_y = kFrustumMargin * 0.5 * shot.whole_height;
