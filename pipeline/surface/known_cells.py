@@ -1,4 +1,4 @@
-"""Where a surface model has heights, coarsely: what is drawn on it is drawn there, and nowhere else."""
+"""A coarse mask of where a surface model has heights, to which products on it are limited."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class KnownCells:
     blocks: Bool[np.ndarray, "rows columns"]
 
     def any_in(self, part: Tile) -> bool:
-        """Whether a block has heights of which some cell lies in a part; none do outside of the raster."""
+        """Whether any block that overlaps a part has heights; there are none outside of the raster."""
         rows = slice(max(part.row, 0) // BLOCK, max(part.row + part.height - 1, -1) // BLOCK + 1)
         columns = slice(max(part.column, 0) // BLOCK, max(part.column + part.width - 1, -1) // BLOCK + 1)
         return bool(self.blocks[rows, columns].any())
@@ -37,7 +37,7 @@ def known_cells(dsm: Path) -> KnownCells:
     """Read where a surface model has heights.
 
     Args:
-        dsm: A GeoTIFF of heights, tiled; it is read once, a row of blocks at a time.
+        dsm: A tiled GeoTIFF of heights; it is read once, one row of blocks at a time.
     """
     with gdal(dsm.parent), rasterio.open(dsm) as raster:
         rows = []

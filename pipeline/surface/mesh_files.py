@@ -1,8 +1,8 @@
-"""A mesh as binary glTF for viewers and as PLY for other programs, in local metres, and where these are.
+"""A mesh as binary glTF for viewers and as PLY for other programs, in local metres, with its georeference.
 
-glTF's vertex colours are linear light (glTF 2.0, section 3.7.2.1), in which 8 bits are too few for shadows: so they
-have 16. The material is unlit, for the sun is in the photos already (KHR_materials_unlit). PLY's colours are sRGB as
-everywhere.
+glTF's vertex colours are linear (glTF 2.0, section 3.7.2.1); 8 bits are too few for shadows, so they have 16. The
+material is unlit because the photos already contain the lighting (KHR_materials_unlit). PLY's colours are sRGB, as
+usual.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ UNLIT = "KHR_materials_unlit"
 
 
 def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, boundary: Path | None) -> None:
-    """Write `mesh.glb`, `mesh.ply` and `georef.json`, which places them, into a folder.
+    """Write `mesh.glb`, `mesh.ply` and `georef.json`, which georeferences them, into a folder.
 
     Args:
-        folder: Where.
-        made: In the frame's local metres.
-        frame: georef's.
-        boundary: `georef.boundary`; None where the run has no such part.
+        folder: Output folder.
+        made: The mesh in the frame's local metres.
+        frame: The run's frame from georef.
+        boundary: `georef.boundary`; None if the run has none.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -69,7 +69,7 @@ def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
 
 
 def _scene(positions: np.ndarray, colours: np.ndarray, triangles: np.ndarray) -> dict[str, Any]:
-    """glTF's description of a mesh whose arrays follow each other in one buffer."""
+    """The glTF JSON of a mesh whose arrays are consecutive in one buffer."""
     lengths = [each.nbytes for each in (positions, colours, triangles)]
     starts = np.concatenate([[0], np.cumsum(lengths)]).tolist()
     return {

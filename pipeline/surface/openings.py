@@ -1,4 +1,4 @@
-"""Outlines of what lies before or behind a wall's plane: its openings, what juts out, and the wall itself."""
+"""Outlines of a wall's openings, its projecting parts, and the wall itself."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ Ring = Float64[np.ndarray, "_ 2"]
 
 
 def recesses(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
-    """Openings: what lies behind the plane with the wall's face around it, as outlines on the sheet, metres."""
+    """Outlines of openings (areas behind the plane surrounded by the wall's face) on the sheet, metres."""
     limit = max(RECESS_M, STEP_GSD * sheet.lattice.cell_m)
     face = np.isfinite(depth) & (np.nan_to_num(depth, nan=-np.inf) >= -limit)
     return _rings(np.nan_to_num(depth, nan=0.0) < -limit, sheet, face)
 
 
 def projections(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
-    """What juts out of the plane, likewise."""
+    """Outlines of parts that project from the plane, likewise."""
     limit = max(JUT_M, STEP_GSD * sheet.lattice.cell_m)
     return _rings(np.nan_to_num(depth, nan=0.0) > limit, sheet, None)
 
 
 def outlines(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
-    """The wall as far as it is known, small holes and notches bridged."""
+    """Outlines of the known wall, with small holes and notches closed."""
     known = np.isfinite(depth).astype(np.uint8)
     reach = round(BRIDGED_M / sheet.lattice.cell_m)
     wide = cv2.copyMakeBorder(known, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
@@ -43,7 +43,7 @@ def outlines(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
 
 
 def _square(cells: int) -> UInt8[np.ndarray, "k k"]:
-    """A kernel with a middle: an even one would move what it is applied to."""
+    """A square kernel of odd size: an even one would shift the result."""
     side = 2 * (cells // 2) + 1
     return np.ones((side, side), np.uint8)
 
@@ -52,10 +52,10 @@ def _rings(there: Bool[np.ndarray, "h w"], sheet: Sheet, face: Bool[np.ndarray, 
     """Outlines of connected parts, along the cells' borders, from the largest.
 
     Args:
-        there: What is outlined.
-        sheet: Its cells.
-        face: What has to lie around openings, which are level rectangles where they nearly are; None where these are
-            none.
+        there: Mask to outline.
+        sheet: The sheet with its cells.
+        face: The wall's face, which has to surround openings; openings that are nearly level rectangles are drawn as
+            such. None if the parts are not openings.
     """
     cell = sheet.lattice.cell_m
     kernel = _square(round(SOFT_M / cell))
@@ -87,7 +87,7 @@ def _enclosed(own: Bool[np.ndarray, "a b"], left: int, top: int, face: Bool[np.n
 
 
 def _level_rectangle(own: Bool[np.ndarray, "h w"]) -> Ring:
-    """The rectangle whose sides are the medians of a part's ends in each row and column."""
+    """The level rectangle whose sides are the medians of a part's ends over rows and columns."""
     height, width = own.shape
     rows, columns = own[own.any(axis=1)], own.T[own.any(axis=0)]
     left, right = np.median(rows.argmax(axis=1)), width - np.median(rows[:, ::-1].argmax(axis=1))
@@ -96,7 +96,7 @@ def _level_rectangle(own: Bool[np.ndarray, "h w"]) -> Ring:
 
 
 def _traced(own: Bool[np.ndarray, "h w"]) -> Ring:
-    """The outline of a part, few corners; cells are doubled, so that it lies on their borders, not their centres."""
+    """A part's simplified outline; cells are doubled so that it follows their borders instead of their centres."""
     fine = np.pad(np.kron(own.view(np.uint8), np.ones((2, 2), np.uint8)), 1)
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(found, key=len)

@@ -1,4 +1,4 @@
-"""Small pictures of large rasters, for pages: from their overviews, so that size costs nothing."""
+"""Thumbnails of large rasters for HTML pages, from their overviews, so that the raster's size does not matter."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from rasterio.enums import Resampling
 from splatpipe.pipeline.surface.geotiff import gdal
 
 EMPTY = 255  # grey of what has no data
-LIGHT_FROM = np.array([-0.5, 0.5, np.sqrt(0.5)])  # east, north, up: from the north-west, half way up, as on maps
-DARKEST, LIGHTEST = 0.25, 1.4  # of slopes away from the light and towards it; level ground has 1
-SPREAD = 0.01  # of the heights at either end, that all have the end's colour
+LIGHT_FROM = np.array([-0.5, 0.5, np.sqrt(0.5)])  # east, north, up: from the north-west at 45°, as on maps
+DARKEST, LIGHTEST = 0.25, 1.4  # brightness of slopes away from and towards the light; level ground has 1
+SPREAD = 0.01  # share of the heights at either end that get the end's colour
 
 
 @dataclass(frozen=True, eq=False)
 class ReliefPicture:
-    """Heights as colours, lit from the north-west.
+    """Hillshaded, coloured heights, lit from the north-west.
 
     Attributes:
         pixels: RGB.
         low: Height of the first colour, in the file's unit.
-        high: Of the last.
+        high: Height of the last colour, in the file's unit.
     """
 
     pixels: UInt8[np.ndarray, "h w 3"]
@@ -35,11 +35,11 @@ class ReliefPicture:
 
 
 def ortho_picture(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
-    """`ortho.tif`, RGB, white where it has nothing.
+    """A thumbnail of `ortho.tif`, RGB, white where there is no data.
 
     Args:
         path: The file.
-        side: Pixels of the longer side at most.
+        side: Maximum length of the longer side, pixels.
     """
     with gdal(path.parent), rasterio.open(path) as raster:
         bands = raster.read(out_shape=(raster.count, *_shape(raster, side)), resampling=Resampling.average)
@@ -47,11 +47,11 @@ def ortho_picture(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def relief_picture(path: Path, side: int) -> ReliefPicture | None:
-    """`dsm.tif`; None where it has no height.
+    """A thumbnail of `dsm.tif`; None if it has no heights.
 
     Args:
         path: The file.
-        side: Pixels of the longer side at most.
+        side: Maximum length of the longer side, pixels.
     """
     with gdal(path.parent), rasterio.open(path) as raster:
         shape = _shape(raster, side)
@@ -69,7 +69,7 @@ def relief_picture(path: Path, side: int) -> ReliefPicture | None:
 
 
 def _light(height: Float64[np.ndarray, "h w"], step: float) -> Float64[np.ndarray, "h w"]:
-    """How much light falls on a surface; as on level ground where its slope is not known."""
+    """Hillshade of a surface; as for level ground where the slope is unknown."""
     down, right = np.gradient(height, step)
     normal = np.stack([-right, down, np.ones_like(height)], axis=-1)
     lit = (normal @ LIGHT_FROM) / np.linalg.norm(normal, axis=-1) / LIGHT_FROM[2]

@@ -1,4 +1,4 @@
-"""Decoded photos in a file without a name: each is decoded once, however many tiles ask for it."""
+"""Decoded photos in an unnamed temporary file: each is decoded once, however many tiles need it."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ SHARE_OF_FREE = 0.5  # of the disk's free space at most: the files that are made
 
 @contextmanager
 def pixels_on_disk(sources: Sequence[PhotoSource], folder: Path, held_bytes: int) -> Iterator[list[PhotoSource]]:
-    """Photos that are decoded when they are asked for first, and mapped from a file from then on.
+    """Photos that are decoded on first use and memory-mapped from a file afterwards.
 
     A tile sees dozens of photos and memory holds a few: without this, all would be decoded again for each tile. The
-    file has no name, so that it is gone with its process, however that ends.
+    file has no name, so it disappears with its process, however that ends.
 
     Args:
         sources: The photos.
-        folder: On whose disk the file lies.
-        held_bytes: What memory holds: where all photos fit into it, or the disk has no room, they stay as they are.
+        folder: A folder on the disk to use.
+        held_bytes: Memory for photos: if all fit into it, or the disk has no room, the photos are returned unchanged.
 
     Raises:
         OSError: if the disk is not writable; on loading, if it is full.
-        ValueError: on loading, if pixels are not of their photo's size.
+        ValueError: on loading, if pixels do not have their photo's size.
     """
     starts = list(accumulate((_pages(source) for source in sources), initial=0))
     if not held_bytes < starts[-1] <= SHARE_OF_FREE * shutil.disk_usage(folder).free:
@@ -49,7 +49,7 @@ def pixels_on_disk(sources: Sequence[PhotoSource], folder: Path, held_bytes: int
 
 
 def _pages(source: PhotoSource) -> int:
-    """What a photo takes in the file: whole pages, from which alone files are mapped."""
+    """A photo's size in the file, in bytes: whole pages, as memory mapping requires."""
     width, height = source.size
     return -(-width * height * 3 // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
 
@@ -60,10 +60,10 @@ class _PhotoSlot:
 
     Attributes:
         source: The photo.
-        file: Number of the open file.
-        start: First byte.
+        file: Descriptor of the open file.
+        start: Offset of its first byte.
         lock: Held while it is written.
-        written: Whether it is there.
+        written: Whether it has been written.
     """
 
     source: PhotoSource
@@ -73,7 +73,7 @@ class _PhotoSlot:
     written: bool = False
 
     def load(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Map the photo; written before, the first time."""
+        """Map the photo, after writing it the first time."""
         with self.lock:
             if not self.written:
                 self._write(loaded(self.source)[0])

@@ -61,10 +61,10 @@ def sample_map(
     """Sample a map over a box.
 
     Args:
-        exact: The map.
-        low: Least of the box's three coordinates.
-        high: Most; above the least.
-        spacing: Of nodes, ``SPACING_M`` in the coordinates' unit.
+        exact: The exact transformation.
+        low: Lowest corner of the box.
+        high: Highest corner of the box.
+        spacing: Spacing of the nodes, ``SPACING_M`` in the coordinates' unit.
     """
     counts = np.clip(np.ceil((high - low)[:2] / spacing), 1, MOST_STEPS).astype(np.int64)
     xs, ys = (np.linspace(low[axis], high[axis], counts[axis] + 1) for axis in (0, 1))

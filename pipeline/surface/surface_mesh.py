@@ -1,4 +1,4 @@
-"""The mesh of a capture: joined from depths, cleaned, decimated to a budget, coloured from the photos."""
+"""The mesh of a capture: fused from depths, cleaned, decimated to a budget, coloured from the photos."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ GREY = 128  # of what no photo shows, where nothing near has a colour
 
 @dataclass(frozen=True, eq=False)
 class MeshTask:
-    """What a mesh is made from.
+    """Inputs of a mesh.
 
     Attributes:
-        surface: The run's photos and depths; triangles all of whose corners lie inside of its area are kept.
-        site: What they show.
-        voxel_m: Side of the voxels, 2 GSD; larger where the site is.
-        most_triangles: In the end.
-        threads: Photos at a time.
+        surface: The run's photos and depths; triangles with all corners inside of its area are kept.
+        site: The area that they cover.
+        voxel_m: Voxel size, 2 GSD, metres; increased for large sites.
+        most_triangles: Maximum number of triangles after decimation.
+        threads: Photos in parallel.
     """
 
     surface: RunSurface
@@ -47,21 +47,21 @@ class MeshTask:
 
 
 def make_mesh(task: MeshTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
-    """Write `mesh.glb`, `mesh.ply` and `georef.json`; the same bits for any number of threads.
+    """Write `mesh.glb`, `mesh.ply` and `georef.json`; bit-identical for any number of threads.
 
-    A killed one goes on from the whole mesh before it is decimated, if it came so far.
+    A killed run resumes from the full mesh before decimation, if it got that far.
 
     Args:
-        task: What it is made from.
-        work: Folder of what is kept meanwhile.
-        out: Where the files go.
-        report: Told of progress.
+        task: Inputs.
+        work: Folder for intermediate files.
+        out: Output folder.
+        report: Receives progress.
 
     Returns:
-        Figures for people: triangles, vertices, the area, the voxels' side.
+        Statistics: triangles, vertices, area, voxel size.
 
     Raises:
-        MachineError: if open3d is not there, or the disk is full.
+        MachineError: if open3d is not installed, or the disk is full.
         SplatpipeError: if there is no surface that enough photos see.
         ValueError: if depths or pixels do not fit their camera.
     """
@@ -95,7 +95,7 @@ def _kept(path: Path) -> tuple[TriangleMesh, float]:
 
 
 def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[TriangleMesh, float]:
-    """The mesh before it is decimated, and the side of its voxels, metres."""
+    """The mesh before decimation, and its voxel size in metres."""
     box = task.site.box
     blocks = surface_blocks(photos, box, task.voxel_m, MOST_BLOCKS, task.threads)
     if blocks.voxel_m > task.voxel_m:
@@ -112,11 +112,11 @@ def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[Trian
 
 
 def decimated(mesh: TriangleMesh, most: int) -> TriangleMesh:
-    """The mesh with so many triangles at most, fewer where it is flat (quadric errors; Garland and Heckbert 1997).
+    """Decimate a mesh to a maximum number of triangles (quadric error metrics; Garland and Heckbert 1997).
 
     Args:
-        mesh: In order.
-        most: Triangles.
+        mesh: Mesh in canonical order.
+        most: Maximum number of triangles.
     """
     if len(mesh.triangles) <= most:
         return mesh
@@ -134,7 +134,7 @@ def decimated(mesh: TriangleMesh, most: int) -> TriangleMesh:
 
 
 def vertex_colours(photos: PhotoSet, mesh: TriangleMesh, threads: int) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of a mesh's vertices from the photos; of what none sees, those of the nearest vertex that one does."""
+    """Colours of a mesh's vertices from the photos; unseen vertices get the colour of the nearest seen one."""
     pieces = SurfacePieces(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.normals().T))
     spacing_m = float(np.sqrt(mesh.areas().sum() / len(mesh.vertices)))
     colours, known = point_colours(photos, pieces, spacing_m, threads)

@@ -1,4 +1,4 @@
-"""Traces: sections and outlines as few places in the world frame, for a page that draws them over the model."""
+"""Traces: thinned sections and outlines in the world frame, for a page that draws them over the model."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Column = list[float | None]
 
 
 def section_trace(section: Section, crs: MapCrs, most: int) -> dict[str, Column]:
-    """A section's heights along its line; of a long one the extremes of each stretch, so that no peak is lost.
+    """A section's heights along its line; a long one keeps the extremes of each stretch, so that no peak is lost.
 
     Args:
-        section: Which.
-        crs: Of its coordinates.
-        most: Places, and points beside them, at least 4.
+        section: The section.
+        crs: CRS of its coordinates.
+        most: Maximum number of places, and likewise of points, at least 4.
 
     Returns:
         Columns, all in metres: ``distance``, ``height`` and ``sigma`` (heights as the CRS counts them, None where the
@@ -44,16 +44,16 @@ def section_trace(section: Section, crs: MapCrs, most: int) -> dict[str, Column]
 
 
 def polygon_trace(surface: SurfaceFile, polygon: Polygon, crs: MapCrs, most: int) -> list[dict[str, Column]]:
-    """A polygon's rings, laid onto the surface; over a hole of it they go straight on.
+    """A polygon's rings draped onto the surface; holes of the surface are bridged.
 
     Args:
-        surface: The model.
+        surface: The surface model.
         polygon: East and north, local metres.
-        crs: The model's.
-        most: Places on each ring, at least 4.
+        crs: CRS of the surface model.
+        most: Maximum number of places on each ring, at least 4.
 
     Returns:
-        Of each ring, closed: ``x``, ``y``, ``z`` in the world frame, metres.
+        For each ring, closed: ``x``, ``y``, ``z`` in the world frame, metres.
     """
     return [_ring_trace(surface, ring, crs, most) for ring in polygon]
 
@@ -74,7 +74,7 @@ def _ring_trace(surface: SurfaceFile, ring: Ring, crs: MapCrs, most: int) -> dic
 
 
 def _thinned(height: Float64[np.ndarray, " n"], most: int) -> Int64[np.ndarray, " k"]:
-    """Which places stay: all of few; else both ends, and the lowest and highest of each stretch. Holes stay holes."""
+    """Rows of places to keep: all if few; else both ends, and each stretch's lowest and highest. Holes stay holes."""
     if len(height) <= most:
         return np.arange(len(height))
     chosen = [0, len(height) - 1]

@@ -1,4 +1,4 @@
-"""Files that libraries write: there whole or as before, also after a kill, with nothing of theirs left beside them."""
+"""Atomic replacement of files that libraries write, even after a kill, without leftovers beside them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ UNFINISHED = ".making"
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A name to fill, in a folder of its own, whose place beside it the file takes when it is whole.
+    """Yield a temporary path in its own folder; the file is moved to ``path`` once it is complete.
 
-    The folder is for what libraries put beside their files, too (GDAL's overviews under way). One process at a time
-    may write a file: what another one left unfinished of it is removed.
+    The folder also holds files that libraries write beside their own (GDAL's temporary overviews). Only one process at
+    a time may write a file: unfinished files of another one are removed.
 
     Args:
-        path: Where; an older file there is replaced.
+        path: Final path; an older file there is replaced.
 
     Raises:
         OSError: if the disk is full or not writable; what was at ``path`` is still there.
@@ -43,7 +43,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_whole_text(path: Path, text: str) -> None:
-    """Write a text as UTF-8 likewise.
+    """Write a text as UTF-8 atomically.
 
     Raises:
         OSError: as ``whole_file``.

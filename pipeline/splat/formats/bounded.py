@@ -1,4 +1,4 @@
-"""What readers of anybody's files share: errors instead of exceptions, and no more memory than a file is worth."""
+"""Shared by readers of untrusted files: clear errors, and memory bounded by the file's size."""
 
 from __future__ import annotations
 
