@@ -1,4 +1,4 @@
-"""A drawing in metres at true size: lines, texts, a picture, a scale bar; what DXF and SVG are written from."""
+"""A drawing in metres at true size: lines, texts, an image, a scale bar; the source of DXF and SVG files."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Stroke:
     """A polyline.
 
     Attributes:
-        layer: Of the constants.
+        layer: One of the layer constants.
         line: Metres to the right and up.
-        closed: Whether its end meets its start.
-        filled: Whether what it encloses is filled: of four corners.
+        closed: Whether its end connects to its start.
+        filled: Whether it is filled; only with four corners.
     """
 
     layer: str
@@ -54,10 +54,10 @@ class Label:
 
     Attributes:
         text: One line.
-        right_m: Where it stands.
-        up_m: Of its baseline.
-        size_mm: Of its letters on paper.
-        anchor: Which part of it stands there: ``start``, ``middle`` or ``end``.
+        right_m: Horizontal position of its anchor.
+        up_m: Height of its baseline.
+        size_mm: Height of its letters on paper.
+        anchor: The part of the text at that position: ``start``, ``middle`` or ``end``.
     """
 
     text: str
@@ -72,7 +72,7 @@ class Dots:
     """Points of one layer.
 
     Attributes:
-        layer: Of the constants.
+        layer: One of the layer constants.
         places: Metres to the right and up.
     """
 
@@ -82,15 +82,15 @@ class Dots:
 
 @dataclass(frozen=True)
 class DrawingPicture:
-    """A picture at true size.
+    """An image at true size.
 
     Attributes:
-        file: Its name, beside the drawing.
-        left_m: Of its lower left corner.
-        bottom_m: Likewise.
-        width_m: Of the whole.
-        height_m: Of the whole.
-        pixels: Width and height.
+        file: Name of the image file beside the drawing.
+        left_m: Left edge.
+        bottom_m: Bottom edge.
+        width_m: Width of the image.
+        height_m: Height of the image.
+        pixels: Width and height, pixels.
     """
 
     file: str
@@ -103,13 +103,13 @@ class DrawingPicture:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """What is drawn, in metres at true size.
+    """A drawing, in metres at true size.
 
     Attributes:
-        scale: It is to be plotted at 1 to so many.
-        strokes: In the order in which they lie on each other.
+        scale: Denominator of the plot scale.
+        strokes: Lines, from bottom to top.
         labels: Texts.
-        picture: Below all; None without one.
+        picture: Image below everything else; None without one.
         dots: Points.
     """
 
@@ -120,7 +120,7 @@ class Drawing:
     dots: Dots | None = None
 
     def box(self) -> tuple[Place2, Place2]:
-        """Lower left and upper right of all lines and the picture; texts reach a little beyond."""
+        """Lower left and upper right corner of all lines and the image; texts extend slightly beyond."""
         parts = [stroke.line for stroke in self.strokes]
         if self.picture is not None:
             left, bottom = self.picture.left_m, self.picture.bottom_m
@@ -130,7 +130,7 @@ class Drawing:
 
 
 def plot_scale(width_m: float, height_m: float) -> int:
-    """The largest usual scale at which something goes onto an A3 sheet; the smallest where none does."""
+    """The largest usual scale at which a drawing fits onto an A3 sheet, or else the smallest usual scale."""
     for scale in SCALES:
         if width_m * 1000.0 / scale <= PAPER_MM[0] and height_m * 1000.0 / scale <= PAPER_MM[1]:
             return scale
@@ -138,12 +138,12 @@ def plot_scale(width_m: float, height_m: float) -> int:
 
 
 def rectangle(left_m: float, bottom_m: float, right_m: float, top_m: float) -> Line2:
-    """Its corners, to be closed."""
+    """Corners of a rectangle, for a closed line."""
     return np.array([[left_m, bottom_m], [right_m, bottom_m], [right_m, top_m], [left_m, top_m]])
 
 
 def caption(title: str, about: Sequence[str], left_m: float, bottom_m: float, scale: int) -> list[Label]:
-    """A title and lines about it, below a drawing whose lower left corner is told."""
+    """A title and descriptive lines below a drawing, given its lower left corner."""
     mm = scale / 1000.0
     labels = [Label(title, left_m, bottom_m - (GAP_MM + TITLE_MM) * mm, TITLE_MM)]
     for number, text in enumerate(about, 1):
@@ -152,12 +152,12 @@ def caption(title: str, about: Sequence[str], left_m: float, bottom_m: float, sc
 
 
 def scale_bar(right_m: float, bottom_m: float, scale: int) -> tuple[list[Stroke], list[Label]]:
-    """A bar that ends at the right below a drawing, its parts filled in turn, with lengths.
+    """A scale bar below the right end of a drawing, with alternately filled parts and lengths.
 
     Args:
-        right_m: Of the drawing's lower right corner.
-        bottom_m: Likewise.
-        scale: Of the plot.
+        right_m: Right edge of the drawing.
+        bottom_m: Bottom edge of the drawing.
+        scale: Denominator of the plot scale.
     """
     mm = scale / 1000.0
     length = max((metres for metres in BAR_LENGTHS_M if metres <= BAR_MM * mm), default=BAR_LENGTHS_M[0])

@@ -1,8 +1,8 @@
-"""Drawings as DXF, for CAD, and as SVG, for everybody.
+"""Drawings as DXF for CAD, and as SVG for general use.
 
-DXF is of AutoCAD 2000 in metres at true size, a picture attached as a reference to the file beside it. SVG is of the
-paper's size, in millimetres, with the picture inside: programs that show an SVG as a picture load nothing from beside
-it.
+DXF files have the AutoCAD 2000 format, in metres at true size, with an image as a reference to the file beside it. SVG
+files have the paper's size, in millimetres, with the image embedded: programs that show an SVG as an image do not load
+other files.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from splatpipe.pipeline.surface.drawing import (
 )
 from splatpipe.pipeline.surface.whole_file import whole_file, write_whole_text
 
-DXF_VERSION = "R2000"  # the oldest with a drawing's unit and pictures, and so read by the most programs
-METRES = 6  # of $INSUNITS
+DXF_VERSION = "R2000"  # the oldest with drawing units and images, so most programs read it
+METRES = 6  # value of $INSUNITS
 DIGITS = 4  # of coordinates in metres: a tenth of a millimetre
-MARGIN_MM = 10.0  # around an SVG, and room for texts that reach beyond lines
-MOST_EMBEDDED = 4096  # pixels a side of a picture in an SVG; larger ones are made smaller
+MARGIN_MM = 10.0  # around an SVG, with room for texts that extend beyond lines
+MOST_EMBEDDED = 4096  # largest side of an image in an SVG, pixels; larger images are reduced
 JPEG_QUALITY = 92
 # AutoCAD's colour, hundredths of a millimetre, and the SVG's colour of each layer.
 LAYERS = {
@@ -63,7 +63,7 @@ ANCHORS = {
 
 
 def write_dxf_drawing(path: Path, drawing: Drawing) -> None:
-    """Write a drawing as DXF; its picture is to lie beside it.
+    """Write a drawing as DXF; its image has to be in the same folder.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -118,7 +118,7 @@ def _attach_picture(document: DxfDocument, drawing: Drawing) -> None:
 
 @contextmanager
 def the_same_bytes() -> Iterator[None]:
-    """Let ezdxf write no date and no random number: its own means to that end."""
+    """Make ezdxf write neither dates nor random numbers, by its own options."""
     before = options.write_fixed_meta_data_for_testing
     options.write_fixed_meta_data_for_testing = True
     try:
@@ -131,10 +131,10 @@ def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "
     """Write a drawing as SVG, in millimetres of paper.
 
     Args:
-        path: Where.
-        drawing: What.
-        colours: The picture that it places, transparent where its last channel is 0; None without one.
-        title: For readers of the file.
+        path: Output file.
+        drawing: The drawing.
+        colours: Its image, transparent where the last channel is 0; None without one.
+        title: Title in the file.
 
     Raises:
         OSError: if the disk is full or not writable.
@@ -186,7 +186,7 @@ def _svg_path(stroke: Stroke, line: np.ndarray) -> str:
 
 
 def _embedded(colours: UInt8[np.ndarray, "h w 4"]) -> str:
-    """A picture as a data URL: JPEG on white, which is a fifth of a PNG."""
+    """An image as a data URL: JPEG on white, a fifth of a PNG's size."""
     flat = Image.fromarray(np.where(colours[..., 3:] > 0, colours[..., :3], np.uint8(255)))
     flat.thumbnail((MOST_EMBEDDED, MOST_EMBEDDED))
     kept = io.BytesIO()

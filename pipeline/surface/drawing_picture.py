@@ -20,7 +20,7 @@ TEXT_ROOM_MM = 25.0  # for what is written below and at the left
 
 
 def write_png_drawing(path: Path, drawing: Drawing) -> None:
-    """Write a drawing as PNG at its plot's scale; its picture, if it has one, is left out.
+    """Write a drawing as PNG at its plot scale, without its image.
 
     Raises:
         OSError: if the disk is full or not writable.
