@@ -13,14 +13,14 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
 
-BLOCKS_A_PHOTO = 20_000  # of pixels, that a plane is laid through each: 20 cm of a wall in photos of a GSD of 3 cm
-LEAST_BLOCK = 6  # pixels a side: a smaller one's slope is noise
+BLOCKS_A_PHOTO = 20_000  # blocks of pixels, each fitted with a plane: 20 cm of a wall in photos with a GSD of 3 cm
+LEAST_BLOCK = 6  # pixels per side: a smaller block's slope is noise
 LEAST_SHARE = 0.6  # of a block's pixels that count
-ROUGH_PX = 3.0  # pixels' widths that a block's depths may scatter by about its plane: more are two surfaces
-UPRIGHT = 0.35  # upward part of a normal, at most: 20°, three deviations of a small block's
-COARSEST = 2.0  # times the usual pixel: coarser ones are of houses beyond those that were flown for
-STRIP_PIXELS = 1 << 20  # fitted at a time: some 100 MB
-MOST_FACETS = 1_000_000  # of all photos; of more, some are left out evenly
+ROUGH_PX = 3.0  # pixel widths by which a block's depths may scatter about its plane: more means two surfaces
+UPRIGHT = 0.35  # largest vertical component of a normal: 20°, three standard deviations for a small block
+COARSEST = 2.0  # times the median pixel: coarser pixels show houses beyond the survey area
+STRIP_PIXELS = 1 << 20  # fitted at a time: about 100 MB
+MOST_FACETS = 1_000_000  # of all photos; more are thinned evenly
 
 
 @dataclass(frozen=True)

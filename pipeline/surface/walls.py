@@ -17,29 +17,29 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.surface.facets import Facets
 from splatpipe.pipeline.survey.boundary import DIRECTIONS
 
-SEED_M, SEED_SECTORS = 1.0, 24  # of plan and of directions: facets in it that walls are looked for from
-SEED_M2 = 2.0  # of facets, of all photos together, that a search starts from at least
-SEED_HEIGHT_M = 1.2  # of what lies in one plane with a seed, at least; half a wall's
+SEED_M, SEED_SECTORS = 1.0, 24  # bins of plan and of direction whose facets seed the search for walls
+SEED_M2 = 2.0  # least area of a seed's facets, of all photos together
+SEED_HEIGHT_M = 1.2  # least height of the facets in a seed's plane; half a wall's
 SAME_WAY = math.cos(math.radians(30.0))  # of a facet's direction and its wall's: three deviations of a facet's noise
-REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # to which a wall grows, its plane taken anew each time
-BAND_M = 0.12  # about a plane: plinths and shutters are in it, and the panes of windows are not
+REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # to which a wall grows, with its plane fitted again each time
+BAND_M = 0.12  # about a plane: includes plinths and shutters, but not window panes
 BAND_PIXELS = 4.0  # the same of coarse depths
-CLAIM_BANDS = 4.0  # about a wall, in which nothing else is looked for...
+CLAIM_BANDS = 4.0  # about a wall, in which no other wall is searched for...
 CLAIM_COSINE = 0.5  # ...that faces nearly as it does: noise turns some of its own facets by more than ``SAME_WAY``
 BIN_M = 0.5  # along a wall
-GAP_M = 3.0  # between pieces of one wall: a tree before it, a gate
-CELL_M = 0.25  # of a wall's face, in which three facets tell that it is there
+GAP_M = 3.0  # between pieces of one wall: a tree in front of it, a gate
+CELL_M = 0.25  # of a wall's face, occupied if it has three facets
 CELL_FACETS = 3
 CLOSED_CELLS = 5  # over which openings are bridged
 LEAST_HEIGHT_M, LEAST_LENGTH_M, LEAST_M2 = 2.1, 2.0, 6.0  # of a wall that meets others: garden walls are lower
 FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
-LOW_FLAT = 0.22  # of the band, in which half of the facets of one that is lower than that lie: on the demo those of
-# low walls do within 0.04 of it, of walls with a plinth within 0.18, of hedges, clipped as high as garages, 0.3 to 0.4
-LEAST_FLAT = 0.6  # of the facets before and behind a wall, those within its band: in hedges and trees they scatter
+LOW_FLAT = 0.22  # of the band, within which half of the facets of a wall lower than that have to lie: on the demo, half
+# lie within 0.04 for low walls, 0.18 for walls with a plinth, and 0.3 to 0.4 for hedges clipped as high as garages
+LEAST_FLAT = 0.6  # share of the facets around a wall's plane that lie within its band: in hedges and trees they scatter
 CORNER_M = 0.4  # from where a wall's facets end to the plane of the next one, at most: two facets
 CORNER_COSINE = math.cos(math.radians(30.0))  # planes that meet at less than this angle make no corner
 TOP_M = 0.4  # above the last facets, which end two of them below the eaves
-END_SHARE = 0.4  # of a wall's usual height that is seen at its ends: what goes on beyond them is a bush or a fence
+END_SHARE = 0.4  # of a wall's usual height that has to be seen at its ends: anything lower is a bush or a fence
 ROUNDS = 5  # of a plane's robust fit
 
 Plan = Float64[np.ndarray, " 2"]

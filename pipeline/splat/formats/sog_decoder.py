@@ -21,11 +21,11 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count
 
 MOST_EXPANSION = 40.0
-"""With harmonics of degree 3 a Gaussian takes 15 bytes of 236, in simple scenes half as many."""
-_SPARE_PIXELS = 1 << 16  # beyond four times what is needed
+"""With SH of degree 3 a Gaussian takes 15 of 236 bytes, in simple scenes half as many."""
+_SPARE_PIXELS = 1 << 16  # allowed beyond four times the pixels needed
 _HEADER_BYTES = 1 << 12  # of a picture
 _PIXEL_BYTES = 5  # of a picture that does not compress, and some more
-_MOST_LOG = 1e3  # of a coordinate: what is this large is caught when it has been made
+_MOST_LOG = 1e3  # of a coordinate: larger values are caught after decoding
 _LEAST_OPACITY = 1e-6  # a byte of 0 or 255 is read as this far from 0 or 1, as PlayCanvas does
 _ROWS_AT_ONCE = 1 << 16
 _AGAIN = "Copy or export it again."
@@ -128,7 +128,7 @@ class SogDecoder:
             gaussians.sh[part_of, 1:] = palette[torch.from_numpy(labels[part_of])]
 
     def _coded(self, name: str, codes: UInt8[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-        """The values of a part's codebook that bytes stand for."""
+        """Look up codes in a part's codebook."""
         book = self._part(name).get("codebook")
         if isinstance(book, list) and len(book) > 2 and book[0] is None:
             book = [0.0, *book[1:]]

@@ -1,4 +1,4 @@
-"""What a SOG file holds, in memory: Gaussians as bytes in lossless pictures, and the meta.json that tells them."""
+"""The contents of a SOG file in memory: Gaussians as bytes in lossless images, and their meta.json."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ class SogImages:
     """Files of a SOG.
 
     Attributes:
-        meta: What `meta.json` says; it names the pictures.
-        images: The pictures, lossless WebP, by file name.
+        meta: Contents of `meta.json`, which names the images.
+        images: Lossless WebP images by file name.
     """
 
     meta: dict[str, Any]
     images: dict[str, bytes]
 
     def files(self) -> dict[str, bytes]:
-        """All by name, `meta.json` first."""
+        """All files by name, `meta.json` first."""
         text = json.dumps(self.meta, separators=(",", ":"), allow_nan=False)
         return {META: text.encode("ascii"), **self.images}
 
@@ -61,19 +61,19 @@ def encode_sog(
     in_order: bool = False,
     turn: Float64[Tensor, "3 3"] | None = None,
 ) -> SogImages:
-    """Code Gaussians; the same bytes for the same Gaussians, whatever the number of threads.
+    """Encode Gaussians; deterministic for any number of threads.
 
     Args:
-        gaussians: Finite, on the CPU, in the file's frame (y down: what viewers take it for), about an origin near the
-            scene: a coordinate's quantum is 1 / 65,535 of its range in ± log(1 + |x|).
-        antialias: Whether their opacities allow for the blur on screen.
-        record: ``SceneFacts.record()`` of a whole file; none in the pieces of a streamed one.
-        in_order: Keep the Gaussians' order, as where an index of levels counts them; along a Morton curve otherwise,
-            which takes less room.
-        turn: Rotation to the file's frame, where they are in another.
+        gaussians: Finite, on the CPU, in the file's frame (y down, as viewers assume), about an origin near the scene:
+            a coordinate's quantum is 1 / 65,535 of its range in ± log(1 + |x|).
+        antialias: Whether their opacities account for the screen-space blur.
+        record: ``SceneFacts.record()`` for a whole file; empty for the pieces of a streamed one.
+        in_order: Keep the order, e.g. if a LOD index refers to it; otherwise sort along a Morton curve, which is
+            smaller.
+        turn: Rotation to the file's frame, if they are in another.
 
     Returns:
-        meta.json and the pictures.
+        meta.json and the images.
 
     Raises:
         ValueError: if a parameter is not finite.
@@ -118,9 +118,9 @@ def _parts(gaussians: Gaussians) -> dict[str, _Part]:
 
 
 def _shown(gaussians: Gaussians) -> Float[Tensor, " n"]:
-    """How much of a picture shows each, in means: its opacity times its area, at most what all but a few have.
+    """Approximate image share of each Gaussian relative to the mean: opacity times area, clipped at a high quantile.
 
-    Errors count by that: a picture's error is the sum of theirs, each as large as its place in the picture.
+    It weights errors, because an image's error is the sum over the pixels that each Gaussian covers.
     """
     if not len(gaussians):
         return torch.zeros(0)
@@ -154,7 +154,7 @@ def _scales(log_scales: Float[Tensor, "n 3"], shown: Float[Tensor, " n"]) -> _Pa
 
 
 def _quats(quats: Float[Tensor, "n 4"]) -> _Part:
-    """The three smallest of w, x, y, z over √½, and which the fourth is."""
+    """Encode the three smallest of w, x, y, z over √½, and the index of the fourth."""
     unit = quats.numpy().astype(np.float64)
     unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-30)
     largest = np.abs(unit).argmax(axis=1)
@@ -174,7 +174,7 @@ def _colours(dc: Float[Tensor, "n 3"], opacity_logits: Float[Tensor, " n"], show
 
 
 def _harmonics(sh: Float[Tensor, "n k 3"], shown: Float[Tensor, " n"]) -> _Part:
-    """A palette of all coefficients of a Gaussian, and which entry each Gaussian has."""
+    """A palette of vectors of all higher SH coefficients, and the index of each Gaussian's entry."""
     rows = sh.flatten(1)
     palette, fitted = torch.zeros(1, rows.shape[1]), torch.zeros(0, dtype=torch.int64)
     if len(rows):
@@ -194,7 +194,7 @@ def _harmonics(sh: Float[Tensor, "n k 3"], shown: Float[Tensor, " n"]) -> _Part:
 def _by_first_use(
     codes: UInt8[np.ndarray, "k d"], labels: Int64[np.ndarray, " n"]
 ) -> tuple[UInt8[np.ndarray, "m d"], Int64[np.ndarray, " n"]]:
-    """Only what is used, in the order of its first use: the labels of neighbours are near one another."""
+    """Keep only used entries, in order of first use, so that neighbours have similar labels."""
     if not len(labels):
         return codes, labels
     used, first, places = np.unique(labels, return_index=True, return_inverse=True)
@@ -205,12 +205,12 @@ def _by_first_use(
 
 
 def palette_size(count: int) -> int:
-    """Entries for so many Gaussians: the largest power of two that is not more, as far as the format goes."""
+    """Number of palette entries: the largest power of two up to the number of Gaussians, within the format's limit."""
     return min(1 << (count.bit_length() - 1), MOST_ENTRIES)
 
 
 def _picture(pixels: UInt8[np.ndarray, "n c"]) -> UInt8[np.ndarray, "h w c"]:
-    """Rows of pixels, nearly a square; zeros after the last."""
+    """Arrange pixels as a nearly square image, padded with zeros."""
     width = max(math.ceil(math.sqrt(len(pixels)) / _SIDES), 1) * _SIDES
     height = max(math.ceil(len(pixels) / width / _SIDES), 1) * _SIDES
     room = np.zeros((width * height, pixels.shape[1]), np.uint8)
@@ -219,5 +219,5 @@ def _picture(pixels: UInt8[np.ndarray, "n c"]) -> UInt8[np.ndarray, "h w c"]:
 
 
 def _numbers(values: Float32[np.ndarray, " n"]) -> list[float]:
-    """As the shortest decimals that are these float32."""
+    """Numbers as the shortest decimals that round to these float32 values."""
     return [float(str(value)) for value in values]
