@@ -1,7 +1,7 @@
-"""The wheel's bill of materials (SBOM): a CycloneDX 1.6 file of what is in the wheel from others, and what it needs.
+"""The wheel's bill of materials (SBOM): a CycloneDX 1.6 file of its third-party contents and its dependencies.
 
-CMake runs it once the pages are bundled; the wheel has the file in its ``*.dist-info/sboms`` (PEP 770). It needs
-nothing but Python, and the same sources give the same bytes. What is in a page's script is told by that script:
+CMake runs it after the pages are bundled; the wheel has the file in its ``*.dist-info/sboms`` (PEP 770). It needs
+only Python, and the same sources give the same bytes. The contents of a page's script are read from the script:
 esbuild's list of licences at its top, and the crates that Spark's WebAssembly names in its messages.
 """
 
@@ -33,7 +33,7 @@ Component = dict[str, Any]
 
 
 def main() -> int:
-    """Write the file; the exit code."""
+    """Write the file and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", type=Path)
     parser.add_argument("--nanobind", required=True, help="Version of nanobind that the kernels' module was made with.")
@@ -77,7 +77,7 @@ def bill(nanobind: str, cuda: str = "") -> dict[str, Any]:
 def component(
     registry: str, name: str, version: str, licence: str = "", *, kind: str = "library", bundled: bool = True
 ) -> Component:
-    """A component as CycloneDX has it; its package URL also refers to it."""
+    """A CycloneDX component; its package URL is also its reference."""
     known = name.lower().replace("_", "-") if registry == "pypi" else name.replace("@", "%40")
     purl = f"pkg:{registry}/{known}" + (f"@{version}" if version else "")
     found: Component = {"type": kind, "bom-ref": purl, "name": name, "purl": purl}
@@ -110,7 +110,7 @@ def bundled_npm() -> dict[str, str]:
 
 
 def npm_packages() -> Iterator[Component]:
-    """What is bundled of npm, with the lock file's licences and digests."""
+    """The bundled npm packages, with the lock file's licences and digests."""
     locked = json.loads((ROOT / "pipeline/web/package-lock.json").read_text(encoding="utf-8"))["packages"]
     for name, version in sorted(bundled_npm().items()):
         facts = locked[f"node_modules/{name}"]
@@ -123,7 +123,7 @@ def npm_packages() -> Iterator[Component]:
 
 
 def crates_of(texts: Iterable[str]) -> Iterator[Component]:
-    """The crates that WebAssembly in a script names; some that never fail may not be named."""
+    """The crates named in a script's WebAssembly; crates without error messages may be missing."""
     found = set()
     for text in texts:
         for packed in WASM.findall(text):
@@ -134,14 +134,14 @@ def crates_of(texts: Iterable[str]) -> Iterator[Component]:
 
 
 def tested_versions() -> list[tuple[str, str]]:
-    """What a run needs, with the versions that constraints.txt has."""
+    """Run-time dependencies, with the versions in constraints.txt."""
     _, _, rest = (ROOT / "constraints.txt").read_text(encoding="utf-8").partition(NEEDED)
     lines = rest.partition("\n")[2].partition("\n#")[0].split()
     return [(name, version) for name, _, version in (line.partition("==") for line in lines)]
 
 
 def licence_file(name: str) -> Path:
-    """Where the licence of an npm package or a library is kept."""
+    """Path of the licence of an npm package or library."""
     return LICENCES / f"{name.lstrip('@').replace('/', '-')}.txt"
 
 
