@@ -1,1 +1,1 @@
-"""Surveying: coordinate systems, frames, control and positions, and how well a model lies."""
+"""Surveying: coordinate reference systems, frames, control points and photo positions, and the model's accuracy."""

@@ -1,4 +1,4 @@
-"""How well a model lies where control, check points and positions say: ``control.json`` and ``accuracy.json``."""
+"""The model's accuracy at control points, check points and photo positions: ``control.json`` and ``accuracy.json``."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, residual
 
 @dataclass(frozen=True)
 class GeoreferencedModel:
-    """A model in the world.
+    """A model in the world frame.
 
     Attributes:
-        model: The one that goes on down the line.
-        world_from_model: Where it lies.
-        offsets: Of the flights' positions: stated less true, metres.
+        model: The model that later stages use.
+        world_from_model: Its similarity to the world frame.
+        offsets: Offset of each flight's positions, stated minus true, metres.
     """
 
     model: SparseModel
@@ -40,9 +40,10 @@ def no_control() -> JSON:
 def control_json(
     survey: Survey, site: LocalSurvey, placed: GeoreferencedModel, photos: Mapping[str, Photo], mark_sigma_px: float
 ) -> JSON:
-    """What ``control.json`` holds: every point of the survey, where it was found, and its marks; local metres.
+    """Return the contents of ``control.json``: every surveyed point, its estimated position and its marks; local
+    metres.
 
-    Residuals are what is estimated less what is surveyed; of pixels, what the model shows less the mark.
+    Residuals are estimated minus surveyed; in pixels, projected minus marked.
     """
     points = []
     for k, point in enumerate(survey.points):
@@ -82,14 +83,14 @@ def accuracy_json(
     gsd: float | None,
     uncertainty: JSON = None,
 ) -> JSON:
-    """What ``accuracy.json`` holds: the errors of positions, control and check points apart; absent groups are null.
+    """Return the contents of ``accuracy.json``: errors of positions, control and check points; absent groups are null.
 
     Args:
         survey: The surveyed points.
-        site: The world.
-        placed: The model in it.
-        gsd: Ground sampling distance.
-        uncertainty: How well positions alone place the model; null where control does.
+        site: The survey in the world frame.
+        placed: The model in the world frame.
+        gsd: Ground sampling distance, metres.
+        uncertainty: Uncertainty of georeferencing by positions alone; null with control.
     """
     tables: dict[str, JSON] = {"gps": None, "control": None, "check": None}
     if site is not None and len(site.stations):

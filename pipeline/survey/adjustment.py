@@ -1,10 +1,10 @@
-"""Bundle adjustment with control, positions and priors of the lens: COLMAP's problem with blocks of our own in it.
+"""Bundle adjustment with control, positions and lens priors: COLMAP's problem with additional residual blocks.
 
-COLMAP builds the reprojection errors of the features; marks, control and positions join them through pyceres. All is in
-the world's metres, and in one order, on one thread: the same bits for the same input. Residuals of features stay in
-pixels, so that everything else is in units of their standard deviation.
+COLMAP builds the reprojection errors of the features; pyceres adds marks, control points and positions. Everything is
+in world metres, in a fixed order and on one thread, so that results are bit-identical. Feature residuals stay in
+pixels; all others are in units of the features' standard deviation.
 
-A flight's common error is an unknown of its own.
+Each flight's common position error is an unknown.
 """
 
 from __future__ import annotations
@@ -26,10 +26,12 @@ from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_
 from splatpipe.pipeline.sfm.lens_blocks import hold, keep_shape
 from splatpipe.pipeline.survey.local_survey import Stations
 
-LEAST_SIGMA_PX = 1.0  # of features: they err together, in one photo, by lens and shutter; control should not
-UNBOUND_M = 1e4  # sigma of a height that nobody measured
+LEAST_SIGMA_PX = (
+    1.0  # of features: lens and shutter errors are correlated within a photo, and must not outweigh control
+)
+UNBOUND_M = 1e4  # sigma of a height that was not measured
 FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
-DISTORTION_SIGMA = 0.2  # of a distortion coefficient about what SfM found
+DISTORTION_SIGMA = 0.2  # of a distortion coefficient about its estimate from SfM
 ROUNDS = 10  # of reweighting
 
 
@@ -38,11 +40,11 @@ class Target:
     """A control point in the adjustment.
 
     Attributes:
-        place: Where it is surveyed, world; height anything where it is not known.
-        sigmas: Standard deviations; infinite where it is not known.
-        start: Where it is found.
-        marks: COLMAP's image id and pixel in the model's camera.
-        mark_sigmas_px: Of the marks, in the model's pixels.
+        place: Surveyed position, world frame; the height is arbitrary if unknown.
+        sigmas: Standard deviations, metres; infinite for unknown coordinates.
+        start: Initial position, triangulated from the marks, world frame.
+        marks: COLMAP image ids and pixels in the model's camera.
+        mark_sigmas_px: Standard deviations of the marks, in the model's pixels.
     """
 
     place: Float64[np.ndarray, " 3"]
@@ -54,18 +56,18 @@ class Target:
 
 @dataclass(frozen=True)
 class ControlAdjustment:
-    """What an adjustment found.
+    """The result of an adjustment.
 
     Attributes:
-        reconstruction: In the world's metres.
-        places: Of the targets.
-        normed: Root mean square of each target's distance to where it is surveyed, over its sigmas.
-        offsets: Of the flights' positions: stated less true.
-        feature_sigma_px: That the features were given.
-        focal_sigmas: Standard deviation of each camera's focal length, relative, by COLMAP's camera id, as the photos
-            and control tell it.
-        held: Cameras whose focal length nothing tells, so that it stays near its prior.
-        usable: Whether the adjustment found a solution.
+        reconstruction: The adjusted model, in world metres.
+        places: Adjusted positions of the targets, world frame.
+        normed: Root mean square of each target's distance to its surveyed position, over its sigmas.
+        offsets: Offset of each flight's positions, stated minus true, metres.
+        feature_sigma_px: Standard deviation assumed for the features.
+        focal_sigmas: Relative standard deviation of each camera's focal length from photos and control, by COLMAP
+            camera id.
+        held: Cameras whose focal length cannot be determined, so that it is held near its prior.
+        usable: Whether the solver found a usable solution.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -79,7 +81,7 @@ class ControlAdjustment:
 
 
 def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
-    """Whether every photo has a pose of its own (no rigs) and there is something to adjust."""
+    """Return whether every photo has its own pose (no rigs) and there are points to adjust."""
     images = [reconstruction.images[number] for number in reconstruction.reg_image_ids()]
     return reconstruction.num_points3D() > 0 and all(image.is_ref_in_frame() for image in images)
 
@@ -95,12 +97,12 @@ def adjust(
     """Adjust a model to control.
 
     Args:
-        reconstruction: In the model's frame; left as it is.
-        world_from_model: Where it lies, nearly.
+        reconstruction: In the model's frame; not modified.
+        world_from_model: Approximate similarity.
         targets: Control points.
-        stations: The photos' positions, in the world, and COLMAP's ids of these photos.
-        focal_priors: Focal lengths in the model's pixels by camera id, where the metadata know them.
-        lenses_held: Leave the lenses as they are.
+        stations: The photos' stations, their positions in the world frame, and the COLMAP ids of these photos.
+        focal_priors: Focal lengths from the metadata, in the model's pixels, by camera id.
+        lenses_held: Keep the interior orientation fixed.
     """
     model = pycolmap.Reconstruction(reconstruction)
     model.transform(
@@ -141,7 +143,7 @@ def adjust(
 
 
 def feature_sigma(model: pycolmap.Reconstruction) -> float:
-    """Standard deviation of the features' coordinates by their residuals, at least a pixel."""
+    """Standard deviation of the features' image coordinates, from their residuals; at least one pixel."""
     errors = []
     for number in sorted(model.reg_image_ids()):
         image = model.images[number]
@@ -160,7 +162,7 @@ def feature_sigma(model: pycolmap.Reconstruction) -> float:
 
 
 class _Blocks:
-    """Adds residual blocks, in units of the features' standard deviation, and keeps what Ceres points at."""
+    """Adds residual blocks, in units of the features' standard deviation, and keeps alive what Ceres points to."""
 
     def __init__(self, problem: Any, sigma_px: float) -> None:
         self.problem = problem
@@ -174,12 +176,12 @@ class _Blocks:
     def add_prior(
         self, parameter: Float64[np.ndarray, " k"], mean: Float64[np.ndarray, " k"], sigmas: Float64[np.ndarray, " k"]
     ) -> None:
-        """A parameter about a mean."""
+        """Add a normal prior of a parameter."""
         covariance = np.diag((sigmas / self.sigma_px) ** 2)
         self.add(pyceres.factors.NormalPrior(mean, covariance), [parameter])
 
     def add_target(self, model: pycolmap.Reconstruction, place: Float64[np.ndarray, " 3"], target: Target) -> None:
-        """A control point: where it is surveyed, and its marks."""
+        """Add a control point: its surveyed position and its marks."""
         for (number, pixel), mark_sigma in zip(target.marks, target.mark_sigmas_px.tolist(), strict=True):
             image = model.images[number]
             camera = model.cameras[image.camera_id]
@@ -190,7 +192,7 @@ class _Blocks:
 
 
 class _StationCost(pyceres.CostFunction):  # type: ignore[misc]
-    """A camera's centre and its flight's offset against the position that its photo states."""
+    """Residual of a camera centre plus its flight's offset against the photo's stated position."""
 
     def __init__(self, stated: Float64[np.ndarray, " 3"], weights: Float64[np.ndarray, " 3"]) -> None:
         super().__init__()
@@ -199,7 +201,7 @@ class _StationCost(pyceres.CostFunction):  # type: ignore[misc]
         self._stated, self._weights = stated, weights
 
     def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
-        """Ceres' interface: pose as quaternion (x, y, z, w) and translation, camera from world; then the offset."""
+        """Ceres' interface. Parameters: cam_from_world as quaternion (x, y, z, w) and translation, and the offset."""
         quat, t = np.asarray(parameters[0][:4]), np.asarray(parameters[0][4:])
         axis, w = -quat[:3], quat[3]  # of the inverse rotation
         turned = np.cross(axis, t)
@@ -219,7 +221,7 @@ class _StationCost(pyceres.CostFunction):  # type: ignore[misc]
 
 
 def _features(model: pycolmap.Reconstruction) -> Any:
-    """COLMAP's bundle adjuster of all photos, with no gauge: control is it."""
+    """Return COLMAP's bundle adjuster of all photos, without a fixed gauge: control defines the datum."""
     options = pycolmap.BundleAdjustmentOptions()
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.reg_image_ids()):
@@ -243,12 +245,12 @@ def _add_stations(
 
 
 def _seen(problem: Any, model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
-    """The cameras that a problem is about, by id."""
+    """Return the cameras that take part in a problem, by id."""
     return [camera for _, camera in sorted(model.cameras.items()) if problem.has_parameter_block(camera.params)]
 
 
 def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Mapping[int, float]) -> None:
-    """What the metadata and SfM know of lenses, so that what neither photos nor control tell stays there."""
+    """Add lens priors from metadata and SfM, which keep parameters that neither photos nor control determine."""
     for number, camera in sorted(model.cameras.items()):
         params = camera.params
         if not blocks.problem.has_parameter_block(params):
@@ -265,12 +267,12 @@ def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Map
 
 
 def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> float:
-    """How far an adjustment moved what the photos show: root mean square of the points' motion after the best
-    similarity, seen by the cameras as they were, pixels.
+    """Return how far an adjustment deformed the model, pixels: RMS displacement of the points after a best-fit
+    similarity, projected into the original cameras.
 
     Args:
         before: The model.
-        after: The same model, adjusted, in any frame; the same points and photos under the same numbers.
+        after: The adjusted model in any frame, with the same ids of points and photos.
     """
     numbers = sorted(set(before.points3D.keys()) & set(after.points3D.keys()))
     if len(numbers) < 3:
@@ -278,7 +280,7 @@ def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) ->
     old = np.array([before.points3D[number].xyz for number in numbers])
     new = np.array([after.points3D[number].xyz for number in numbers])
     weights = np.ones(len(numbers))
-    for _ in range(ROUNDS):  # points far off are seen by few, and would turn the rest
+    for _ in range(ROUNDS):  # distant points are seen by few photos, and would rotate the fit
         scale, rotation, translation = fit_similarity(new, old, weights)
         back = Similarity(float(scale), rotation, translation).apply(new)
         distance = np.linalg.norm(back - old, axis=1)

@@ -1,4 +1,4 @@
-"""Control that is wrong: in another CRS, swapped, or off; every case with what to do about it."""
+"""Detection of control blunders: wrong CRS, swapped names, wrong coordinates; each is reported with a remedy."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.surveyed_points import Survey, SurveyPoint
 
-FAR_M = 2000.0  # from the photos: control that they are to show lies nearer
-DATUM_M = 20.0  # off the positions, and more than they are wrong: another datum
+FAR_M = 2000.0  # from the photos; control that they show must be nearer
+DATUM_M = 20.0  # a larger horizontal offset from the positions (and DATUM_SIGMAS) means another datum
 DATUM_SIGMAS = 5.0
 DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
-SWAPPED_SHARE = 0.3  # of how far two points are off, what is left of it when their names are swapped
-WEAK = 4.0  # times the control's own accuracy: the model is known less well
-LEAST_GSD = 3.0  # a point off by fewer ground pixels is none that a message helps with
+SWAPPED_SHARE = 0.3  # largest share of two points' errors that remains if swapping their names explains them
+WEAK = 4.0  # model uncertainty over the control's own accuracy that is worth a warning
+LEAST_GSD = 3.0  # errors below this many ground pixels are not worth a message
 CONTROL_HINT = "--set georef.control=none runs without control."
 
 
 def require_near(survey: Survey, config: GeorefConfig, stations: Stations) -> Float64[np.ndarray, "n 3"]:
-    """Where the survey's points are, if that is where the photos were taken.
+    """Return the survey's points in geographic coordinates, after checking that they are near the photos.
 
     Returns:
-        Latitude, longitude, height (NaN where it is not known).
+        Latitude, longitude, height (NaN if unknown).
 
     Raises:
-        SplatpipeError: if they are elsewhere; the hint names the CRS that would put them there.
+        SplatpipeError: if they are elsewhere; the hint names a CRS that would match the photos, if any does.
     """
     try:
         geodetic = locate_survey(survey, config)
@@ -75,7 +75,8 @@ def name_blunders(
     config: GeorefConfig,
     report: Reporter,
 ) -> Survey:
-    """The survey without control that contradicts the rest; what is wrong is told, of check points as well."""
+    """Return the survey without control points that contradict the rest; blunders, also of check points, are
+    reported."""
     similarity, priors = start
     observed = observed_in(site, survey, model, similarity.scale, config.mark_sigma_px)
     control = [k for k, point in enumerate(survey.points) if point.role == "control" and point.found is not None]
@@ -105,7 +106,7 @@ def name_blunders(
 
 @dataclass(frozen=True)
 class _Offset:
-    """How far a point is from where it is surveyed: found less surveyed; NaN in height where that is not known."""
+    """Offset of a point from its surveyed position, estimated minus surveyed, metres; NaN for an unknown height."""
 
     enu: Float64[np.ndarray, " 3"]
 
@@ -119,7 +120,7 @@ class _Offset:
 
 
 def offset_of(point: SurveyPoint, site: LocalSurvey, index: int, similarity: Similarity) -> _Offset:
-    """Where a point is found less where it is surveyed."""
+    """Return a point's estimated minus its surveyed position."""
     assert point.found is not None
     off = similarity.apply(point.found.xyz[None])[0] - site.targets.enu[index]
     return _Offset(np.where(np.isfinite(site.targets.sigmas[index]), off, np.nan))
@@ -128,7 +129,7 @@ def offset_of(point: SurveyPoint, site: LocalSurvey, index: int, similarity: Sim
 def is_off(
     fit: JointFit, site: LocalSurvey, point: SurveyPoint, index: int, least_m: float, config: GeorefConfig
 ) -> bool:
-    """Whether a point that took no part in a fit contradicts it."""
+    """Return whether a point that was not used in a fit contradicts it."""
     if point.found is None or fit.degrees == 0:
         return False
     mark = fit.similarity.scale * config.mark_sigma_px * np.sqrt(np.trace(point.found.covariance) / 3.0)
@@ -145,7 +146,7 @@ def is_off(
 
 
 def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Reporter) -> None:
-    """Warn of control that lies beside the positions by more than these are wrong."""
+    """Warn if the control is offset from the positions by more than their accuracy allows."""
     if len(stations) == 0:
         return
     shift = np.hypot(fit.offsets[:, 0], fit.offsets[:, 1])
@@ -166,7 +167,8 @@ def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Report
 
 
 def tell_weak(fit: JointFit, observed: JointObservations, model: SparseModel, report: Reporter) -> None:
-    """Warn of control that hardly tells where the model is away from it: few points, in one corner or on a line."""
+    """Warn if the control's geometry is weak (few points, in one corner or on a line), so that it extrapolates
+    badly."""
     control = observed.sigmas[observed.is_control]
     if len(model.points) == 0 or len(control) == 0:
         return
@@ -182,7 +184,7 @@ def tell_weak(fit: JointFit, observed: JointObservations, model: SparseModel, re
 
 
 def gsd_m(survey: Survey, model: SparseModel, scale: float) -> float:
-    """Ground sampling distance: metres a pixel, the median over the marks."""
+    """Ground sampling distance, metres per pixel: the median over the marks; 0 without any."""
     sizes = []
     for point in survey.points:
         if point.found is None:
@@ -214,7 +216,7 @@ def _told_off(point: SurveyPoint, off: _Offset, report: Reporter) -> SurveyPoint
 def _swapped(
     suspects: Sequence[int], survey: Survey, site: LocalSurvey, similarity: Similarity
 ) -> list[tuple[int, int]]:
-    """Pairs of which each lies where the other is surveyed."""
+    """Return pairs of points that each lie at the other's surveyed position."""
     pairs: list[tuple[int, int]] = []
     taken: set[int] = set()
     for a in suspects:
@@ -229,7 +231,7 @@ def _swapped(
 
 
 def _gap(survey: Survey, site: LocalSurvey, similarity: Similarity, found: int, surveyed: int) -> float:
-    """How far the place of one point is from where another is surveyed."""
+    """Distance from one point's estimated position to another's surveyed position, metres."""
     place = survey.points[found].found
     assert place is not None
     off = similarity.apply(place.xyz[None])[0] - site.targets.enu[surveyed]
@@ -244,7 +246,7 @@ def _distance_m(geodetic: Float64[np.ndarray, "n 3"], stations: Stations) -> flo
 
 
 def _better_reading(survey: Survey, stations: Stations) -> str:
-    """The CRS, or the order of coordinates, that would put the points where the photos were taken; empty if none."""
+    """Return a hint at the CRS or axis order that would put the points near the photos; empty if there is none."""
     if len(stations) == 0:
         return ""
     place = np.median(stations.geodetic, axis=0)

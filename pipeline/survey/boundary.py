@@ -1,4 +1,4 @@
-"""A boundary laid onto the model: within it Gaussians are spent and figures count, what is outside is a backdrop."""
+"""The boundary in the model's frames: inside, Gaussians are spent and figures count; the outside is a backdrop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WITHOUT = "Or run without a boundary: --set georef.boundary=none."
 DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 LARGEST_DEGREES = (180.0, 90.0)
 DEGREE_DIGITS = 8  # a millimetre
-FEW_POINTS = 100  # of the sparse model inside: a start that tells little of a building
+FEW_POINTS = 100  # sparse points inside; fewer are a poor start
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +30,9 @@ class Boundary:
     """A boundary in the world frame.
 
     Attributes:
-        area: East and north, metres.
-        degrees: The same polygons as longitude and latitude, WGS 84: its vertices, ring by ring.
-        share: Of the sparse points that lie inside, 0..1.
+        area: The polygons in east and north, metres.
+        degrees: Vertices of the same polygons as longitude and latitude, WGS 84, ring by ring.
+        share: Share of the sparse points that lie inside, 0..1.
     """
 
     area: PlanArea
@@ -43,22 +43,22 @@ class Boundary:
 def lay_boundary(
     path: Path, frame: Frame, points: Float64[np.ndarray, "n 3"], out: Path, report: Reporter
 ) -> dict[str, JSON]:
-    """Write the part `georef.boundary`: the polygons in the world frame and in the model's, none where none are drawn.
+    """Write the part `georef.boundary`: the polygons in the world and the model frame; null without a boundary.
 
     Args:
-        path: The user's file; one that is not there for no boundary.
-        frame: georef's.
+        path: The user's file; if it does not exist, there is no boundary.
+        frame: georef's frame.
         points: Sparse points in the model's frame.
         out: The file to write.
-        report: Told of what lies inside.
+        report: Receives messages about what lies inside.
 
     Returns:
-        What the stage's summary says of it.
+        Entries for the stage's summary.
 
     Raises:
-        SplatpipeError: if the file is broken, the model lies nowhere on the earth, or nothing of it lies inside.
+        SplatpipeError: if the file is broken, the model is not georeferenced, or no point lies inside.
     """
-    if not path.is_file():  # no number of the frame in it: training does not depend on that, then
+    if not path.is_file():  # must not contain the frame, so that training does not depend on it
         write_json(out, {"format": FORMAT, "world": None, "model": None, "degrees": None})
         return {}
     drawing = read_boundary(path)
@@ -78,12 +78,12 @@ def placed(drawing: BoundaryFile, frame: Frame, points: Float64[np.ndarray, "n 3
     """Bring a boundary into the world frame.
 
     Args:
-        drawing: As it was read.
-        frame: georef's.
+        drawing: The boundary file.
+        frame: georef's frame.
         points: Sparse points in the world frame.
 
     Raises:
-        SplatpipeError: if the frame lies nowhere, the CRS cannot be used there, or no point lies inside.
+        SplatpipeError: if the frame is not georeferenced, the CRS cannot be used there, or no point lies inside.
     """
     text = _crs_of(drawing, frame)
     area, degrees = _in_world(drawing, text, frame, swapped=False)
@@ -94,16 +94,16 @@ def placed(drawing: BoundaryFile, frame: Frame, points: Float64[np.ndarray, "n 3
 
 
 def placed_area(drawing: BoundaryFile, frame: Frame) -> PlanArea:
-    """The polygons in the world frame, wherever they lie.
+    """Return the polygons in the world frame, without checking that points lie inside.
 
     Raises:
-        SplatpipeError: as ``placed``, but for what lies inside.
+        SplatpipeError: as ``placed``, except for points inside.
     """
     return _in_world(drawing, _crs_of(drawing, frame), frame, swapped=False)[0]
 
 
 def _crs_of(drawing: BoundaryFile, frame: Frame) -> str:
-    """What a file names, or WGS 84 by RFC 7946, or the run's CRS where the numbers are no degrees."""
+    """Return the CRS that the file names, or WGS 84 (RFC 7946), or the run's CRS if the numbers are not degrees."""
     if frame.origin is None:
         raise SplatpipeError(
             f"The boundary {drawing.name} cannot be used on a model that is not georeferenced: {frame.note}".rstrip(
@@ -127,12 +127,13 @@ def _crs_of(drawing: BoundaryFile, frame: Frame) -> str:
 def _in_world(
     drawing: BoundaryFile, crs: str, frame: Frame, swapped: bool
 ) -> tuple[PlanArea, tuple[tuple[Ring, ...], ...]]:
-    """The polygons in east and north, metres, and in longitude and latitude; coordinates ``swapped`` on the way."""
+    """Return the polygons in east and north, metres, and in longitude and latitude; ``swapped`` swaps the input
+    axes."""
     assert frame.origin is not None
     every = np.concatenate([ring for polygon in drawing.polygons for ring in polygon])
     stated = np.column_stack([every[:, ::-1] if swapped else every, np.full(len(every), np.nan)])
     geodetic = to_geodetic(stated, parse_crs(crs), frame.approximate_crs).geodetic
-    geodetic[:, 2] = frame.origin.height_m  # in plan all heights are one
+    geodetic[:, 2] = frame.origin.height_m  # heights do not matter in plan
     plan = frame.origin.enu_from_geodetic(geodetic)[:, :2]
     world, degrees, start = [], [], 0
     for polygon in drawing.polygons:
@@ -147,7 +148,7 @@ def _in_world(
 def _elsewhere(
     drawing: BoundaryFile, crs: str, frame: Frame, points: Float64[np.ndarray, "n 3"], area: PlanArea
 ) -> SplatpipeError:
-    """Where a boundary lies that holds nothing of the model, and why that may be."""
+    """Return the error for a boundary that contains no point, saying where it lies and the likely reason."""
     vertices = np.concatenate([ring for polygon in area.polygons for ring in polygon])
     middle = np.median(points[np.isfinite(points).all(axis=1)], axis=0)[:2]
     apart = vertices - middle
@@ -158,7 +159,7 @@ def _elsewhere(
     try:
         if _in_world(drawing, crs, frame, swapped=True)[0].contains(points).any():
             hint = "Its coordinates are swapped: in GeoJSON, longitude (or easting) comes first."
-    except SplatpipeError:  # the other way round they are nowhere
+    except SplatpipeError:  # swapped coordinates are invalid
         pass
     told = f"{away / 1000.0:,.1f} km" if away >= 1000.0 else f"{away:.0f} m"
     return SplatpipeError(

@@ -1,7 +1,7 @@
-"""A boundary as people draw it in QGIS and the like: the polygons of a GeoJSON file, from an untrusted hand.
+"""Boundaries drawn in QGIS or similar programs: the polygons of an untrusted GeoJSON file.
 
-RFC 7946 (GeoJSON) knows WGS 84 alone; the specification of 2008 before it has a member `crs`, which programs still
-write. Coordinates are east (or longitude) first in both.
+RFC 7946 (GeoJSON) allows only WGS 84; the earlier specification of 2008 has a member `crs`, which programs still write.
+Both put east (or longitude) first.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import Polygon, Ring, signed_area
 
-LARGEST_FILE = 8 << 20  # bytes: a hundred times what a detailed outline takes
-MOST_VERTICES = 20_000  # of all rings: finer than any boundary that was drawn or measured
-DEEPEST = 8  # collections within collections
-LONGEST_NAME = 80  # characters of a feature's name: what a label has room for
-LARGEST = 1e9  # of a coordinate: beyond it there is no earth
+LARGEST_FILE = 8 << 20  # bytes: a hundred times the size of a detailed outline
+MOST_VERTICES = 20_000  # in all rings: finer than any drawn or measured boundary
+DEEPEST = 8  # nested collections
+LONGEST_NAME = 80  # characters of a feature's name that fit a label
+LARGEST = 1e9  # absolute coordinate; no CRS of the earth has larger ones
 EXPECTED = "Draw it as a polygon in QGIS or geojson.io, and save it as GeoJSON."
 WGS84 = "EPSG:4326"
 Vertex = Float64[np.ndarray, " 2"]
@@ -40,15 +40,15 @@ _CRS84 = re.compile(
 
 @dataclass(frozen=True, eq=False)
 class BoundaryFile:
-    """What a boundary file holds.
+    """The contents of a boundary file.
 
     Attributes:
-        name: The file's, for messages.
-        polygons: As they are stated: east (or longitude), north (or latitude).
-        names: Of the features that they are of, one each; empty where a feature has none.
-        crs: As ``parse_crs`` takes it; empty where the file names none.
-        passed_over: Points and lines in it, which bound nothing.
-        crossing: Where an outline crosses itself; empty where none does.
+        name: File name, for messages.
+        polygons: In the file's coordinates: east (or longitude), north (or latitude).
+        names: Name of each polygon's feature; empty if it has none.
+        crs: In the form that ``parse_crs`` accepts; empty if the file names none.
+        passed_over: Number of ignored points and lines.
+        crossing: A point where an outline crosses itself; empty if none does.
     """
 
     name: str
@@ -63,10 +63,10 @@ def read_boundary(path: Path) -> BoundaryFile:
     """Read a boundary.
 
     Args:
-        path: A GeoJSON file: a polygon, several, or features with such geometries.
+        path: A GeoJSON file with polygons, multipolygons, or features with such geometries.
 
     Raises:
-        SplatpipeError: if it is none, holds no polygon, or is larger, deeper or finer than any boundary.
+        SplatpipeError: if it is not GeoJSON, has no polygon, or exceeds the limits on size, nesting or vertices.
     """
     value = _value(path)
     try:
@@ -83,7 +83,7 @@ def read_boundary(path: Path) -> BoundaryFile:
 
 
 class _BrokenError(ValueError):
-    """What is wrong, the end of a sentence."""
+    """An invalid file; the message completes a sentence about it."""
 
 
 def _value(path: Path) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def _value(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_no_number)
     except OSError as error:
         raise SplatpipeError(f"The boundary {path.name} cannot be read: {error.strerror}.", EXPECTED) from error
-    except (ValueError, RecursionError) as error:  # no text, no JSON, a number of a million digits, a tower of brackets
+    except (ValueError, RecursionError) as error:  # not text, not JSON, a number of a million digits, deep nesting
         raise SplatpipeError(f"The boundary {path.name} is not valid GeoJSON.", EXPECTED) from error
     if not isinstance(value, dict):
         raise SplatpipeError(f"The boundary {path.name} is not valid GeoJSON.", EXPECTED)
@@ -105,7 +105,7 @@ def _no_number(text: str) -> float:
 
 
 def _geometries(value: Any, depth: int, name: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """The geometries of an object that has some, collections taken apart; each with its feature's name."""
+    """Yield the geometries in an object, with collections flattened, each with its feature's name."""
     if depth > DEEPEST:
         raise _BrokenError(f"has collections within collections, more than {DEEPEST} deep")
     kind = value.get("type") if isinstance(value, dict) else None
@@ -114,7 +114,7 @@ def _geometries(value: Any, depth: int, name: str) -> Iterator[tuple[dict[str, A
     elif kind == "GeometryCollection":
         parts = value.get("geometries")
     elif kind == "Feature":
-        parts = [] if value.get("geometry") is None else [value["geometry"]]  # a row of a table without a place
+        parts = [] if value.get("geometry") is None else [value["geometry"]]  # a table row without a geometry
         name = _name(value.get("properties"))
     elif kind in ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon"):
         yield value, name
@@ -128,10 +128,10 @@ def _geometries(value: Any, depth: int, name: str) -> Iterator[tuple[dict[str, A
 
 
 def _name(properties: Any) -> str:
-    """What a feature is called, in one line of valid text."""
+    """Return a feature's name as one line of valid text."""
     stated = properties.get("name") if isinstance(properties, dict) else None
     text = " ".join(stated.split()) if isinstance(stated, str) else ""
-    return text[:LONGEST_NAME].encode("utf-8", "replace").decode("utf-8")  # JSON may hold halves of a character
+    return text[:LONGEST_NAME].encode("utf-8", "replace").decode("utf-8")  # JSON may contain lone surrogates
 
 
 def _polygons(geometries: list[tuple[dict[str, Any], str]]) -> Iterator[tuple[Polygon, str]]:
@@ -147,7 +147,7 @@ def _polygons(geometries: list[tuple[dict[str, Any], str]]) -> Iterator[tuple[Po
                 if left < 0:
                     raise _BrokenError(f"has more than {MOST_VERTICES:,} vertices")
                 polygon.append(_ring(ring))
-            if polygon:  # an empty one is valid, and nothing
+            if polygon:  # an empty polygon is valid
                 yield tuple(polygon), name
 
 
@@ -158,7 +158,7 @@ def _listed(value: Any) -> list[Any]:
 
 
 def _ring(stated: list[Any]) -> Ring:
-    """A ring's vertices, none twice in a row, the first not again at the end."""
+    """Return a ring's vertices without consecutive duplicates, and without the closing one."""
     ring = np.array([_position(position) for position in stated], np.float64).reshape(-1, 2)
     ring = ring[np.any(ring != np.roll(ring, -1, axis=0), axis=1)] if len(ring) else ring
     if len(ring) < 3 or signed_area(ring) == 0.0:
@@ -177,7 +177,7 @@ def _position(stated: Any) -> tuple[float, float]:
 
 
 def _crs(value: dict[str, Any], name: str) -> str:
-    """The CRS that a file names by the specification of 2008; empty where it names none."""
+    """Return the CRS that a file names by the specification of 2008; empty if it names none."""
     stated = value.get("crs")
     if stated is None:
         return ""
@@ -192,10 +192,10 @@ def _crs(value: dict[str, Any], name: str) -> str:
 
 
 def crossing_of(ring: Ring) -> tuple[float, ...]:
-    """Where a ring crosses itself, two coordinates; empty where it does not.
+    """Return a point where a ring crosses itself, two coordinates; empty if it does not.
 
     Args:
-        ring: Its vertices, none twice in a row.
+        ring: Vertices without consecutive duplicates.
     """
     following = np.roll(ring, -1, axis=0)
     low, high = np.minimum(ring, following), np.maximum(ring, following)
@@ -218,17 +218,17 @@ def crossing_of(ring: Ring) -> tuple[float, ...]:
 def _side(
     a: Float64[np.ndarray, "*n 2"], b: Float64[np.ndarray, "*n 2"], c: Float64[np.ndarray, "*m 2"]
 ) -> Float64[np.ndarray, "*k"]:
-    """On which side of the line from a to b each c lies."""
+    """Return the side of the line from a to b on which each c lies, by sign."""
     first, second = b - a, c - a
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def _meet(a: Vertex, b: Vertex, c: Ring, d: Ring) -> Bool[np.ndarray, " k"]:
-    """Which segments from c to d the one from a to b crosses; touching is none."""
+    """Return which segments from c to d the segment from a to b crosses; touching does not count."""
     return np.asarray((_side(a, b, c) * _side(a, b, d) < 0.0) & (_side(c, d, a) * _side(c, d, b) < 0.0))
 
 
 def _meeting(a: Vertex, b: Vertex, c: Vertex, d: Vertex) -> Vertex:
-    """Where the line from a to b crosses the segment from c to d."""
+    """Return the point where the line from a to b crosses the segment from c to d."""
     from_c, from_d = float(_side(a, b, c)), float(_side(a, b, d))
     return np.asarray(c + from_c / (from_c - from_d) * (d - c))

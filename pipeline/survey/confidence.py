@@ -1,4 +1,4 @@
-"""What a few residuals tell: confidence intervals of a root mean square error, from the chi-squared distribution."""
+"""Confidence intervals of an RMSE from few residuals, by the chi-squared distribution."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ CONFIDENCE = 0.95
 
 
 def rmse_interval(rmse: float, values: int) -> tuple[float, float]:
-    """Where the true standard deviation lies, of which so many normal residuals showed this RMSE, with 95 %.
+    """Return the 95 % confidence interval of the standard deviation behind an RMSE of normal residuals.
 
     Args:
         rmse: Root mean square of ``values`` independent residuals of mean zero.
-        values: How many; at least one.
+        values: Number of residuals; at least one.
     """
     tail = (1.0 - CONFIDENCE) / 2.0
     low, high = chi_squared_quantile(1.0 - tail, values), chi_squared_quantile(tail, values)
@@ -22,5 +22,5 @@ def rmse_interval(rmse: float, values: int) -> tuple[float, float]:
 
 
 def chi_squared_quantile(probability: float, degrees: int) -> float:
-    """The value that a chi-squared variable stays below with this probability: its half is a gamma variable."""
+    """Return the quantile of the chi-squared distribution, of which half is gamma-distributed."""
     return 2.0 * float(gammaincinv(degrees / 2.0, probability))

@@ -1,4 +1,4 @@
-"""Which of several places are which of several points: two constellations laid over each other."""
+"""Matching of detected places to surveyed points by their constellation."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 
-REACH_M = 25.0  # horizontally, by which a whole capture may be misplaced: a poor receiver's
-TOLERANCE_M = 1.5  # of points after the whole was moved: the frame of positions is turned a little
-LEAST_TOLERANCE_M = 0.15  # after the similarity: the model is bent a little
-RESIDUALS = 4.0  # times their median
-LEAST_MATCHES = 3  # fewer places lie like points by chance
+REACH_M = 25.0  # horizontal offset of a whole capture, with a poor receiver
+TOLERANCE_M = 1.5  # after translation: the positions' frame may be slightly rotated
+LEAST_TOLERANCE_M = 0.15  # after the similarity: the model may be slightly deformed
+RESIDUALS = 4.0  # tolerance over the median residual
+LEAST_MATCHES = 3  # fewer places may match points by chance
 MOST_HYPOTHESES = 2000
-MOST_TRIPLES = 500  # of known pairs, to make hypotheses with
+MOST_TRIPLES = 500  # of known pairs, as hypotheses
 ROUNDS = 5
-FLAT = 0.1  # of the longest extent: what lies on a line tells no tilt
-WRONG = 3.0  # times the tolerance: a place that is known by its number is another point's
+FLAT = 0.1  # second over longest extent; points nearly on a line do not determine a tilt
+WRONG = 3.0  # times the tolerance: beyond it, a place known by its number belongs to another point
 
 
 @dataclass(frozen=True)
 class ConstellationMatch:
-    """How places lie over points.
+    """A match of places to points.
 
     Attributes:
-        pairs: Rows of place and point.
-        residuals_m: Of them.
-        tolerance_m: What they may miss each other by.
+        pairs: Indices of place and point.
+        residuals_m: Distance of each pair after the transformation.
+        tolerance_m: Largest distance accepted.
         points_from_places: The transformation.
     """
 
@@ -46,12 +46,12 @@ def overlay(
     """Find which places are which points.
 
     Args:
-        places: Metres; roughly turned and scaled as the points are, but moved, unless three are known.
-        points: Metres; a height that is not known is NaN.
-        known: Points of some places, by the places' rows: they take part as they are.
+        places: (m, 3) metres, in roughly the points' orientation and scale, but translated, unless three are known.
+        points: (n, 3) metres; an unknown height is NaN.
+        known: Indices of the points of some places, by index of the place; used as given.
 
     Returns:
-        None where no way to lay them is better than all others.
+        The match; None if no match is better than all others.
     """
     if len(known) >= LEAST_MATCHES:
         pairs = np.array(sorted(known.items()), dtype=np.int64).reshape(-1, 2)
@@ -77,7 +77,8 @@ def overlay(
 def _agreed(
     places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], known: Int64[np.ndarray, "k 2"]
 ) -> Similarity:
-    """What most of the known pairs agree on: targets may have been laid out with each other's numbers."""
+    """Fit the similarity that most of the known pairs agree on, as targets may have been laid out with swapped
+    numbers."""
     whole = _fitted(places, points, known)
     target = points[known[:, 1]]
     if (_distances(whole.apply(places)[known[:, 0]], target) <= TOLERANCE_M).all():
@@ -96,7 +97,7 @@ def _agreed(
 def _moved(
     places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], known: Mapping[int, int]
 ) -> Float64[np.ndarray, " 3"] | None:
-    """The translation that brings most places to points; None where two that differ bring as many."""
+    """Return the translation that matches most places to points; None if a different one matches as many."""
     differences = points[None] - places[:, None]
     near = np.hypot(differences[..., 0], differences[..., 1]) < REACH_M
     if known:
@@ -121,7 +122,7 @@ def _moved(
 def _assigned(
     places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], tolerance: float
 ) -> tuple[Int64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
-    """Places and points that are nearest to each other, within a tolerance."""
+    """Return mutual nearest neighbours of places and points within a tolerance, and their distances."""
     if len(places) == 0 or len(points) == 0:
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     away = _distances(places[:, None], points[None])
@@ -142,7 +143,7 @@ def _distances(
 def _fitted(
     places: Float64[np.ndarray, "m 3"], points: Float64[np.ndarray, "n 3"], pairs: Int64[np.ndarray, "k 2"]
 ) -> Similarity:
-    """Least squares: of all seven, or without the tilt where the pairs do not tell it."""
+    """Fit a similarity by least squares: all seven parameters, or no tilt if the pairs do not determine it."""
     source, target = places[pairs[:, 0]], points[pairs[:, 1]]
     whole = np.isfinite(target).all(axis=1)
     if _spread(source, whole):
@@ -160,7 +161,7 @@ def _fitted(
 
 
 def _spread(source: Float64[np.ndarray, "k 3"], whole: Bool[np.ndarray, " k"]) -> bool:
-    """Whether places whose points have a height tell a rotation."""
+    """Return whether the places whose points have heights determine a rotation."""
     if whole.sum() < LEAST_MATCHES:
         return False
     extents = np.linalg.svd(source[whole] - source[whole].mean(axis=0), compute_uv=False)

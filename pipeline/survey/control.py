@@ -1,4 +1,4 @@
-"""Georeferencing by control: the frame that it gives, and the model that it bends where the model is bent."""
+"""Georeferencing by control: the frame, and the model adjusted to the control if SfM deformed it."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ from splatpipe.pipeline.survey.model import SparseModel, model_of
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.surveyed_points import Survey, locate
 
-BENT_PX = 0.5  # what control has to move the photos' content by, root mean square, for the model to be worth bending
-QUIET = 2.0  # times the stated sigmas: control that is off by no more keeps them
-STRAY = 0.1  # of a focal length from its prior: worth a warning
-SUSPICIOUS = 1.0  # with sigmas that are none too small, sound control stays well below
-LONELY = 3.0  # a point is off alone where the others are quieter without it by this
-CROWD = 3.0  # sigmas: where half of the points are off by more, it is not one that is
-SUSPECTS = 3  # points that are tried so, those with the largest residuals
-ROUNDS = 4  # of adjustment, each with the control that the one before showed to be wrong or less accurate
+BENT_PX = 0.5  # least RMS shift in the images by which control must deform the model for the adjusted one to be used
+QUIET = 2.0  # times the stated sigmas; control with residuals up to this keeps its sigmas
+STRAY = 0.1  # relative deviation of a focal length from its prior that is worth a warning
+SUSPICIOUS = 1.0  # noise over sigmas; sound control with realistic sigmas stays well below
+LONELY = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
+CROWD = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
+SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
+ROUNDS = 4  # of adjustment, each without a blunder found in the one before, or with larger sigmas
 
 
 @dataclass(frozen=True)
 class GeorefInput:
-    """What georeferencing starts from.
+    """Input of georeferencing.
 
     Attributes:
         model: The sparse model.
-        positions: What the photos state.
+        positions: The photos' stated positions.
         photos: All photos of the capture by name.
-        focal_priors: What the metadata say, in the model's pixels, by COLMAP's camera id.
-        lenses_held: Whether the lenses stay as they are.
+        focal_priors: Focal lengths from the metadata, in the model's pixels, by COLMAP camera id.
+        lenses_held: Whether the interior orientation is kept fixed.
     """
 
     model: SparseModel
@@ -64,17 +64,17 @@ class GeorefInput:
 
 @dataclass(frozen=True)
 class ControlResult:
-    """What control gives.
+    """Result of georeferencing by control.
 
     Attributes:
         frame: The frame.
-        survey: The points, with what became of them, found in the model that goes on.
-        site: The world.
-        placed: The model that goes on, in it.
-        bent: It, where control bent it; None where the model stays as it was.
-        moved_px: How far control moved what the photos show; None where nothing was adjusted.
-        sigma_factor: What the control's stated or assumed sigmas were multiplied by.
-        focal_held: COLMAP's ids of cameras whose focal length neither photos nor control tell.
+        survey: The points with their final roles, triangulated in the resulting model.
+        site: The survey in the world frame.
+        placed: The resulting model in the world frame.
+        bent: The resulting model if the adjustment changed it; None if it is unchanged.
+        moved_px: How far the adjustment moved the images' content, RMS; None if nothing was adjusted.
+        sigma_factor: Factor applied to the control's stated or assumed sigmas.
+        focal_held: COLMAP ids of cameras whose focal length neither photos nor control determine.
     """
 
     frame: Frame
@@ -90,18 +90,18 @@ class ControlResult:
 def place_by_control(
     survey: Survey, capture: GeorefInput, frame: Frame | None, config: GeorefConfig, report: Reporter
 ) -> ControlResult:
-    """Georeference a model by its survey.
+    """Georeference a model by surveyed points.
 
     Args:
-        survey: Its points.
+        survey: The surveyed points.
         capture: The model and its photos.
-        frame: What the positions alone give; None where they give nothing.
+        frame: The frame from the positions alone; None if there is none.
         config: Options.
-        report: Takes warnings.
+        report: Receives warnings.
 
     Raises:
         NoPlaceError: if there are neither positions nor enough control.
-        SplatpipeError: if the control is elsewhere, or has another shape.
+        SplatpipeError: if the control is elsewhere, or its geometry contradicts the model's.
     """
     model = capture.model
     stations = stations_of(model, capture.positions, frame)
@@ -121,7 +121,7 @@ def place_by_control(
             result = _adjusted(result, capture, config, report)
         else:
             report.warning("A model with camera rigs is georeferenced by control, but not adjusted to it.")
-    if result.bent is None:  # with what the adjustment found of the control
+    if result.bent is None:  # refit with the adjustment's roles and sigmas of control
         observed = observed_in(site, result.survey, model, start[0].scale, config.mark_sigma_px)
         observed = with_sigmas_times(observed, result.sigma_factor)
         fit = fit_jointly(fit.similarity, observed, start[1])
@@ -142,14 +142,14 @@ def _frame(frame: Frame | None, survey: Survey, site: LocalSurvey, fit: JointFit
     if not heights:
         note += " Heights are the positions'." if len(site.stations) else " Heights are relative to the control points."
     residuals = dict(frame.residuals) if frame is not None else {}
-    residuals.pop("uncertainty", None)  # the positions' alone
+    residuals.pop("uncertainty", None)  # applies to the positions alone
     left_out = frame.left_out if frame is not None else ()
     return Frame("enu", fit.similarity, site.origin, vertical, residuals, left_out, note)
 
 
 @dataclass(frozen=True)
 class _TrustedAdjustment:
-    """An adjustment with the control that it believes."""
+    """An adjustment with the control points and sigmas it used."""
 
     survey: Survey
     done: ControlAdjustment
@@ -158,7 +158,7 @@ class _TrustedAdjustment:
 
 
 def _settle(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> _TrustedAdjustment:
-    """Adjust until the control agrees: without a point that alone is off, else with larger sigmas."""
+    """Adjust until the control agrees, leaving out single blunders or else enlarging the sigmas."""
     best = _try(result.survey, 1.0, result, capture, config)
     for _ in range(ROUNDS):
         better = _without_one(best, result, capture, config) if best.noise > SUSPICIOUS else None
@@ -190,7 +190,8 @@ def _try(
 def _without_one(
     settled: _TrustedAdjustment, result: ControlResult, capture: GeorefInput, config: GeorefConfig
 ) -> tuple[int, float, _TrustedAdjustment] | None:
-    """The point without which the others agree, how far it is off then, and the adjustment; None if there is none."""
+    """Return the point without which the others agree, its offset in metres, and that adjustment; None if there is
+    none."""
     chosen = _chosen(settled.survey)
     if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > CROWD:
         return None
@@ -210,7 +211,7 @@ def _without_one(
 
 
 def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> ControlResult:
-    """The result with the model that an adjustment bends, where that moves what the photos show."""
+    """Return the result with the adjusted model, if the adjustment moves the images' content noticeably."""
     settled = _settle(result, capture, config, report)
     survey, done, factor = settled.survey, settled.done, settled.factor
     if not done.usable:
@@ -249,7 +250,7 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
 
 
 def _tell_lens(done: ControlAdjustment, capture: GeorefInput, report: Reporter) -> None:
-    """Warn of focal lengths that nothing tells, and of those that control takes far from the value in the metadata."""
+    """Warn of undetermined focal lengths, and of those that control moves far from the value in the metadata."""
     for number, camera in sorted(done.reconstruction.cameras.items()):
         prior = capture.focal_priors.get(number)
         if number in done.held:
@@ -267,7 +268,7 @@ def _tell_lens(done: ControlAdjustment, capture: GeorefInput, report: Reporter) 
 
 
 def _noise(normed: Float64[np.ndarray, " n"], coordinates: Int64[np.ndarray, " n"]) -> float:
-    """Of control over its sigmas, by the degrees of freedom that a similarity leaves."""
+    """Return the control's RMS residual over its sigmas, with the degrees of freedom left by a similarity."""
     return math.sqrt(float((coordinates * normed**2).sum()) / max(int(coordinates.sum()) - SIMILARITY, 1))
 
 

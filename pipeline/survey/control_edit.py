@@ -1,7 +1,7 @@
-"""Marks written into a control file line by line: what others wrote there, comments too, stays as it is.
+"""Editing of marks in a control file line by line; everything else in it, including comments, is preserved.
 
-Two comments are ours. ``# not visible:`` says that a photo does not show a point, so that nobody looks twice;
-``# unmarked:`` keeps the coordinates of a point of ODM's list, which knows points by their marks alone.
+Two comments are our own. ``# not visible:`` records that a photo does not show a point, so that it is not checked
+again; ``# unmarked:`` keeps the coordinates of a point in ODM's list, which stores points only with their marks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CSV_TITLES = ("name", "x", "y", "z", "photo", "pixel_x", "pixel_y", "role", "sig
 CSV_KEYS = ("name", "x", "y", "z", "photo", "px", "py", "role", "sigma_horizontal", "sigma_vertical")
 MARKED = ("photo", "px", "py")
 BOM = "\ufeff"
-TABS = 5  # in a line of ODM's list, from which on tabs part its fields
+TABS = 5  # a line of ODM's list with at least as many is tab-separated
 
 FindPhoto = Callable[[str], str | None]
 
@@ -32,10 +32,10 @@ class ControlText:
     """A control file that is being marked.
 
     Attributes:
-        path: Where it lies, or will.
-        table: What it says.
-        find: The photo of the capture that a name means.
-        newline: What ends its lines.
+        path: The file, which may not exist yet.
+        table: Its contents.
+        find: Returns the photo of the capture that a name refers to.
+        newline: Its line ending.
         bom: Whether it begins with a byte order mark.
     """
 
@@ -47,10 +47,10 @@ class ControlText:
 
     @staticmethod
     def read(path: Path, find: FindPhoto) -> ControlText:
-        """Read a file that is there.
+        """Read an existing file.
 
         Raises:
-            SplatpipeError: if it is no control file.
+            SplatpipeError: if it is not a control file.
         """
         table = _with_columns(read_table(path), path)
         raw = path.read_bytes()
@@ -58,13 +58,13 @@ class ControlText:
 
     @staticmethod
     def begin(path: Path, crs: str, as_csv: bool, find: FindPhoto) -> ControlText:
-        """The text of a new file: ODM's list, or a CSV where points state a role or an accuracy."""
+        """Return the text of a new file: ODM's list or, if ``as_csv``, a CSV, which can state roles and accuracies."""
         lines = [crs, ",".join(CSV_TITLES)] if as_csv else [crs]
         return ControlText(path, Table(tuple(enumerate(lines, 1)), 2 if as_csv else None, crs, ()), find)
 
     @property
     def marks(self) -> dict[str, dict[str, tuple[float, float]]]:
-        """Pixels as written, by point and photo; of a photo that the capture does not have there is none."""
+        """Pixels as written, by point and photo; marks in photos outside the capture are omitted."""
         found: dict[str, dict[str, tuple[float, float]]] = {}
         for name, rows in self.table.groups.items():
             seen = found.setdefault(name, {})
@@ -76,7 +76,7 @@ class ControlText:
 
     @property
     def hidden(self) -> set[tuple[str, str]]:
-        """Points and the photos that are said not to show them."""
+        """Pairs of point and photo that are recorded as not visible."""
         named = (line[len(HIDDEN) :].strip().split("\t") for _, line in self.table.lines if line.startswith(HIDDEN))
         return {(fields[0], fields[1]) for fields in named if len(fields) == 2}
 
@@ -92,7 +92,7 @@ class ControlText:
         return found
 
     def with_mark(self, point: SurveyedPoint, photo: str, pixel: tuple[float, float]) -> ControlText:
-        """The text with a mark, new or moved; the photo is one that shows the point, then."""
+        """Return the text with a mark added or moved; this removes the comment that the point is not visible there."""
         text = self.with_hidden(point.name, photo, hidden=False)
         group = text.table.groups.get(point.name, [])
         here = next((row for row in group if row.mark and self.find(row.mark.photo) == photo), None)
@@ -106,12 +106,12 @@ class ControlText:
         return text._insert(at, text._marked(like, photo, pixel, keep=False))
 
     def without_mark(self, point: SurveyedPoint, photo: str) -> ControlText:
-        """The text without a mark; the point stays."""
+        """Return the text without a mark; the point is kept."""
         group = self.table.groups.get(point.name, [])
         here = next((row for row in group if row.mark and self.find(row.mark.photo) == photo), None)
         if here is None:
             return self
-        numbered = any(not row.name for row in self.table.rows)  # by their first lines, of which none may go
+        numbered = any(not row.name for row in self.table.rows)  # named by their first lines, which must stay
         if self.table.header is not None and (numbered or len(group) == 1):
             return self._put(here.line, self._marked(self._line(here.line), "", None, keep=False))
         if numbered:
@@ -122,19 +122,19 @@ class ControlText:
         return self._put(here.line, f"{UNMARKED}\t" + "\t".join([*fields, point.name]))
 
     def with_hidden(self, point: str, photo: str, hidden: bool) -> ControlText:
-        """The text with, or without, the comment that a photo does not show a point."""
+        """Return the text with, or without, the comment that a photo does not show a point."""
         comment = f"{HIDDEN}\t{point}\t{photo}"
         if not hidden:
             return self._without_comment(lambda line: line.rstrip() == comment)
         return self if (point, photo) in self.hidden else self._insert(len(self.table.lines), comment)
 
     def save(self) -> None:
-        """Replace the file in one step: there whole or as before, even after a power cut.
+        """Replace the file atomically, so that it is complete even after a power cut.
 
         Raises:
             MachineError: if it cannot be written.
         """
-        target = self.path.resolve()  # a link stays one
+        target = self.path.resolve()  # keep a symbolic link
         text = (BOM if self.bom else "") + "".join(line + self.newline for _, line in self.table.lines)
         try:
             write_durably(target, text)
@@ -144,7 +144,7 @@ class ControlText:
             ) from error
 
     def _named(self) -> ControlText:
-        """The text of ODM's list with the names written out that points without one go by."""
+        """Return the text of ODM's list with the implicit names of unnamed points written out."""
         lines = [text for _, text in self.table.lines]
         for name, group in self.table.groups.items():
             for row in group:
@@ -158,7 +158,7 @@ class ControlText:
         return self.table.lines[number - 1][1]
 
     def _marked(self, line: str, photo: str, pixel: tuple[float, float] | None, keep: bool) -> str:
-        """An observation's line with another pixel and, unless that is to stay as written, another photo."""
+        """Return an observation's line with a new pixel and, unless ``keep``, a new photo name."""
         shown = ("", "") if pixel is None else (f"{pixel[0]:.2f}", f"{pixel[1]:.2f}")
         if self.table.header is None:
             fields = _split(line)
@@ -173,7 +173,7 @@ class ControlText:
         return _csv_line(cells, delimiter)
 
     def _new_line(self, point: SurveyedPoint, photo: str) -> str:
-        """An observation's line of a point that the file does not have yet, without its pixel."""
+        """Return an observation's line for a point that is not in the file yet, without its pixel."""
         height = "NaN" if point.z is None else repr(point.z)
         if self.table.header is None:
             return _joined([repr(point.x), repr(point.y), height, "0", "0", photo, point.name])
@@ -202,7 +202,7 @@ class ControlText:
         return text
 
     def _put(self, number: int, line: str | None) -> ControlText:
-        """The text with another line in a place, or without it."""
+        """Return the text with a line replaced or, for None, removed."""
         lines = [text for _, text in self.table.lines]
         lines[number - 1 : number] = [] if line is None else [line]
         return self._with_lines(lines)
@@ -217,7 +217,7 @@ class ControlText:
 
 
 def _with_columns(table: Table, path: Path) -> Table:
-    """A table of points alone with the columns that marks go into."""
+    """Return a table of points with the columns for marks added."""
     if table.header is None:
         return table
     lines = [text for _, text in table.lines]
@@ -232,7 +232,7 @@ def _with_columns(table: Table, path: Path) -> Table:
 
 
 def _split(line: str) -> list[str]:
-    """The fields of a line of ODM's list, as its reader parts them."""
+    """Return the fields of a line of ODM's list, split as by its reader."""
     return [field.strip() for field in line.split("\t")] if line.count("\t") >= TABS else line.split()
 
 
