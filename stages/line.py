@@ -17,7 +17,7 @@ from splatpipe.pipeline.web.options import ExportConfig
 
 INGEST = Stage(
     "ingest",
-    version=4,
+    version=5,
     config=IngestConfig,
     reads=("source.photos", "source.geo", "source.lens"),
     parts={
@@ -52,7 +52,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=4,
+    version=5,
     config=SparseConfig,
     reads=(
         "matches.database",
@@ -87,7 +87,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=7,
+    version=8,
     config=GeorefConfig,
     reads=(
         "sparse.model",

@@ -85,7 +85,7 @@ def test_what_fails_stops_no_other_and_what_is_finished_is_not_touched(tmp_path:
     bad = dict.fromkeys(("broken", "wrong", "nowhere"), "failed")
     assert states(told) == {"house": "done", **bad} and told["exit_code"] == 1
     of = {capture["name"]: capture for capture in told["captures"]}  # type: ignore[attr-defined]
-    assert "cut off" in of["broken"]["reason"] and of["broken"]["hint"] and of["broken"]["tries"] == 1
+    assert "is truncated" in of["broken"]["reason"] and of["broken"]["hint"] and of["broken"]["tries"] == 1
     assert "train.iterations" in of["wrong"]["reason"] and "There is no folder" in of["nowhere"]["reason"]
     assert json.loads((out / "batch.json").read_text())["captures"] == told["captures"]
     table = {row["capture"]: row for row in csv.DictReader((out / "batch.csv").read_text().splitlines())}
@@ -164,7 +164,7 @@ def test_a_killed_stage_is_begun_again_and_ctrl_c_ends_all_in_order(tmp_path: Pa
     filed = json.loads((out / "batch.json").read_text())
     (house,) = filed["captures"]
     assert (house["state"], house["stage"], house["tries"], filed["at_work"]) == ("stopped", "features", 2, False)
-    assert "features: The stage features died of SIGKILL" in house["earlier"][0]
+    assert "features: The stage features was ended by SIGKILL" in house["earlier"][0]
 
 
 def test_a_batch_that_is_killed_leaves_nothing_at_work_and_no_lie(tmp_path: Path) -> None:

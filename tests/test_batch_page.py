@@ -98,7 +98,7 @@ def test_hostile_names_and_messages_stay_text(tmp_path: Path, open_page: Callabl
     assert (watched.requests, watched.errors) == ([], [])
     assert watched.page.evaluate("document.documentElement.scrollWidth") <= width
     assert watched.page.locator("script").count() == 1
-    assert watched.page.title().startswith("▶ At work")  # not "taken"
+    assert watched.page.title().startswith("▶ Running")  # not "taken"
     assert words(watched).count('document.title = "taken"') >= 5
     text = (tmp_path / "batch.html").read_text(encoding="utf-8")
     assert "\u202e" not in text and "\u2066" not in text

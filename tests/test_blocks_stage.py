@@ -291,7 +291,10 @@ def test_blocks_that_are_missing_are_named_before_anything_is_merged(
     plan, coarse = (part(undisturbed, f"blocks/{name}") for name in ("blocks.json", "coarse"))
     given = inputs(scene, TrainConfig(**QUICK), blocks_plan=plan, blocks_coarse=coarse)
     shards = [part(undisturbed, f"{name}/model.ply").parent for name in SHARDS]
-    for there, named in ((shards[:2], "block 3 left"), ([shards[0], tmp_path, shards[2]], "block 2 left")):
+    for there, named in (
+        (shards[:2], "block 3 has no model"),
+        ([shards[0], tmp_path, shards[2]], "block 2 has no model"),
+    ):
         with pytest.raises(StageError, match=named) as raised:
             train.run(TrainConfig(**QUICK), replace(given, shards=tuple(there)), tmp_path, tiny_scene.Recorder())
         assert "--rerun-from train" in raised.value.hint

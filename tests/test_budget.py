@@ -479,7 +479,7 @@ def test_growth_ends_where_memory_runs_out_all_the_same_and_pruning_goes_on(
     monkeypatch.setattr(planning_of_schedule, "resolve_schedule", tiny_scene.resolver(**limits))
     recorder = tiny_scene.Recorder()
     train.run(tiny_scene.plain(iterations=60), make_inputs(scene), tmp_path, recorder)
-    assert len(recorder.warnings) == 1 and "no Gaussian is added after iteration 10" in recorder.warnings[0]
+    assert len(recorder.warnings) == 1 and "no Gaussians are added after iteration 10" in recorder.warnings[0]
     history = json.loads((tmp_path / "history.json").read_text())
     assert history["growth_ended"] == 10 and history["resets"] == [25, 50]
     first, *rest = history["density"]

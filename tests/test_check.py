@@ -120,7 +120,7 @@ def test_faults_of_single_photos_are_found_and_name_them(tmp_path: Path) -> None
     assert [finding.photos for finding in told["blurred"]] == [(name(3),)]
     assert [finding.photos for finding in told["underexposed"]] == [(name(8),)]
     assert [finding.photos for finding in told["duplicate"]] == [(name(5), "copy.JPG")]
-    assert told["unreadable"][0].photos == (name(10),) and "cut off" in told["unreadable"][0].message
+    assert told["unreadable"][0].photos == (name(10),) and "is truncated" in told["unreadable"][0].message
     assert [finding.photos for finding in told["position-swapped"]] == [(name(6), name(13))]
     assert (name(15),) in [finding.photos for finding in told["cameras"]]
     assert (name(1),) in [finding.photos for finding in told["resized"]]

@@ -188,7 +188,7 @@ def test_one_stage_alone_needs_what_it_reads(numbers: Path, out: Path) -> None:
         ("kill", StageError, "SIGKILL"),
         ("raise", StageError, "out of order"),
         ("disk", MachineError, "No space left"),
-        ("forget", StageError, "left no count.txt"),
+        ("forget", StageError, "did not write count.txt"),
     ],
 )
 def test_a_failed_stage_has_a_reason_and_what_came_before_it_stays(

@@ -284,7 +284,7 @@ def test_height_that_the_drone_contradicts_is_told(tmp_path: Path) -> None:
     for record in scene.positions:
         record["relative_altitude_m"] = 34.0
     _, _, warnings = georef(scene, tmp_path)
-    assert any("34.0 m by the drone" in warning for warning in warnings)
+    assert any("34.0 m according to the drone" in warning for warning in warnings)
 
 
 def test_model_that_is_none_is_refused(tmp_path: Path) -> None:
@@ -330,7 +330,7 @@ def test_scale_bars_make_a_metric_frame_without_any_position(tmp_path: Path) -> 
     assert abs(bars[0]["error_m"]) < 0.01 and bars[2]["error_m"] == pytest.approx(-bars[2]["metres"] / 6.0, abs=0.02)
     assert summary["scale_bars"] == 2
     assert any("contradict the others" in text and "T2 to T7" in text for text in warnings)
-    assert any("was not found: T1 to T9" in text for text in warnings)
+    assert any("was not detected: T1 to T9" in text for text in warnings)
     assert not any("Arbitrary scale" in text for text in warnings)
 
 

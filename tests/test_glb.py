@@ -126,7 +126,7 @@ def test_opacities_and_scales_at_their_ends_stay_finite(tmp_path: Path):
 
 
 def test_what_a_glb_cannot_hold_is_refused():
-    with pytest.raises(SplatpipeError, match="32 bits"):
+    with pytest.raises(SplatpipeError, match="32-bit length"):
         write_head(io.BytesIO(), {}, MOST_FILE_BYTES - 3)
     with pytest.raises(SplatpipeError, match="without Gaussians"):
         glb.write(Path("never"), Scene(Gaussians.empty(0, 0)))

@@ -280,8 +280,8 @@ def bad_files(folder: Path) -> dict[str, str]:
     head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     (folder / "bomb.png").write_bytes(head + struct.pack(">I", 1000) + b"IDAT" + zlib.compress(b"\0" * 10**6))
     return {
-        "half.jpg": "cut off",
-        "half.png": "cut off",
+        "half.jpg": "is truncated",
+        "half.png": "is truncated",
         "text.jpg": "no JPEG",
         "empty.png": "is empty",
         "header.jpg": "damaged",
@@ -337,13 +337,13 @@ def test_pictures_with_a_second_one_inside_are_read_and_panoramas_and_raws_are_n
 def test_decoding_tells_when_a_photo_has_changed_since(folder: Path) -> None:
     result = ingest(folder)
     save(folder / "a.jpg", 1, (WIDTH, WIDTH))
-    with pytest.raises(SplatpipeError, match=r"a\.jpg is not what it was"):
+    with pytest.raises(SplatpipeError, match=r"a\.jpg has changed since"):
         result.pixels("a.jpg")
     replace_in_silence(folder / "b.jpg")
     with pytest.raises(SplatpipeError, match=r"b\.jpg has changed since the photos were checked: it was rep"):
         result.pixels("b.jpg")
     (folder / "b.jpg").unlink()
-    with pytest.raises(SplatpipeError, match=r"b\.jpg is not what it was"):
+    with pytest.raises(SplatpipeError, match=r"b\.jpg has changed since"):
         result.pixels("b.jpg")
 
 
@@ -356,7 +356,7 @@ def test_photo_replaced_in_silence_is_refused_by_the_stage_that_reads_it(folder:
             replace_in_silence(folder / "b.jpg")
 
     request = Request(LINE, LineConfig(), folder, tmp_path / "run", Machine("cpu", 1))
-    with pytest.raises(SplatpipeError, match=r"b\.jpg is not what it was"), open_session(request, meddle) as runner:
+    with pytest.raises(SplatpipeError, match=r"b\.jpg has changed since"), open_session(request, meddle) as runner:
         runner.walk(until="features")
     assert runner.outcome.ran == ["ingest"] and runner.outcome.failed == "features"
     with open_session(request, lambda event: None) as again:
@@ -519,7 +519,7 @@ def test_masks_that_do_not_fit_are_named(folder: Path) -> None:
     (folder / "masks" / "b.png").write_text("no mask")
     result = ingest(folder)
     assert result.summary["masks"] == 0
-    assert any("masks/a.png has another shape" in warning for warning in result.warnings)
+    assert any("masks/a.png has another aspect ratio" in warning for warning in result.warnings)
     assert any("masks/nobody.png" in warning for warning in result.warnings)
     assert any("masks/b.png cannot be read" in warning for warning in result.warnings)
 
@@ -528,7 +528,7 @@ def test_masks_that_leave_nothing_are_told(folder: Path) -> None:
     (folder / "masks").mkdir()
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(folder / "masks" / "a.png")
     result = ingest(folder)
-    assert any("a.jpg leaves hardly anything" in warning for warning in result.warnings)
+    assert any("The mask of a.jpg hides almost the whole photo" in warning for warning in result.warnings)
 
 
 def test_masks_beside_images_are_found_without_a_model(folder: Path) -> None:

@@ -118,7 +118,7 @@ def test_the_page_for_web_hosts_shows_the_same(out: Path) -> None:
     assert (out / "web/index.html").read_bytes() == (out / "viewer.html").read_bytes() != PLAIN
     (out / "web/index.html").write_bytes(b"<title>of an earlier version</title>")
     (out / "viewer.html").write_bytes(PLAIN)
-    assert "web/index.html is of an earlier version" in renew_viewer(out)
+    assert "web/index.html was written by an earlier version" in renew_viewer(out)
     assert told(out)["sections"]
 
 

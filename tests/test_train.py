@@ -202,7 +202,7 @@ def test_going_on_with_another_instruction_set_is_told(
     monkeypatch.setattr(rasterizer, "isa_name", lambda: "other")
     recorder = tiny_scene.Recorder()
     train.run(QUICK, make_inputs(scene), tmp_path, recorder)
-    assert len(recorder.warnings) == 1 and "goes on with other" in recorder.warnings[0]
+    assert len(recorder.warnings) == 1 and "resumes on other" in recorder.warnings[0]
 
 
 def test_broken_checkpoint_is_told_and_ignored(scene: Path, undisturbed: Path, tmp_path: Path) -> None:

@@ -320,7 +320,7 @@ def test_the_landing_page_leads_to_what_there_is(
     for title in ("3D viewer", "Report", "Film"):
         link = page.locator("a.way", has_text=title).get_attribute("href")
         assert served.ask(str(link), method="HEAD").status == 200
-    page.get_by_text("Training").click()
+    page.get_by_text("Training", exact=True).click()
     page.wait_for_url("**/live")
     assert watched.errors == []
     assert all(url.startswith(served.address) for url in watched.requests)
@@ -353,7 +353,7 @@ def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> 
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
 
     done = view(tmp_path)
-    assert done.returncode == 2 and "does not contain a run" in done.stderr
+    assert done.returncode == 2 and "does not contain a run" in " ".join(done.stderr.replace("│", " ").split())
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -69,7 +69,7 @@ class Executor:
         self._process = None
         _close(process)
         raise StageError(
-            f"The stage {task.stage} crashed{_cause(code)}.",
+            f"The stage {task.stage} {_cause(code)}.",
             hint=f"{_remedy(code)} See the end of the log: {self._log}",
         )
 
@@ -148,11 +148,11 @@ def _close(process: subprocess.Popen[str]) -> None:
 
 def _cause(code: int) -> str:
     if code >= 0:
-        return f" (exit code {code})"
+        return f"crashed (exit code {code})"
     try:
-        return f" of {signal.Signals(-code).name}"
+        return f"was ended by {signal.Signals(-code).name}"
     except ValueError:
-        return f" of signal {-code}"
+        return f"was ended by signal {-code}"
 
 
 def _remedy(code: int) -> str:
