@@ -86,7 +86,7 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *sets]
     with (out.parent / "demo_run.lock").open("a+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the first worker makes it, the others wait
-        if not lock.tell():
+        if not os.fstat(lock.fileno()).st_size:
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
             lock.write("done")

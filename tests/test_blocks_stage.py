@@ -96,7 +96,9 @@ def digests(out: Path) -> dict[str, str]:
 
 def alone(scene: Path, out: Path, shard: str, threads: int) -> subprocess.Popen[str]:
     words = [sys.executable, str(LINE), scene, out, shard, json.dumps(OPTIONS), threads]
-    return subprocess.Popen(list(map(str, words)), stdout=subprocess.PIPE, text=True, start_new_session=True)
+    return subprocess.Popen(
+        list(map(str, words)), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
 
 
 @pytest.mark.parametrize("limit", [1_000_000_000, 1_500_000_000, 2_000_000_000])

@@ -474,7 +474,7 @@ def test_found_targets_are_shown_moved_and_refused_in_the_browser(found_run: Pat
         photo, pixel = "DJI_0034.JPG", TRUTH["P16"]["seen_px"]["DJI_0034.JPG"]
         page.evaluate(f"splatpipe.mark.goTo('P16', '{photo}')")
         chosen = page.locator("#photos li[aria-current]")
-        assert "found" in (chosen.get_attribute("class") or "") and "found" in (chosen.get_attribute("title") or "")
+        assert "found" in (chosen.get_attribute("class") or "") and "detected" in (chosen.get_attribute("title") or "")
         assert "were detected" in (page.locator("#list li", has_text="P16").get_attribute("title") or "")
         assert "found in" in page.locator("#about").inner_text()
         page.keyboard.press("Enter")  # agreed to: nothing is written

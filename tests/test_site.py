@@ -217,7 +217,7 @@ def test_a_file_that_is_lost_is_told_once_and_leaves_no_hole(site: Path, open_pa
         shown = page.evaluate("() => splatpipe.shown()")
         assert leaf["file"] not in shown["files"]
         assert len(shown["files"]) > 3  # the others came
-        assert "is not there (404)" in page.locator("#notice").inner_text()
+        assert "is missing (404)" in page.locator("#notice").inner_text()
         assert host.asked[leaf["file"]] == 3
         host.missing = set()
         page.evaluate("() => dispatchEvent(new Event('online'))")

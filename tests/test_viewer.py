@@ -198,7 +198,7 @@ def test_a_large_splat_lies_beside_its_page_which_asks_for_it_or_loads_it_from_a
 ) -> None:
     write_tiny(tmp_path, largest_bytes=1e5)
     page = open_page((tmp_path / "viewer.html").as_uri()).page
-    assert "lies beside the page, in splat.spz" in page.locator("#message").inner_text()
+    assert "stored beside the page, in splat.spz" in page.locator("#message").inner_text()
     assert "splatpipe view" in page.locator("#advice").inner_text()
     page.set_input_files("#file", tmp_path / "splat.spz")
     page.locator("body.ready").wait_for(state="attached")

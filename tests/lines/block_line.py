@@ -63,9 +63,10 @@ def make(
 
 
 def tell(event: Event) -> None:
-    """Print when a training is running."""
+    """Print when a training is running, then wait for the caller: no shard finishes before it is killed."""
     if event.kind == "progress" and "training" in str(event.data["what"]):
         print(event.stage, event.data["done"], flush=True)
+        sys.stdin.read()
 
 
 if __name__ == "__main__":
