@@ -214,7 +214,7 @@ def test_a_large_splat_lies_beside_its_page_which_asks_for_it_or_loads_it_from_a
         assert served.errors == []
         (tmp_path / "splat.spz").unlink()
         page = open_page(f"http://127.0.0.1:{server.server_port}/viewer.html").page
-        page.locator("#message", has_text="splat.spz is not there (404)").wait_for()
+        page.locator("#message", has_text="splat.spz is missing (404)").wait_for()
     finally:
         server.shutdown()
         server.server_close()
