@@ -1,1 +1,1 @@
-"""From photos to cameras: pairs, keypoints, matches, mapping, lenses; what the stages and the ladder share."""
+"""Structure from motion: pair selection, keypoints, matching, mapping, lens calibration and the recovery ladder."""

@@ -1,4 +1,4 @@
-"""What finding the cameras may look at, and what it has found so far."""
+"""Input of camera estimation, and its result so far."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 @dataclass(frozen=True)
 class MappingInput:
-    """The photos of a run, and all that is known of them before mapping.
+    """The photos of a run and everything known about them before mapping.
 
     Attributes:
         database: Cameras with their priors, images 1, 2, … in name order, keypoints, verified two-view geometries.
         features: The same images and keypoints, with descriptors.
         colours: (n, 3) RGB of all keypoints of ``features``, image after image.
         photos: The checked list.
-        photos_part: The folder of the part ``ingest.photos``.
+        photos_part: The folder of the artifact ``ingest.photos``.
         photos_dir: The user's folder.
         positions: The entries of ``positions.json``.
         cameras: The camera groups of ``ingest.cameras``; the camera of group 0 has COLMAP's id 1.
         scratch: An existing folder for temporary files.
-        threads: That may work at a time; the answer does not depend on it.
-        tried: Pairs of photos that were matched, (i, j), i < j, COLMAP's numbers, whether anything held or not.
+        threads: Number of worker threads; the result does not depend on it.
+        tried: Pairs of photos that were matched, (i, j), i < j, COLMAP's numbers, whether or not they were verified.
     """
 
     database: Path
@@ -51,13 +51,13 @@ class MappingResult:
     """Cameras and points so far.
 
     Attributes:
-        model: The one that goes on.
+        model: The model passed on to later steps.
         others: Sub-models that could not be joined to it, the largest first.
         database: The one that the keypoint indices of ``model`` refer to.
         verified: Its view graph.
         colours: (n, 3) RGB of all its keypoints, image after image.
-        tried: A row for each mapper that was tried, for ``models.json``.
-        rungs: A row for each rung of the ladder that was climbed, for ``models.json``.
+        tried: A row for each mapping attempt, for ``models.json``.
+        rungs: A row for each rung of the ladder that was run, for ``models.json``.
     """
 
     model: pycolmap.Reconstruction

@@ -1,7 +1,7 @@
-"""A sub-model brought into the frame of another one, over points of both that matched keypoints observe.
+"""Join a sub-model to another model through points of both that matched keypoints observe.
 
-The similarity is found by RANSAC and judged in pixels, both ways: a point of the one has to lie where a photo of the
-other saw it.
+The similarity transform is estimated by RANSAC and checked in pixels both ways: a point of one model must project to
+where a photo of the other observed it.
 """
 
 from __future__ import annotations
@@ -28,25 +28,28 @@ from splatpipe.pipeline.sfm.ladder_poses import (
 from splatpipe.pipeline.sfm.structure import Structure, Track, cameras_of, make_model, poses_of, read_structure
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-SLACK = 3.0  # times a pose's tolerance: both models err, and neither was adjusted to the other
-TRIALS = 2000  # finds three right pairs with 99.9 % while a sixth of all are right
-SCORED = 1000  # ties that a trial is held against: enough to tell the best, whatever the models' size
-REFITS = 5  # rounds of fitting to the inliers
-LEAST_LINKS = 2  # pairs of photos between the models; one alone may show a twin
+SLACK = 3.0  # times a pose's tolerance: both models have errors, and neither was adjusted to the other
+TRIALS = 2000  # draws three correct ties with 99.9 % probability if a sixth of all are correct
+SCORED = 1000  # ties that score a trial: enough to find the best, whatever the models' size
+REFITS = 5  # rounds of refitting to the inliers
+LEAST_LINKS = 2  # pairs of photos between the models; a single pair may show a look-alike
 
 
 @dataclass(frozen=True)
 class TiePoints:
-    """Points of two models that should be one: which, and how each is seen from the other model's photos.
+    """Pairs of points, one from each model, that should coincide, with the photos that observe them.
+
+    Values come in pairs: "here" is the model whose frame stays, "there" the other one.
 
     Attributes:
-        rows: (k, 2) of the points, here and there.
+        rows: (k, 2) row of the point, here and there.
         links: (k, 2) the photos whose keypoints were matched, here and there.
         points: (k, 3) here; (k, 3) there.
         poses: (k, 3, 4) cam_from_world of the photo here; of the photo there, each in its own model's frame.
-        places: (k, 2) where the photo saw it, undistorted, on the plane at depth 1; here; there.
+        places: (k, 2) undistorted observation in the photo, on the plane at depth 1; here; there.
         pixels: (k,) pixels per unit of that plane; here; there.
-        cells: (k,) part of the picture here that it lies in.
+        limits: (k,) tolerance of the reprojection, pixels; here; there.
+        cells: (k,) grid cell of the image here that contains the observation.
     """
 
     rows: Int64[np.ndarray, "k 2"]
@@ -62,7 +65,7 @@ class TiePoints:
         return len(self.rows)
 
     def only(self, chosen: Int64[np.ndarray, " n"]) -> TiePoints:
-        """Some of them."""
+        """Return the chosen rows."""
         both = (self.points, self.poses, self.places, self.pixels, self.limits)
         points, poses, places, pixels, limits = ((one[chosen], two[chosen]) for one, two in both)
         cells = self.cells[chosen]
@@ -72,13 +75,13 @@ class TiePoints:
 def join(
     model: pycolmap.Reconstruction, other: pycolmap.Reconstruction, verified: ViewGraph, seed: int
 ) -> pycolmap.Reconstruction | None:
-    """One model of two, not yet adjusted; None where it is not sure how they lie to each other.
+    """Join two models into one, not yet adjusted; None if their relative placement is uncertain.
 
     Args:
-        model: Whose frame and cameras stay.
-        other: Another one over the same view graph.
-        verified: The view graph; its keypoints may have grown since.
-        seed: Of RANSAC.
+        model: The model whose frame and cameras are kept.
+        other: Another model of the same view graph.
+        verified: The view graph; keypoints may have been added since.
+        seed: For RANSAC.
     """
     here, there = read_structure(model), read_structure(other)
     ties = find_ties(model, here, other, there, verified)
@@ -98,7 +101,7 @@ def find_ties(
     there: Structure,
     verified: ViewGraph,
 ) -> TiePoints:
-    """Pairs of points that verified matches between photos of both models lead to, or photos that are in both."""
+    """Return the ties given by verified matches between photos of both models, and by photos that are in both."""
     counts = {number: len(places) for number, places in verified.keypoints.items()}
     ours, theirs = set(model.reg_image_ids()), set(other.reg_image_ids())
     rows_here = {number: rows for number, rows in here.rows(counts).items() if number in ours}
@@ -149,13 +152,16 @@ def _tied(
 def fit_ties(
     ties: TiePoints, chosen: Bool[np.ndarray, " k"], seed: int, least: int = LEAST_INLIERS
 ) -> tuple[Similarity, Bool[np.ndarray, " k"]] | None:
-    """The similarity from there to here that most of the chosen ties agree with, and which of all ties do.
+    """Fit the similarity from there to here that most of the chosen ties agree with.
 
     Args:
-        ties: All.
-        chosen: Those to fit to.
-        seed: Of the lots.
-        least: Ties that have to agree.
+        ties: All ties.
+        chosen: (k,) mask of those to fit to.
+        seed: For the random draws.
+        least: Minimum number of chosen ties that must agree.
+
+    Returns:
+        The similarity and the mask of all ties that agree with it, or None if too few of the chosen ties do.
     """
     rows = np.flatnonzero(chosen)
     if len(rows) < least:
@@ -191,7 +197,7 @@ def fit_ties(
 
 
 def agree(ties: TiePoints, similarity: Similarity) -> Bool[np.ndarray, " k"]:
-    """Which ties a similarity brings within the tolerance, in the photo here and in the photo there."""
+    """Return the mask of ties that a similarity brings within tolerance, both in the photo here and the one there."""
     moved = similarity.apply(ties.points[1]), similarity.inverse().apply(ties.points[0])
     good = np.ones(len(ties), bool)
     for side in (0, 1):
@@ -204,7 +210,7 @@ def agree(ties: TiePoints, similarity: Similarity) -> Bool[np.ndarray, " k"]:
 
 
 def _sure(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
-    """Enough points, of enough of what the matches say, over the pictures and over several pairs of photos."""
+    """Whether the inliers are numerous enough, a large enough share, and spread over the images and photo pairs."""
     held = min(len(np.unique(ties.rows[inliers, side])) for side in (0, 1))
     share = held / max(1, min(len(np.unique(ties.rows[:, side])) for side in (0, 1)))
     enough = (held >= MANY_INLIERS and share >= LEAST_SHARE) or (held >= LEAST_INLIERS and share >= LARGE_SHARE)
@@ -213,7 +219,7 @@ def _sure(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
 
 
 def _foretells(ties: TiePoints, seed: int) -> bool:
-    """Whether the similarity of every second point explains the others nearly as well, and the other way round."""
+    """Cross-validate: whether the fit to either half of the points explains the other half nearly as well."""
     _, order = np.unique(ties.rows[:, 0], return_inverse=True)
     for odd in (0, 1):
         mine = order % 2 == odd
@@ -235,7 +241,7 @@ def _united(
     similarity: Similarity,
     same: Int64[np.ndarray, "_ 2"],
 ) -> pycolmap.Reconstruction:
-    """Both in the frame of the first; of a photo or camera in both, the first's is kept."""
+    """Return both models merged in the first's frame; for a photo or camera in both, the first's is kept."""
     poses = poses_of(model)
     for number, pose in poses_of(other).items():
         if number not in poses:

@@ -1,4 +1,4 @@
-"""Whom a photo that was left may share things with: by matches, by what placed photos show, by position, by look."""
+"""Rank likely partners of leftover photos: by matches, by shared points, by position, by visual similarity."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from splatpipe.pipeline.sfm.pairs import Costs, Pair, positions_tell, spatial_co
 from splatpipe.pipeline.sfm.structure import read_structure
 
 Ranked = dict[int, list[int]]
-"""For photos that are left, others that may show the same, the likeliest first."""
+"""For each leftover photo, others that may show the same thing, most likely first."""
 
-LOOKED_AT = 100  # of a ranking; nobody asks for more
+LOOKED_AT = 100  # entries of a ranking that are kept; callers never need more
 
 
 def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[int], seed: int) -> Ranked:
-    """The likeliest of each kind of hint in turn: placed photos, or photos of another model than their own.
+    """Interleave the rankings of all hints; candidates are placed photos and photos of other sub-models.
 
     Args:
         capture: Positions and descriptors.
         found: The model and its view graph.
         left: Photos that are not placed.
-        seed: Of the comparison of looks.
+        seed: For the visual similarity.
     """
     placed = set(found.model.reg_image_ids())
     groups = [set(other.reg_image_ids()) for other in found.others]
@@ -47,7 +47,7 @@ def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[
 
 
 def by_matches(found: MappingResult, left: Collection[int], placed: Collection[int]) -> Ranked:
-    """Those with verified matches, the most of them first."""
+    """Rank placed photos by the number of verified matches with each leftover photo."""
     ranked = {}
     for photo in sorted(left):
         shared = [(-len(mine), partner) for partner, mine, _ in partners_of(found.verified, photo) if partner in placed]
@@ -56,7 +56,7 @@ def by_matches(found: MappingResult, left: Collection[int], placed: Collection[i
 
 
 def by_model(found: MappingResult, left: Collection[int], placed: Collection[int]) -> Ranked:
-    """Those that share points with placed photos with which the photo has verified matches."""
+    """Rank photos by the points they share with placed photos that have verified matches with the leftover photo."""
     tracks = read_structure(found.model).tracks
     rows: dict[int, list[int]] = {}
     for row, track in enumerate(tracks):
@@ -73,12 +73,15 @@ def by_model(found: MappingResult, left: Collection[int], placed: Collection[int
 
 
 def choose_pairs(ranked: Ranked, avoided: Collection[Pair], most: int) -> list[Pair]:
-    """Each photo with its likeliest partners.
+    """Pair each photo with its most likely partners.
 
     Args:
         ranked: Partners by photo.
-        avoided: (i, j), i < j, not to be chosen.
-        most: Pairs of a photo.
+        avoided: (i, j), i < j, pairs to exclude.
+        most: Maximum number of pairs per photo.
+
+    Returns:
+        The pairs (i, j), i < j, sorted.
     """
     chosen: set[Pair] = set()
     for photo, partners in ranked.items():
@@ -88,7 +91,7 @@ def choose_pairs(ranked: Ranked, avoided: Collection[Pair], most: int) -> list[P
 
 
 def _by_costs(left: Collection[int], costs: Costs) -> Ranked:
-    """Those of least cost, where it is known."""
+    """Rank other photos by cost, lowest first, where it is known."""
     ranked = {}
     for photo in sorted(left):
         row = costs(photo - 1).copy()

@@ -1,7 +1,7 @@
-"""Photos that were left, placed against a finished model: a pose from points that their verified matches lead to.
+"""Place leftover photos in a finished model: resection from the points that their verified matches lead to.
 
-A photo at the wrong place is worse than a missing one. So a pose has to hold for much of what the matches say, over the
-picture, through more than one placed photo, and the pose of every second match has to explain the others as well.
+A misplaced photo is worse than a missing one. So a pose must agree with a large share of the matches, spread over the
+image and over more than one placed photo, and a pose from half of the keypoints must explain the other half as well.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-ERROR = 0.003  # of the longer side, within which a point has to lie: COLMAP's 12 pixels of a photo of 4,000
-LEAST_ERROR_PX = 4.0  # of small photos: keypoints of a coarse scale err by pixels
-LEAST_INLIERS = 15  # keypoints; COLMAP's least of a pair
-MANY_INLIERS = 30  # COLMAP's least of a pose
-LEAST_SHARE = 0.25  # of the keypoints that lead to a point; COLMAP's least of a pose
-LARGE_SHARE = 0.5  # demanded where there are few: most of what the matches say has to agree
-CELLS = 4  # a side, over the picture
-LEAST_CELLS = 4  # of the 16: a pose from one corner turns about it
-HELD_OUT = 0.6  # of the share among every second match, which the pose of these must reach among the others
-LEAST_PARTNERS = 2  # placed photos: one alone may show a twin of the place
+ERROR = 0.003  # reprojection tolerance as a share of the longer side: COLMAP's 12 pixels in a photo of 4,000
+LEAST_ERROR_PX = 4.0  # minimum tolerance for small photos: coarse-scale keypoints are off by pixels
+LEAST_INLIERS = 15  # keypoints; COLMAP's minimum for a pair
+MANY_INLIERS = 30  # COLMAP's minimum for a pose
+LEAST_SHARE = 0.25  # of the keypoints that lead to a point; COLMAP's minimum for a pose
+LARGE_SHARE = 0.5  # required where inliers are few: most matches must agree
+CELLS = 4  # grid cells along each side of the image
+LEAST_CELLS = 4  # of the 16: a pose from one corner alone can pivot about it
+HELD_OUT = 0.6  # a pose from half of the keypoints must explain this fraction of its own inlier share in the other half
+LEAST_PARTNERS = 2  # placed photos: a single one may show a look-alike of the place
 
 
 @dataclass(frozen=True)
 class PoseCorrespondences:
-    """What a photo's verified matches with placed photos say it sees.
+    """2D-3D correspondences of a photo, from its verified matches with placed photos.
 
     Attributes:
-        keypoints: (k,) of the photo; one may be said to see several points.
-        rows: (k,) of the model's points.
-        partners: (k,) the placed photo that says so; the first of them.
+        keypoints: (k,) keypoint indices of the photo; one may correspond to several points.
+        rows: (k,) rows of the model's points.
+        partners: (k,) the placed photo that gives the correspondence; the first if there are several.
     """
 
     keypoints: Int64[np.ndarray, " k"]
@@ -49,13 +49,13 @@ class PoseCorrespondences:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Where a photo was taken.
+    """Estimated pose of a photo.
 
     Attributes:
         pose: cam_from_world.
-        camera: As it was calibrated, or refined on the way where the model has no photo of it.
+        camera: As calibrated, or refined with the pose if the model has no other photo of it.
         observations: Keypoint and point of each inlier, each keypoint once.
-        share: Of the keypoints that lead to points, those that agree.
+        share: Share of the keypoints with correspondences that are inliers.
     """
 
     pose: pycolmap.Rigid3d
@@ -65,11 +65,11 @@ class PoseEstimate:
 
 
 def sightings(verified: ViewGraph, rows: Mapping[int, Int64[np.ndarray, " _"]], number: int) -> PoseCorrespondences:
-    """Gather what leads from a photo's keypoints to points.
+    """Collect the correspondences between a photo's keypoints and the model's points.
 
     Args:
         verified: The view graph.
-        rows: Of placed photos, the point of each keypoint, or -1.
+        rows: For each placed photo, the point row of each keypoint, or -1.
         number: The photo.
     """
     found: dict[tuple[int, int], int] = {}
@@ -83,7 +83,7 @@ def sightings(verified: ViewGraph, rows: Mapping[int, Int64[np.ndarray, " _"]], 
 
 
 def partners_of(verified: ViewGraph, number: int) -> list[tuple[int, Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]]]:
-    """Photos that share verified matches with one: their number, its keypoints, theirs; by number."""
+    """List the photos with verified matches to one, sorted by number: their number, its keypoints, their keypoints."""
     found = []
     for (i, j), matches in verified.matches.items():
         if number in (i, j):
@@ -100,15 +100,15 @@ def place(
     calibrated: bool,
     seed: int,
 ) -> PoseEstimate | None:
-    """The pose of a photo; None where it is not sure.
+    """Estimate the pose of a photo; None if it is uncertain.
 
     Args:
-        seen: What it sees.
-        keypoints: All of its, pixels.
-        points: The model's.
-        camera: Its own; refined only where it is not calibrated.
-        calibrated: Whether the model tells its focal length.
-        seed: Of RANSAC.
+        seen: Its correspondences.
+        keypoints: All of its keypoints, pixels.
+        points: The model's points.
+        camera: Its camera; a copy is refined if it is not calibrated.
+        calibrated: Whether the model determines its focal length.
+        seed: For RANSAC.
     """
     total = len(np.unique(seen.keypoints))
     if total < LEAST_INLIERS:
@@ -145,7 +145,7 @@ def _estimate(
     limit_px: float,
     seed: int,
 ) -> tuple[pycolmap.Rigid3d, Bool[np.ndarray, " k"]] | None:
-    """COLMAP's pose from points; the camera is refined in place unless it is calibrated."""
+    """Run COLMAP's absolute pose estimation; the camera is refined in place unless it is calibrated."""
     estimation = pycolmap.AbsolutePoseEstimationOptions()
     estimation.ransac.max_error = limit_px
     estimation.ransac.random_seed = seed
@@ -157,7 +157,7 @@ def _estimate(
 
 
 def _spread(places: Float64[np.ndarray, "k 2"], camera: pycolmap.Camera) -> bool:
-    """Whether places lie in enough parts of the picture."""
+    """Whether the keypoints lie in enough grid cells of the image."""
     size = np.array([camera.width, camera.height], np.float64)
     cells = np.clip((places / size * CELLS).astype(int), 0, CELLS - 1)
     return len(np.unique(cells[:, 0] * CELLS + cells[:, 1])) >= LEAST_CELLS
@@ -171,7 +171,7 @@ def _foretells(
     limit_px: float,
     seed: int,
 ) -> bool:
-    """Whether the pose of every second keypoint explains the others nearly as well, and the other way round."""
+    """Cross-validate: whether a pose from either half of the keypoints explains the other half nearly as well."""
     _, order = np.unique(keypoints, return_inverse=True)
     for odd in (0, 1):
         mine = order % 2 == odd
@@ -193,7 +193,7 @@ def _explained(
     pose: pycolmap.Rigid3d,
     limit_px: float,
 ) -> Bool[np.ndarray, " k"]:
-    """Which points a pose puts where they were seen."""
+    """Return the mask of points whose reprojection error under a pose is within the limit."""
     shown, _ = project_through_lens(camera, pose.matrix(), spots)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.linalg.norm(shown - places, axis=1) <= limit_px)

@@ -1,4 +1,4 @@
-"""Cameras from the view graph: which mapper, and which of two answers."""
+"""Estimate cameras from the view graph: choose the mapper, and the better of two models."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]
 
-LEAST_SHARE = 0.1  # of the photos; a model of fewer is an accident
-LEAST_SEEN = 15  # points a photo, on average; COLMAP's least of a pair
-ENOUGH_SHARE = 0.5  # below it an attempt with lower demands is worth its time
-MOST_SHARE = 0.85  # below it the other mapper may do better; above it the ladder places what is left for less
-STRAY_UNOBSERVED = 0.03  # which a focal length may have where the photos cannot tell it
-CLEARLY = 0.005  # of the score, by which a second answer has to be better; below it the first one stays
-ROUNDS = 2  # of new pairs
+LEAST_SHARE = 0.1  # of the photos; a model of fewer is accidental
+LEAST_SEEN = 15  # mean points per photo; COLMAP's minimum for a pair
+ENOUGH_SHARE = 0.5  # below this share, an attempt with relaxed thresholds is worth its time
+MOST_SHARE = 0.85  # below this share the other mapper may do better; above it the ladder places the rest more cheaply
+STRAY_UNOBSERVED = 0.03  # relative deviation allowed for a focal length that the photos do not determine
+CLEARLY = 0.005  # score margin by which a second model must be better to replace the first
+ROUNDS = 2  # of matching additional pairs
 
 
 @dataclass(frozen=True, eq=False)
 class MappingAttempt:
-    """What one way of mapping gave.
+    """Result of one mapping attempt.
 
     Attributes:
-        how: The way, for people.
-        mapper: Which.
+        how: Human-readable description of the attempt.
+        mapper: The mapper used.
         options: Its options.
-        models: The largest first; perhaps none.
-        judgement: Of the first; None where there is none.
-        cpu_s: What it took.
+        models: The models, largest first; may be empty.
+        judgement: Of the first model; None if there is none.
+        cpu_s: CPU time, seconds.
     """
 
     how: str
@@ -55,12 +55,12 @@ class MappingAttempt:
 
     @property
     def placed(self) -> int:
-        """Photos of the largest model."""
+        """Number of photos placed in the largest model."""
         return self.models[0].num_reg_images() if self.models else 0
 
 
 class Reconstructor:
-    """Maps a capture, perhaps more than once, and keeps a row of each try."""
+    """Map a capture, more than once if needed, and record every attempt."""
 
     def __init__(self, capture: MappingInput, config: SparseConfig, report: Reporter) -> None:
         self.capture, self.config, self.report = capture, config, report
@@ -70,7 +70,7 @@ class Reconstructor:
         self.notes: dict[int, str] = {}
 
     def map(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:
-        """Map one way, and judge."""
+        """Run one mapper and judge its largest model."""
         began = time.process_time()
         wide = coarseness(self.verified.cameras.values())
         chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size, coarseness=wide), **options)
@@ -87,25 +87,25 @@ class Reconstructor:
         return answer
 
     def rows(self, chosen: MappingAttempt) -> tuple[JSON, ...]:
-        """What was tried, for ``models.json``."""
+        """Rows describing every attempt, for ``models.json``."""
         return tuple(
             {**_row(answer), "chosen": answer is chosen, "why": self.notes.get(id(answer), "")} for answer in self.tried
         )
 
 
 def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -> MappingResult:
-    """Find the cameras.
+    """Estimate the cameras.
 
     Args:
-        capture: The photos and what is known of them.
-        config: Which mapper; ``auto`` maps photo after photo first, and all at once where that is doubtful.
-        report: Told of the progress.
+        capture: The photos and what is known about them.
+        config: Selects the mapper; ``auto`` maps incrementally first, then globally if the result is doubtful.
+        report: Receives progress.
 
     Returns:
-        The better model. Its database may have more pairs than the capture's.
+        The best model. Its database may have more pairs than the capture's.
 
     Raises:
-        SplatpipeError: if too few photos can be placed.
+        SplatpipeError: If too few photos can be placed.
     """
     work = Reconstructor(capture, config, report)
     answer = _best(work)
@@ -123,7 +123,7 @@ def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -
 
 
 def _best(work: Reconstructor) -> MappingAttempt:
-    """The better answer of the mappers that the configuration allows."""
+    """Return the best attempt of the mappers that the configuration allows."""
     mapper: Mapper = "global" if work.config.mapper == "global" else "incremental"
     best = _with_held_focal(work, work.map(mapper, mapper))
     total = len(work.verified.names)
@@ -138,7 +138,7 @@ def _best(work: Reconstructor) -> MappingAttempt:
 
 
 def _doubts(answer: MappingAttempt, total: int, verified: ViewGraph) -> list[str]:
-    """Why to map the other way, too."""
+    """Return the reasons for also trying the other mapper."""
     if answer.judgement is None:
         return ["no photo was placed"]
     found = []
@@ -153,7 +153,7 @@ def _doubts(answer: MappingAttempt, total: int, verified: ViewGraph) -> list[str
 
 
 def _better(first: MappingAttempt, second: MappingAttempt) -> MappingAttempt:
-    """Of two answers; the first unless the second is clearly better."""
+    """Return the better of two attempts: the first unless the second is clearly better."""
     if second.judgement is None or first.judgement is None:
         return first if second.judgement is None else second
     bad = first.judgement.level == "bad", second.judgement.level == "bad"
@@ -163,7 +163,10 @@ def _better(first: MappingAttempt, second: MappingAttempt) -> MappingAttempt:
 
 
 def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
-    """The answer, or where it foretold wrongly or the graph is thin a better one from a graph with more pairs."""
+    """Match more pairs where the model is uncertain or the graph sparse, and map again if that can help.
+
+    Returns the given attempt, or a better one from the extended graph.
+    """
     for _ in range(ROUNDS):
         model = answer.models[0]
         thin = pairs_a_photo(model, work.verified) < THIN
@@ -180,7 +183,7 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
         if not (thin or found.prove_a_bend):
             break
         again = _with_held_focal(work, work.map(answer.mapper, f"{answer.mapper}, with more pairs"))
-        best = _better(again, answer)  # of two that are as good the one that more is known of
+        best = _better(again, answer)  # of two equally good models, prefer the one with more evidence
         if best.judgement is not None and best.judgement.level == "bad" and answer.mapper == "incremental":
             best = _better(best, _with_held_focal(work, work.map("global", "global, with more pairs")))
         if best is answer:
@@ -190,13 +193,13 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
 
 
 def _unsure(answer: MappingAttempt, verified: ViewGraph) -> bool:
-    """Whether nothing but the matches themselves tells that a model is right."""
+    """Whether a model lacks a prior focal length, or is judged less than good."""
     known = all(verified.cameras[number].has_prior_focal_length for number in _used(answer.models[0]))
     return not known or (answer.judgement is not None and answer.judgement.level != "good")
 
 
 def _judged_again(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
-    """The same models, held against the graph as it is now."""
+    """Judge an attempt's largest model again, against the current view graph."""
     judgement = judge(answer.models[0], work.verified, work.capture.cameras)
     fresh = replace(answer, judgement=judgement)
     work.tried[work.tried.index(answer)] = fresh
@@ -205,11 +208,11 @@ def _judged_again(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt
 
 
 def _with_held_focal(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
-    """The answer, or where the photos cannot tell the focal length one near that of the metadata.
+    """Return the attempt, or one with the focal length held near its prior if the photos do not determine it.
 
-    If they cannot, the one that is held explains the matches just as well.
+    In that case the held focal length explains the matches just as well.
     """
-    enough = answer.placed >= ENOUGH_SHARE * len(work.verified.names)  # a small model tells nothing about the lens
+    enough = answer.placed >= ENOUGH_SHARE * len(work.verified.names)  # a small model says nothing about the lens
     if not enough or not _focal_unobserved(answer.models[0], work.verified.cameras):
         return answer
     relaxed = answer.options.relaxed
@@ -249,7 +252,7 @@ def _row(answer: MappingAttempt) -> dict[str, JSON]:
 
 
 def _has_points(model: Model) -> bool:
-    """Whether a model's photos see points; those taken from one spot are placed without any."""
+    """Whether a model's photos observe enough points; photos taken from one spot are placed without any."""
     return bool(model.compute_num_observations() >= LEAST_SEEN * model.num_reg_images())
 
 
@@ -263,7 +266,7 @@ def _check_enough(count: int, config: SparseConfig, total: int) -> None:
 
 
 def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bool:
-    """Whether a focal length left its prior although the photos cannot tell it; control may, later."""
+    """Whether a focal length left its prior although the photos do not determine it; ground control may, later."""
     used = _used(model)
     strayed = [number for number in used if _stray(model.cameras[number], priors[number]) >= STRAY_UNOBSERVED]
     if not strayed or not all(priors[number].has_prior_focal_length for number in used):
@@ -273,7 +276,7 @@ def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bo
 
 
 def _used(model: Model) -> list[int]:
-    """The cameras of the placed photos."""
+    """Ids of the placed photos' cameras, sorted."""
     return sorted({model.images[number].camera_id for number in model.reg_image_ids()})
 
 

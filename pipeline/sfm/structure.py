@@ -1,4 +1,4 @@
-"""A model's points and who sees them as arrays, and the way back: a model on a view graph's keypoints."""
+"""Convert a model's points and tracks to arrays, and arrays back to a model on a view graph's keypoints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Track = list[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Structure:
-    """Points in one fixed order: that of their tracks.
+    """Points in a fixed order, sorted by track.
 
     Attributes:
         points: (m, 3), model units.
@@ -28,10 +28,10 @@ class Structure:
     tracks: Sequence[Track]
 
     def rows(self, counts: Mapping[int, int]) -> dict[int, Int64[np.ndarray, " _"]]:
-        """Of every photo, the point that each of its keypoints observes; -1 where none.
+        """Return, for every photo, the row of the point that each keypoint observes, or -1.
 
         Args:
-            counts: Keypoints of each photo.
+            counts: Number of keypoints of each photo.
         """
         found = {number: np.full(count, -1, np.int64) for number, count in counts.items()}
         for row, track in enumerate(self.tracks):
@@ -41,7 +41,7 @@ class Structure:
 
 
 def read_structure(model: pycolmap.Reconstruction) -> Structure:
-    """The points of a model."""
+    """Return the points and tracks of a model."""
     found = sorted(
         (
             (sorted((element.image_id, element.point2D_idx) for element in point.track.elements), point.xyz)
@@ -59,11 +59,11 @@ def make_model(
     verified: ViewGraph,
     structure: Structure,
 ) -> pycolmap.Reconstruction:
-    """A model whose photos have all keypoints of a view graph, which may have grown since.
+    """Build a model whose photos have all keypoints of a view graph, including those added since.
 
     Args:
-        cameras: Those of the photos, as calibrated.
-        poses: cam_from_world of the photos that are placed.
+        cameras: The photos' cameras, as calibrated.
+        poses: cam_from_world of the placed photos.
         verified: Names, cameras and keypoints of the photos.
         structure: Observations of placed photos only; points of fewer than two are left out.
     """
@@ -84,11 +84,11 @@ def make_model(
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Rigid3d]:
-    """cam_from_world of every placed photo."""
+    """Return cam_from_world of every placed photo."""
     return {number: model.images[number].cam_from_world() for number in sorted(model.reg_image_ids())}
 
 
 def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
-    """The cameras of the placed photos, by number."""
+    """Return the cameras of the placed photos, by number."""
     used = {model.images[number].camera_id for number in model.reg_image_ids()}
     return {number: model.cameras[number] for number in sorted(used)}

@@ -1,4 +1,4 @@
-"""What matching left, in memory: each photo's keypoints, and which of them verified pairs of photos share."""
+"""The result of matching in memory: each photo's keypoints and the verified matches between pairs of photos."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class ViewGraph:
         names: Of all photos, placed or not.
         camera_of: The camera of each.
         cameras: As they were before mapping: focal lengths from the metadata.
-        keypoints: Places in the stored grid, pixels, the centre of the first at (0.5, 0.5).
-        matches: Of each pair (i, j), i < j, that has any: rows of keypoints in i and in j that its geometry verified.
+        keypoints: Locations in the stored pixel grid, pixels; the centre of the first pixel is at (0.5, 0.5).
+        matches: For each pair (i, j), i < j, that has any: keypoint rows in i and in j, geometrically verified.
     """
 
     names: Mapping[int, str]
@@ -31,7 +31,7 @@ class ViewGraph:
 
 
 def read_verified(database: Path) -> ViewGraph:
-    """Read the view graph of a database that matching left."""
+    """Read the view graph from the database that matching wrote."""
     with pycolmap.Database.open(database) as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
         keypoints = {
