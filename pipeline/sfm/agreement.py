@@ -1,7 +1,7 @@
-"""How far a model explains the verified matches: each pair of photos held against the cameras that were found.
+"""How well a model explains the verified matches: each pair of photos is checked against the estimated cameras.
 
-Most verified matches are none of the model's own observations, so they tell of it what its reprojection error cannot:
-photos that were not placed explain nothing, a bend leaves matches across it unexplained, a wrong lens most of them.
+Most verified matches are not observations of the model, so they reveal what its reprojection error cannot: unplaced
+photos explain nothing, a bend leaves the matches across it unexplained, and a wrong lens most matches.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-EXPLAINED_PX = 4.0  # the distance from the epipolar line that verification itself allows; more in large photos
-LEAST_PARALLAX = 2.0  # of a match, times EXPLAINED_PX, for its depth to have a sign worth asking for
+EXPLAINED_PX = 4.0  # distance from the epipolar line that verification itself allows; more in large photos
+LEAST_PARALLAX = 2.0  # times EXPLAINED_PX: minimum parallax of a match for the sign of its depth to be meaningful
 
 Rays = Float64[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Each verified pair of photos against a model; a row a pair, in the order of ``ViewGraph.matches``.
+    """Agreement of each verified pair of photos with a model; one row per pair, sorted by image ids.
 
     Attributes:
         pairs: Image ids, the smaller first.
         placed: Whether the model has both photos.
-        matches: Verified.
-        explained: Of these, within ``EXPLAINED_PX`` of their epipolar line and in front of both cameras.
-        closeness: Sum over the matches of 1 on the line, falling to 0 at ``EXPLAINED_PX`` from it.
-        held_out: Verified matches that are no two observations of one point of the model.
-        held_out_explained: Of those.
-        median_px: Distance from the epipolar line; a match behind a camera counts as infinitely far; nan if not placed.
+        matches: Number of verified matches.
+        explained: How many of them are within ``EXPLAINED_PX`` of the epipolar line and in front of both cameras.
+        closeness: Sum over the matches of a weight that is 1 on the line and falls to 0 at ``EXPLAINED_PX`` from it.
+        held_out: Number of verified matches that are not two observations of the same model point.
+        held_out_explained: How many of those are explained.
+        median_px: Median distance from the epipolar line; infinite for a match behind a camera; NaN if not placed.
     """
 
     pairs: Int64[np.ndarray, "n 2"]
@@ -47,7 +47,7 @@ class Agreement:
 
 
 def compare(model: pycolmap.Reconstruction, verified: ViewGraph) -> Agreement:
-    """Hold every verified pair against a model, whose keypoints are those of ``verified``."""
+    """Check every verified pair against a model whose keypoints are those of ``verified``."""
     placed = sorted(model.reg_image_ids())
     rays = {number: _rays(model, number, verified) for number in placed}
     poses = {number: model.images[number].cam_from_world().matrix() for number in placed}
@@ -83,17 +83,20 @@ def epipolar_errors(
     two_from_world: Float64[np.ndarray, "3 4"],
     noise: float,
 ) -> Float64[np.ndarray, " n"]:
-    """Distances of matches from their epipolar lines in two calibrated photos.
+    """Compute the distances of matches from their epipolar lines in two calibrated photos.
 
-    The Sampson distance (Hartley and Zisserman, Multiple View Geometry, 11.4.3); infinite for what would lie behind a
-    camera, as long as its rays converge by more than noise.
+    The Sampson distance (Hartley and Zisserman, Multiple View Geometry, 11.4.3); infinite for points behind a camera
+    if their parallax exceeds the noise.
 
     Args:
-        one: Matched places in the first photo, undistorted, in units of the focal length.
+        one: Matched keypoints in the first photo, undistorted, in units of the focal length.
         two: The same in the second.
-        one_from_world: Pose of the first.
-        two_from_world: Pose of the second.
-        noise: Of a place, in units of the focal length.
+        one_from_world: Pose of the first photo.
+        two_from_world: Pose of the second photo.
+        noise: Keypoint noise, in units of the focal length.
+
+    Returns:
+        Distances in units of the focal length.
     """
     turn = two_from_world[:, :3] @ one_from_world[:, :3].T
     shift = two_from_world[:, 3] - turn @ one_from_world[:, 3]
@@ -112,7 +115,7 @@ def epipolar_errors(
     ahead_two = -np.einsum("ij,ij->i", np.cross(shift, turned), normal)
     angle = np.linalg.norm(normal, axis=1) / (np.linalg.norm(turned, axis=1) * np.linalg.norm(second, axis=1))
     behind = (np.minimum(ahead_one, ahead_two) < 0.0) & (angle > LEAST_PARALLAX * noise)
-    # A lens whose distortion cannot be undone at a place has no ray there.
+    # Where a lens's distortion cannot be inverted, there is no ray.
     return np.where(behind | ~np.isfinite(errors), np.inf, errors)
 
 
@@ -122,7 +125,7 @@ def _rays(model: pycolmap.Reconstruction, number: int, verified: ViewGraph) -> R
 
 
 def _points(model: pycolmap.Reconstruction, number: int, count: int) -> Int64[np.ndarray, " n"]:
-    """The point that each keypoint of a photo belongs to, -1 for none."""
+    """Return the id of the point that each keypoint of a photo observes, -1 for none."""
     result = np.full(count, -1, np.int64)
     for row, point in enumerate(model.images[number].points2D):
         if point.has_point3D():

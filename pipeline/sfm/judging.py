@@ -1,9 +1,9 @@
-"""Whether the cameras that were found are right: an answer is judged, not the way it was found.
+"""Judge whether the estimated cameras are right, by the model itself and not by how it was obtained.
 
-The evidence is what the model did not need to be found: all verified matches (``agreement``), the metadata's focal
-lengths where these deserve trust, and plain shares of the photos. A bent model gives itself away by pairs of photos
-whose matches it contradicts. A few contradictions are usual, since windows and roofs repeat; in a bent or ghosted
-model they are many, as strong as what holds, or they stand between two groups of cameras.
+The evidence is what was not used to build the model: all verified matches (``agreement``), the metadata's focal
+lengths where they can be trusted, and simple shares of the photos. A bent model shows as pairs of photos whose matches
+it contradicts. A few contradictions are normal, since windows and roofs repeat; in a bent or ghosted model they are
+numerous, as strong as the consistent pairs, or separate two groups of cameras.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from splatpipe.pipeline.sfm.view_graph import ViewGraph
 Level = Literal["good", "doubt", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubt", "bad")
 
-PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # share of the photos; Pix4D's quality report asks for 95 %
+PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # share of the photos; Pix4D's quality report requires 95 %
 TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "lens-file", "xmp-dewarp")
-# A trusted focal length errs by a few per cent (a Phantom's by 0.5, sensor tables by up to 5); a 35 mm equivalent was
-# seen 26 % off on a phone, and a resized file's can be anything within reason.
-FOCAL_TRUSTED = (0.10, 0.30)  # stray from which on it is a doubt, and bad
-FOCAL_STATED = (0.35, 1.0)  # the same of a stated one that does not deserve trust, as a ratio less one
-FOCAL_LONGER = (0.25, 6.0)  # of the longer side: the lenses of cameras that people map with, 127 to 10 degrees
-FEW_SHARE = 0.1  # of the photos: what is wrong with the lens of fewer says nothing of the others
-EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed photos; sound models have 0.93 and more
+# A trusted focal length is off by a few per cent (a Phantom's by 0.5, sensor tables by up to 5); a 35 mm equivalent was
+# seen 26 % off on a phone, and that of a resized file can be off by even more.
+FOCAL_TRUSTED = (0.10, 0.30)  # relative deviation above which the level is doubt, and bad
+FOCAL_STATED = (0.35, 1.0)  # the same for an untrusted focal length, as a ratio less one
+FOCAL_LONGER = (0.25, 6.0)  # of the longer side: the lenses used for mapping, 127 to 10 degrees
+FEW_SHARE = 0.1  # of the photos: a wrong lens of fewer photos says nothing about the others
+EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed photos; sound models have 0.93 or more
 CONTRADICTED_DOUBT, CONTRADICTED_BAD = 0.04, 0.10  # of the pairs among placed photos; sound models have 0 to 0.03
-STRONG_BAD = 0.02  # the same, of pairs with more matches than half of those that hold
-FEW_PAIRS = 3  # contradicting pairs that may be chance
-LEAST_MATCHES = 15  # of a pair to contradict; COLMAP's own bound of a pair
-CUT_DOUBT, CUT_BAD = 0.5, 1.0  # matches that contradict between two groups of cameras, to those that agree
+STRONG_BAD = 0.02  # the same, for pairs with at least the median number of matches of consistent pairs
+FEW_PAIRS = 3  # fewer contradicting pairs may be chance
+LEAST_MATCHES = 15  # for a pair to count as contradicting; COLMAP's own minimum for a pair
+CUT_DOUBT, CUT_BAD = 0.5, 1.0  # ratio of contradicting to consistent matches between two groups of cameras
 
 
 @dataclass(frozen=True)
 class Reason:
-    """Something that speaks against a model.
+    """Evidence against a model.
 
     Attributes:
-        level: How heavily.
-        text: What, in plain words, a whole sentence.
-        hint: What to do about it, or nothing.
-        kind: For programs: ``placed``, ``focal``, ``bent``, ``unexplained``, ``lens``, ``positions``.
+        level: Its severity.
+        text: The problem in plain words, a whole sentence.
+        hint: What to do about it; may be empty.
+        kind: Machine-readable kind: ``placed``, ``focal``, ``bent``, ``unexplained``, ``lens``, ``positions``.
     """
 
     level: Level
@@ -60,17 +60,17 @@ class Reason:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is to be held of a model.
+    """Assessment of a model.
 
     Attributes:
-        level: The worst of the reasons'.
+        level: The worst level among the reasons.
         reasons: The worst first.
-        score: How much of all verified matches the model explains and how well, 0 to 1; for comparing two models of
+        score: How many of all verified matches the model explains and how closely, 0 to 1; for comparing two models of
             the same view graph.
-        explained: Share of all verified matches that it explains.
-        held_out: The same of those among placed photos that are none of its own observations.
-        contradicted: Pairs whose matches it contradicts.
-        pairs: Pairs among placed photos.
+        explained: Share of all verified matches that the model explains.
+        held_out: The same for matches among placed photos that are not observations of the model.
+        contradicted: Number of pairs whose matches the model contradicts.
+        pairs: Number of pairs among placed photos.
     """
 
     level: Level
@@ -82,12 +82,12 @@ class Judgement:
     pairs: int
 
     def joined(self, more: Sequence[Reason]) -> Judgement:
-        """The same with more reasons."""
+        """Return a copy with more reasons."""
         reasons = _worst_first([*self.reasons, *more])
         return replace(self, level=reasons[0].level if reasons else "good", reasons=reasons)
 
     def as_json(self) -> JSON:
-        """For ``models.json``."""
+        """Return level and reasons for ``models.json``."""
         told = [{"level": it.level, "kind": it.kind, "text": it.text, "hint": it.hint} for it in self.reasons]
         return {"level": self.level, "reasons": told}
 
@@ -100,9 +100,9 @@ def judge(
     Args:
         model: In any frame, with the keypoints of ``verified``.
         verified: The view graph.
-        cameras: The camera groups of ``ingest.cameras``, for where their focal lengths are from; COLMAP's ids count
+        cameras: The camera groups of ``ingest.cameras``, for the sources of their focal lengths; COLMAP's ids count
             from 1 in their order.
-        placeable: Photos that the share of placed ones is counted of; all of them unless given.
+        placeable: Number of photos on which the share of placed photos is based; defaults to all photos.
     """
     agreement = compare(model, verified)
     contradicts = contradicting(agreement)
@@ -129,18 +129,18 @@ def _worst_first(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
 
 
 def contradicting(agreement: Agreement) -> Bool[np.ndarray, " n"]:
-    """Pairs of placed photos less than half of whose matches the model explains."""
+    """Return the mask of pairs of placed photos for which the model explains less than half of the matches."""
     enough = agreement.placed & (agreement.matches >= LEAST_MATCHES)
     return np.asarray(enough & (2 * agreement.explained < agreement.matches))
 
 
 def is_trusted(camera: Mapping[str, JSON]) -> bool:
-    """Whether a camera group's focal length before mapping is worth holding a model against."""
+    """Whether a camera group's prior focal length is reliable enough to check a model against."""
     return bool(camera.get("has_prior")) and camera.get("focal_source") in TRUSTED_SOURCES
 
 
 def _score(agreement: Agreement) -> float:
-    """Pairs count by the root of their matches: a bend shows in the wide ones, which have few."""
+    """Weight pairs by the square root of their matches: a bend shows in wide-baseline pairs, which have few."""
     weights = np.sqrt(agreement.matches)
     return _share(weights * agreement.closeness / np.maximum(agreement.matches, 1), weights)
 
@@ -211,7 +211,7 @@ def _unexplained(agreement: Agreement) -> list[Reason]:
 
 
 def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: ViewGraph) -> list[Reason]:
-    """Contradictions that are more than the odd wrong match."""
+    """Report contradictions that go beyond the occasional wrong match."""
     count = int(contradicts.sum())
     if count < FEW_PAIRS:
         return []

@@ -1,7 +1,7 @@
-"""A ladder for photos that mapping left: registration, joined sub-models, more pairs, stronger keypoints.
+"""Recovery ladder for photos that mapping did not place: registration, joining sub-models, more pairs, more keypoints.
 
-The cheapest rung comes first, and a rung works for what is still left alone. It is kept only where it placed photos and
-the model is not worse for it: its own photos keep their points, and the error does not grow.
+The cheapest rung comes first, and each rung handles only the photos still left. Its result is kept only if it placed
+photos without degrading the model: the old photos keep their points, and the reprojection error does not grow.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
 
-PAIRS_A_PHOTO = 20  # as many as `matches` tries for each
-ROUNDS = 4  # of registration: photos that were just placed bring points for the next
-PARTNERS = 3  # placed photos that get stronger keypoints, too, for each that is left
-MOST_STRONGER = 12  # photos looked at again, or a share of all: no more than mapping costs
+PAIRS_A_PHOTO = 20  # as many as `matches` tries per photo
+ROUNDS = 4  # of registration: newly placed photos add points for the next ones
+PARTNERS = 3  # placed photos that also get stronger keypoints, per leftover photo
+MOST_STRONGER = 12  # photos extracted again, or the share of all below: costs no more than mapping
 MOST_STRONGER_SHARE = 0.125
-WEAK_SHARE = 0.5  # of the placed photos' median keypoints; fewer are worth another look
+WEAK_SHARE = 0.5  # of the placed photos' median keypoint count; photos with fewer are worth extracting again
 LEAST_KEYPOINTS = 16  # a photo with fewer is blank, blurred or masked
-KEPT_OBSERVATIONS = 0.98  # of the photos that were there before: a right photo takes none away
-WORSE_ERROR = 1.05  # times the mean reprojection error before, and
-WORSE_ERROR_PX = 0.05  # more than it
+KEPT_OBSERVATIONS = 0.98  # share the old photos must keep: a correctly placed photo takes none away
+WORSE_ERROR = 1.05  # the mean reprojection error may grow to this multiple,
+WORSE_ERROR_PX = 0.05  # or by this much if that is more
 
 
 @dataclass(frozen=True)
 class LadderContext:
-    """What all rungs share."""
+    """Context shared by all rungs."""
 
     capture: MappingInput
     options: MappingOptions
@@ -64,16 +64,17 @@ class LadderContext:
 
 
 def climb(capture: MappingInput, found: MappingResult, config: SparseConfig, report: Reporter) -> MappingResult:
-    """Place photos that mapping left, as far as that is sure.
+    """Place the photos that mapping did not, where that is certain.
 
     Args:
         capture: The run's photos.
-        found: What mapping gave.
-        config: ``ladder`` and the seed.
-        report: Told of progress and of each rung's cost.
+        found: The result of mapping.
+        config: ``ladder``, the seed and the minimum model size.
+        report: Receives progress, and how many photos each rung placed.
 
     Returns:
-        The same where nothing is left or nothing helped; else a larger model, perhaps on a view graph that has grown.
+        An unchanged model if no photo is left or no rung helped; otherwise a larger model, whose view graph may have
+        been extended.
     """
     held = any(row.get("focal_held") for row in found.tried if row.get("chosen"))
     wide = coarseness(found.verified.cameras.values())
@@ -101,13 +102,13 @@ def climb(capture: MappingInput, found: MappingResult, config: SparseConfig, rep
 
 
 def unplaced(found: MappingResult) -> list[int]:
-    """COLMAP's numbers of photos that the model lacks."""
+    """Return COLMAP's numbers of the photos that are not in the model."""
     placed = set(found.model.reg_image_ids())
     return [number for number in sorted(found.verified.names) if number not in placed]
 
 
 def settle(work: LadderContext, found: MappingResult) -> MappingResult:
-    """Register single photos and join sub-models until neither helps, each on what is there."""
+    """Register single photos and join sub-models, using the existing matches, until neither places more."""
     while True:
         grown = _joined(work, _registered(work, found))
         if grown.model.num_reg_images() == found.model.num_reg_images():
@@ -116,7 +117,7 @@ def settle(work: LadderContext, found: MappingResult) -> MappingResult:
 
 
 def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
-    """Match photos that are left with others that may show the same, then place them."""
+    """Match leftover photos with their likely partners, then place them."""
     left = unplaced(found)
     work.tell(0, len(left), "looking for matches of the remaining photos")
     tried = work.capture.tried | tried_pairs(found.database)
@@ -129,7 +130,7 @@ def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
 
 
 def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> MappingResult:
-    """Find new keypoints in photos that are left and in those that may show the same, then place them."""
+    """Extract new keypoints in leftover photos and their likely partners, then place them."""
     left = unplaced(found)
     work.tell(0, len(left), "looking for matches of the remaining photos")
     ranked = rank_partners(work.capture, found, left, work.options.seed)
@@ -149,9 +150,9 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
 
 
 def _worth_another_look(found: MappingResult, ranked: Ranked, most: int) -> list[int]:
-    """Photos that are left and their likeliest partners, as many as may be; those with the most matches first.
+    """Choose leftover photos and their likeliest partners, at most ``most``; those with the most matches first.
 
-    One that has plenty of keypoints and yet no match with what is placed shows something else.
+    A photo with many keypoints but no match with a placed photo is left out: it shows something else.
     """
     placed = set(found.model.reg_image_ids())
     counts = {number: len(places) for number, places in found.verified.keypoints.items()}
@@ -170,7 +171,7 @@ def _worth_another_look(found: MappingResult, ranked: Ranked, most: int) -> list
 
 
 def _among(found: MappingResult, ranked: Ranked, photos: Collection[int]) -> list[Pair]:
-    """Pairs among photos: each that is left with its partners, and those that share matches already."""
+    """Return pairs among photos: each leftover photo with its partners, and pairs that already have matches."""
     chosen = set(photos)
     pairs = {pair for pair in found.verified.matches if chosen.issuperset(pair)}
     for photo in chosen & ranked.keys():
@@ -181,7 +182,7 @@ def _among(found: MappingResult, ranked: Ranked, photos: Collection[int]) -> lis
 
 
 def _on(found: MappingResult, wider: MappingResult) -> MappingResult:
-    """The same model on a view graph that has grown."""
+    """Transfer the model to an extended view graph."""
     model = make_model(
         cameras_of(found.model).values(), poses_of(found.model), wider.verified, read_structure(found.model)
     )
@@ -189,7 +190,7 @@ def _on(found: MappingResult, wider: MappingResult) -> MappingResult:
 
 
 def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
-    """Add photos whose pose is sure, round after round, then adjust; all or nothing of what is still sure then."""
+    """Add photos whose pose is certain, in rounds, then adjust and keep those that still hold."""
     model, added = found.model, set[int]()
     for _ in range(ROUNDS):
         left = [number for number in unplaced(found) if number not in added]
@@ -233,7 +234,7 @@ def _placements(
 
 
 def _extended(model: Model, verified: ViewGraph, placements: Mapping[int, PoseEstimate]) -> Model:
-    """A model with more photos, and with what they see of its points."""
+    """Return the model with more photos and their observations of its points."""
     structure = read_structure(model)
     tracks = [list(track) for track in structure.tracks]
     cameras = cameras_of(model)
@@ -248,7 +249,7 @@ def _extended(model: Model, verified: ViewGraph, placements: Mapping[int, PoseEs
 
 
 def _joined(work: LadderContext, found: MappingResult) -> MappingResult:
-    """Join the other models that share enough with this one."""
+    """Join the sub-models that share enough points with the model."""
     remaining = []
     for other in found.others:
         fresh = set(other.reg_image_ids()) - set(found.model.reg_image_ids())
@@ -270,13 +271,16 @@ def _joined(work: LadderContext, found: MappingResult) -> MappingResult:
 
 
 def _adjusted(work: LadderContext, found: MappingResult, model: Model, added: Collection[int]) -> MappingResult:
-    """Adjust a model with new photos and drop those that do not hold; the old one where nothing does or it was better.
+    """Adjust a model with new photos and drop those whose pose does not hold.
 
     Args:
         work: The options.
-        found: Before.
-        model: With the new photos; changed in place.
+        found: The result before.
+        model: The model with the new photos; changed in place.
         added: The new photos.
+
+    Returns:
+        The result with the new model, or ``found`` itself if no new photo holds or the model got worse.
     """
     old = sorted(found.model.reg_image_ids())
     before, error = sum(observations(found.model, old).values()), mean_error_px(found.model)
@@ -296,7 +300,7 @@ def _adjusted(work: LadderContext, found: MappingResult, model: Model, added: Co
 
 
 def _not_held(verified: ViewGraph, model: Model, photos: Collection[int]) -> set[int]:
-    """Which of the photos lost their points in the adjustment, or are where their matches do not agree."""
+    """Return the photos that lost their points in the adjustment, or whose pose their matches contradict."""
     placed = set(model.reg_image_ids())
     agreement = compare(model, verified)
     matches, explained = dict.fromkeys(photos, 0), dict.fromkeys(photos, 0)
@@ -318,7 +322,7 @@ def _not_held(verified: ViewGraph, model: Model, photos: Collection[int]) -> set
 
 
 def without(model: Model, verified: ViewGraph, photos: Collection[int]) -> Model:
-    """The same model without some photos and what only they saw."""
+    """Return the model without some photos and without the points that fewer than two other photos observe."""
     structure = read_structure(model)
     tracks = [[element for element in track if element[0] not in photos] for track in structure.tracks]
     poses = {number: pose for number, pose in poses_of(model).items() if number not in photos}
@@ -328,7 +332,7 @@ def without(model: Model, verified: ViewGraph, photos: Collection[int]) -> Model
 
 
 def _row(name: str, before: MappingResult, after: MappingResult) -> dict[str, JSON]:
-    """What a rung brought, for ``models.json``."""
+    """Describe what a rung achieved, for ``models.json``."""
     return {
         "rung": name,
         "left": len(unplaced(before)),

@@ -1,4 +1,4 @@
-"""What follows when photos were added to a model: points from their matches, and how it went."""
+"""Extend a model after photos were added: triangulate points from their matches, and measure the result."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pycolmap
 from splatpipe.pipeline.sfm.completion import LEAST_MATCHES
 from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
 
-LEAST_OBSERVATIONS = 15  # of a photo that was added, once everything is adjusted
+LEAST_OBSERVATIONS = 15  # of an added photo, after the adjustment
 
 
 class ModelMapper:
-    """COLMAP's mapper over a model that is there already; its database must hold the model's keypoints."""
+    """COLMAP's mapper on an existing model; the database must contain the model's keypoints."""
 
     def __init__(self, database: Path, model: pycolmap.Reconstruction, options: MappingOptions) -> None:
         pycolmap.set_random_seed(options.seed)
@@ -31,22 +31,22 @@ class ModelMapper:
         self._model = model
 
     def triangulate(self, photos: Sequence[int]) -> None:
-        """Make points of what placed photos' keypoints match, and lengthen tracks by them."""
+        """Triangulate points from the matches of placed photos, then complete and merge tracks."""
         for number in photos:
             self._mapper.triangulate_image(self._triangulation, number)
         self._mapper.complete_and_merge_tracks(self._triangulation)
 
     def place_by_pairs(self, photos: Sequence[int]) -> list[int]:
-        """Place photos by matches with placed ones that have no points yet, and make points of them.
+        """Place photos by matches with placed ones that have no points yet, and triangulate these.
 
         COLMAP's structure-less registration: the pose that most matches' rays agree with, over several placed photos.
 
         Returns:
-            Those that were placed, to be held against what their matches say.
+            The photos that were placed; the caller must still check them against their matches.
         """
         mapping, placed = self._options.get_mapper(), []
         for number in photos:
-            known = self._model.exists_image(number)  # one without matches is not
+            known = self._model.exists_image(number)  # False for a photo without matches
             if known and self._mapper.register_next_structure_less_image(mapping, number):
                 self._mapper.triangulate_image(self._triangulation, number)
                 placed.append(number)
@@ -54,17 +54,17 @@ class ModelMapper:
         return placed
 
     def end(self) -> None:
-        """Take leave of the model, which is left whole."""
+        """Detach the mapper from the model, keeping all of it."""
         self._mapper.end_reconstruction(False)
 
 
 def observations(model: pycolmap.Reconstruction, photos: Collection[int]) -> dict[int, int]:
-    """Keypoints of each photo that observe a point."""
+    """Count the keypoints of each photo that observe a point."""
     return {number: int(model.images[number].num_points3D) for number in sorted(photos)}
 
 
 def mean_error_px(model: pycolmap.Reconstruction) -> float:
-    """Mean reprojection error over all observations."""
+    """Return the mean reprojection error over all observations, pixels; infinite without points."""
     model.update_point_3d_errors()
     if model.num_points3D() == 0:
         return float(np.inf)

@@ -1,4 +1,4 @@
-"""More and stronger keypoints for a few photos, appended to what they have: COLMAP's SIFT on larger pictures."""
+"""Extract more keypoints for a few photos with COLMAP's SIFT on larger images, appended to the existing ones."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from splatpipe.pipeline.sfm.pairs import Pair
 from splatpipe.pipeline.sfm.reduction import copy_photos
 
 STRONGER = FeaturesConfig(extractor="sift", max_image_size=2400, max_features=12_288)
-"""Half as much again as what `standard` looks at, and half as many keypoints more."""
-THREAD_SHARE = 0.5  # of the threads: a photo takes twice the memory (0.36 GB a megapixel) that it did in `features`
+"""One and a half times the image size and the keypoints of `standard`."""
+THREAD_SHARE = 0.5  # of the threads: a photo takes twice the memory (0.36 GB per megapixel) that it did in `features`
 
 
 @dataclass(frozen=True)
 class ExtendedDatabase:
-    """A database that has grown.
+    """A database with added keypoints.
 
     Attributes:
-        database: All keypoints: those of before, under their numbers, then the new ones.
+        database: All keypoints: the existing ones, with their indices unchanged, then the new ones.
         colours: (n, 3) RGB of all of them, image after image.
-        keypoints: So many were added.
+        keypoints: Number of keypoints added.
     """
 
     database: Path
@@ -51,18 +51,18 @@ def strengthen(
     seed: int,
     report: Reporter,
 ) -> ExtendedDatabase:
-    """Find new keypoints in some photos, and match them among these.
+    """Extract new keypoints in some photos, and match them among these photos.
 
-    New ones are matched with new ones only: an old and a new keypoint of one spot have nearly the same descriptor, and
-    each would spoil the other's ratio test.
+    New keypoints are matched only with new ones: an old and a new keypoint at the same spot have nearly the same
+    descriptor, and each would make the other fail the ratio test.
 
     Args:
         capture: The photos' files.
         found: The database so far, and its view graph; only read.
-        photos: COLMAP's numbers of those to look at again.
-        pairs: Of them, to be matched.
-        seed: Of the verification.
-        report: Told of the progress.
+        photos: COLMAP's numbers of the photos to extract again.
+        pairs: Pairs of these photos to match.
+        seed: For the verification.
+        report: Receives progress.
     """
     folder = Path(tempfile.mkdtemp(prefix="keypoints-", dir=capture.scratch))
     target, fresh, work = folder / "database.db", folder / "fresh.db", folder / "work.db"

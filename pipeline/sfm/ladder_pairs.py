@@ -1,6 +1,6 @@
-"""More pairs of photos for a finished model: which to try, and their verified matches in a database that has grown.
+"""Propose more pairs of photos for a finished model, and add their verified matches to a copy of the database.
 
-Photos are under COLMAP's numbers here, as in ``ViewGraph``.
+Photos have COLMAP's numbers here, as in ``ViewGraph``.
 """
 
 from __future__ import annotations
@@ -22,29 +22,30 @@ from splatpipe.pipeline.sfm.pairs import Pair
 from splatpipe.pipeline.sfm.structure import Structure, poses_of, read_structure
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-SAMPLE = 64  # points of a photo that are looked for in the others
-LEAST_POINTS = 8  # of a photo; fewer tell nothing about what it shows
-ALIKE_COS = float(np.cos(np.radians(40.0)))  # SIFT matches little past it, and another side of things shows there
-LEAST_SCALE = 0.4  # of the distances to a point: past a factor of 2.5 keypoints are of other sizes
-LEAST_SHARE = 0.2  # of a photo's points in the other picture
-NEAREST = 60  # photos that are looked at for each, by what they look at: the cost grows like the photos
+SAMPLE = 64  # points of a photo that are projected into the others
+LEAST_POINTS = 8  # of a photo; fewer say nothing about what it shows
+ALIKE_COS = float(np.cos(np.radians(40.0)))  # beyond it SIFT matches little, and other sides of objects are visible
+LEAST_SCALE = 0.4  # ratio of the distances to a point: beyond a factor of 2.5 the keypoint scales differ
+LEAST_SHARE = 0.2  # of a photo's points that must lie in the other image
+NEAREST = 60  # candidate photos per photo, nearest by the points they observe: the cost grows linearly with the photos
 
 
 def propose_pairs(
     model: pycolmap.Reconstruction, verified: ViewGraph, count: int, avoided: Collection[Pair] = ()
 ) -> list[Pair]:
-    """Pairs of placed photos that, by the model, show the same thing and yet have no verified matches.
+    """Propose pairs of placed photos that show the same thing according to the model but have no verified matches.
 
-    Those that close a loop come first: no third photo has matches with both. They are spread over the photos.
+    Pairs that close a loop, those where no third photo has matches with both, come first. Pairs are spread over the
+    photos.
 
     Args:
-        model: With points.
+        model: A model with points.
         verified: Its view graph.
-        count: Most pairs wanted.
-        avoided: (i, j), i < j, that are not asked for: matching tried them in vain.
+        count: Maximum number of pairs.
+        avoided: (i, j), i < j, pairs to exclude because matching has already tried them.
 
     Returns:
-        (i, j), i < j, COLMAP's numbers; the most telling first.
+        (i, j), i < j, COLMAP's numbers; the most informative first.
     """
     poses, structure = poses_of(model), read_structure(model)
     numbers = np.array(sorted(poses))
@@ -78,8 +79,9 @@ def propose_pairs(
 def shared_views(
     model: pycolmap.Reconstruction, structure: Structure, numbers: np.ndarray
 ) -> Float64[np.ndarray, "n n"]:
-    """Of points that photo i observes, the share that lies in photo j's picture too and is seen alike; the mean of
-    both ways. What stands between is not known.
+    """Estimate the overlap of each two photos: the share of one's points that the other sees from a similar view.
+
+    Entry (i, j) is the mean of both directions. Occlusion is not considered.
 
     Args:
         model: With the poses and cameras.
@@ -106,7 +108,7 @@ def shared_views(
 
 
 def _samples(structure: Structure, numbers: np.ndarray) -> list[Float64[np.ndarray, "_ 3"]]:
-    """Some of the points that each photo observes, evenly over their order."""
+    """Return an evenly strided sample of the points that each photo observes."""
     rows: dict[int, list[int]] = {int(number): [] for number in numbers}
     for row, track in enumerate(structure.tracks):
         for photo, _ in track:
@@ -115,7 +117,7 @@ def _samples(structure: Structure, numbers: np.ndarray) -> list[Float64[np.ndarr
 
 
 def _nearest(middles: Float64[np.ndarray, "n 3"], j: int) -> np.ndarray:
-    """The photos whose points lie nearest to those of photo j; without it and those without points."""
+    """Return the photos whose points lie nearest to those of photo j, excluding j and photos without points."""
     if not np.isfinite(middles[j]).all():
         return np.zeros(0, int)
     with np.errstate(invalid="ignore"):
@@ -148,12 +150,12 @@ def match_more(capture: MappingInput, base: Path, pairs: Sequence[Pair], seed: i
     Args:
         capture: Whose scratch folder takes the new database.
         base: Verified pairs so far; its keypoints start with those of ``capture.features``. Only read.
-        pairs: (i, j), COLMAP's numbers. One that is verified already is matched again.
-        seed: Of the verification.
-        report: Told of the progress.
+        pairs: (i, j), COLMAP's numbers. Pairs that are already verified are matched again.
+        seed: For the verification.
+        report: Receives progress.
 
     Returns:
-        A database with everything of ``base`` and what holds of the pairs, also where that is nothing.
+        A database with everything in ``base`` and the verified matches of the pairs, even if there are none.
     """
     folder = Path(tempfile.mkdtemp(prefix="pairs-", dir=capture.scratch))
     target = folder / "database.db"
@@ -168,15 +170,15 @@ def match_more(capture: MappingInput, base: Path, pairs: Sequence[Pair], seed: i
 
 
 def take_verified(work: Path, target: Path, starts: dict[int, int] | None = None) -> int:
-    """Put the verified matches of one database into another, in place of those of the same keypoints.
+    """Copy the verified matches of one database into another, replacing those of the same keypoints.
 
     Args:
-        work: Where pairs were matched.
-        target: Where to.
-        starts: Of photos whose keypoints in ``work`` were appended to those in ``target``: where they begin there.
+        work: The database in which pairs were matched.
+        target: The database to write to.
+        starts: For photos whose keypoints in ``work`` were appended to those in ``target``, the index of the first.
 
     Returns:
-        Pairs with verified matches among them.
+        Number of copied pairs with verified matches.
     """
     starts = starts or {}
     held = 0
@@ -200,7 +202,7 @@ def take_verified(work: Path, target: Path, starts: dict[int, int] | None = None
 
 
 def tried_pairs(database: Path) -> set[Pair]:
-    """Pairs whose matches a database has, whether anything held or not; `matches` leaves only those that held."""
+    """Return the pairs with a two-view geometry in a database, verified or not; `matches` keeps only verified ones."""
     with pycolmap.Database.open(database) as opened:
         numbers, _ = opened.read_two_view_geometries()
     return {tuple(sorted(pycolmap.pair_id_to_image_pair(number))) for number in numbers}
