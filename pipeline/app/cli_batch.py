@@ -44,7 +44,9 @@ RetryFailedOption = Annotated[
         "--retry-failed", help="Retry captures that failed because of their photos or options, even if unchanged."
     ),
 ]
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="List the jobs that would run (Snakemake's dry run).")]
+DryRunOption = Annotated[
+    bool, typer.Option("--dry-run", help="List what would run for each capture, and count the jobs.")
+]
 
 
 def batch(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
-from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, BatchPlan, Call
+from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, BatchPlan, Call, PlannedCapture
 from splatpipe.pipeline.app.batch.publication import PAGE_FILE, publish
 from splatpipe.pipeline.app.batch.snakemake_process import (
     Profile,
@@ -28,6 +28,7 @@ from splatpipe.pipeline.app.batch.state import RENEWED_EVERY_S, BatchState, Capt
 from splatpipe.pipeline.app.batch.workflow import write_workflow
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, notify
 from splatpipe.pipeline.app.report import REPORT_FILE
+from splatpipe.pipeline.app.report.wording import roughly
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, StopSignal, UsageError, exit_code
 from splatpipe.pipeline.engine.lock import locked
@@ -277,19 +278,31 @@ def _guarded(call: Call, lock: int) -> Iterator[Callable[[JSON], None]]:
 
 
 def dry_run(call: Call, profile: Profile) -> int:
-    """Have Snakemake print what it would run, on stderr.
+    """Print on stderr which stages of each capture would run, then Snakemake's own count of jobs by kind.
 
     Returns:
-        Its exit code.
+        Snakemake's exit code.
     """
     require_snakemake()
     plan = call.plan()
     write_workflow(call, plan, LINE)
-    command = [*snakemake_command(call, plan, profile), "--dry-run", "--printshellcmds"]
+    sys.stderr.write("".join(f"{planned_line(capture)}\n" for capture in plan.captures))
+    sys.stderr.flush()
+    command = [*snakemake_command(call, plan, profile), "--dry-run", "--quiet", "rules", "host", "reason"]
     done = subprocess.run(
         command, stdin=subprocess.DEVNULL, stdout=2, cwd=call.folder, env=snakemake_environment(call), check=False
     )
     return done.returncode
+
+
+def planned_line(capture: PlannedCapture) -> str:
+    """What a capture would run, with the forecast of its working time, in one line."""
+    if capture.message:
+        return f"{capture.name}: fails before it starts. {capture.message} {capture.hint}".rstrip()
+    if not capture.jobs:
+        return f"{capture.name}: nothing to do, all stages are valid"
+    stages = ", ".join(job.stage for job in capture.jobs)
+    return f"{capture.name}: {stages} ({roughly(sum(job.seconds for job in capture.jobs))} forecast)"
 
 
 def _moved(before: CaptureState | None, now: CaptureState) -> bool:

@@ -79,7 +79,9 @@ def require_snakemake() -> None:
         MachineError: if Snakemake is not installed.
     """
     if importlib.util.find_spec("snakemake") is None:
-        raise MachineError("Snakemake is not installed.", hint="Install it: pip install 'splatpipe[batch]'.")
+        raise MachineError(
+            "Snakemake is not installed.", hint="Install it: pip install 'FILE.whl[batch]', with splatpipe's wheel."
+        )
 
 
 def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str]:
