@@ -1,4 +1,4 @@
-"""The lenses that a file or the photos' metadata state, brought to the pixels of the camera groups."""
+"""Lenses stated by a file or the photos' metadata, converted to the pixels of the camera groups."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from splatpipe.pipeline.sfm.lens_file import FileLens, checked_lens, fitted, rea
 from splatpipe.pipeline.sfm.lens_model import StatedLens, named_params, simplest
 
 FILE, DEWARP = "lens-file", "xmp-dewarp"
-SHAPE_TOLERANCE = 0.005  # between a lens's pictures and the photos: a pixel lost by reducing them
+SHAPE_TOLERANCE = 0.005  # on the aspect ratio of the lens's images and the photos: a pixel lost in resizing
 MAX_DEWARP_CHARS = 600
-LENS_STRAY = 0.35  # of a focal length from what metadata say: a rough 35 mm equivalent was seen 26 % off
+LENS_STRAY = 0.35  # of a focal length from the metadata's: a rough 35 mm equivalent was seen 26 % off
 SIZES_SHOWN = 4
 
 
@@ -31,16 +31,17 @@ def state_lenses(
     """Find each group's stated lens, and start the group's camera from it.
 
     Args:
-        groups: As the photos have them.
-        members: The photos of each.
-        path: The file of lenses; None where there is none.
-        report: Takes what is to be said.
+        groups: The photos' camera groups.
+        members: The photos of each group.
+        path: The lens file; None if there is none.
+        report: Receives notes.
 
     Returns:
-        The groups, with the simple lens that is nearest to a stated one, and the stated lenses, in each group's pixels.
+        The groups, with the simple lens that is nearest to the stated one, and the stated lenses, in each group's
+        pixels; None for a group without one.
 
     Raises:
-        SplatpipeError: if the file cannot be read, or fits no group.
+        SplatpipeError: If the file cannot be read, fits no group, or is ambiguous for one.
     """
     lenses: list[StatedLens | None] = [None] * len(groups)
     if path is not None:
@@ -55,7 +56,7 @@ def state_lenses(
 
 
 def lenses_json(lenses: Sequence[StatedLens | None]) -> JSON:
-    """What ``lenses.json`` holds."""
+    """Return the content of ``lenses.json``."""
     return {"lenses": [None if lens is None else asdict(lens) for lens in lenses]}
 
 
@@ -96,13 +97,13 @@ def _of_file(
 
 
 def _is_likely(lens: StatedLens, group: CameraGroup) -> bool:
-    """Whether a lens can be a camera's, as far as its own metadata tell: another camera's of the same shape is not."""
+    """Whether a lens agrees with a group's prior focal length; rules out other cameras of the same aspect ratio."""
     named = named_params(lens.colmap())
     return not group.has_prior or abs(0.5 * (named["fx"] + named["fy"]) / group.focal_px - 1.0) <= LENS_STRAY
 
 
 def _chosen(near: Sequence[tuple[FileLens, StatedLens, int]], group: CameraGroup, name: str) -> StatedLens | None:
-    """The one lens of a group: by the photos that it names, by the camera's name, or because there is no other."""
+    """Choose the lens of a group: by the photos it names, by the camera's name, or because it is the only candidate."""
     if not near:
         return None
     most = max(near, key=lambda entry: entry[2])
@@ -120,7 +121,7 @@ def _chosen(near: Sequence[tuple[FileLens, StatedLens, int]], group: CameraGroup
 
 
 def _of_metadata(group: CameraGroup, photos: Sequence[CheckedPhoto]) -> StatedLens | None:
-    """DJI's ``DewarpData``, where most photos of a group have the same and the drone has not applied it."""
+    """Return DJI's ``DewarpData`` if most photos of a group have the same and the drone has not applied it."""
     counts = Counter(lens for photo in photos if (lens := dewarp_lens(photo)) is not None)
     if not counts:
         return None
@@ -132,12 +133,14 @@ def _of_metadata(group: CameraGroup, photos: Sequence[CheckedPhoto]) -> StatedLe
 
 
 def dewarp_lens(photo: CheckedPhoto) -> StatedLens | None:
-    """The lens of a photo's ``drone-dji:DewarpData``: ``date;fx,fy,cx,cy,k1,k2,p1,p2,k3``.
+    """Parse the lens in a photo's ``drone-dji:DewarpData``: ``date;fx,fy,cx,cy,k1,k2,p1,p2,k3``.
 
-    Pixels of the picture that the camera took, the centre counted from its middle, the rest as OpenCV (DJI's manuals).
+    Values are in pixels of the original image, the principal point relative to its centre, the rest as in OpenCV
+    (DJI's manuals).
 
     Returns:
-        In the photo's pixels; None without one, with one that cannot be, or that was applied already (``DewarpFlag``).
+        The lens in the photo's pixels; None if there is none, it is implausible, or it was already applied
+        (``DewarpFlag``).
     """
     text = photo.xmp.get("drone-dji:DewarpData", "")
     scale = picture_scale(photo.exif, photo.width, photo.height)

@@ -134,9 +134,11 @@ def _seen_alike(
     camera: pycolmap.Camera,
     centre: Float64[np.ndarray, " 3"],
 ) -> Bool[np.ndarray, " m"]:
-    """Which points lie in a picture and are seen at nearly the angle and distance at which their owners see them."""
+    """Return the mask of points inside an image that it sees at a similar angle and distance as their owners do."""
     pixels, _ = project_through_lens(camera, image.cam_from_world().matrix(), points)
-    inside = ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1)  # nowhere behind the camera
+    inside = ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(
+        axis=1
+    )  # NaN behind the camera, hence False
     here, there = points - centre, points - owners
     far, near = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
     cosines = (here * there).sum(axis=1) / np.maximum(far * near, 1e-12)
@@ -148,8 +150,8 @@ def match_more(capture: MappingInput, base: Path, pairs: Sequence[Pair], seed: i
     """Match and verify more pairs with the keypoints of ``capture.features``.
 
     Args:
-        capture: Whose scratch folder takes the new database.
-        base: Verified pairs so far; its keypoints start with those of ``capture.features``. Only read.
+        capture: The photos; the new database is written to its scratch folder.
+        base: Database of the verified pairs so far; its keypoints start with those of ``capture.features``. Only read.
         pairs: (i, j), COLMAP's numbers. Pairs that are already verified are matched again.
         seed: For the verification.
         report: Receives progress.

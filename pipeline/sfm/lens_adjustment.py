@@ -1,7 +1,7 @@
-"""Bundle adjustment of chosen lens parameters, with what is known of them beforehand, on one thread.
+"""Bundle adjustment of chosen lens parameters with priors, on one thread.
 
-COLMAP frees groups of parameters for all cameras alike; here each camera has its own, by Ceres' manifolds. The wide
-models have two focal lengths, which stay one, and FULL_OPENCV a denominator, which stays as it is.
+COLMAP frees the same groups of parameters for all cameras; here each camera has its own, through Ceres' manifolds. The
+wide models have two focal lengths, whose ratio is kept, and FULL_OPENCV has a denominator, which is held.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from splatpipe.pipeline.sfm.focal import solver_options
 from splatpipe.pipeline.sfm.lens_blocks import hold, tie_focals
 from splatpipe.pipeline.sfm.lens_model import NAMES, is_known, named_params
 
-PRINCIPAL_POINT_SHARE = 0.01  # of the width: how far a principal point lies from the middle
-WEAK_SIGMA = {"k1": 0.2, "k2": 0.2, "k3": 0.2, "k4": 0.2, "p1": 0.01, "p2": 0.01}  # no lens of a camera has more
-STATED_SHARE = 1e-3  # of the width, at the corner: how far a lens strays from its calibration, by warmth and focus
+PRINCIPAL_POINT_SHARE = 0.01  # of the width: typical offset of a principal point from the image centre
+WEAK_SIGMA = {"k1": 0.2, "k2": 0.2, "k3": 0.2, "k4": 0.2, "p1": 0.01, "p2": 0.01}  # no camera lens has more
+STATED_SHARE = 1e-3  # of the width, at the corner: how far a lens departs from its calibration with temperature, focus
 STATED_FOCAL_SHARE = 3e-3
 FREE = 1e6
-ROBUST_PX = 1.0  # residuals from which on SOFT_L1 counts less than squares: as the last adjustment of mapping
+ROBUST_PX = 1.0  # scale of the SOFT_L1 loss, as in the last adjustment of mapping
 BASE = ("fx", "fy", "k1")
 
 
 @dataclass(frozen=True)
 class LensPrior:
-    """What is known of a lens before the photos are asked.
+    """Prior on the parameters of a lens.
 
     Attributes:
-        mean: By name; of the wide model.
-        sigmas: Likewise; of those that are missing nothing is known.
+        mean: By parameter name of the wide model.
+        sigmas: Standard deviations, likewise; missing parameters have no prior.
     """
 
     mean: Mapping[str, float]
@@ -43,7 +43,7 @@ class LensPrior:
 
 
 def weak_prior(camera: pycolmap.Camera) -> LensPrior:
-    """What holds of every lens: its principal point is near the middle, its distortion no larger than lenses have."""
+    """Return a prior that fits every lens: principal point near the image centre, distortion of a plausible size."""
     if not is_known(camera.model_name):
         return LensPrior({}, {})
     sigmas = {name: WEAK_SIGMA[name] for name in named_params(camera) if name in WEAK_SIGMA}
@@ -53,10 +53,10 @@ def weak_prior(camera: pycolmap.Camera) -> LensPrior:
 
 
 def stated_prior(camera: pycolmap.Camera) -> LensPrior:
-    """About a calibrated lens: each parameter may stray by what is seen at the corner.
+    """Return a prior around a calibrated lens: each parameter's sigma is set by its effect at the image corner.
 
     Args:
-        camera: The lens as it is stated, of a wide model.
+        camera: The stated lens, of a wide model.
     """
     named = named_params(camera)
     effects = corner_effects(camera)
@@ -67,7 +67,7 @@ def stated_prior(camera: pycolmap.Camera) -> LensPrior:
 
 
 def corner_effects(camera: pycolmap.Camera) -> dict[str, Float64[np.ndarray, "n 2"]]:
-    """How far pixels at corners and edges go a unit of each parameter."""
+    """Return the displacement of pixels at corners and edges per unit of each parameter, by name."""
     places = [[x, y] for x in (0.0, camera.width / 2, camera.width) for y in (0.0, camera.height / 2, camera.height)]
     rays = np.asarray(camera.cam_from_img(np.array(places)), np.float64)
     rays = np.concatenate([np.where(np.isfinite(rays), rays, 0.0), np.ones((len(rays), 1))], axis=1)
@@ -86,11 +86,11 @@ def corner_effects(camera: pycolmap.Camera) -> dict[str, Float64[np.ndarray, "n 
 
 @dataclass(frozen=True)
 class LensFreedom:
-    """What an adjustment may do to a camera.
+    """What an adjustment may change in a camera.
 
     Attributes:
-        free: Names of the wide model's parameters; none holds the lens.
-        prior: What is known of them.
+        free: Names of the free parameters of the wide model; if empty, the lens is held.
+        prior: Their prior.
     """
 
     free: tuple[str, ...]
@@ -103,8 +103,8 @@ class LensAdjustment:
 
     Attributes:
         model: Its poses, lenses and points.
-        covariances: Of the free parameters of each lens, in the order of the wide model, by camera id, with features
-            known to a pixel; missing where nothing determines them.
+        covariances: Covariance of the free parameters of each lens, in the order of the wide model, by camera id, for
+            a feature noise of one pixel; missing where the parameters are undetermined.
     """
 
     model: pycolmap.Reconstruction
@@ -114,12 +114,12 @@ class LensAdjustment:
 def adjust_lenses(
     model: pycolmap.Reconstruction, freedoms: Mapping[int, LensFreedom], doubt: bool = False
 ) -> LensAdjustment:
-    """Adjust poses, points and what is free of the lenses, in place, all features alike; scale and place stay.
+    """Adjust poses, points and free lens parameters in place, with equal feature weights and the gauge fixed.
 
     Args:
-        model: Its cameras are of wide models.
+        model: A model whose cameras are of wide models.
         freedoms: By camera id.
-        doubt: Estimate covariances, too.
+        doubt: Also estimate covariances.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
@@ -160,15 +160,15 @@ def _all_covariances() -> pycolmap.BACovarianceOptions:
 
 
 def free_lens(problem: Any, camera: pycolmap.Camera, freedom: LensFreedom) -> list[object]:
-    """Let a problem change some parameters of a camera, and only these.
+    """Free some parameters of a camera in a problem, and hold the others.
 
     Args:
-        problem: pyceres', as COLMAP builds it.
-        camera: The problem's own, of a wide model.
+        problem: A pyceres problem as COLMAP builds it.
+        camera: The problem's own camera, of a wide model.
         freedom: What may change.
 
     Returns:
-        What has to be kept until the problem is solved.
+        Objects that must be kept alive until the problem is solved.
     """
     params = camera.params
     if not problem.has_parameter_block(params):
@@ -191,13 +191,16 @@ def free_lens(problem: Any, camera: pycolmap.Camera, freedom: LensFreedom) -> li
 def corner_sigma_px(
     camera: pycolmap.Camera, names: Iterable[str], covariance: Float64[np.ndarray, "k k"], free: Iterable[str]
 ) -> float:
-    """Standard deviation of where the corners are seen, by some of the parameters alone: the worst corner, pixels.
+    """Propagate the covariance of some parameters to the image corners.
 
     Args:
-        camera: Of a wide model.
-        names: Of the parameters.
-        covariance: Of all the free ones, in the model's order.
-        free: Their names.
+        camera: A camera of a wide model.
+        names: The parameters to propagate.
+        covariance: Covariance of all free parameters, in the model's order.
+        free: Names of the free parameters.
+
+    Returns:
+        The largest standard deviation of a corner or edge position, pixels.
     """
     order = [name for name in NAMES[camera.model_name] if name in set(free)]
     rows = [order.index(name) for name in names]

@@ -1,7 +1,7 @@
-"""What every adjustment keeps of a lens: the ratio of its two focal lengths, and a denominator of its distortion.
+"""What every adjustment keeps fixed in a lens: the ratio of its focal lengths, and the distortion's denominator.
 
-COLMAP's larger models have a focal length for each axis and FULL_OPENCV a rational distortion: both are more than
-photos of a scene tell beside the rest.
+COLMAP's larger models have a focal length for each axis, and FULL_OPENCV has rational distortion: photos of a scene
+cannot determine either along with the other parameters.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ DENOMINATOR = {"FULL_OPENCV": (9, 10, 11)}  # k4, k5, k6
 
 
 class _Tie(pyceres.CostFunction):  # type: ignore[misc]
-    """The ratio of two focal lengths stays."""
+    """Residual that keeps the ratio of two focal lengths."""
 
     def __init__(self, size: int, ratio: float) -> None:
         super().__init__()
@@ -27,7 +27,7 @@ class _Tie(pyceres.CostFunction):  # type: ignore[misc]
         self._row[:2] = ratio / TIE_SIGMA_PX, -1.0 / TIE_SIGMA_PX
 
     def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
-        """Ceres' interface."""
+        """Evaluate the residual; Ceres' interface."""
         residuals[0] = float(self._row[:2] @ np.asarray(parameters[0][:2]))
         if jacobians is not None and jacobians[0] is not None:
             jacobians[0][:] = self._row
@@ -35,7 +35,7 @@ class _Tie(pyceres.CostFunction):  # type: ignore[misc]
 
 
 def tie_focals(problem: Any, camera: pycolmap.Camera) -> list[object]:
-    """Keep the ratio of a camera's focal lengths in a problem; returns what has to be kept until it is solved."""
+    """Keep the ratio of a camera's focal lengths; return the objects to keep alive until the problem is solved."""
     params = camera.params
     if len(camera.focal_length_idxs()) != 2 or not problem.has_parameter_block(params):
         return []
@@ -45,7 +45,7 @@ def tie_focals(problem: Any, camera: pycolmap.Camera) -> list[object]:
 
 
 def hold(problem: Any, camera: pycolmap.Camera, held: list[int]) -> list[object]:
-    """Hold some of a camera's parameters in a problem, and free the others; returns what has to be kept."""
+    """Hold some of a camera's parameters and free the others; return the objects to keep alive."""
     params = camera.params
     if len(held) == len(params):
         problem.set_parameter_block_constant(params)
@@ -59,7 +59,7 @@ def hold(problem: Any, camera: pycolmap.Camera, held: list[int]) -> list[object]
 def keep_shape(problem: Any, camera: pycolmap.Camera, principal_point: bool = False) -> list[object]:
     """Tie a camera's focal lengths, and hold its denominator and, unless it is free, its principal point.
 
-    A camera of one focal length is as COLMAP has it.
+    A camera with a single focal length is left as COLMAP set it up. Returns the objects to keep alive.
     """
     if len(camera.focal_length_idxs()) != 2 or not problem.has_parameter_block(camera.params):
         return []

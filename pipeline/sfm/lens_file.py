@@ -1,11 +1,11 @@
 """Files of calibrated lenses: COLMAP's ``cameras.txt``, Metashape's XML, Pix4D's ``.cam`` and camera parameters.
 
-Untrusted text: no document types, no entities, and limits on everything. Conventions, all brought to COLMAP's:
+The files are untrusted: no document types, no entities, and limits on everything. Conventions, converted to COLMAP's:
 
-* Metashape (user manual, "Camera models"): ``cx``, ``cy`` count from the middle of the picture, fx = f + b1, and
-  x' = x (1 + k1 r^2 + …) + p1 (r^2 + 2 x^2) + 2 p2 x y: its p1 is OpenCV's p2, and the other way round.
+* Metashape (user manual, "Camera models"): ``cx``, ``cy`` are relative to the image centre, fx = f + b1, and
+  x' = x (1 + k1 r^2 + …) + p1 (r^2 + 2 x^2) + 2 p2 x y: its p1 is OpenCV's p2, and vice versa.
 * Pix4D ("How are the internal and external camera parameters defined?"): x' = x (1 + K1 r^2 + …) + 2 T1 x y
-  + T2 (r^2 + 2 x^2), as OpenCV. A ``.cam`` is in millimetres on a sensor whose size a comment tells.
+  + T2 (r^2 + 2 x^2), as OpenCV. A ``.cam`` is in millimetres on a sensor whose size is given in a comment.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ import numpy as np
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.sfm.lens_model import GRID, PARAMETERS, StatedLens, is_known
 
-MAX_BYTES = 32 << 20  # Pix4D's parameters have half a kilobyte a photo
+MAX_BYTES = 32 << 20  # Pix4D's parameters take half a kilobyte per photo
 MAX_LENSES = 1000
 MAX_LINES = 2_000_000
 MAX_DEPTH = 16
-MAX_ELEMENTS = 200_000  # Metashape's cameras.xml has some ten a photo
-MAX_CHARS = 200  # of a number, or a name that is kept
-HIGHEST_TERM_PX = 0.5  # what may be lost of a lens with terms that COLMAP has not, at worst
-INNER = 0.95  # of the picture: calibrations have no marks in the outermost corners
-LARGEST_COEFFICIENT = 100.0  # of distortion; a long lens has large ones, as r is small
+MAX_ELEMENTS = 200_000  # Metashape's cameras.xml has about ten per photo
+MAX_CHARS = 200  # of a number, or of a name that is kept
+HIGHEST_TERM_PX = 0.5  # maximum error from dropping lens terms that COLMAP's models lack
+INNER = 0.95  # of the image: calibrations have no targets in the outermost corners
+LARGEST_COEFFICIENT = 100.0  # of distortion; long lenses have large ones, since r is small
 FORMATS = "COLMAP's cameras.txt, Metashape's calibration XML, or Pix4D's .cam or calibrated_camera_parameters.txt"
 CAM_KEYS = ("F", "Px", "Py", "K1", "K2", "K3", "T1", "T2")
 SENSOR = re.compile(r"sensor width of\s+([0-9.eE+-]{1,40})\s*x\s*([0-9.eE+-]{1,40})\s*mm")
@@ -38,11 +38,11 @@ SENSOR = re.compile(r"sensor width of\s+([0-9.eE+-]{1,40})\s*x\s*([0-9.eE+-]{1,4
 
 @dataclass(frozen=True)
 class FileLens:
-    """A lens of a file.
+    """A lens read from a file.
 
     Attributes:
-        lens: Its size may be in millimetres, as its parameters then are.
-        photos: Names of the photos that the file says were taken with it; empty where it names none.
+        lens: The lens; its size and parameters may be in millimetres.
+        photos: Names of the photos taken with it, according to the file; empty if it names none.
     """
 
     lens: StatedLens
@@ -50,14 +50,14 @@ class FileLens:
 
 
 class _RefusedError(Exception):
-    """The file is past a limit, or not what it seems to be."""
+    """The file exceeds a limit, or is not what it seems to be."""
 
 
 def read_lens_file(path: Path) -> tuple[FileLens, ...]:
     """Read every lens of a file.
 
     Raises:
-        SplatpipeError: if it is none of the formats, is broken, or holds none that can be used.
+        SplatpipeError: If the format is not supported, the file is broken, or it contains no usable lens.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -80,7 +80,7 @@ def read_lens_file(path: Path) -> tuple[FileLens, ...]:
 
 
 def fitted(lens: StatedLens, width: int, height: int, tolerance: float) -> StatedLens | None:
-    """The lens for pictures of another size; None where their shape is another."""
+    """Rescale a lens to another image size; None if the aspect ratio differs by more than the tolerance."""
     by_x, by_y = width / lens.width, height / lens.height
     if abs(by_x / by_y - 1.0) > tolerance:
         return None
@@ -95,10 +95,10 @@ def fitted(lens: StatedLens, width: int, height: int, tolerance: float) -> State
 
 
 def checked_lens(lens: StatedLens) -> StatedLens:
-    """A lens that can be one: finite, its centre in the picture, and one to one as far as the corners.
+    """Return the lens if it is plausible: finite, principal point in the image, invertible up to the corners.
 
     Raises:
-        ValueError: with the reason.
+        ValueError: With the reason, if it is not.
     """
     if not is_known(lens.model):
         raise ValueError(f"COLMAP's camera model {lens.model[:40]} is not supported")
@@ -154,7 +154,7 @@ def _text(text: str) -> list[FileLens]:
 
 
 def _colmap(lines: Sequence[str]) -> list[FileLens]:
-    """``CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`` a line; lines with # are comments."""
+    """Parse ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`` per line; lines starting with # are comments."""
     found = []
     for line in lines:
         fields = line.split()
@@ -197,7 +197,7 @@ def _pix4d_cam(lines: Sequence[str]) -> FileLens:
 
 
 def _pix4d_parameters(lines: Sequence[str]) -> list[FileLens]:
-    """Ten lines a photo: name and size, three of K, radial, tangential, position, three of rotation."""
+    """Parse ten lines per photo: name and size, three of K, radial, tangential, position, three of rotation."""
     rows = [line.split() for line in lines if line.strip()]
     start = next((k for k, row in enumerate(rows) if _is_size(row)), len(rows))
     photos: dict[StatedLens, set[str]] = {}
@@ -224,12 +224,12 @@ def _is_size(row: Sequence[str]) -> bool:
 def _brown(
     inner: tuple[float, float, float, float], radial: Sequence[float], tangential: tuple[float, float]
 ) -> tuple[float, ...]:
-    """FULL_OPENCV's parameters; tangential in OpenCV's order."""
+    """Return FULL_OPENCV's parameters; ``tangential`` is in OpenCV's order."""
     return (*inner, radial[0], radial[1], *tangential, radial[2], 0.0, 0.0, 0.0)
 
 
 class _Calibrations:
-    """Collects Metashape's ``calibration`` elements: its own file, and those of sensors in ``cameras.xml``."""
+    """Collect Metashape's ``calibration`` elements, from a calibration file or from the sensors in ``cameras.xml``."""
 
     def __init__(self) -> None:
         self.found: list[dict[str, str]] = []
@@ -282,7 +282,7 @@ def _metashape(data: bytes) -> list[FileLens]:
         parser.Parse(data, True)
     except (expat.ExpatError, LookupError) as error:
         raise _RefusedError(f"its XML is broken ({str(error)[:80]})") from error
-    # Of a sensor's initial and adjusted calibration the latter; its own file has one without a class.
+    # Prefer a sensor's adjusted calibration to its initial one; in a calibration file it has no class.
     adjusted = {entry["label"] for entry in collected.found if entry["class"] == "adjusted"}
     wanted = [e for e in collected.found if e["class"] != "initial" or e["label"] not in adjusted]
     return [FileLens(checked_lens(_metashape_lens(entry))) for entry in wanted]
@@ -315,7 +315,7 @@ def _metashape_lens(entry: Mapping[str, str]) -> StatedLens:
 
 
 def _three_of_four(radial: Sequence[float], focal: float, corner_px: float) -> list[float]:
-    """Three coefficients that say what four do, as far as the corner, by least squares in pixels."""
+    """Approximate four radial coefficients by three up to the corner, by least squares in pixels."""
     if radial[3] == 0.0:
         return list(radial[:3])
     r = np.linspace(0.0, 1.05 * corner_px / focal, 200)

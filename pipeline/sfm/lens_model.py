@@ -1,7 +1,7 @@
-"""Lenses as COLMAP's camera models: which parameters mean what, made wider for calibration and narrow again after it.
+"""Lenses as COLMAP's camera models: parameter names, and conversion to wider and narrower models.
 
-Calibration works on the widest model of a kind, FULL_OPENCV or OPENCV_FISHEYE, with one focal length for both axes;
-what goes on is the narrowest one that says the same.
+Calibration uses the widest model of a kind, FULL_OPENCV or OPENCV_FISHEYE, with one focal length for both axes; the
+result is stored as the narrowest equivalent model.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ PARAMETERS = {  # of each model, by the names of the wide ones; f is both focal 
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV_FISHEYE": NAMES[WIDE_FISHEYE],
 }
-GRID = 21  # places a side of the picture where two lenses are compared
+GRID = 21  # samples along each side of the image where two lenses are compared
 
 
 @dataclass(frozen=True)
 class StatedLens:
-    """A lens that a file or the photos' metadata state.
+    """A lens stated by a file or the photos' metadata.
 
     Attributes:
         model: COLMAP's camera model.
-        width: Of the pictures that ``params`` are about, in their unit: pixels, once it is fitted to photos.
+        width: Width of the images that ``params`` refer to, in the same unit: pixels, once it is fitted to photos.
         height: Likewise.
-        params: COLMAP's, pixels; the centre of the first pixel is (0.5, 0.5).
-        source: ``file``, ``xmp-dewarp``.
-        camera: What the file calls the camera; empty where it does not.
+        params: COLMAP's parameters, in that unit; the centre of the first pixel is (0.5, 0.5).
+        source: ``file``, ``lens-file``, ``xmp-dewarp``.
+        camera: The camera's name in the file; empty if it has none.
     """
 
     model: str
@@ -63,7 +63,7 @@ class StatedLens:
     camera: str = ""
 
     def colmap(self, number: int = 1) -> pycolmap.Camera:
-        """COLMAP's camera of it."""
+        """Return the lens as a COLMAP camera."""
         return pycolmap.Camera(
             camera_id=number,
             model=self.model,
@@ -74,7 +74,7 @@ class StatedLens:
 
 
 def stated_lenses(lenses: Sequence[JSON]) -> dict[int, StatedLens]:
-    """What the part ``ingest.lenses`` has, in each camera group's pixels, by COLMAP's camera id."""
+    """Read the lenses of the artifact ``ingest.lenses``, in each camera group's pixels, by COLMAP's camera id."""
     return {
         number: StatedLens(**{**lens, "params": tuple(lens["params"])})
         for number, lens in enumerate(lenses, start=1)
@@ -83,17 +83,17 @@ def stated_lenses(lenses: Sequence[JSON]) -> dict[int, StatedLens]:
 
 
 def is_known(model: str) -> bool:
-    """Whether a camera model is one of those that calibration can widen."""
+    """Whether a camera model is one that calibration can widen."""
     return model in PARAMETERS
 
 
 def kind_of(model: str) -> str:
-    """The widest model of the kind of a model."""
+    """Return the widest model of the same kind."""
     return WIDE_FISHEYE if model in FISHEYES else WIDE
 
 
 def named_params(camera: pycolmap.Camera) -> dict[str, float]:
-    """All parameters of the camera's wide model by name."""
+    """Return all parameters of the camera's wide model by name."""
     own = dict(zip(PARAMETERS[camera.model_name], (float(value) for value in camera.params), strict=True))
     if "f" in own:
         own["fx"] = own["fy"] = own.pop("f")
@@ -101,19 +101,19 @@ def named_params(camera: pycolmap.Camera) -> dict[str, float]:
 
 
 def set_lens(camera: pycolmap.Camera, model: str, named: Mapping[str, float]) -> None:
-    """Give a camera, in place, another model and its parameters; its size and number stay."""
+    """Change a camera's model and parameters in place; its image size and id stay."""
     focal = 0.5 * (named["fx"] + named["fy"])
     camera.model = pycolmap.CameraModelId.__members__[model]
     camera.params = [focal if name == "f" else named[name] for name in PARAMETERS[model]]
 
 
 def widen(camera: pycolmap.Camera) -> None:
-    """Make a camera, in place, the widest model of its kind; it sees the same."""
+    """Convert a camera in place to the widest model of its kind; its projection stays the same."""
     set_lens(camera, kind_of(camera.model_name), named_params(camera))
 
 
 def narrow(camera: pycolmap.Camera) -> None:
-    """Make a camera, in place, the narrowest model of its kind that sees the same."""
+    """Convert a camera in place to the narrowest model of its kind with the same projection."""
     named = named_params(camera)
     for model in NARROW[kind_of(camera.model_name)]:
         kept = PARAMETERS[model]
@@ -124,18 +124,18 @@ def narrow(camera: pycolmap.Camera) -> None:
 
 
 def picture_rays(width: int, height: int, camera: pycolmap.Camera) -> Float64[np.ndarray, "n 2"]:
-    """x/z and y/z of a grid over the picture, as the camera has them; not finite where it has none."""
+    """Return x/z and y/z of the camera's rays on a grid over the image; not finite where there is no ray."""
     x, y = np.meshgrid(np.linspace(0.0, width, GRID), np.linspace(0.0, height, GRID))
     return np.asarray(camera.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1)), np.float64)
 
 
 def simplest(lens: pycolmap.Camera) -> tuple[str, tuple[float, ...]]:
-    """The simple model with a centred principal point that is nearest to a lens: what mapping starts from.
+    """Fit the simple model with a centred principal point that is nearest to a lens, as the start for mapping.
 
-    By least squares over the picture, in pixels: both unknowns, f and f k1, are linear.
+    Least squares over the image, in pixels: both unknowns, f and f k1, are linear.
 
     Returns:
-        SIMPLE_RADIAL or, of a fisheye, SIMPLE_RADIAL_FISHEYE, and its parameters.
+        SIMPLE_RADIAL or, for a fisheye, SIMPLE_RADIAL_FISHEYE, and its parameters.
     """
     fisheye = kind_of(lens.model_name) == WIDE_FISHEYE
     x, y = np.meshgrid(np.linspace(0.0, lens.width, GRID), np.linspace(0.0, lens.height, GRID))
@@ -156,15 +156,15 @@ def simplest(lens: pycolmap.Camera) -> tuple[str, tuple[float, ...]]:
 
 
 def apart_px(found: pycolmap.Camera, other: pycolmap.Camera, turn: bool = False) -> Float64[np.ndarray, " n"]:
-    """How far apart two lenses see the rays of a grid over the picture, pixels.
+    """Compare where two lenses project the rays of a grid over the image.
 
     Args:
         found: One lens.
-        other: Another of the same size, whose picture the grid is over.
-        turn: After the small rotation of all rays that brings them nearest: the poses take it.
+        other: Another lens of the same image size; the grid covers its image.
+        turn: First remove the small common rotation that fits best, which the poses would absorb.
 
     Returns:
-        Distances; infinite where one of them sees nothing.
+        Distances, pixels; infinite where one of the lenses has no projection.
     """
     rays = picture_rays(other.width, other.height, other)
     rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
@@ -187,5 +187,5 @@ def apart_px(found: pycolmap.Camera, other: pycolmap.Camera, turn: bool = False)
 
 
 def indices(model: str, names: Sequence[str]) -> list[int]:
-    """Where parameters of a wide model lie."""
+    """Return the indices of parameters of a wide model."""
     return [NAMES[model].index(name) for name in names]

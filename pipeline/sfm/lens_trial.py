@@ -1,4 +1,4 @@
-"""What may be freed of each camera's lens: adjustments with and without it, judged by tracks that took no part."""
+"""Test which lens parameters to free per camera: adjust with and without them, and compare on held-out tracks."""
 
 from __future__ import annotations
 
@@ -34,28 +34,28 @@ from splatpipe.pipeline.sfm.lens_model import (
     widen,
 )
 
-LEAST_GAIN = 0.002  # of the held-out errors' squares: noise gives a tenth of it
+LEAST_GAIN = 0.002  # relative reduction of the squared held-out errors; noise gives a tenth of it
 LEAST_SIGMAS = 3.0
-LEAST_EFFECT = 0.25  # of the held-out error, at the corner: less moves nothing that is measured later
+LEAST_EFFECT = 0.25  # of the held-out error, at the corner: smaller effects do not change any later measurement
 STEPS = {
     WIDE: (("k2",), ("cx", "cy"), ("p1", "p2"), ("k3",)),
     WIDE_FISHEYE: (("k2",), ("cx", "cy"), ("k3",), ("k4",)),
 }
-PASSES = 2  # what was refused beside a wrong lens may be there beside a better one
-WIDE_ANGLE = 1.2  # tangent of half the field of view, at the corner, from which on a lens may be a fisheye
+PASSES = 2  # a group rejected with a wrong lens may be justified with a better one
+WIDE_ANGLE = 1.2  # tangent of half the field of view, at the corner, above which a lens may be a fisheye
 
 
 @dataclass(frozen=True)
 class LensState:
-    """A camera so far.
+    """Calibration state of a camera.
 
     Attributes:
-        freedom: What is free of it.
-        focal_told: Whether the photos tell its focal length.
+        freedom: Its free parameters.
+        focal_told: Whether the photos determine its focal length.
         freed: The groups that were kept, in order.
         tried: A row for every group that was tried.
-        changed: Whether it is no longer the lens that mapping left.
-        stated: Where its lens came from; empty where none is used.
+        changed: Whether the lens differs from the result of mapping.
+        stated: Source of the stated lens; empty if none is used.
     """
 
     freedom: LensFreedom
@@ -67,18 +67,18 @@ class LensState:
 
 
 class LensTrial:
-    """Adjustments of the tracks that decide; the best so far, and how well it predicts the tracks that are held out."""
+    """Trial adjustments of a subset of tracks: the best so far, and its errors on the held-out tracks."""
 
     def __init__(
         self, model: pycolmap.Reconstruction, tracks: TrackObservations, states: Mapping[int, LensState], seed: int
     ) -> None:
-        """Begin with the simple lenses, adjusted to the same tracks as all that follow.
+        """Start with the simple lenses, adjusted to the same tracks as all later trials.
 
         Args:
-            model: Of the tracks that decide, and wide cameras; changed in place.
-            tracks: Held out; of the photos that take part.
-            states: Of all its cameras.
-            seed: Of the draws of photos.
+            model: Model of the adjusted tracks, with cameras of wide models; changed in place.
+            tracks: The held-out tracks, observed by photos of the model.
+            states: States of all its cameras.
+            seed: For the bootstrap over photos.
         """
         self.states = dict(states)
         self._tracks, self._seed = tracks, seed
@@ -88,11 +88,14 @@ class LensTrial:
 
     @property
     def model(self) -> pycolmap.Reconstruction:
-        """The best so far."""
+        """The best model so far."""
         return self._best.model
 
     def take_stated(self, stated: Mapping[int, StatedLens], held: bool) -> None:
-        """Take stated lenses, refined about what they say, unless held; not where the photos speak against them."""
+        """Use stated lenses, refined under their prior or held as they are.
+
+        Unless ``held``, a stated lens is rejected if the held-out tracks are predicted worse with it.
+        """
         if not stated:
             return
         model = pycolmap.Reconstruction(self.model)
@@ -117,7 +120,7 @@ class LensTrial:
         self._keep(solved, errors, wanted, kept)
 
     def free_steps(self) -> None:
-        """Free what helps, first all together to see whether anything does, then group by group."""
+        """Free the groups that help: first all together to see whether any does, then one by one."""
         open_ = {number for number, state in self.states.items() if state.freedom.free and not state.stated}
         if not open_:
             return
@@ -135,7 +138,7 @@ class LensTrial:
                 self._free_group({n: names for n in sorted(hopeful) if (names := self._open(n, step))})
 
     def try_fisheye(self) -> None:
-        """Take a fisheye's model instead of the other where it predicts better, with one coefficient or more."""
+        """Switch wide-angle cameras to the fisheye model if it predicts the held-out tracks better."""
         wanted = {}
         model = pycolmap.Reconstruction(self.model)
         for number, state in sorted(self.states.items()):
@@ -187,7 +190,7 @@ class LensTrial:
     def _doubt(
         self, number: int, names: tuple[str, ...], solved: LensAdjustment, state: LensState
     ) -> tuple[float, float, float]:
-        """What a group does at the corner, its standard deviation there, pixels; that of the focal length, relative."""
+        """Return a group's corner effect and its sigma, pixels, and the relative sigma of the focal length."""
         camera, covariance = solved.model.cameras[number], solved.covariances.get(number)
         now, was = named_params(camera), named_params(self.model.cameras[number])
         effects = corner_effects(camera)
@@ -201,7 +204,7 @@ class LensTrial:
         return effect, sigma, focal
 
     def _open(self, number: int, step: int) -> tuple[str, ...]:
-        """A camera's group of a step, unless it is free or nothing was freed since it was tried; none then."""
+        """Return a camera's group of a step; empty if it is free already, or nothing was kept since it was tried."""
         steps, state = self._steps(number), self.states[number]
         names = steps[step] if step < len(steps) else ()
         tried = [row["freed"] for row in state.tried]
@@ -211,7 +214,7 @@ class LensTrial:
         return names if " ".join(names) not in state.freed and any(row["kept"] for row in since) else ()
 
     def _steps(self, number: int) -> tuple[tuple[str, ...], ...]:
-        """The groups of a camera."""
+        """Return the groups for a camera's model."""
         return STEPS[self.model.cameras[number].model_name]
 
     def _with(self, number: int, names: tuple[str, ...]) -> LensState:
@@ -233,7 +236,7 @@ class LensTrial:
         return improves(self._errors[rows], errors[rows], self._tracks.image[rows], LEAST_GAIN, self._seed)
 
     def _typical(self, number: int) -> float:
-        """Of the held-out errors along one axis, pixels."""
+        """Return the typical held-out error along one axis, pixels."""
         return float(np.median(self._errors[self._rows[number]])) / math.sqrt(2.0 * math.log(2.0))
 
     def _keep(
@@ -243,7 +246,7 @@ class LensTrial:
         wanted: Mapping[int, LensState],
         kept: Mapping[int, bool],
     ) -> None:
-        """Go on with what was found, where all of it is kept; else adjust again with what is."""
+        """Adopt the result if all changes are kept; otherwise revert the rejected lenses and adjust again."""
         self.states.update(wanted)
         if all(kept.values()):
             self._best, self._errors = solved, errors
@@ -263,7 +266,7 @@ def _is_wide(camera: pycolmap.Camera) -> bool:
 
 
 def _as_fisheye(camera: pycolmap.Camera) -> None:
-    """The fisheye with one coefficient that is nearest to a lens within what both see, in place."""
+    """Convert a camera in place to the one-coefficient fisheye that is nearest to its lens within the image."""
     named = named_params(camera)
     rays = picture_rays(camera.width, camera.height, camera)
     tangent = np.linalg.norm(rays, axis=1)

@@ -1,9 +1,10 @@
-"""True lenses: what a simple lens leaves unsaid is freed step by step, where tracks that took no part say it is there.
+"""Lens calibration: free lens parameters step by step, as long as held-out tracks show that they are needed.
 
-Mapping keeps one focal length and one coefficient of distortion a camera, which is what its first photos can bear. Then
-principal point, further radial and tangential distortion are freed, a group at a time, in an adjustment that some
-tracks take no part in. A group is kept where these are predicted better, photo by photo and not by chance, and where
-its own standard deviation leaves no doubt that it is there. A lens that is simple stays as it is, to the bit.
+Mapping estimates one focal length and one distortion coefficient per camera, all that its first photos can support.
+Afterwards the principal point and further radial and tangential distortion are freed, one group at a time, in an
+adjustment that excludes some tracks. A group is kept if these held-out tracks are predicted significantly better, with
+photos as the unit of resampling, and if its effect is significant by its own standard deviation. A lens that needs
+nothing more stays as it is, bit for bit.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from splatpipe.pipeline.sfm.lens_trial import LensState, LensTrial
 from splatpipe.pipeline.sfm.retriangulation import MOST_ERROR_PX, retriangulate
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-LEAST_PHOTOS = 8  # of a camera: fewer cannot tell its lens from their poses
-LEAST_TRACKS = 400  # that decide; fewer tell nothing
-MOST_TRACKS = 6000  # some 30,000 observations for a dozen unknowns a camera
+LEAST_PHOTOS = 8  # of a camera: fewer cannot separate its lens from their poses
+LEAST_TRACKS = 400  # tracks used for the decision; fewer are inconclusive
+MOST_TRACKS = 6000  # some 30,000 observations for a dozen unknowns per camera
 HELD_OUT = 0.25
-FAR_FROM_STATED = 2e-3  # of the width: twice what a lens strays from its calibration
+FAR_FROM_STATED = 2e-3  # of the width: twice the usual deviation of a lens from its calibration
 WORDS = {
     "cx cy": "principal point",
     "k2": "second radial coefficient",
@@ -41,24 +42,24 @@ WORDS = {
     "fisheye": "a fisheye's projection",
     "stated": "as it is stated",
 }
-WANTED_A_PHOTO = 80  # of the tracks that decide
-LEAST_A_PHOTO = 20  # of those that are adjusted: six unknowns want more than three points
+WANTED_A_PHOTO = 80  # tracks used for the decision
+LEAST_A_PHOTO = 20  # adjusted tracks: six unknowns need more than three points
 
 
 def calibrate(
     model: pycolmap.Reconstruction, verified: ViewGraph, stated: Mapping[int, StatedLens], how: str, seed: int = 0
 ) -> tuple[pycolmap.Reconstruction, tuple[JSON, ...]]:
-    """Free what the photos show of their lenses.
+    """Free the lens parameters that the photos determine.
 
     Args:
-        model: As mapping leaves it, with simple lenses; left as it is.
+        model: The result of mapping, with simple lenses; not modified.
         verified: Its view graph, with the cameras as they were before mapping.
-        stated: Lenses that files or metadata state, in each camera's own pixels, by COLMAP's camera id.
-        how: ``auto``; ``simple`` leaves the model alone; ``held`` takes stated lenses as they are.
-        seed: Of the tracks that are held out.
+        stated: Lenses from files or metadata, in each camera's own pixels, by COLMAP's camera id.
+        how: ``auto``; ``simple`` changes nothing; ``held`` uses stated lenses without refining them.
+        seed: For the choice of held-out tracks.
 
     Returns:
-        The model itself where every lens stays simple, else a new one; and a row a camera for ``models.json``.
+        The model itself if every lens stays simple, otherwise a new one; and a row per camera for ``models.json``.
     """
     usable = {number: lens for number, lens in stated.items() if number in model.cameras}
     chosen = _deciding(model, seed)
@@ -85,7 +86,7 @@ def calibrate(
 def _with_held(
     model: pycolmap.Reconstruction, verified: ViewGraph, stated: Mapping[int, StatedLens], seed: int
 ) -> tuple[pycolmap.Reconstruction, tuple[JSON, ...]]:
-    """The model with its stated lenses as they are, where there are too few tracks to hold any against them."""
+    """Return the model with its stated lenses fixed, for when there are too few tracks to test them."""
     lensed = _only(model, set(model.points3D))
     states = {}
     for number, camera in lensed.cameras.items():
@@ -100,7 +101,11 @@ def _with_held(
 
 
 def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
-    """Points of three photos or more, in a seeded order: as many as it takes, and of every photo some."""
+    """Choose the points used for the decision, in a seeded order.
+
+    Only points seen by three photos or more; up to ``MOST_TRACKS``, and beyond that only those of photos that still
+    have too few.
+    """
     numbers = np.array(
         sorted(number for number, point in model.points3D.items() if point.track.length() >= LEAST_VIEWS), np.int64
     )
@@ -118,10 +123,11 @@ def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " 
 
 
 def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> dict[int, LensState]:
-    """What is free of the cameras as mapping leaves them.
+    """Return the initial state of each camera after mapping.
 
-    Those of few photos are held, and those whose focal length the photos do not tell: there, over flat ground from one
-    height, distortion is as free to bend the ground, and held-out tracks, which bend with it, do not tell.
+    Cameras of few photos are held, and so are those whose focal length the photos do not determine. In the latter case,
+    over flat ground from one height, distortion could bend the ground, and held-out tracks would bend with it and not
+    show it.
     """
     counts = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     fewer = math.sqrt(within.compute_num_observations() / max(model.compute_num_observations(), 1))
@@ -135,7 +141,7 @@ def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> 
 
 
 def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstruction:
-    """A copy with some of the points alone, the photos that they hold, and wide cameras."""
+    """Return a copy with only some of the points, the photos with enough of them, and cameras of the wide models."""
     copy = pycolmap.Reconstruction(model)
     for number in sorted(copy.points3D):
         if number not in points:
@@ -145,7 +151,7 @@ def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstr
     for number in sorted(copy.reg_image_ids()):
         if seen[number] < LEAST_A_PHOTO:
             observations.deregister_frame(copy.images[number].frame_id)
-    copy.tear_down()  # COLMAP's covariance asks for the pose of every photo that is there
+    copy.tear_down()  # COLMAP's covariance needs a pose for every photo in the model
     for number, camera in sorted(model.cameras.items()):
         if not copy.exists_camera(number):
             copy.add_camera_with_trivial_rig(camera)
@@ -162,7 +168,7 @@ def _finished(
     states: Mapping[int, LensState],
     seed: int,
 ) -> pycolmap.Reconstruction:
-    """The whole model with the lenses that were found: adjusted, completed, and adjusted to the end."""
+    """Apply the calibrated lenses to the whole model: adjust, retriangulate, and adjust again."""
     result = pycolmap.Reconstruction(model)
     for number, camera in result.cameras.items():
         lens = lensed.cameras[number]
@@ -210,13 +216,13 @@ def _rows(
 
 
 def _rms(distances: Float64[np.ndarray, " n"]) -> float | None:
-    """Of those that are known, pixels."""
+    """Return the RMS of the finite distances, pixels; None if there are none."""
     known = distances[np.isfinite(distances)]
     return round(float(np.sqrt(np.mean(known**2))), 3) if len(known) else None
 
 
 def tell_lenses(summary: Mapping[str, JSON], report: Reporter) -> None:
-    """Say what became of the lenses."""
+    """Report the outcome of the lens calibration."""
     for row in summary["lenses"]:
         if row["freed"]:
             what = ", ".join(WORDS.get(name, name) for name in row["freed"])
