@@ -1,4 +1,4 @@
-"""A model that stands on some of the verified matches gets all of them, and one last adjustment over everything."""
+"""Complete a model that was built from some of the verified matches: add all of them, and adjust to convergence."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import pycolmap
 
 from splatpipe.pipeline.sfm.coarseness import coarseness
 
-LEAST_MATCHES = 15  # verified ones of a pair; COLMAP's own bound
-STRICT_PX = 2.0  # observations that were thrown out come back only within it, or they would come and go for ever
-SETTLED = 2e-3  # of the observations: thrown out after a robust adjustment, so few had hardly pulled
+LEAST_MATCHES = 15  # verified matches of a pair; COLMAP's own minimum
+STRICT_PX = 2.0  # filtered observations return only within this error, or they would come and go forever
+SETTLED = 2e-3  # share of observations filtered after a robust adjustment: so few had hardly any influence
 MOST_ROUNDS = 4
-ROUGH_TOLERANCE, ROUGH_ITERATIONS = 1e-4, 10  # relative change of the cost: before the wrong observations are out
+ROUGH_TOLERANCE, ROUGH_ITERATIONS = 1e-4, 10  # relative change of the cost: before wrong observations are filtered
 FINE_TOLERANCE, FINE_ITERATIONS = 1e-6, 100
-GRADIENT_TOLERANCE = 1e-6  # COLMAP's 1.0 ends where a focal length still has some pixels to go
-# Wrong matches along an epipolar line have no third view that betrays them, and pull at the cameras. Cauchy's loss left
-# a third less of their pull than SOFT_L1 on flights whose truth is known, and the demo's centres 13 % nearer to theirs.
-ROBUST_PX = 1.0  # residuals from which on it counts far less than squares: twice what keypoints scatter
+GRADIENT_TOLERANCE = 1e-6  # COLMAP's 1.0 stops while a focal length is still some pixels off
+# Wrong matches along an epipolar line have no third view to expose them, and bias the cameras. On flights with known
+# ground truth Cauchy loss left a third less of that bias than SOFT_L1, and the demo's centres 13 % nearer to the truth.
+ROBUST_PX = 1.0  # scale of the loss: twice the keypoint noise
 
 
 def complete(
@@ -27,17 +27,17 @@ def complete(
     stop: pycolmap.CancellationToken,
     place_left: bool = True,
 ) -> None:
-    """Bring all verified matches into a model, in place, and adjust it to convergence, on one thread.
+    """Add all verified matches to a model, in place, and adjust it to convergence, on one thread.
 
-    Every verified match is triangulated against the cameras as they stand, tracks are completed and merged, photos
-    that only all matches can place are placed, and wrong observations are filtered between the adjustments.
+    Every verified match is triangulated with the current cameras, tracks are completed and merged, photos that need
+    all matches are placed, and wrong observations are filtered between the adjustments.
 
     Args:
         model: Some of the database's photos with cameras, in any frame.
-        database: Whose keypoint indices the model refers to.
-        options: The mapper's, with its seeds.
+        database: The database that the model's keypoint indices refer to.
+        options: The mapper's options, with its seeds.
         stop: Ends an adjustment early.
-        place_left: Place photos that only all matches can place; the ladder has demands of its own.
+        place_left: Also place photos that need all matches; the ladder, with its own criteria, passes False.
     """
     cache_options = pycolmap.DatabaseCacheOptions()
     cache_options.min_num_matches = LEAST_MATCHES
@@ -69,7 +69,7 @@ def _place_left(
     mapping: pycolmap.IncrementalMapperOptions,
     triangulation: pycolmap.IncrementalTriangulatorOptions,
 ) -> None:
-    """Place the photos that some matches could not; the mapper tries each a few times."""
+    """Place photos that the reduced matches could not; the mapper tries each a few times."""
     candidates = mapper.find_next_images(mapping, False)
     while candidates:
         for number in candidates:
@@ -85,7 +85,7 @@ def _adjust(
     stop: pycolmap.CancellationToken,
     rough: bool,
 ) -> None:
-    """Adjust over everything; COLMAP's own call, since the mapper's holds Python's lock all the time."""
+    """Run a global bundle adjustment through COLMAP's function, since the mapper's method holds the GIL throughout."""
     adjustment = options.get_global_bundle_adjustment()
     solver = adjustment.ceres.solver_options
     solver.num_threads = 1

@@ -1,9 +1,9 @@
-"""How well a reconstruction tells its focal lengths: their standard deviation with everything else unknown.
+"""How well a reconstruction determines its focal lengths: their standard deviation with everything else unknown.
 
-Over flat ground, photographed straight down from one height, a longer lens from higher up makes the same photos. The
-formal standard deviation shows it, but is far too small by itself: features of one photo err together, and a lens has
-more to it than its model. So features count as known to a pixel, and the principal point as free by a hundredth of the
-width. That tells them apart on real captures: 0.01 to 0.07 % where photos are oblique, 3 % on a flat nadir flight.
+In nadir photos of flat ground from one height, focal length and flying height are not separable. The formal standard
+deviation shows this, but is far too small by itself: feature errors within a photo are correlated, and a real lens
+deviates from its model. So features count as known to a pixel, and the principal point as free by a hundredth of the
+width. That separates real captures well: 0.01 to 0.07 % with oblique photos, 3 % on a flat nadir flight.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ import pycolmap
 
 from splatpipe.pipeline.sfm.lens_blocks import keep_shape
 
-UNOBSERVED = 0.01  # relative standard deviation from which on the photos do not tell a focal length
+UNOBSERVED = 0.01  # relative standard deviation above which the photos do not determine a focal length
 PRINCIPAL_POINT_SIGMA = 0.01  # of the width
 MOST_DENSE = 60  # photos up to which the reduced system is solved densely
 MOST_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6
-EXTRA_SIGMA = 0.2  # of a distortion coefficient: no lens has more
+EXTRA_SIGMA = 0.2  # of a distortion coefficient: no lens has larger ones
 
 
 def focal_sigmas(model: pycolmap.Reconstruction) -> dict[int, float]:
-    """Relative standard deviation of each camera's focal length, by its features alone.
+    """Estimate the relative standard deviation of each camera's focal length from its features alone.
 
     Args:
-        model: In any frame; left as it is.
+        model: In any frame; not modified.
 
     Returns:
-        By COLMAP's camera id; without those that nothing determines.
+        By COLMAP's camera id; cameras whose focal length is undetermined are missing.
     """
     copy = pycolmap.Reconstruction(model)
-    copy.tear_down()  # of photos that are not placed: COLMAP's covariance asks for every photo's pose
+    copy.tear_down()  # drops photos that are not placed: COLMAP's covariance needs every photo's pose
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     config = pycolmap.BundleAdjustmentConfig()
@@ -59,12 +59,12 @@ def focal_sigmas(model: pycolmap.Reconstruction) -> dict[int, float]:
 
 
 def adjust_within(model: pycolmap.Reconstruction, focals: Mapping[int, float], share: float) -> None:
-    """Adjust a model in place, its focal lengths free within a share of what the metadata say; on one thread.
+    """Adjust a model in place with focal lengths bounded around given values, on one thread.
 
     Args:
-        model: Whose scale and place may change.
-        focals: Focal lengths of the metadata, pixels, by COLMAP's camera id.
-        share: They may differ by.
+        model: The model; its scale and position may change.
+        focals: Known focal lengths, pixels, by COLMAP's camera id.
+        share: Maximum relative deviation from them.
     """
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.reg_image_ids()):
@@ -80,7 +80,7 @@ def adjust_within(model: pycolmap.Reconstruction, focals: Mapping[int, float], s
 
 
 def keep_near(problem: Any, camera: pycolmap.Camera, focal_px: float, share: float) -> None:
-    """Start a problem's focal length at what the metadata say, and let it differ by a share of that."""
+    """Start a problem's focal length at a given value, and bound its relative deviation from that."""
     params = camera.params
     if problem.has_parameter_block(params):
         for index in camera.focal_length_idxs():
@@ -90,7 +90,7 @@ def keep_near(problem: Any, camera: pycolmap.Camera, focal_px: float, share: flo
 
 
 def solver_options(photos: int) -> Any:
-    """Ceres' for a bundle adjustment of so many photos: one thread, and the same bits again."""
+    """Return Ceres' options for a bundle adjustment of ``photos`` photos: one thread, bitwise reproducible."""
     options = pyceres.SolverOptions()
     options.num_threads = 1
     options.linear_solver_type = (
@@ -104,11 +104,14 @@ def solver_options(photos: int) -> Any:
 
 
 def posterior_focal_sigmas(model: pycolmap.Reconstruction, problem: Any) -> dict[int, float]:
-    """The same from a Ceres problem over the model, whose residuals of features are in pixels.
+    """Estimate relative standard deviations of focal lengths from a Ceres problem with feature residuals in pixels.
 
     Args:
-        model: Whose parameters the problem is about.
-        problem: pyceres', as COLMAP builds it, perhaps with blocks added.
+        model: The model whose parameters the problem optimises.
+        problem: A pyceres problem as COLMAP builds it, possibly with blocks added.
+
+    Returns:
+        By COLMAP's camera id, as ``focal_sigmas``.
     """
     options = pycolmap.BACovarianceOptions()
     options.params = pycolmap.BACovarianceOptionsParams.ALL

@@ -1,4 +1,4 @@
-"""Keypoints of one photo: where, how large, their descriptors and their colours."""
+"""Keypoint extraction for one photo: locations, shapes, descriptors and colours."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DESCRIPTOR_NORM = 512.0  # COLMAP's: 8-bit descriptors are 512 times the unit ve
 
 @dataclass(frozen=True)
 class Features:
-    """What was found in a photo.
+    """Keypoints of a photo.
 
     Attributes:
         keypoints: (n, 6) x, y in pixels of the photo's stored grid, and the 2x2 shape matrix, row by row.
@@ -40,7 +40,7 @@ class Features:
 
 @contextmanager
 def single_threaded_opencv() -> Iterator[None]:
-    """Photos are the unit of parallel work: OpenCV's own threads would only get in their way."""
+    """Turn off OpenCV's threads in a context: photos are processed in parallel, so they would only add overhead."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -50,17 +50,17 @@ def single_threaded_opencv() -> Iterator[None]:
 
 
 def extract(photo: Photo, config: FeaturesConfig, part: Path, photos_dir: Path, scratch: Path) -> Features:
-    """Find the keypoints of a photo, outside its mask.
+    """Extract the keypoints of a photo in its unmasked area.
 
     Args:
-        photo: One of the list's.
-        config: How.
-        part: The folder of the part ``ingest.photos``.
+        photo: A photo of the photo list.
+        config: Extraction options.
+        part: The folder of the artifact ``ingest.photos``.
         photos_dir: The user's folder.
         scratch: An existing folder for temporary files.
 
     Raises:
-        SplatpipeError: if the photo is gone or is no longer the one that was checked.
+        SplatpipeError: If the photo is missing or has changed since it was checked.
     """
     pixels = decode(photo, part, photos_dir)
     mask = decode_mask(photo, part)
@@ -87,21 +87,21 @@ def extract(photo: Photo, config: FeaturesConfig, part: Path, photos_dir: Path, 
 
 
 def largest(keypoints: Floats, places: int) -> npt.NDArray[np.int64]:
-    """Rows of the largest keypoints, which are the most repeatable, the largest first; equal ones in their order.
+    """Return rows of the largest, most repeatable keypoints, largest first; ties keep their order.
 
     Args:
         keypoints: (n, 6) as in ``Features``.
-        places: Distinct places wanted; a place with several orientations counts once.
+        places: Number of distinct locations; a location with several orientations counts once.
     """
     sizes = np.hypot(keypoints[:, 2], keypoints[:, 4])
     order = np.argsort(-sizes, kind="stable")
     _, first, index = np.unique(keypoints[order, :2], axis=0, return_index=True, return_inverse=True)
-    ranks = np.argsort(np.argsort(first))  # of each place, by its largest keypoint
+    ranks = np.argsort(np.argsort(first))  # of each location, by its largest keypoint
     return np.asarray(order[ranks[index.ravel()] < places], np.int64)
 
 
 def reduced(pixels: Bytes, longest: int) -> Bytes:
-    """Shrink a picture to a longer side of at most ``longest`` pixels, averaging; smaller ones stay as they are."""
+    """Downscale an image to a longer side of at most ``longest`` pixels by area averaging; never upscale."""
     height, width = pixels.shape[:2]
     scale = longest / max(height, width)
     if scale >= 1.0:
@@ -111,24 +111,25 @@ def reduced(pixels: Bytes, longest: int) -> Bytes:
 
 
 def _pixels_at(image: Bytes, points: npt.NDArray[np.floating]) -> Bytes:
-    """Values of the pixels that points (n, 2; centre of the first pixel 0.5, 0.5) fall into."""
+    """Return the pixel values at points (n, 2; the centre of the first pixel is (0.5, 0.5))."""
     x = np.clip(np.floor(points[:, 0]).astype(int), 0, image.shape[1] - 1)
     y = np.clip(np.floor(points[:, 1]).astype(int), 0, image.shape[0] - 1)
     return np.asarray(image[y, x])
 
 
 def colmap_sift(grey: Bytes, limit: int, scratch: Path) -> tuple[Floats, Bytes]:
-    """COLMAP's SIFT.
+    """Run COLMAP's SIFT.
 
-    Called through ``extract_features``: pycolmap's direct extractor keeps the GIL, hence one photo at a time.
+    Called through ``extract_features``: pycolmap's direct extractor holds the GIL, so only one photo at a time could
+    be processed.
 
     Args:
         grey: (h, w).
-        limit: Keypoints wanted, coarse scales first. The scale at which it is reached is still taken whole.
+        limit: Target number of keypoints, coarse scales first. All keypoints of the scale that reaches it are kept.
         scratch: An existing folder for temporary files.
 
     Returns:
-        (n, 6) keypoints as ``Features`` has them but in pixels of ``grey``, and (n, 128) descriptors.
+        (n, 6) keypoints as in ``Features`` but in pixels of ``grey``, and (n, 128) descriptors.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -149,9 +150,9 @@ def colmap_sift(grey: Bytes, limit: int, scratch: Path) -> tuple[Floats, Bytes]:
 
 
 def opencv_sift(grey: Bytes) -> tuple[Floats, Bytes]:
-    """OpenCV's SIFT with square-rooted descriptors (RootSIFT; Arandjelović and Zisserman, CVPR 2012).
+    """Run OpenCV's SIFT with square-rooted descriptors (RootSIFT; Arandjelović and Zisserman, CVPR 2012).
 
-    All keypoints are returned: OpenCV's own cap keeps the strongest responses, which costs half the matches.
+    All keypoints are returned: OpenCV's own limit keeps the strongest responses, which costs half the matches.
 
     Args:
         grey: (h, w).

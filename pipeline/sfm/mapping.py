@@ -1,6 +1,6 @@
-"""Cameras and points from verified matches: COLMAP's incremental and its global mapper, each the same bits again.
+"""Map verified matches to cameras and points with COLMAP's incremental or global mapper, bitwise reproducibly.
 
-Both work in a thread of their own, so that the calling one can tell of progress and be interrupted.
+Both run in a thread of their own, so that the calling thread can report progress and be interrupted.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from splatpipe.pipeline.sfm.view_graph import read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
 Tell: TypeAlias = Callable[[int, int, str], None]
-"""Told a few times a second: photos placed, of how many, and what is being done."""
+"""Called a few times a second with the photos placed, their total, and the current step."""
 
 
-BEST_KEYPOINTS = 400  # a photo; 700 placed no more photos of any capture, and took up to twice the time
-WORTH_IT = 0.9  # of the matches; where more are left after choosing, choosing saves nothing
-GROWTH = 1.5  # of photos or points between adjustments over everything; COLMAP's 1.1 makes four times as many
+BEST_KEYPOINTS = 400  # per photo; 700 placed no more photos in any capture, and took up to twice the time
+WORTH_IT = 0.9  # of the matches; if more remain after the reduction, it saves nothing
+GROWTH = 1.5  # of photos or points between global adjustments; COLMAP's 1.1 makes four times as many
 GOOD_ENOUGH = 1e-4  # relative change of the cost at which these adjustments end
-ONE_THREAD = 1  # with several, COLMAP's and Ceres' sums depend on which ends first
+ONE_THREAD = 1  # with several, COLMAP's and Ceres' sums depend on which thread finishes first
 
 
 @dataclass(frozen=True)
 class MappingOptions:
-    """How to map.
+    """Options of the mappers.
 
     Attributes:
-        seed: Of everything that draws lots.
-        min_model_size: Models of fewer photos are dropped.
-        relaxed: Accept fewer and worse inliers for a photo's pose (incremental only).
-        hold_focal: Keep focal lengths at what the database says.
-        coarseness: Times by which bounds in pixels are wider than usual (incremental only).
+        seed: For all random choices.
+        min_model_size: Models with fewer photos are dropped.
+        relaxed: Accept fewer inliers and a lower inlier ratio for a photo's pose (incremental only).
+        hold_focal: Keep focal lengths at the database's values.
+        coarseness: Factor by which pixel thresholds are wider than usual (incremental only).
     """
 
     seed: int = 0
@@ -50,15 +50,19 @@ class MappingOptions:
 
 
 def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
-    """Every sub-model that photo after photo gives, the largest first.
+    """Run COLMAP's incremental mapper.
 
-    Cameras are found from each photo's best keypoints, then all verified matches come in and everything is adjusted.
+    Cameras are estimated from each photo's best keypoints; then all verified matches are added and everything is
+    adjusted.
 
     Args:
         database: Cameras, images, keypoints and verified two-view geometries; only read.
-        scratch: A folder in which temporary files may come and go.
-        options: How.
-        tell: Called from this thread.
+        scratch: An existing folder for temporary files.
+        options: Mapping options.
+        tell: Progress callback, called from the calling thread.
+
+    Returns:
+        All sub-models, the largest first.
     """
     total = _photos(database)
     placed, begun, doing = 0, 0, "choosing keypoints"
@@ -75,7 +79,7 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell
 
     def work() -> list[Model]:
         nonlocal doing
-        pycolmap.set_random_seed(options.seed)  # is this thread's own
+        pycolmap.set_random_seed(options.seed)  # thread-local
         settings = incremental_options(options)
         with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
             reduced = _reduced(database, Path(folder))
@@ -97,15 +101,18 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell
 
 
 def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
-    """Every sub-model that all photos at once give (GLOMAP; Pan et al., ECCV 2024), the largest first.
+    """Run COLMAP's global mapper (GLOMAP; Pan et al., ECCV 2024).
 
-    COLMAP cannot be asked to stop here: where this thread is interrupted, the call is left to itself.
+    COLMAP cannot be stopped here: if the calling thread is interrupted, the mapper runs on in the background.
 
     Args:
         database: Cameras, images, keypoints and verified two-view geometries; only read.
-        scratch: A folder in which temporary files may come and go.
-        options: How.
-        tell: Called from this thread.
+        scratch: An existing folder for temporary files.
+        options: Mapping options.
+        tell: Progress callback, called from the calling thread.
+
+    Returns:
+        All sub-models, the largest first.
     """
     total = _photos(database)
 
@@ -118,22 +125,22 @@ def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tel
 
 
 def _reduced(database: Path, folder: Path) -> Path:
-    """A database of the best keypoints' matches; the whole one where that would leave hardly any out."""
+    """Write a database of the best keypoints' matches; return the whole one if that drops hardly any matches."""
     target = folder / "best.db"
     kept, total = write_reduced(database, target, best_keypoints(read_verified(database), BEST_KEYPOINTS))
     return target if kept < WORTH_IT * total else database
 
 
 def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's options of incremental mapping."""
+    """Return COLMAP's options for incremental mapping."""
     result = pycolmap.IncrementalPipelineOptions()
     result.min_model_size = options.min_model_size
-    result.extract_colors = False  # the keypoints have theirs
+    result.extract_colors = False  # the keypoints have colours already
     result.random_seed = options.seed
     result.mapper.random_seed = options.seed
     result.triangulation.random_seed = options.seed
     result.num_threads = ONE_THREAD
-    # What comes in last is adjusted to convergence; until then cameras need only be good enough for the next photo.
+    # The final adjustment runs to convergence; until then cameras need only be good enough to place the next photo.
     result.ba_global_frames_ratio = result.ba_global_points_ratio = GROWTH
     result.ba_global_max_refinements, result.ba_local_max_refinements = 2, 1
     result.ba_global_max_num_iterations = 20
@@ -155,7 +162,7 @@ def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipeline
 
 
 def global_options(options: MappingOptions) -> pycolmap.GlobalPipelineOptions:
-    """COLMAP's options of global mapping."""
+    """Return COLMAP's options for global mapping."""
     result = pycolmap.GlobalPipelineOptions()
     result.multiple_models = True
     result.min_model_size = options.min_model_size
@@ -170,7 +177,7 @@ def global_options(options: MappingOptions) -> pycolmap.GlobalPipelineOptions:
 
 
 def largest_first(models: Mapping[int, Model]) -> list[Model]:
-    """By photos, then by points; COLMAP's first may be the smaller."""
+    """Sort models by photos, then by points, largest first; COLMAP's first model may not be the largest."""
     return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 

@@ -1,4 +1,4 @@
-"""Descriptors of pairs of photos matched, their geometry verified, and what holds written in one fixed order."""
+"""Match descriptors of pairs of photos, verify their geometry, and write the result in a fixed order."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from splatpipe.pipeline.sfm.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.reduction import copy_photos
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
-TILE = 16  # photos; pairs are matched tile by tile, so that a block needs few photos' descriptors
-PAIRS_A_PROCESS = 12  # at least: a process starts in half a second and builds the search trees of its photos anew
+TILE = 16  # photos; pairs are matched tile by tile, so that a block needs the descriptors of few photos
+PAIRS_A_PROCESS = 12  # at least: a process takes half a second to start and rebuilds its photos' search trees
 MATCHER = "splatpipe.pipeline.sfm.matching_process"
 
 
 class StoredDescriptors(Sequence[UInt8[np.ndarray, "_ 128"]]):
-    """Those of each photo's largest keypoints, read when asked for, so that one photo's are in memory at a time."""
+    """Descriptors of each photo's largest keypoints, read on access so that only one photo's are in memory."""
 
     def __init__(self, database: pycolmap.Database) -> None:
         self._database = database
@@ -39,24 +39,24 @@ class StoredDescriptors(Sequence[UInt8[np.ndarray, "_ 128"]]):
 
 
 def look_alike(features: Path, seed: int) -> Costs:
-    """Costs from the descriptors that a database of features has."""
+    """Return pair costs from the descriptors in a database of features."""
     with pycolmap.Database.open(features) as database:
         return look_alike_costs(StoredDescriptors(database), seed)
 
 
 def match_pairs(features: Path, work: Path, pairs: Sequence[Pair], seed: int, threads: int, report: Reporter) -> None:
-    """Match and verify pairs, a process of one thread for each of ``threads``.
+    """Match and verify pairs in up to ``threads`` single-threaded processes.
 
-    Threads of one process must not match side by side: the linear algebra in pycolmap's wheels (OpenBLAS built for
-    one thread, without its locks) gives two of them the same buffer now and then, and both pairs lose many matches.
+    Threads of one process must not match concurrently: the linear algebra in pycolmap's wheels (OpenBLAS built for
+    one thread, without locks) occasionally gives two of them the same buffer, and both pairs lose many matches.
 
     Args:
         features: The database with keypoints and descriptors; only read.
         work: The database to write: photos, and the verified geometry of each pair that was matched.
         pairs: (i, j) of photos, counted from 0.
-        seed: Of the verification.
-        threads: Processes at a time.
-        report: Told of the progress.
+        seed: For the verification.
+        threads: Maximum number of concurrent processes.
+        report: Receives progress.
     """
     tiled = sorted(pairs, key=lambda pair: (pair[0] // TILE, pair[1] // TILE, pair))
     count = max(1, min(threads, len(tiled) // PAIRS_A_PROCESS))
@@ -86,7 +86,7 @@ def _list_of(place: Path) -> Path:
 
 
 def _write_share(features: Path, place: Path, share: Sequence[Pair]) -> None:
-    """The database of one process: the photos of its pairs, under numbers for names, which lists need no quotes for."""
+    """Write the database of one process: the photos of its pairs, named by number so that lists need no quoting."""
     wanted = sorted({number + 1 for pair in share for number in pair})
     with pycolmap.Database.open(features) as source, pycolmap.Database.open(place) as database:
         copy_photos(source, database, set(wanted))
@@ -109,17 +109,17 @@ def _join(features: Path, places: Sequence[Path], work: Path) -> None:
 
 
 def write_verified(work: Path, features: Path, target: Path) -> dict[Pair, int]:
-    """Write a new database in one fixed order, since threads leave theirs in the order in which they end.
+    """Write the verified matches to a new database in a fixed order, independent of which process finished first.
 
-    Descriptors and raw matches are not carried along: mapping needs the verified ones alone.
+    Descriptors and raw matches are not copied: mapping needs only the verified matches.
 
     Args:
-        work: Where pairs were matched.
-        features: Where the cameras, images and keypoints are.
+        work: The database in which pairs were matched.
+        features: The database of cameras, images and keypoints.
         target: The database to write.
 
     Returns:
-        Verified inliers of each pair (i, j) of photos, counted from 0, i < j.
+        Number of verified inliers of each pair (i, j) of photos, counted from 0, i < j.
     """
     inliers: dict[Pair, int] = {}
     with (

@@ -1,4 +1,4 @@
-"""One process of matching: matches and verifies a list of pairs in a database of its own, by one thread."""
+"""A matching process: matches and verifies a list of pairs in its own database, on one thread."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ BLOCK_PAIRS = 64  # COLMAP keeps as many photos' search trees in memory
 
 
 def match_listed(database: Path, listing: Path, seed: int) -> None:
-    """Match and verify the pairs of a list, and leave raw matches and geometries in the database.
+    """Match and verify the pairs of a list, and write raw matches and geometries to the database.
 
     Args:
-        database: Photos, called by their numbers, with keypoints and descriptors.
-        listing: Two numbers a line.
-        seed: Of the verification.
+        database: Photos, named by their numbers, with keypoints and descriptors.
+        listing: Text file with two photo numbers per line.
+        seed: For the verification.
     """
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = 1

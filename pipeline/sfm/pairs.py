@@ -1,4 +1,4 @@
-"""Which photos are matched with which: pure functions of what is known before matching."""
+"""Pair selection: pure functions of what is known about the photos before matching."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ Pair = tuple[int, int]
 Costs = Callable[[int], Float64[np.ndarray, " n"]]
 """How unlikely each photo is to see what photo i sees; infinite where nothing is known."""
 
-LOCATED_SHARE = 0.8  # of the photos must have positions for these to lead
-SPREAD_OVER_SIGMA = 2.0  # positions that scatter no wider than this say nothing about who is whose neighbour
+LOCATED_SHARE = 0.8  # of the photos must have positions for spatial pairing
+SPREAD_OVER_SIGMA = 2.0  # positions that spread less than this times their sigma say nothing about neighbours
 SAME_PLACE_M = 0.1
-LEAST_FACING = 0.01  # cos² of half the angle between views: opposite views count as ten times further apart or more
-SEQUENCE_LENGTH = 8  # photos a folder; shorter ones are no sequence
-LEAST_OVERLAP = 0.01  # of two photos' footprints; pairs with less give a point in some hundreds
-FLOOR = 6  # nearest photos that are partners whatever the angles say: these may be wrong
-TILTED = -0.87  # of a viewing direction's height, sine: 60° down; views of walls part more and need more partners
-WIDER = 1.5  # times the partners of a photo that looks straight down
-CANDIDATES_OVER_PARTNERS = 6  # photos looked at, nearest first: an orbit has nearer ones that look elsewhere
-LOOP_SHARE = 4  # one pair in so many of a sequence looks for places seen before
+LEAST_FACING = 0.01  # minimum of cos² of half the angle between views, by which distances are divided
+SEQUENCE_LENGTH = 8  # photos per folder; shorter folders do not count as sequences
+LEAST_OVERLAP = 0.01  # of two photos' footprints; pairs with less yield one point in several hundred
+FLOOR = 6  # nearest photos that are always partners, since the stated angles may be wrong
+TILTED = -0.87  # up component of the viewing direction: 60° down; views of walls diverge more and need more partners
+WIDER = 1.5  # times the partners of a nadir photo
+CANDIDATES_OVER_PARTNERS = 6  # candidates per partner, nearest first: on an orbit nearer photos may look elsewhere
+LOOP_SHARE = 4  # one of this many neighbours in a sequence is used for loop closure
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What is known of the photos before matching.
+    """What is known about the photos before matching.
 
     Attributes:
         names: Their names, sorted.
-        times: When each was taken, seconds of any epoch; NaN where not known.
-        positions_m: (n, 3) east, north, up about any origin; NaN where not known.
-        sigmas_m: Standard deviation of each position, NaN where not known.
-        directions: (n, 3) unit viewing directions in the same axes; NaN where not known.
-        views: How the photos were taken, where that is known of most of them.
+        times: Capture times, seconds since any epoch; NaN if unknown.
+        positions_m: (n, 3) east, north, up relative to any origin; NaN if unknown.
+        sigmas_m: Standard deviation of each position; NaN if unknown.
+        directions: (n, 3) unit viewing directions in the same axes; NaN if unknown.
+        views: Stated poses, if most photos have one; otherwise None.
     """
 
     names: Sequence[str]
@@ -57,12 +57,12 @@ class Layout:
         return len(self.names)
 
     def located(self) -> np.ndarray:
-        """(n,) whether each position is known."""
+        """Return (n,) whether each position is known."""
         return np.asarray(np.isfinite(self.positions_m).all(axis=1))
 
 
 def choose_pairing(layout: Layout, exhaustive_up_to: int) -> str:
-    """What `auto` means for these photos: ``exhaustive``, ``spatial``, ``sequential`` or ``retrieval``."""
+    """Resolve `auto` for these photos: ``exhaustive``, ``spatial``, ``sequential`` or ``retrieval``."""
     tell = positions_tell(layout)
     overlap_is_known = layout.views is not None and bool(layout.views.known().all())
     if len(layout) <= exhaustive_up_to and not (tell and overlap_is_known):
@@ -73,7 +73,7 @@ def choose_pairing(layout: Layout, exhaustive_up_to: int) -> str:
 
 
 def positions_tell(layout: Layout) -> bool:
-    """Whether most photos have positions, and these spread wider than their noise."""
+    """Whether most photos have positions that spread wider than their noise."""
     located = layout.located()
     if np.count_nonzero(located) < LOCATED_SHARE * len(layout):
         return False
@@ -84,9 +84,9 @@ def positions_tell(layout: Layout) -> bool:
 
 
 def sequences(layout: Layout) -> list[list[int]]:
-    """The photos of each folder in the order of their names, if they were taken in that order; else nothing.
+    """Return each folder's photos in name order if all folders were captured in that order; otherwise nothing.
 
-    Names are compared as people read them: ``2`` before ``10``.
+    Names are sorted naturally: ``2`` before ``10``.
     """
     folders: dict[str, list[int]] = {}
     for number, name in enumerate(layout.names):
@@ -102,7 +102,7 @@ def sequences(layout: Layout) -> list[list[int]]:
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sorting key: runs of digits as numbers."""
+    """Return a sort key that compares runs of digits as numbers."""
     pieces = re.findall(r"([0-9]{1,18})|([^0-9]+|[0-9]+)", name)
     return [(0, int(digits), "") if digits else (1, 0, other) for digits, other in pieces]
 
@@ -111,16 +111,16 @@ def select_pairs(layout: Layout, pairing: str, neighbours: int, look_alike: Call
     """Choose the pairs to match, so that they connect all photos.
 
     Args:
-        layout: What is known of the photos.
+        layout: What is known about the photos.
         pairing: ``exhaustive``, ``spatial``, ``sequential`` or ``retrieval``.
         neighbours: Partners chosen for each photo.
-        look_alike: Makes the costs from the photos' content; called only where they are needed.
+        look_alike: Computes costs from the photos' content; called only if needed.
 
     Returns:
         Sorted pairs (i, j), i < j, each once.
 
     Raises:
-        SplatpipeError: if the pairing needs something that the photos do not have.
+        SplatpipeError: If the pairing is ``spatial`` and the photos have no positions.
     """
     count = len(layout)
     if pairing == "exhaustive":
@@ -161,7 +161,7 @@ def _spatial(layout: Layout, neighbours: int, look_alike: Callable[[], Costs]) -
 
 
 def _overlapping(views: StatedPoses, neighbours: int) -> set[Pair]:
-    """Each photo with those whose footprints overlap its own most; more of them for views of walls."""
+    """Pair each photo with those whose footprints overlap its own most; views of walls get more partners."""
     wide = math.ceil(WIDER * neighbours)
     partners: dict[int, list[tuple[float, Pair]]] = {}
     for pair, share in overlaps(views, CANDIDATES_OVER_PARTNERS * wide).items():
@@ -177,9 +177,9 @@ def _overlapping(views: StatedPoses, neighbours: int) -> set[Pair]:
 
 
 def spatial_costs(layout: Layout) -> Costs:
-    """Distance between two photos, the longer the more their views part: over cos² of half the angle between them.
+    """Return costs from the distance between two photos divided by cos² of half the angle between their views.
 
-    A typical spacing is added to it, so that opposite views from one place are not neighbours either.
+    A typical spacing is added to the distance, so that opposite views from one place are not neighbours either.
     """
     known = layout.positions_m[layout.located()]
     spacing = float(np.sqrt(known.var(axis=0).sum() / len(known)))
@@ -208,7 +208,7 @@ def _without(costs: Costs, pairs: set[Pair]) -> Costs:
 
 
 def nearest(photos: Iterable[int], costs: Costs, neighbours: int) -> set[Pair]:
-    """Each of the photos with its cheapest partners; equal costs in the photos' order."""
+    """Pair each of the photos with its cheapest partners; ties are broken by photo order."""
     pairs: set[Pair] = set()
     for i in photos:
         row = costs(i).copy()
@@ -220,12 +220,15 @@ def nearest(photos: Iterable[int], costs: Costs, neighbours: int) -> set[Pair]:
 
 
 def connect(pairs: set[Pair], count: int, costs: Costs) -> list[Pair]:
-    """Add the cheapest pairs that make the graph of photos one piece (Borůvka's algorithm).
+    """Add the cheapest pairs that connect the graph of photos (Borůvka's algorithm).
 
     Args:
         pairs: The pairs chosen so far.
-        count: Photos.
-        costs: Infinite ones are taken where there are no others.
+        count: Number of photos.
+        costs: Costs of all pairs; infinite ones are used only if there are no others.
+
+    Returns:
+        All pairs, sorted.
     """
     pairs = set(pairs)
     while True:
@@ -242,7 +245,7 @@ def connect(pairs: set[Pair], count: int, costs: Costs) -> list[Pair]:
 
 
 def components(pairs: Iterable[Pair], count: int) -> np.ndarray:
-    """(count,) number of the connected piece that each photo is in; pieces by their first photo."""
+    """Return (count,) the connected component of each photo; components are numbered by their first photo."""
     rows = np.array(sorted(pairs), np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(rows), np.bool_), (rows[:, 0], rows[:, 1])), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1])

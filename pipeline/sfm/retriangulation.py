@@ -1,4 +1,4 @@
-"""Tracks as far as better cameras see them: what mapping had to leave out or throw out is triangulated again."""
+"""Retriangulate tracks with improved cameras, including matches that mapping left out or filtered."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ LEAST_ANGLE_DEG = 1.5
 
 
 def retriangulate(model: pycolmap.Reconstruction, verified: ViewGraph, seed: int) -> None:
-    """Bring verified matches into a model, in place, as far as its cameras explain them; what they do not goes.
+    """Add the verified matches that a model's cameras explain, in place, and filter observations that they do not.
 
     Args:
-        model: Its keypoints are those of ``verified``.
+        model: A model with the keypoints of ``verified``.
         verified: The view graph.
-        seed: Of the triangulation.
+        seed: For the triangulation.
     """
     graph = pycolmap.CorrespondenceGraph()
     placed = sorted(model.reg_image_ids())
