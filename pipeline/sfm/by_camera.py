@@ -1,4 +1,4 @@
-"""Captures of several cameras: what became of each, and those of so few photos that they cannot be calibrated."""
+"""Captures with several cameras: a summary of each, and cameras with too few photos to be calibrated."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from splatpipe.pipeline.sfm.focal import adjust_within
 from splatpipe.pipeline.sfm.judging import TRUSTED_SOURCES
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-CAMERAS_TOLD = 10  # on the console; the report has them all
-FEW_PHOTOS = 3  # of a camera: fewer trade its focal length for their distance
-STATED_STRAY = 0.05  # of a trusted focal length: what lenses stray from it by
-KIN_STRAY = 0.02  # of one that other photos of the same body and zoom have been calibrated to
+CAMERAS_TOLD = 10  # on the console; the report lists them all
+FEW_PHOTOS = 3  # of a camera: with fewer, focal length and distance are not separable
+STATED_STRAY = 0.05  # maximum relative deviation from a trusted focal length
+KIN_STRAY = 0.02  # the same, from one calibrated with other photos of the same body and zoom
 
 
 def hold_few(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[int]:
-    """Bring the focal lengths of cameras of one or two photos back to what is known of them, and adjust, in place.
+    """Reset the focal lengths of cameras with one or two photos to known values, and adjust, in place.
 
-    A single photo, far from others or of a flat thing, leaves its focal length free, and mapping lets it run away. What
-    is known is what other photos of the same body and zoom were calibrated to (in another size, or turned), else what
-    the metadata state. A model whose cameras are all sound is left as it is, to the bit.
+    A single photo, far from others or of a flat object, does not determine its focal length, which may run away in
+    mapping. The known value is the calibration from other photos of the same body and zoom (of another size or
+    orientation), or else a trusted one from the metadata. A model that needs no reset stays as it is, bit for bit.
 
     Args:
-        model: As mapping left it.
+        model: The result of mapping.
         verified: Its view graph, with the cameras as they were before mapping.
         cameras: The camera groups of ``ingest.cameras``; COLMAP's ids count them from 1.
 
     Returns:
-        COLMAP's ids of the cameras that were brought back.
+        COLMAP's ids of the cameras that were reset.
     """
     placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     few = [number for number, count in sorted(placed.items()) if count < FEW_PHOTOS]
     if 2 * sum(placed[number] for number in few) > model.num_reg_images():
-        return []  # a collection of many people's photos: its cameras hold each other
+        return []  # a collection of many people's photos: its cameras constrain each other
     strayed = {}
     for number in few:
         known = _known(number, model, verified, cameras, placed)
@@ -57,7 +57,7 @@ def _known(
     cameras: Sequence[JSON],
     placed: Mapping[int, int],
 ) -> tuple[float, float] | None:
-    """A camera's focal length in pixels as far as anything but its photos tells, and by how much it may be off."""
+    """Return a camera's focal length known from other sources, pixels, and its tolerance; None if there is none."""
     own, body = verified.cameras[number].mean_focal_length(), _body(cameras, number)
     changes = [
         model.cameras[other].mean_focal_length() / verified.cameras[other].mean_focal_length()
@@ -70,7 +70,7 @@ def _known(
 
 
 def _body(cameras: Sequence[JSON], number: int) -> tuple[str, str, str, float]:
-    """Make and model, where the focal length is from, and what it is over the longer side (the zoom)."""
+    """Return make, model, source of the focal length, and the focal length over the longer side (the zoom)."""
     group = cameras[number - 1] if number <= len(cameras) else {}
     longer = max(group.get("width", 1), group.get("height", 1))
     zoom = round(float(group.get("focal_px", 0.0)) / longer, 2)
@@ -78,7 +78,7 @@ def _body(cameras: Sequence[JSON], number: int) -> tuple[str, str, str, float]:
 
 
 def camera_rows(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[JSON]:
-    """A row a camera that has photos in the model: what it is, photos, how many were placed, focal lengths, error."""
+    """Return a row per camera in the model: name, photos, photos placed, focal lengths, reprojection error."""
     placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     photos = Counter(verified.camera_of.values())
     errors = _errors_px(model)
@@ -104,7 +104,7 @@ def camera_rows(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Se
 
 
 def tell_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None:
-    """Say what became of each camera, where there are several."""
+    """Report the result for each camera if there are several."""
     for row in rows[:CAMERAS_TOLD] if len(rows) > 1 else ():
         focal = f"{row['focal_px']:.0f} px ({row['focal_source'] or 'stated'}: {row['prior_focal_px']:.0f})"
         placed = f"{row['placed']} of {row['photos']} photos"
@@ -113,7 +113,7 @@ def tell_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None:
 
 
 def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
-    """Mean reprojection error of each camera's observations."""
+    """Return the mean reprojection error of each camera's observations, pixels."""
     result = {}
     for number in sorted(model.cameras):
         camera, total, count = model.cameras[number], 0.0, 0

@@ -1,4 +1,4 @@
-"""How much wider bounds in pixels have to be for large photos, whose keypoints are found in reduced ones."""
+"""How much to widen pixel thresholds for large photos, whose keypoints are extracted from downscaled images."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Iterable
 
 import pycolmap
 
-# Presets look for keypoints in photos of 1,600 to 3,200 pixels, and COLMAP's bounds are made for such. In a photo of
-# 5,472 the same keypoints err by as many pixels more; no capture that bounds were set on has more than 3,000.
+# Presets extract keypoints at 1,600 to 3,200 pixels, and COLMAP's thresholds are made for such images. In a photo of
+# 5,472 pixels the errors of the same keypoints scale accordingly; thresholds were set on captures of at most 3,000.
 USUAL_PX = 3200
 
 
 def coarseness(cameras: Iterable[pycolmap.Camera]) -> float:
-    """Times by which bounds in pixels are wider than those of photos of usual size; 1 for these and smaller ones.
+    """Return the factor by which to widen pixel thresholds; 1 for photos of the usual size and smaller.
 
     Args:
-        cameras: Of the photos; the largest counts.
+        cameras: The photos' cameras; the largest image counts.
     """
     return max([1.0, *(float(max(camera.width, camera.height)) / USUAL_PX for camera in cameras)])

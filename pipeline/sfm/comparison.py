@@ -1,7 +1,7 @@
-"""How photos differ from their neighbours in what both show: in detail, and in brightness.
+"""Compare the detail and brightness of photos with those of neighbours that show the same thing.
 
-Each pair of photos that match is compared where they match, so that what they show cancels out. A photo's own share in
-these differences is what most of its neighbours say; those that are found odd themselves do not count the second time.
+Each matching pair is compared at its matches, so that the scene content cancels out. A photo's own deviation is the
+median of these differences; neighbours that turn out to be outliers are excluded in later passes.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from splatpipe.pipeline.photos.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.pairs import Pair
 from splatpipe.pipeline.sfm.quick_match import InlierMatches, QuickFeatures
 
-LEAST_PLACES = 8  # matches that a pair is compared by
-ALIKE_SIZES = 1.5  # of a keypoint in both photos, relative to them: further apart, one photo has more detail of right
+LEAST_PLACES = 8  # minimum number of matches for comparing a pair
+ALIKE_SIZES = 1.5  # ratio of relative keypoint sizes: beyond it, one photo has more detail because it is closer
 PASSES = 3
-ODD_DETAIL = 0.6  # of a logarithm of energies: photos that dull are no standard for others
+ODD_DETAIL = 0.6  # logarithm of an energy ratio: such dull photos are not a reference for others
 ODD_LEVEL_EV = 0.7
-CLIPPED = -0.06  # binary logarithm of linear light from which on nothing brighter is told: 250 of 255
-ALONE_DETAIL, ALONE_EV = 2.0, 2.0  # of photos that match none, against all others: what they show differs, too
+CLIPPED = -0.06  # binary logarithm of linear light above which values are saturated: 250 of 255
+ALONE_DETAIL, ALONE_EV = 2.0, 2.0  # for photos that match none, against all others, whose content differs as well
 
 
 def duller(
     glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]
 ) -> Float64[np.ndarray, "n directions"]:
-    """How much less fine detail each photo has than its neighbours where both show the same, by direction.
+    """Estimate how much less fine detail each photo has than its neighbours where both show the same, by direction.
 
     Returns:
-        Natural logarithms of a ratio of energies, above 0 for a duller photo, about the median of all; NaN for photos
-        that nothing is compared with.
+        Natural logarithms of a ratio of energies, above 0 for a duller photo; NaN for photos that could not be
+        compared.
     """
     differences = {}
     for pair, agreed in found.items():
@@ -43,7 +43,7 @@ def duller(
 
 
 def brighter_ev(glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]) -> Float64[np.ndarray, " n"]:
-    """Exposure values by which each photo shows the same things brighter than its neighbours do; NaN where unknown."""
+    """Estimate by how many EV each photo is brighter than its neighbours where both show the same; NaN if unknown."""
     differences = {}
     for (i, j), agreed in found.items():
         here, there = glimpses[i].levels[agreed.first], glimpses[j].levels[agreed.second]
@@ -60,7 +60,7 @@ def brighter_ev(glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMa
 def _detail_difference(
     first: QuickFeatures, second: QuickFeatures, agreed: InlierMatches
 ) -> tuple[Float64[np.ndarray, " directions"], Float64[np.ndarray, " directions"]] | None:
-    """How much duller the first photo is, in its directions, and the second, in its own."""
+    """Return how much duller the first photo is, by its own directions, and the second, by its own; None if unknown."""
     ratio = (first.sizes[agreed.first] / first.width) / (second.sizes[agreed.second] / second.width)
     alike = (ratio > 1.0 / ALIKE_SIZES) & (ratio < ALIKE_SIZES)
     here, there = first.detail[agreed.first], second.detail[agreed.second]
@@ -83,7 +83,7 @@ def _medians(values: Float32[np.ndarray, "n k"], size: int) -> Float64[np.ndarra
 def _or_alone(
     own: Float64[np.ndarray, "n k"], plain: Sequence[Float64[np.ndarray, " k"]], least: float
 ) -> Float64[np.ndarray, "n k"]:
-    """The same, with photos that match none set against all others, where they differ from these by ``least``."""
+    """Compare photos that match no other with all others; fill in their values where they differ by over ``least``."""
     alone = ~np.isfinite(own).any(axis=1)
     told = np.stack(plain) if len(plain) else own
     others = told[~alone & np.isfinite(told).all(axis=1)]
@@ -100,7 +100,7 @@ def _own_share(
     size: int,
     odd: float,
 ) -> Float64[np.ndarray, "count size"]:
-    """Each photo's median difference from its neighbours; from those that are not odd, where it has enough of them."""
+    """Return each photo's median difference from its neighbours, excluding outlier neighbours unless all are."""
     neighbours: list[list[tuple[int, Float64[np.ndarray, " k"]]]] = [[] for _ in range(count)]
     for (i, j), (of_first, of_second) in sorted(differences.items()):
         neighbours[i].append((j, of_first))

@@ -1,9 +1,9 @@
-"""Two groups of cameras that disagree: the mark of a bent or ghosted model.
+"""Find two groups of cameras that disagree: the sign of a bent or ghosted model.
 
-Photos are the nodes of a graph whose edges are matches that the model explains (they pull together) and matches that it
-contradicts (they push apart). The cut is looked for along the smallest eigenvector of the signed Laplacian (Kunegis et
-al., Spectral analysis of signed graphs for clustering, SDM 2010), whose signs are two groups that agree within and
-contradict each other.
+Photos are the nodes of a graph whose edges are matches that the model explains (positive) and matches that it
+contradicts (negative). The cut is searched along the eigenvector of the signed Laplacian's smallest eigenvalue (Kunegis
+et al., Spectral analysis of signed graphs for clustering, SDM 2010), whose signs split the photos into two groups that
+agree internally and contradict each other.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.sfm.agreement import Agreement
 
-MOST_MATCHES = 200  # of a pair that count: neighbours with thousands prove no more than that they are neighbours
-SMALLEST_GROUP = 2  # photos; one by itself is a wrong photo, not a bend
+MOST_MATCHES = 200  # cap per pair: thousands of matches prove only that two photos are neighbours
+SMALLEST_GROUP = 2  # photos; a single one is a wrong photo, not a bend
 SMALLEST_SHARE = 0.02  # of the photos
 DENSE = 600  # photos up to which all eigenvectors are computed
 STEPS = 300  # of the power iteration above
-DIGITS = 8  # of the eigenvector that count: the last ones are another with every number of threads
-LEAST_MATCHES_APART = 1.0  # what holds a group that nothing holds counts as
+DIGITS = 8  # decimals of the eigenvector that are kept: the last ones vary with the number of threads
+LEAST_MATCHES_APART = 1.0  # minimum for the consistent matches across a cut, to avoid dividing by zero
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class GraphCut:
     """The two groups that disagree most.
 
     Attributes:
-        group: Image ids of the smaller.
-        ratio: Matches between the groups that contradict the model, to those that agree with it.
+        group: Image ids of the smaller group.
+        ratio: Ratio of contradicting to consistent matches between the groups.
     """
 
     group: tuple[int, ...] = ()
@@ -38,7 +38,7 @@ class GraphCut:
 
 
 def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> GraphCut:
-    """The cut of the placed photos with the largest ratio."""
+    """Return the cut of the placed photos with the largest ratio; empty if nothing contradicts."""
     numbers = np.unique(agreement.pairs[agreement.placed])
     if not contradicts.any() or len(numbers) < 2 * SMALLEST_GROUP:
         return GraphCut()
@@ -61,7 +61,7 @@ def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> Graph
 def _weights(
     agreement: Agreement, contradicts: Bool[np.ndarray, " n"], numbers: np.ndarray
 ) -> tuple[Float64[np.ndarray, "m m"], Float64[np.ndarray, "m m"]]:
-    """Matches that hold photos together, and those that contradict, as symmetric matrices."""
+    """Return the consistent and the contradicting matches between photos as symmetric matrices."""
     agree = np.zeros((len(numbers), len(numbers)))
     against = np.zeros_like(agree)
     rows = np.searchsorted(numbers, agreement.pairs[agreement.placed])
@@ -75,13 +75,13 @@ def _weights(
 
 
 def _eigenvector(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray, "m m"]) -> Float64[np.ndarray, " m"]:
-    """Of the smallest eigenvalue of the signed Laplacian, normalised by degree."""
+    """Return the eigenvector of the smallest eigenvalue of the signed Laplacian, normalised by degree."""
     degree = np.maximum((agree + against).sum(axis=1), 1.0)
     signed = (agree - against) / np.sqrt(degree[:, None] * degree[None, :])
     if len(signed) <= DENSE:
         vector = np.linalg.eigh(signed)[1][:, -1]
     else:
-        vector = np.cos(np.arange(len(signed), dtype=np.float64))  # any start that is no eigenvector
+        vector = np.cos(np.arange(len(signed), dtype=np.float64))  # any start that is not an eigenvector
         for _ in range(STEPS):
             vector = vector + signed @ vector
             vector /= np.linalg.norm(vector)
@@ -92,13 +92,13 @@ def _eigenvector(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray,
 
 
 def _detached(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray, "m m"]) -> list[np.ndarray]:
-    """Orders that begin with the photos that are contradicted most: a small ghosted group."""
+    """Return orders that start with the most contradicted photos, to find a small ghosted group."""
     held, contra = agree.sum(axis=1), against.sum(axis=1)
     return [np.argsort(-contra / np.maximum(held + contra, 1.0), kind="stable")]
 
 
 def _crossing(weights: Float64[np.ndarray, "m m"], order: np.ndarray) -> Float64[np.ndarray, " k"]:
-    """Weight between the first k photos of an order and the others, for k from 1 to all but one."""
+    """Return the weight between the first k photos of an order and the others, for k from 1 to all but one."""
     ordered = weights[np.ix_(order, order)]
     before = np.tril(ordered, -1).sum(axis=1)  # to those that came earlier
     after = np.triu(ordered, 1).sum(axis=1)

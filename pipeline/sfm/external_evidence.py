@@ -1,4 +1,4 @@
-"""What is known of a model from outside the matches: how well they tell the lens, and where photos say they were."""
+"""Evidence beyond the verified matches: how well the lens is determined, and the photos' stated positions."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from splatpipe.pipeline.sfm.judging import Reason, is_trusted
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-LEAST_POSITIONS = 8  # photos; a similarity bends itself to fewer
+LEAST_POSITIONS = 8  # photos; a similarity fits fewer too easily
 STEPS = 30  # of the reweighted fit
-FAR_SIGMAS, FAR_SHARE = 5.0, 0.04  # of the stated error, and of the flight's size: what a receiver's noise is not
-SMOOTH = 0.5  # a residual's difference from its neighbour's, to its length: noise has 1.4, a bend next to nothing
+FAR_SIGMAS, FAR_SHARE = 5.0, 0.04  # of the stated error, and of the flight's size: more than receiver noise
+SMOOTH = 0.5  # difference of neighbouring residuals over their length: about 1.4 for noise, almost 0 for a bend
 
 
 @dataclass(frozen=True)
 class PositionMisfit:
-    """How positions stand to a model after the similarity that most of them agree on.
+    """Misfit between a model and stated positions after a robust similarity fit.
 
     Attributes:
-        median_m: Length of the residuals.
-        size_m: Root mean square distance of the positions from their middle.
+        median_m: Median length of the residuals.
+        size_m: Root mean square distance of the positions from their mean.
         smooth: Median difference of a residual from that of the nearest camera, over ``median_m``.
     """
 
@@ -40,7 +40,7 @@ class PositionMisfit:
 def outside_reasons(
     model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON], positions: Sequence[JSON]
 ) -> list[Reason]:
-    """Doubts that the matches themselves cannot raise.
+    """Return reasons for doubt that the matches themselves cannot reveal.
 
     Args:
         model: In any frame.
@@ -89,7 +89,7 @@ def _positions(model: pycolmap.Reconstruction, positions: Sequence[JSON]) -> lis
 
 
 def _metres(entries: Sequence[JSON]) -> Float64[np.ndarray, "n 3"]:
-    """East, north and up of the first position, on a sphere: enough for residuals of metres."""
+    """Return east, north and up from the first position, on a sphere: accurate enough for residuals of metres."""
     degrees = np.array([[entry["longitude"], entry["latitude"]] for entry in entries])
     off = np.radians(np.mod(degrees - degrees[0] + 180.0, 360.0) - 180.0) * EARTH_RADIUS_M
     up = np.array([entry["altitude_m"] for entry in entries], np.float64)
@@ -97,11 +97,11 @@ def _metres(entries: Sequence[JSON]) -> Float64[np.ndarray, "n 3"]:
 
 
 def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, "n 3"]) -> PositionMisfit:
-    """Fit a similarity by least absolute distances, and describe what is left.
+    """Fit a similarity by least absolute distances, and summarise the residuals.
 
     Args:
-        centres: Of the cameras, in the model's frame.
-        places: Where they are said to be, metres, in the same order.
+        centres: Camera centres in the model's frame.
+        places: Their stated positions, metres, in the same order.
     """
     weights = np.ones(len(centres))
     for _ in range(STEPS):  # iteratively reweighted least squares
@@ -120,7 +120,7 @@ def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray
 def _similar(
     one: Float64[np.ndarray, "n 3"], two: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """The first places brought onto the second by the best weighted similarity (Umeyama, 1991)."""
+    """Align the first points to the second by the best weighted similarity (Umeyama, 1991)."""
     shares = weights / weights.sum()
     middle = shares @ one, shares @ two
     a, b = one - middle[0], two - middle[1]

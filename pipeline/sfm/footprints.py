@@ -1,8 +1,8 @@
-"""How much of what one photo shows another one shows, too, from positions, angles and focal lengths alone.
+"""Estimate the overlap of photos from positions, angles and focal lengths alone.
 
-Each photo's rays are followed to where they may end: to the ground, and to where the views of the photos cross, which
-is the building that an orbit goes around. The share of these points that lies in another picture, weighted by how alike
-the two see them, says whether the pair is worth matching.
+Each photo's rays are cast to where they may end: to the ground, and to where the views of the photos cross, such as the
+building at the centre of an orbit. The share of these points inside another image, weighted by the similarity of the
+two views, says whether the pair is worth matching.
 """
 
 from __future__ import annotations
@@ -12,26 +12,26 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-GRID = 5  # rays across a picture, and as many down
-FURTHEST = 4.0  # times the height above ground or the distance to the building: what is behind is small in the picture
+GRID = 5  # rays across an image, and as many down
+FURTHEST = 4.0  # times the height above ground or the distance to the crossing: anything beyond is small in the image
 LEAST_HEIGHT_M = 2.0
-CROSSING_DEG = 15.0  # views that part less do not tell where they cross
-CROSSING_MISS = 0.3  # of the distance: axes that pass each other by more do not look at the same thing
+CROSSING_DEG = 15.0  # minimum angle between views to determine where they cross
+CROSSING_MISS = 0.3  # of the distance: axes that miss each other by more do not point at the same thing
 LEAST_CROSSINGS = 3
-MARGIN = 0.1  # of a half picture: angles err by some degrees
-ALIKE_DEG, UNLIKE_DEG = 15.0, 90.0  # SIFT matches as well as ever up to the one, and nothing past the other
+MARGIN = 0.1  # of half an image: angles are off by a few degrees
+ALIKE_DEG, UNLIKE_DEG = 15.0, 90.0  # SIFT matching is unaffected up to the first angle, and fails beyond the second
 
 
 @dataclass(frozen=True)
 class StatedPoses:
-    """How photos were taken; NaN throughout for a photo of which that is not known.
+    """Stated poses and fields of view of photos; all NaN for a photo whose pose is unknown.
 
     Attributes:
-        centres_m: East, north, up about any origin.
+        centres_m: East, north, up relative to any origin.
         enu_from_camera: Rotations; camera x right, y down, z forward.
         half_size: Tangents of half the field of view, across and down.
-        ground_m: Height of the ground in the same axes, below each photo.
-        noise_m: Standard deviation of the positions against each other.
+        ground_m: Height of the ground below each photo, in the same axes.
+        noise_m: Relative standard deviation of the positions.
     """
 
     centres_m: Float64[np.ndarray, "n 3"]
@@ -44,7 +44,7 @@ class StatedPoses:
         return len(self.centres_m)
 
     def known(self) -> Bool[np.ndarray, " n"]:
-        """Of which photos it is known how they were taken."""
+        """Return the mask of photos whose pose is known."""
         return np.asarray(np.isfinite(self.centres_m).all(axis=1) & np.isfinite(self.axes).all(axis=1))
 
     @property
@@ -54,14 +54,14 @@ class StatedPoses:
 
 
 def overlaps(views: StatedPoses, candidates: int) -> dict[tuple[int, int], float]:
-    """The share of two photos' points that both show, weighted by how alike they show them.
+    """Estimate the share of two photos' points that both see, weighted by the similarity of the views.
 
     Args:
         views: The photos.
-        candidates: So many of the nearest photos are looked at, for each.
+        candidates: Number of nearest photos to consider for each photo.
 
     Returns:
-        From 0 (exclusive) to 1, the mean of both ways, by pair (i, j), i < j; pairs without any are left out.
+        From 0 (exclusive) to 1, the mean of both directions, by pair (i, j), i < j; pairs without overlap are omitted.
     """
     known = np.flatnonzero(views.known())
     crossings = crossing_distances(views)
@@ -78,7 +78,7 @@ def overlaps(views: StatedPoses, candidates: int) -> dict[tuple[int, int], float
 
 
 def crossing_distances(views: StatedPoses) -> Float64[np.ndarray, " n"]:
-    """Distance along each photo's axis to where other views cross it (the median); NaN where too few do."""
+    """Return the median distance along each photo's axis to where other views cross it; NaN if too few do."""
     distances = np.full(len(views), np.nan)
     axes = views.axes
     for i in range(len(views)):
@@ -97,7 +97,7 @@ def crossing_distances(views: StatedPoses) -> Float64[np.ndarray, " n"]:
 
 
 def _points(views: StatedPoses, i: int, crossing_m: float) -> Float64[np.ndarray, "m 3"]:
-    """Where the rays of a photo may end."""
+    """Return the points where the rays of a photo may end."""
     steps = (np.arange(GRID) + 0.5) / GRID * 2.0 - 1.0
     across, down = np.meshgrid(steps * views.half_size[i, 0], steps * views.half_size[i, 1])
     rays = np.stack([across.ravel(), down.ravel(), np.ones(GRID * GRID)], axis=1) @ views.enu_from_camera[i].T
@@ -108,7 +108,7 @@ def _points(views: StatedPoses, i: int, crossing_m: float) -> Float64[np.ndarray
     depths = to_ground[to_ground <= reach]
     points = [views.centres_m[i] + depths[:, None] * rays[to_ground <= reach]]
     if not np.isnan(crossing_m):
-        in_front = to_ground > crossing_m  # the ground ends the others before
+        in_front = to_ground > crossing_m  # the other rays hit the ground first
         points.append(views.centres_m[i] + crossing_m * rays[in_front])
     elif not len(depths):
         points.append(views.centres_m[i] + reach / 2.0 * rays)
@@ -118,7 +118,7 @@ def _points(views: StatedPoses, i: int, crossing_m: float) -> Float64[np.ndarray
 def _share_seen(
     views: StatedPoses, i: int, others: Int[np.ndarray, " k"], points: Float64[np.ndarray, "m 3"]
 ) -> Float64[np.ndarray, " k"]:
-    """Of points that photo i shows, the weighted share that each of the others shows."""
+    """Return the weighted share of photo i's points that each of the others sees."""
     to_point = points[None] - views.centres_m[others][:, None]  # (k, m, 3)
     in_camera = np.einsum("kmx,kxc->kmc", to_point, views.enu_from_camera[others])
     half_size = views.half_size[others][:, None]

@@ -1,7 +1,7 @@
-"""Tracks that an adjustment does not see, and how well its cameras explain them.
+"""Held-out tracks: how well adjusted cameras predict tracks that the adjustment did not use.
 
-Each observation of a held-out track is predicted from the track's others: they are intersected without it, and the
-place is projected into its photo. That asks cameras and lenses, and no point of the adjustment.
+Each observation of a held-out track is predicted from the others: their rays are intersected, and the point is
+projected into the observation's photo. This tests cameras and lenses, independently of the adjusted points.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 LEAST_VIEWS = 3  # two that intersect, and one that is predicted
-REWEIGHTINGS = 2  # by the distances of the place that was found before
-LEAST_ANGLE = 0.02  # of the smaller eigenvalue's share: rays that are nearly parallel place nothing
-CAP = 4.0  # times the median error: one wrong match shall not decide
+REWEIGHTINGS = 2  # by the distance to the point from the previous round
+LEAST_ANGLE = 0.02  # its square is the minimum eigenvalue ratio: nearly parallel rays do not determine a point
+CAP = 4.0  # times the median error: a single wrong match must not decide
 BOOTSTRAPS = 500
-DOUBT = 0.01  # of the bootstraps may say otherwise
+DOUBT = 0.01  # share of the bootstrap samples that may show no improvement
 
 
 @dataclass(frozen=True)
 class TrackObservations:
-    """Observations of tracks, one after the other.
+    """Observations of tracks, track after track.
 
     Attributes:
-        track: Number of each one's track, from 0, ascending.
-        image: COLMAP's image id of each.
-        pixels: Where it is seen.
+        track: Track number of each observation, from 0, ascending.
+        image: COLMAP's image id of each observation.
+        pixels: Image coordinates of each observation, pixels.
     """
 
     track: Int64[np.ndarray, " n"]
@@ -37,7 +37,7 @@ class TrackObservations:
 
 
 def tracks_of(model: pycolmap.Reconstruction, points: Int64[np.ndarray, " k"]) -> TrackObservations:
-    """The observations of some of a model's points, in their order."""
+    """Return the observations of some of a model's points, in the order given."""
     rows = [
         (number, element.image_id, *model.images[element.image_id].points2D[element.point2D_idx].xy)
         for number, point in enumerate(points.tolist())
@@ -48,7 +48,7 @@ def tracks_of(model: pycolmap.Reconstruction, points: Int64[np.ndarray, " k"]) -
 
 
 def of_photos(tracks: TrackObservations, images: set[int]) -> TrackObservations:
-    """The tracks as some photos see them, those of three photos or more."""
+    """Restrict tracks to some photos, and keep those with three observations or more."""
     inside = np.isin(tracks.image, sorted(images))
     lengths = np.bincount(tracks.track[inside], minlength=int(tracks.track.max(initial=-1)) + 1)
     inside &= lengths[tracks.track] >= LEAST_VIEWS
@@ -57,14 +57,14 @@ def of_photos(tracks: TrackObservations, images: set[int]) -> TrackObservations:
 
 
 def predicted_errors(model: pycolmap.Reconstruction, tracks: TrackObservations) -> Float64[np.ndarray, " n"]:
-    """How far each observation lies from where the others of its track have it, pixels.
+    """Compute the distance of each observation from its prediction by the others of its track.
 
     Args:
-        model: Whose poses and lenses count, and no points.
-        tracks: Of three observations or more each.
+        model: Supplies poses and lenses; its points are not used.
+        tracks: Tracks of three observations or more.
 
     Returns:
-        Infinite where the others place nothing.
+        Errors, pixels; infinite where the other observations do not determine a point.
     """
     rotations, centres, rays = _rays(model, tracks)
     count = int(tracks.track[-1]) + 1 if len(tracks.track) else 0
@@ -103,17 +103,17 @@ def improves(
     least: float,
     seed: int,
 ) -> tuple[float, bool]:
-    """Whether errors became smaller, and not by chance: photos are drawn again and again, each with all it sees.
+    """Test whether errors decreased significantly, by a bootstrap over photos.
 
     Args:
-        before: Pixels.
-        after: Likewise, of the same observations.
-        images: Each one's photo: errors in one photo go together.
-        least: What of the squares' sum has to go.
-        seed: Of the draws.
+        before: Errors, pixels.
+        after: Errors of the same observations, pixels.
+        images: Photo of each observation: errors within a photo are correlated.
+        least: Required relative reduction of the sum of squares.
+        seed: For the bootstrap.
 
     Returns:
-        The share that went, and whether it is enough, and nearly all draws say that some went.
+        The relative reduction, and whether it reaches ``least`` and nearly all bootstrap samples show a reduction.
     """
     if not len(before):
         return 0.0, False
@@ -145,7 +145,7 @@ def rows_by_camera(
 def _rays(
     model: pycolmap.Reconstruction, tracks: TrackObservations
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Of each observation: the photo's rotation, its centre, and the unit ray in the model's frame."""
+    """Return for each observation the photo's rotation, its centre, and the unit ray in the model's frame."""
     numbers, which = np.unique(tracks.image, return_inverse=True)
     poses = np.stack([model.images[number].cam_from_world().matrix() for number in numbers.tolist()])
     turns = poses[:, :, :3]

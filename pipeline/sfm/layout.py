@@ -1,4 +1,4 @@
-"""What is known of the photos before matching, as pair selection takes it: positions, angles, heights, times."""
+"""Input of pair selection, from what is known before matching: positions, angles, heights, times."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.sfm.footprints import StatedPoses
 from splatpipe.pipeline.sfm.pairs import LOCATED_SHARE, Layout
 
-LEVELLING_SIGMA_M = 1.0  # altitudes that are as good tell how high flights took off against each other
-TAKEN_BY = ("latitude", "yaw_deg", "pitch_deg", "relative_altitude_m")  # what tells how a photo was taken
+LEVELLING_SIGMA_M = 1.0  # altitudes this accurate determine the relative take-off heights of flights
+TAKEN_BY = ("latitude", "yaw_deg", "pitch_deg", "relative_altitude_m")  # fields required for a stated pose
 WITHIN_FLIGHT = 0.5  # of a position's standard deviation: most of the error is common to a flight
-EARTH_RADIUS_M = 6_371_000.0  # of a sphere: these metres only choose neighbours
+EARTH_RADIUS_M = 6_371_000.0  # spherical Earth: accurate enough for choosing neighbours
 
 
 def make_layout(photos: Sequence[Photo], positions: Sequence[dict[str, JSON]]) -> Layout:
-    """Put what `ingest` found into arrays.
+    """Convert the positions, angles and times from `ingest` to arrays.
 
     Args:
         photos: Sorted by name.
@@ -50,7 +50,7 @@ def make_layout(photos: Sequence[Photo], positions: Sequence[dict[str, JSON]]) -
 
 
 def half_sizes(features: Path, names: Sequence[str]) -> Float64[np.ndarray, "n 2"]:
-    """Tangents of half the field of view of each photo, across and down in the stored grid, by its camera's prior."""
+    """Return tangents of each photo's half field of view, across and down in the stored grid, by its prior camera."""
     with pycolmap.Database.open(features) as database:
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         of_name = {image.name: cameras[image.camera_id] for image in database.read_all_images()}
@@ -62,14 +62,14 @@ def half_sizes(features: Path, names: Sequence[str]) -> Float64[np.ndarray, "n 2
 def make_views(
     photos: Sequence[Photo], positions: Sequence[dict[str, JSON]], half_size: Float64[np.ndarray, "n 2"]
 ) -> StatedPoses | None:
-    """How photos were taken; None unless it is known of most, by positions, angles and heights above take-off.
+    """Assemble the stated poses from positions, angles and heights above take-off; None unless most photos have them.
 
-    The height is the barometer's: a receiver's altitude errs by metres between photos, unless it is RTK's.
+    The height is barometric: a GNSS altitude varies by metres between photos, except with RTK.
 
     Args:
         photos: Sorted by name.
         positions: The entries of ``positions.json``.
-        half_size: Tangents of half the fields of view.
+        half_size: Tangents of the half fields of view.
     """
     by_name = {entry["name"]: entry for entry in positions}
     found = [(index, by_name[photo.name]) for index, photo in enumerate(photos) if photo.name in by_name]
@@ -92,7 +92,7 @@ def make_views(
 
 
 def _ground_m(entries: Sequence[dict[str, JSON]], height: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Where each photo's flight took off: 0, unless altitudes are good enough to tell flights' heights apart."""
+    """Return the take-off height of each photo's flight: 0 unless altitudes are accurate enough to compare flights."""
     ground = np.zeros(len(entries))
     if any(entry["altitude_m"] is None or entry["sigma_vertical_m"] > LEVELLING_SIGMA_M for entry in entries):
         return ground
@@ -104,14 +104,14 @@ def _ground_m(entries: Sequence[dict[str, JSON]], height: Float64[np.ndarray, " 
 
 
 def _metres(entry: dict[str, JSON], origin: dict[str, JSON]) -> tuple[float, float]:
-    """East and north of an origin on a sphere; the way round the date line is the short one."""
+    """Return east and north offsets from an origin on a sphere, the short way round across the date line."""
     degrees_east = (entry["longitude"] - origin["longitude"] + 180.0) % 360.0 - 180.0
     east = np.radians(degrees_east) * np.cos(np.radians(origin["latitude"])) * EARTH_RADIUS_M
     return float(east), float(np.radians(entry["latitude"] - origin["latitude"]) * EARTH_RADIUS_M)
 
 
 def viewing_direction(yaw_deg: float, pitch_deg: float) -> Float64[np.ndarray, " 3"]:
-    """East, north, up of the view of a gimbal: yaw clockwise from north, pitch -90 straight down."""
+    """Return a gimbal's viewing direction as east, north, up: yaw clockwise from north, pitch -90 straight down."""
     yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
     return np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)])
 

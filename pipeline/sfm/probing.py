@@ -1,7 +1,7 @@
-"""New evidence for a model: photos that by the model show the same thing, but were never matched, are.
+"""Probe a model by matching pairs that show the same thing according to the model but were never matched.
 
-A graph of few pairs can leave a bend that contradicts none of its matches. What the model foretells about other pairs
-then proves it right or wrong, and mends it.
+With few pairs, a bent model may contradict none of its matches. Its predictions for other pairs then confirm or refute
+it, and their matches help to correct it.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from splatpipe.pipeline.sfm.judging import contradicting
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs, tried_pairs
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
-PROBES = 24  # pairs: a few seconds' work, and enough for a share of them to mean something
-PROVEN = (3, 0.1)  # contradicting probes, and their share of those that hold: more than look-alikes give, 0 to 0.05
-THIN = 8.0  # verified pairs a photo; drone captures with overlap have 15 and more, chains and trees 2 to 5
-FILL = 6  # pairs a photo that a thin graph gets
+PROBES = 24  # pairs: a few seconds' work, and enough for a meaningful share
+PROVEN = (3, 0.1)  # minimum of contradicting probes, and share of those verified; look-alikes give only 0 to 0.05
+THIN = 8.0  # verified pairs per photo; drone captures with overlap have 15 or more, chains and trees 2 to 5
+FILL = 6  # new pairs per photo for a sparse graph
 
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """What new pairs said.
+    """Result of matching new pairs.
 
     Attributes:
-        database: Everything so far and what holds of the new pairs.
+        database: The database, with the verified matches of the new pairs added.
         verified: Its view graph.
-        tried: Pairs matched.
-        held: Of these, verified.
-        contradicting: Of these, those whose matches the model contradicts.
+        tried: Number of pairs matched.
+        held: How many of these were verified.
+        contradicting: How many of the verified pairs the model contradicts.
     """
 
     database: Path
@@ -45,12 +45,12 @@ class ProbeResult:
 
     @property
     def prove_a_bend(self) -> bool:
-        """Whether the model foretold wrongly."""
+        """Whether enough new pairs contradict the model to prove it bent."""
         return self.contradicting >= max(PROVEN[0], PROVEN[1] * self.held)
 
 
 def pairs_a_photo(model: pycolmap.Reconstruction, verified: ViewGraph) -> float:
-    """Verified pairs of a placed photo with other placed ones, on average."""
+    """Return the mean number of verified pairs of a placed photo with other placed photos."""
     placed = set(model.reg_image_ids())
     inside = sum(i in placed and j in placed for i, j in verified.matches)
     return 2.0 * inside / max(len(placed), 1)
@@ -64,15 +64,15 @@ def probe(
     seed: int,
     report: Reporter,
 ) -> ProbeResult:
-    """Match pairs that a model says show the same thing, and hold the model against them.
+    """Match pairs that show the same thing according to a model, and check the model against them.
 
     Args:
-        capture: Where the descriptors are.
-        model: With the keypoints of the graph.
-        graph: The database so far, and what it says.
-        count: Pairs at most.
-        seed: Of the verification.
-        report: Told of the progress.
+        capture: Supplies the descriptors.
+        model: A model with the keypoints of the graph.
+        graph: The current database, and its view graph.
+        count: Maximum number of pairs.
+        seed: For the verification.
+        report: Receives progress.
     """
     database, verified = graph
     pairs = propose_pairs(model, verified, count, capture.tried | tried_pairs(database))

@@ -1,4 +1,4 @@
-"""A quick look at which photos show the same thing, at low resolution: enough to tell who overlaps whom, no more."""
+"""Quick low-resolution matching, just enough to find which photos overlap."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from splatpipe.pipeline.photos.detail import (
 from splatpipe.pipeline.sfm.keypoints import DESCRIPTOR_NORM, reduced
 from splatpipe.pipeline.sfm.pairs import Pair
 
-LONGEST_PX = 640  # of the pictures that are matched: a fifth of a second a photo
+LONGEST_PX = 640  # longer side of the matched images: a fifth of a second per photo
 MOST_KEYPOINTS = 1000
-FEW_KEYPOINTS = 600  # fields and water, dark or hazy photos: there fainter ones are taken, too
-FAINT = 0.008  # of OpenCV's contrast threshold, whose default is 0.04; COLMAP's own is about as low
-RATIO = 0.85  # of the angles to the best and to the second best descriptor, looser than COLMAP's 0.8: RANSAC follows
-LEAST_MATCHES = 12  # that agree on a two-view geometry; chance gives 8 and a few
-LEAST_SHARE = 0.2  # of the candidates: fewer agree by chance among many
+FEW_KEYPOINTS = 600  # below this (fields, water, dark or hazy photos) fainter keypoints are used too
+FAINT = 0.008  # OpenCV's contrast threshold for these; its default is 0.04, COLMAP's is about as low as this
+RATIO = 0.85  # of the angles to the best and second-best descriptor, looser than COLMAP's 0.8: RANSAC follows
+LEAST_MATCHES = 12  # inliers of a two-view geometry; chance gives a few more than 8
+LEAST_SHARE = 0.2  # of the candidates: among many, a smaller share agrees by chance
 TOLERANCE_PX = 1.5  # at the low resolution
 ROUNDS = 1000  # of RANSAC
 CONFIDENCE = 0.999
@@ -36,19 +36,19 @@ CONFIDENCE = 0.999
 
 @dataclass(frozen=True)
 class QuickFeatures:
-    """What is kept of a photo.
+    """Low-resolution features of a photo.
 
     Attributes:
         places: (n, 2) keypoints in the stored grid, pixels.
         sizes: Their diameters, likewise.
         angles_deg: Their orientations, from x towards y.
         descriptors: Square-rooted SIFT, unit length.
-        detail: Of each keypoint, as ``detail_at`` has it.
-        levels: Of each keypoint, as ``levels_at`` has it.
-        brightness: Of the photo.
-        signature: The photo at a few pixels.
-        width: Of the stored grid.
-        height: Likewise.
+        detail: Detail at each keypoint, from ``detail_at``.
+        levels: Brightness at each keypoint, from ``levels_at``.
+        brightness: Brightness of the photo.
+        signature: The photo downscaled to a few pixels.
+        width: Width of the stored grid, pixels.
+        height: Its height.
     """
 
     places: Float64[np.ndarray, "n 2"]
@@ -63,13 +63,13 @@ class QuickFeatures:
     height: int
 
     def rooted(self) -> UInt8[np.ndarray, "n 128"]:
-        """The descriptors as the line has them."""
+        """Return the descriptors in the pipeline's 8-bit format."""
         return np.asarray(np.minimum(np.rint(self.descriptors * DESCRIPTOR_NORM), 255), np.uint8)
 
 
 @dataclass(frozen=True)
 class InlierMatches:
-    """Rows of keypoints of two photos that agree on a two-view geometry: of the first, of the second."""
+    """Keypoint rows, in the first and the second photo, of matches that agree on a two-view geometry."""
 
     first: Int64[np.ndarray, " m"]
     second: Int64[np.ndarray, " m"]
@@ -82,10 +82,10 @@ NOTHING = InlierMatches(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 def glimpse(photo: CheckedPhoto) -> QuickFeatures:
-    """Read a photo, find its largest keypoints at low resolution, and measure detail and brightness around them.
+    """Read a photo, extract its largest keypoints at low resolution, and measure detail and brightness around them.
 
     Raises:
-        SplatpipeError: if the file is gone or is no longer the one that was checked.
+        SplatpipeError: If the file is missing or has changed since it was checked.
     """
     grey = read_grey(photo)
     small = reduced(grey, LONGEST_PX)
@@ -117,14 +117,14 @@ def glimpse(photo: CheckedPhoto) -> QuickFeatures:
 
 
 def match_glimpses(glimpses: Sequence[QuickFeatures], pairs: Iterable[Pair], threads: int) -> dict[Pair, InlierMatches]:
-    """Match pairs of photos; each with what agrees, nothing included."""
+    """Match pairs of photos; return the inliers of each pair, which may be empty."""
     listed = sorted(set(pairs))
     found = ordered_map(lambda pair: agreement(glimpses[pair[0]], glimpses[pair[1]]), listed, threads)
     return dict(zip(listed, found, strict=True))
 
 
 def agreement(first: QuickFeatures, second: QuickFeatures) -> InlierMatches:
-    """Keypoints of two photos that are mutually nearest and agree on a fundamental matrix."""
+    """Return the mutual nearest neighbours of two photos that agree on a fundamental matrix."""
     rows, columns = _mutual(first.descriptors, second.descriptors)
     if len(rows) < LEAST_MATCHES:
         return NOTHING
@@ -143,7 +143,7 @@ def agreement(first: QuickFeatures, second: QuickFeatures) -> InlierMatches:
 def _mutual(
     first: Float32[np.ndarray, "n 128"], second: Float32[np.ndarray, "m 128"]
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
-    """Rows that are each other's nearest, by far."""
+    """Return the rows of mutual nearest neighbours that pass the ratio test."""
     if min(len(first), len(second)) < 2:
         return NOTHING.first, NOTHING.second
     cosines = first @ second.T

@@ -1,7 +1,7 @@
-"""The matches that mapping starts from: those of each photo's best keypoints, spread over the photo.
+"""Reduce the matches that mapping starts from to those of each photo's best keypoints, spread over the photo.
 
-A keypoint that more pairs of photos verified ties more cameras together, and some hundred well spread over a photo
-place it as well as thousands. Mapping costs as its matches do, so the others come in when the cameras stand.
+A keypoint verified in more pairs ties more cameras together, and a few hundred that are well spread over a photo place
+it as well as thousands. The cost of mapping grows with its matches, so the others are added once the cameras are known.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from jaxtyping import Bool, Int64
 
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-GRID = 8  # cells along either side of a photo; its keypoints are taken cell by cell
-PAIR_FLOOR = 60  # matches that every pair keeps if it has them: twice what COLMAP places a photo by
+GRID = 8  # cells along each side of a photo; its keypoints are chosen cell by cell
+PAIR_FLOOR = 60  # matches that every pair keeps if it has them: twice COLMAP's minimum for placing a photo
 
 
 def best_keypoints(verified: ViewGraph, wanted: int) -> dict[int, Bool[np.ndarray, " n"]]:
-    """Which keypoints of each photo mapping starts from.
+    """Choose the keypoints of each photo that mapping starts from.
 
-    Photo after photo, in the order of their numbers: those that are in already because they match one of an earlier
-    photo, then the most often verified of each cell in turn until there are enough. What matches a keypoint that comes
-    in comes in as well, so that tracks stay whole.
+    Photos are processed in the order of their numbers. Each keeps the keypoints already chosen because they match one
+    of an earlier photo, then adds the most often verified of each cell in turn until there are enough. The direct
+    matches of an added keypoint are chosen too, to keep tracks together.
 
     Args:
         verified: The view graph.
-        wanted: Keypoints a photo; it may get more by its partners.
+        wanted: Keypoints per photo; matches with other photos may add more.
 
     Returns:
         By COLMAP's number of the photo, a flag for each of its keypoints.
@@ -53,7 +53,7 @@ def best_keypoints(verified: ViewGraph, wanted: int) -> dict[int, Bool[np.ndarra
 def _edges(
     verified: ViewGraph, starts: dict[int, int]
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Both ends of each verified match among all keypoints, photo after photo, and the number of its pair."""
+    """Return both ends of each verified match, as indices into all keypoints photo after photo, and its pair number."""
     pairs = sorted(verified.matches)
     if not pairs:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -66,7 +66,7 @@ def _edges(
 def _up_to_floor(
     pair: Int64[np.ndarray, " m"], kept: Bool[np.ndarray, " m"], degree: Int64[np.ndarray, " m"]
 ) -> Int64[np.ndarray, " _"]:
-    """Matches to add so that each pair keeps its floor: those whose ends are verified most often."""
+    """Return the matches to add so that each pair reaches its floor: those whose ends are verified most often."""
     missing = PAIR_FLOOR - np.bincount(pair[kept], minlength=int(pair.max(initial=-1)) + 1)
     left = np.flatnonzero(~kept & (missing[pair] > 0))
     order = left[np.lexsort((left, -degree[left], pair[left]))]
@@ -78,7 +78,7 @@ def _up_to_floor(
 def _neighbours(
     first: Int64[np.ndarray, " m"], second: Int64[np.ndarray, " m"], count: int
 ) -> tuple[Int64[np.ndarray, " twice"], Int64[np.ndarray, " offsets"]]:
-    """All partners, keypoint after keypoint, and where each keypoint's begin."""
+    """Return all matched keypoints, keypoint after keypoint, and the offset at which each keypoint's begin."""
     ends = np.concatenate([first, second])
     order = np.argsort(ends, kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=count))])
@@ -96,7 +96,7 @@ def _gather(
 def _spread_best(
     places: np.ndarray, degree: Int64[np.ndarray, " n"], chosen: Bool[np.ndarray, " n"], wanted: int
 ) -> Int64[np.ndarray, " _"]:
-    """Rows to add so that ``wanted`` are chosen: each cell's first, then each cell's second, and so on."""
+    """Return the rows to add so that ``wanted`` are chosen: each cell's best, then each cell's second, and so on."""
     usable = np.flatnonzero(degree > 0)
     missing = wanted - int(np.count_nonzero(chosen))
     if missing <= 0 or len(usable) == 0:
@@ -112,15 +112,15 @@ def _spread_best(
 
 
 def write_reduced(database: Path, target: Path, chosen: Mapping[int, Bool[np.ndarray, " n"]]) -> tuple[int, int]:
-    """Write a database whose verified matches are those between chosen keypoints; keypoints keep their numbers.
+    """Write a database with only the verified matches between chosen keypoints; keypoints keep their indices.
 
     Args:
-        database: The whole one; only read.
+        database: The complete database; only read.
         target: The database to write.
         chosen: Flags of each photo's keypoints.
 
     Returns:
-        Verified matches kept, and of how many.
+        Number of verified matches kept, and the total.
     """
     kept, total = 0, 0
     with pycolmap.Database.open(database) as source, pycolmap.Database.open(target) as reduced:

@@ -1,7 +1,7 @@
-"""Which photos look alike: their own descriptors, aggregated over a codebook that is learnt from the capture.
+"""Visual similarity of photos: their descriptors, aggregated over a codebook that is learnt from the capture.
 
-Descriptors are whole numbers, and so are the codebook and the aggregates here: products of them are exact in floating
-point whatever the order of summation, so that the answer is the same for any linear algebra library and its threads.
+Descriptors are integers, and so are the codebook and the aggregates here: their products are exact in floating point
+whatever the order of summation, so the result is the same for any linear algebra library and number of threads.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ AGGREGATE_NORM = 2048.0  # of a photo's vector before rounding: products stay be
 
 
 def look_alike_costs(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Costs:
-    """Costs from the photos' content: the negative similarity of their aggregated descriptors.
+    """Return costs from the photos' content: the negative similarity of their aggregated descriptors.
 
     Args:
-        descriptors: Of each photo, the largest keypoints first; asked for twice, one after the other.
-        seed: Of the codebook.
+        descriptors: Descriptors of each photo, largest keypoints first; iterated twice in sequence.
+        seed: For the codebook.
     """
     words = codebook(descriptors, seed)
     vectors = np.empty((len(descriptors), words.size), np.float32)
@@ -55,7 +55,7 @@ def codebook(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Fl
 
 
 def assign(values: Float32[np.ndarray, "n 128"], words: Float32[np.ndarray, "words 128"]) -> Int64[np.ndarray, " n"]:
-    """The nearest word of each descriptor, the first among equals."""
+    """Return the nearest word of each descriptor, the first in case of ties."""
     norms = (words * words).sum(axis=1)
     return np.asarray((norms - 2.0 * (values @ words.T)).argmin(axis=1), np.int64)
 
@@ -63,9 +63,9 @@ def assign(values: Float32[np.ndarray, "n 128"], words: Float32[np.ndarray, "wor
 def aggregate(
     photo: UInt8[np.ndarray, "n 128"], words: Float32[np.ndarray, "words 128"]
 ) -> Float32[np.ndarray, " length"]:
-    """A photo's vector of locally aggregated descriptors (VLAD; Jégou et al., CVPR 2010), rounded.
+    """Compute a photo's vector of locally aggregated descriptors (VLAD; Jégou et al., CVPR 2010), rounded.
 
-    Residuals are summed a word, normalised a word (Arandjelović and Zisserman, CVPR 2013), then as a whole.
+    Residuals are summed and normalised per word (Arandjelović and Zisserman, CVPR 2013), then as a whole.
     """
     values = photo.astype(np.float32)
     labels = assign(values, words)
@@ -90,5 +90,5 @@ def _sums(
 
 
 def _spread(photo: UInt8[np.ndarray, "n 128"], wanted: int) -> UInt8[np.ndarray, "_ 128"]:
-    """At most ``wanted`` rows, evenly spread over all; copied, since a view would keep all of them in memory."""
+    """Return at most ``wanted`` evenly spaced rows; copied, since a view would keep all of them in memory."""
     return photo[:: max(1, -(-len(photo) // wanted))].copy()

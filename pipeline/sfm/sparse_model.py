@@ -1,4 +1,4 @@
-"""Writes COLMAP models, and makes sure that they are there: pycolmap does not say so when the disk is full."""
+"""Write COLMAP models and verify them: pycolmap does not report a full disk."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pathlib import Path
 
 import pycolmap
 
-CAMERA_BYTES = 24  # id, model, width, height; then 8 a parameter
-IMAGE_BYTES = 73  # id, pose, camera id, the name's end, number of points; then the name, and 24 a point
-POINT_BYTES = 51  # id, place, colour, error, length of the track; then 8 an element
+CAMERA_BYTES = 24  # id, model, width, height; plus 8 per parameter
+IMAGE_BYTES = 73  # id, pose, camera id, the name's terminator, number of points; plus the name, and 24 per point
+POINT_BYTES = 51  # id, position, colour, error, track length; plus 8 per track element
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model as .bin files into a new folder, and read it back.
+    """Write a model as .bin files to a new folder, and read it back.
 
-    Sizes are compared first: pycolmap ends the whole process when it reads a file of points that was cut off.
+    Sizes are compared first: pycolmap aborts the whole process when it reads a truncated points file.
 
     Raises:
-        OSError: ENOSPC, if the files are not whole.
+        OSError: ENOSPC, if the files are incomplete.
     """
     folder.mkdir(parents=True)
     model.write_binary(folder)
@@ -33,7 +33,7 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     }
     for name, size in expected.items():
         path = folder / name
-        if not path.is_file() or path.stat().st_size < 8 + size:  # 8: how many there are
+        if not path.is_file() or path.stat().st_size < 8 + size:  # 8: the element count
             raise _full(path)
     try:
         read = pycolmap.Reconstruction(folder)
