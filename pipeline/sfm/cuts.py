@@ -26,7 +26,7 @@ LEAST_MATCHES_APART = 1.0  # minimum for the consistent matches across a cut, to
 
 @dataclass(frozen=True)
 class GraphCut:
-    """The two groups that disagree most.
+    """The two groups of photos that disagree most.
 
     Attributes:
         group: Image ids of the smaller group.

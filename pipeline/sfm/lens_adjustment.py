@@ -67,7 +67,7 @@ def stated_prior(camera: pycolmap.Camera) -> LensPrior:
 
 
 def corner_effects(camera: pycolmap.Camera) -> dict[str, Float64[np.ndarray, "n 2"]]:
-    """Return the displacement of pixels at corners and edges per unit of each parameter, by name."""
+    """Return the displacement of the image corners, edge midpoints and centre per unit of each parameter, by name."""
     places = [[x, y] for x in (0.0, camera.width / 2, camera.width) for y in (0.0, camera.height / 2, camera.height)]
     rays = np.asarray(camera.cam_from_img(np.array(places)), np.float64)
     rays = np.concatenate([np.where(np.isfinite(rays), rays, 0.0), np.ones((len(rays), 1))], axis=1)
@@ -200,7 +200,7 @@ def corner_sigma_px(
         free: Names of the free parameters.
 
     Returns:
-        The largest standard deviation of a corner or edge position, pixels.
+        The largest standard deviation at a corner or edge midpoint, pixels.
     """
     order = [name for name in NAMES[camera.model_name] if name in set(free)]
     rows = [order.index(name) for name in names]

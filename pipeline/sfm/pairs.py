@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.footprints import StatedPoses, overlaps
 
 Pair = tuple[int, int]
 Costs = Callable[[int], Float64[np.ndarray, " n"]]
-"""How unlikely each photo is to see what photo i sees; infinite where nothing is known."""
+"""Costs of all photos as partners of photo i, lower for likelier overlap; infinite where nothing is known."""
 
 LOCATED_SHARE = 0.8  # of the photos must have positions for spatial pairing
 SPREAD_OVER_SIGMA = 2.0  # positions that spread less than this times their sigma say nothing about neighbours

@@ -13,11 +13,11 @@ from jaxtyping import Float32, UInt32
 
 @dataclass(frozen=True)
 class ViewGraph:
-    """The view graph; images and cameras under COLMAP's numbers, which count from 1 in name order.
+    """The view graph; images and cameras have COLMAP's numbers, which count from 1 in name order.
 
     Attributes:
-        names: Of all photos, placed or not.
-        camera_of: The camera of each.
+        names: Names of all photos, placed or not.
+        camera_of: Camera id of each photo.
         cameras: As they were before mapping: focal lengths from the metadata.
         keypoints: Locations in the stored pixel grid, pixels; the centre of the first pixel is at (0.5, 0.5).
         matches: For each pair (i, j), i < j, that has any: keypoint rows in i and in j, geometrically verified.
