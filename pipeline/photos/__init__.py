@@ -1,1 +1,1 @@
-"""Photos: what their metadata say, the checked list, and the undistorted dataset."""
+"""Photos: their metadata, the checked photo list, and the undistorted dataset."""

@@ -1,4 +1,4 @@
-"""Conventions of a camera's yaw, pitch and roll, brought to that of gimbals: pitch -90 straight down."""
+"""Convert the conventions of a camera's yaw, pitch and roll to that of gimbals: pitch -90 is straight down."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ from typing import Literal
 from scipy.spatial.transform import Rotation
 
 Convention = Literal["gimbal", "nadir"]
-DOWNWARD_DEG = -60.0  # who looks further down than this counts from the horizon: from nadir it would look back and up
-LOCKED = 1e-6  # cosine of the pitch: straight down, where yaw and roll turn about one axis
+DOWNWARD_DEG = -60.0  # a lower pitch is counted from the horizon: counted from nadir, it would look backwards and up
+LOCKED = 1e-6  # cosine of the pitch: straight down, gimbal lock, where yaw and roll turn about the same axis
 
 
 def tell_convention(pitches_deg: Iterable[float]) -> Convention:
-    """Where the pitch of a camera's photos is counted from: 0 is the horizon (``gimbal``) or straight down (``nadir``).
+    """Detect what pitch 0 means in a camera's photos: the horizon (``gimbal``) or straight down (``nadir``).
 
-    Pix4D's ``Camera:`` tags count from nadir, and some makers write the gimbal's angle there all the same. Photos that
-    are taken for mapping look down in part: as -90 from the horizon, as 0 from nadir, where -60 or less would look
-    back past the horizontal's half.
+    Pix4D's ``Camera:`` tags count from nadir, but some makers write the gimbal's angle there. Some mapping photos
+    always look down: -90 counted from the horizon, 0 counted from nadir, where -60 or less would look far backwards.
     """
     pitches = [(pitch + 180.0) % 360.0 - 180.0 for pitch in pitches_deg]
     return "gimbal" if pitches and min(pitches) <= DOWNWARD_DEG else "nadir"
 
 
 def gimbal_from_nadir(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
-    """Angles of an aircraft whose camera looks down between its wings, as those of a gimbal.
+    """Convert the angles of an aircraft whose camera looks straight down to those of a gimbal.
 
     Args:
-        yaw_deg: Of the top of the picture, clockwise from north.
+        yaw_deg: Of the top of the image, clockwise from north.
         pitch_deg: Nose up, so that the camera looks forward.
         roll_deg: Right wing down.
 

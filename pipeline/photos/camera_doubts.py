@@ -1,4 +1,4 @@
-"""Photos that do not go with the others: of another camera, another zoom, another size."""
+"""Photos that do not match the others: another camera, another zoom, another size."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.doubts import Doubt
 from splatpipe.pipeline.photos.names import some
 
-MINORITY = 0.25  # of the photos: a camera that took more of them was meant to
+MINORITY = 0.25  # of the photos: a camera that took more of them was used on purpose
 
 
 def camera_doubts(
     photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int]
 ) -> list[Doubt]:
-    """What speaks against one camera, one zoom, and photos as it wrote them.
+    """Report mixed cameras, mixed zoom settings, and photos that were resized or cropped.
 
     Args:
-        photos: Those that take part.
+        photos: The photos in use.
         groups: Their cameras.
-        camera_of: The camera of each photo.
+        camera_of: Index of each photo's camera in ``groups``, by name.
     """
     resized = {photo.name: _resizing(photo) for photo in photos}
     sizes = Counter(resized.values())
@@ -47,7 +47,7 @@ def camera_doubts(
 
 
 def _resizing(photo: CheckedPhoto) -> str:
-    """What was done to a photo's size, as EXIF tells; empty where nothing was."""
+    """Describe how a photo's size was changed, judged by its EXIF; empty if it was not."""
     taken = photo.exif.width, photo.exif.height
     if taken[0] is None or taken[1] is None:
         return ""
@@ -61,7 +61,7 @@ def _resizing(photo: CheckedPhoto) -> str:
 def _mixed_cameras(
     photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int], resized: set[str]
 ) -> list[Doubt]:
-    """The cameras of few photos one by one, those of many once."""
+    """Report cameras with few photos one by one, and those with many photos together."""
     if len(groups) < 2:
         return []
     members: dict[int, list[CheckedPhoto]] = {}

@@ -1,11 +1,11 @@
-"""Coded square targets in a photo, ArUco's and AprilTag's: which they are, and where their centres are.
+"""Detect coded square targets (ArUco and AprilTag) in a photo: their ids and centres.
 
-OpenCV's detector finds dark squares and reads them (Garrido-Jurado et al., "Automatic generation and detection of
+OpenCV's detector finds dark squares and decodes them (Garrido-Jurado et al., "Automatic generation and detection of
 highly reliable fiducial markers under occlusion", Pattern Recognition 2014; Olson, "AprilTag", ICRA 2011). Small ones
-are read in an enlarged picture: a cell of two pixels blurs into its neighbours otherwise.
+are decoded in an enlarged image: otherwise a cell of two pixels blurs into its neighbours.
 
-Dictionaries with few bits read something into noise: of those with 16 bits no error is corrected. A square that two
-dictionaries read is told as both: the names of control points say which one is meant.
+Dictionaries with few bits find codes in noise: for those with 16 bits, no bit error is corrected. A square that two
+dictionaries decode is reported for both: the names of the ground control points say which one is meant.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-# OpenCV's smaller ones of a family are the first ids of the largest but for 4X4_1000 and others of another distance.
+# In OpenCV, a family's smaller dictionaries are the first ids of its largest, except 4X4_1000 and others with a
+# different Hamming distance.
 DICTIONARIES = (
     "DICT_APRILTAG_36h11",
     "DICT_APRILTAG_25h9",
@@ -30,12 +31,12 @@ DICTIONARIES = (
 )
 ENLARGED = 2
 SMALLEST_PX = 12.0  # side of a black square
-LARGEST_SHARE = 0.9  # of the picture's longer side
-TILE_PX, OVERLAP_PX = 1536, 160  # enlarged pictures are looked at in pieces, for the memory; larger squares as they are
+LARGEST_SHARE = 0.9  # of the image's longer side
+TILE_PX, OVERLAP_PX = 1536, 160  # enlarged images are searched in tiles, to save memory; larger squares at full size
 SAMPLES = 3  # along a cell's side
-LEAST_CORRELATION = 0.7  # of what is seen with what the dictionary has there
-# One square in 66 is a code of this one by chance (250 codes, turned in four ways, of 16 bits): eight times as many as
-# of any other. Windows of a façade reach 0.79, drawn ones from 20 px on have 0.86 at the least.
+LEAST_CORRELATION = 0.7  # of the pixels with the dictionary's pattern
+# One square in 66 is a code of this dictionary by chance (250 codes, four rotations, 16 bits): eight times as many as
+# for any other. Windows of a façade reach 0.79; rendered targets of 20 px or more have at least 0.86.
 DENSEST, LEAST_OF_DENSEST = "DICT_4X4_250", 0.83
 LEAST_CONTRAST = 25.0  # of 255
 CENTRE_SIGMA_PX = 0.1
@@ -43,15 +44,15 @@ CENTRE_SIGMA_PX = 0.1
 
 @dataclass(frozen=True)
 class CodedTarget:
-    """A target found.
+    """A detected target.
 
     Attributes:
-        dictionary: OpenCV's name without ``DICT_``, in small letters.
+        dictionary: OpenCV's name without ``DICT_``, in lower case.
         number: Its id.
         x: Of its centre, pixels; (0, 0) is the top-left corner of the first pixel.
-        y: The same.
-        size_px: The root of its black square's area.
-        sigma_px: Standard deviation of x and y.
+        y: Likewise.
+        size_px: Square root of its black square's area, pixels.
+        sigma_px: Standard deviation of x and y, pixels.
         score: Correlation of the pixels with the pattern.
     """
 
@@ -65,13 +66,13 @@ class CodedTarget:
 
 
 def find_coded_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[CodedTarget]:
-    """Find targets in a picture.
+    """Find coded targets in an image.
 
     Args:
         pixels: RGB.
 
     Returns:
-        By their dictionaries, ids and places.
+        The targets, sorted by dictionary, id and position.
     """
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
@@ -88,7 +89,7 @@ def find_coded_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[CodedTarget]:
 
 
 def _starts(length: int) -> list[int]:
-    """Where tiles begin that cover a side."""
+    """Start positions of the tiles that cover a side."""
     return list(range(0, max(length - OVERLAP_PX, 1), TILE_PX - OVERLAP_PX))
 
 
@@ -98,7 +99,7 @@ def _same(a: CodedTarget, b: CodedTarget) -> bool:
 
 
 def _found_in(grey: UInt8[np.ndarray, "h w"], scale: int, smallest_px: float) -> list[CodedTarget]:
-    """Those in a picture that is enlarged by a factor first."""
+    """Find the targets in an image that is first enlarged by ``scale``; coordinates are those of the original."""
     height, width = grey.shape
     if min(height, width) < smallest_px:
         return []
@@ -117,7 +118,7 @@ def _found_in(grey: UInt8[np.ndarray, "h w"], scale: int, smallest_px: float) ->
     for quad, number, index in zip(
         corners, [] if ids is None else ids.ravel(), [] if ids is None else which.ravel(), strict=True
     ):
-        # Centres of pixels are whole numbers to OpenCV, in the enlarged picture too.
+        # In OpenCV, pixel centres are whole numbers, in the enlarged image too.
         square = (quad.reshape(4, 2).astype(np.float64) + 0.5) / scale
         target = _judged(grey, square, dictionaries[int(index)], int(number), names[int(index)])
         if target is not None:
@@ -132,7 +133,7 @@ def _judged(
     number: int,
     name: str,
 ) -> CodedTarget | None:
-    """The target, if its pixels are those of one."""
+    """Return the target if its pixels match the dictionary's pattern, else None."""
     cells = dictionary.markerSize + 2
     ideal = dictionary.generateImageMarker(number, cells * SAMPLES).astype(np.float32)
     plane = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)

@@ -1,7 +1,7 @@
-"""COLMAP's binary model of pinhole photos, read without COLMAP: training and rendering run where pycolmap is not.
+"""Read COLMAP's binary model of pinhole photos without pycolmap, which training and rendering may lack.
 
-The format is that of COLMAP's documentation ("Output format", binary): little-endian, lengths first. What is read is
-checked against the file's size before memory is taken for it.
+The format is that of COLMAP's documentation ("Output format", binary): little-endian, lengths first. Lengths
+are checked against the file's size before memory is allocated.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 CAMERAS, IMAGES, POINTS = "cameras.bin", "images.bin", "points3D.bin"
-SIMPLE_PINHOLE, PINHOLE = 0, 1  # COLMAP's numbers of the models, with 3 and 4 parameters
+SIMPLE_PINHOLE, PINHOLE = 0, 1  # COLMAP's ids of the camera models, with 3 and 4 parameters
 LONGEST_NAME_BYTES = 4096
-UNMATCHED = -1  # the id of no point: all 64 bits set
+UNMATCHED = -1  # a keypoint without a point: all 64 bits set
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
@@ -30,7 +30,7 @@ _ELEMENT_BYTES = 8  # of a track: two 32-bit numbers
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A camera: its size and, in pixels, its focal lengths and principal point."""
+    """A pinhole camera: its size, focal lengths and principal point, in pixels."""
 
     width: int
     height: int
@@ -48,7 +48,7 @@ class ModelPhoto:
         name: Its name.
         camera: Its camera.
         cam_from_world: Its pose.
-        points: Ids of the points that it observes, a keypoint each, in the order of its keypoints.
+        points: Ids of the points that it observes, one per keypoint, in the order of its keypoints.
     """
 
     name: str
@@ -59,14 +59,14 @@ class ModelPhoto:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """The points, by ascending id.
+    """The sparse points, by ascending id.
 
     Attributes:
-        ids: COLMAP's numbers.
-        xyz: World units.
+        ids: COLMAP's ids.
+        xyz: Positions, world units.
         rgb: Colours.
-        errors_px: Mean reprojection errors; -1 where not known.
-        track_lengths: Photos that observe each.
+        errors_px: Mean reprojection errors, pixels; -1 where not known.
+        track_lengths: Number of photos that observe each.
     """
 
     ids: Int64[np.ndarray, " n"]
@@ -77,14 +77,14 @@ class Cloud:
 
 
 def read_photos(folder: Path) -> list[ModelPhoto]:
-    """The posed photos of a model, by ascending id.
+    """Read the posed photos of a model, by ascending id.
 
     Args:
         folder: With `cameras.bin` and `images.bin`.
 
     Raises:
         OSError: if a file cannot be read.
-        ValueError: if one is broken, or a camera is no pinhole.
+        ValueError: if one is broken, or a camera is not a pinhole camera.
     """
     cameras = _read_cameras(_File(folder / CAMERAS))
     file = _File(folder / IMAGES)
@@ -101,7 +101,7 @@ def read_photos(folder: Path) -> list[ModelPhoto]:
 
 
 def read_cloud(folder: Path) -> Cloud:
-    """The points of a model.
+    """Read the sparse points of a model.
 
     Args:
         folder: With `points3D.bin`.
@@ -141,9 +141,9 @@ def _read_cameras(file: _File) -> dict[int, Pinhole]:
 
 
 def _matrix(pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "4 4"]:
-    """A pose as a matrix, from its quaternion (w, x, y, z) and translation.
+    """Convert a pose from quaternion (w, x, y, z) and translation to a matrix.
 
-    The sums are those of Eigen's ``toRotationMatrix``, so that COLMAP's matrices come out to the bit.
+    The sums are those of Eigen's ``toRotationMatrix``, so that the result equals COLMAP's matrices bit for bit.
     """
     if not np.isfinite(pose).all():
         raise ValueError(f"{IMAGES}: a pose that is not finite")
@@ -162,7 +162,7 @@ def _matrix(pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "4 4"]:
 
 
 class _File:
-    """Bytes of an untrusted file, taken one after the other."""
+    """Sequential reader of an untrusted file."""
 
     def __init__(self, path: Path) -> None:
         with path.open("rb") as file:
@@ -180,21 +180,21 @@ class _File:
         self._at += length
 
     def count(self, least_bytes: int) -> int:
-        """A number of entries, each of which takes so many bytes at least."""
+        """Read a number of entries, each of which takes at least ``least_bytes``."""
         (number,) = self.take(_COUNT)
         if number * least_bytes > len(self._data) - self._at:
             raise ValueError(f"{self._name} claims {number} entries, more than it has bytes for")
         return int(number)
 
     def array(self, kind: np.dtype[np.void]) -> np.ndarray:
-        """Entries of one kind, their number before them."""
+        """Read an array of entries, preceded by their number."""
         number = self.count(kind.itemsize)
         start = self._at
         self.skip(number * kind.itemsize)
         return np.frombuffer(self._data, kind, number, start)
 
     def name(self) -> str:
-        """Text up to its zero."""
+        """Read a zero-terminated text."""
         window = bytes(self._data[self._at : self._at + LONGEST_NAME_BYTES])
         length = window.find(0)
         if length < 0:

@@ -1,4 +1,4 @@
-"""Turns photos that are not plain 8-bit RGB or grey into PNGs that every reader takes."""
+"""Convert photos that are not plain 8-bit RGB or grey to PNGs that every reader supports."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from PIL import Image
 from splatpipe.pipeline.photos.check import CheckedPhoto, deep_pixels, stored_orientation
 from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, read_checked
 
-PNG_LEVEL = 1  # zlib's fastest: half the size at ten times the time is no bargain for an intermediate file
+PNG_LEVEL = 1  # zlib's fastest: half the size is not worth ten times the time for an intermediate file
 FULL_RANGE = 65535.0
 NARROW_RANGE = FULL_RANGE / 4  # 16-bit files that use less hold 10 to 14 bits, or temperatures
 
 
 def scale_of(ranges: list[tuple[float, float]]) -> tuple[float, float]:
-    """The values that become black and white in all photos of one camera, so that their brightness stays comparable.
+    """Choose the values that become black and white in all photos of one camera, so that brightness stays comparable.
 
     Args:
         ranges: Lowest and highest value of each photo.
 
     Returns:
-        0 and 65535 for photos that use the 16 bits; else the lowest and the highest value of all.
+        0 and 65535 for photos that use the full 16 bits; else the lowest and the highest value of all photos.
     """
     low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
     if low >= 0.0 and high <= FULL_RANGE and high - low >= NARROW_RANGE:
@@ -38,11 +38,11 @@ def read_8bit(
     """Decode a photo of any kind to 8 bits, in the stored grid.
 
     Args:
-        photo: One that was checked.
+        photo: A checked photo.
         scale: Of a deep photo: the values that become 0 and 255.
 
     Returns:
-        (h, w, 3) RGB or (h, w) grey, uint8; and the opacity, 0 to 255, or None for an opaque picture.
+        (h, w, 3) RGB or (h, w) grey, uint8; and the opacity, 0 to 255, or None for an opaque photo.
     """
     data = read_checked(photo.path, photo.name, photo.sha256)
     with open_picture(BytesIO(data)) as picture:
@@ -64,12 +64,12 @@ def convert_photo(
     """Write a photo's 8-bit PNG.
 
     Args:
-        photo: One that is not plain.
+        photo: A checked photo that is not plain.
         scale: Of a deep photo: the values that become 0 and 255.
-        target: The PNG; its folder is made.
+        target: The PNG; its folder is created.
 
     Returns:
-        Its mask from transparency, 0 where more transparent than not, else 255; None for an opaque photo.
+        Its mask from transparency, 0 where opacity is below half, else 255; None for an opaque photo.
     """
     pixels, opacity = read_8bit(photo, scale)
     save_png(pixels, target)
@@ -79,7 +79,7 @@ def convert_photo(
 
 
 def save_png(pixels: UInt8[np.ndarray, "h w *channels"], target: Path) -> None:
-    """Write a PNG without any metadata; makes its folder."""
+    """Write a PNG without any metadata, creating its folder."""
     target.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.ascontiguousarray(pixels)).save(target, format="PNG", compress_level=PNG_LEVEL)
 

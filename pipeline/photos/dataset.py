@@ -1,4 +1,4 @@
-"""The dataset that `undistort` leaves and training reads: `images/`, `masks/` and `sky_masks/` if any, `sparse/0`."""
+"""The dataset that `undistort` writes for training: `images/`, `masks/` and `sky_masks/` if any, `sparse/0`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class View:
         camera: Its pinhole camera; ``camera.name`` is the photo's name.
         image_path: The undistorted photo, in the camera's grid.
         mask_path: Its mask (8-bit, 0 = ignored, same grid), or None.
-        sky_path: The mask of its sky (8-bit, 0 = something else, same grid), or None where nobody drew one.
+        sky_path: Its sky mask (8-bit, 0 = not sky, same grid), or None if the user supplied none.
     """
 
     camera: Camera
@@ -49,7 +49,7 @@ class Points:
     Attributes:
         xyz: Positions, world units.
         rgb: Colours.
-        track_lengths: How many photos each was seen in.
+        track_lengths: Number of photos that observe each.
         errors_px: Mean reprojection error of each, pixels of the undistorted photos; -1 where not known.
     """
 
@@ -63,17 +63,17 @@ class Points:
 
 
 def image_path(dataset: Path, name: str) -> Path:
-    """Where the undistorted photo of that name lies."""
+    """Return the path of the undistorted photo of that name."""
     return dataset / IMAGES / PurePosixPath(name)
 
 
 def mask_path(dataset: Path, name: str, folder: str = MASKS) -> Path:
-    """Where its mask lies, if it has one: COLMAP's convention, the photo's whole name with `.png` after it."""
+    """Return the path of its mask, by COLMAP's convention: the photo's full name followed by `.png`."""
     return dataset / folder / PurePosixPath(f"{name}.png")
 
 
 def load_views(dataset: Path) -> list[View]:
-    """The dataset's photos with their cameras, sorted by name.
+    """Load the dataset's photos with their cameras, sorted by name.
 
     Args:
         dataset: The folder that `undistort` left.
@@ -97,7 +97,7 @@ def _view(dataset: Path, photo: ModelPhoto) -> View:
 
 
 def load_points(dataset: Path) -> Points:
-    """The dataset's sparse points.
+    """Load the dataset's sparse points.
 
     Args:
         dataset: The folder that `undistort` left.
@@ -109,7 +109,7 @@ def load_points(dataset: Path) -> Points:
 
 
 def load_points_and_tracks(dataset: Path) -> tuple[Points, dict[str, Int64[np.ndarray, " _"]]]:
-    """The sparse points, and which of them each photo observes: rows by the photo's name, ascending, each once.
+    """Load the sparse points, and the rows of those that each photo observes: by photo name, ascending, each once.
 
     Args:
         dataset: The folder that `undistort` left.
@@ -123,7 +123,7 @@ def load_points_and_tracks(dataset: Path) -> tuple[Points, dict[str, Int64[np.nd
 
 
 def _rows(cloud: Cloud, photo: ModelPhoto) -> Int64[np.ndarray, " _"]:
-    """Which rows of the points a photo observes."""
+    """Return the rows of the points that a photo observes."""
     observed = np.unique(photo.points)
     rows = np.searchsorted(cloud.ids, observed)
     if observed.size and not np.array_equal(cloud.ids[np.minimum(rows, len(cloud.ids) - 1)], observed):

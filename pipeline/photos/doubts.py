@@ -1,4 +1,4 @@
-"""What is doubtful about photos, as it is told; positions that cannot be right, judged by those of the other photos."""
+"""Doubts about a capture's photos, as reported; detection of positions that cannot be right, given the others."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-METRES_A_DEGREE = 111_195.0  # of a sphere: these distances only tell what is far
-FAR_M = 500.0  # no drone photographs one building from further
-FAR_SPREADS = 20.0  # times the median distance from the middle: long corridors are captures, too
-MIN_POSITIONS = 3  # of two, nobody knows which is wrong
+METRES_A_DEGREE = 111_195.0  # of a sphere: these distances only serve to detect what is far
+FAR_M = 500.0  # nobody photographs one building with a drone from farther away
+FAR_SPREADS = 20.0  # times the median distance from the middle: long corridors are valid captures, too
+MIN_POSITIONS = 3  # of two, it cannot be known which is wrong
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Something that may be wrong with a capture, as a run warns of it and a preflight tells it.
+    """Something that may be wrong with a capture: a warning of a run, or a finding of the preflight.
 
     Attributes:
         code: What it is, for programs.
         message: One sentence.
         hint: What to do about it.
-        photos: Names of those that it is about; empty where it is about the whole capture.
+        photos: Names of the photos concerned; empty if it concerns the whole capture.
         weight: A ``note`` costs neither photos nor accuracy.
     """
 
@@ -35,13 +35,13 @@ class Doubt:
 
 
 def find_wrong(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:
-    """Photos that state to be far from all others, and why.
+    """Find photos whose stated position is far from all others.
 
     Args:
         places: Latitude and longitude in degrees, by photo.
 
     Returns:
-        The end of a sentence that starts with the photo's name, by photo.
+        The reason by photo, as the end of a sentence that starts with the photo's name.
     """
     if len(places) < MIN_POSITIONS:
         return {}
@@ -62,11 +62,11 @@ def find_wrong(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:
 
 
 def median_distance_m(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]]) -> float:
-    """Median distance between two statements of where the same photos were taken; 0 without any.
+    """Median distance in metres between two sets of positions of the same photos; 0 without any.
 
     Args:
         first: Latitude and longitude in degrees.
-        second: The same, of the other.
+        second: The same, of the other set.
     """
     if not first:
         return 0.0
@@ -77,6 +77,6 @@ def median_distance_m(first: Sequence[tuple[float, float]], second: Sequence[tup
 
 
 def _distances_m(places: Float64[np.ndarray, "n 2"], middle: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " n"]:
-    """Along the meridian and the parallel; enough to tell what is far."""
+    """Distances in metres, along the meridian and the parallel; accurate enough to detect what is far."""
     east = (places[:, 1] - middle[1]) * np.cos(np.radians(middle[0]))
     return np.asarray(METRES_A_DEGREE * np.hypot(places[:, 0] - middle[0], east))

@@ -1,4 +1,4 @@
-"""Photos that are there twice: they would count double in matching and put a test photo among the trained ones."""
+"""Duplicate photos: they would count double in matching, and a held-out photo could be among the training photos."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto]
         photos: Sorted by name.
 
     Returns:
-        The photos that stay, and the others with the twin's name.
+        The photos that are kept, and the duplicates, with the name of the photo that each one equals.
     """
     kept: list[CheckedPhoto] = []
     left_out: list[ExcludedPhoto] = []

@@ -1,4 +1,4 @@
-"""What EXIF says about a photo, from untrusted bytes: every value is checked, a bad one is None."""
+"""A photo's EXIF, from untrusted bytes: every value is checked, and an invalid one is None."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ VOID = "V"  # GPSStatus of a receiver without a fix
 
 @dataclass(frozen=True)
 class Gps:
-    """A position as EXIF states it: NaN where a value is there but is none; not yet checked for plausibility.
+    """A position as EXIF states it: NaN where a value is present but invalid; not yet checked for plausibility.
 
     Attributes:
         latitude: Degrees north, WGS84.
         longitude: Degrees east, WGS84.
-        altitude_m: Metres above what AltitudeRef calls sea level, or None.
+        altitude_m: Metres above the reference that GPSAltitudeRef names (sea level), or None.
         horizontal_error_m: GPSHPositioningError, or None.
-        void: The receiver said that it had no fix.
+        void: Whether the receiver reported that it had no fix.
     """
 
     latitude: float
@@ -43,18 +43,18 @@ class Exif:
     """The tags that photogrammetry uses.
 
     Attributes:
-        make: Without NULs and blanks around; empty when unknown.
+        make: Without NULs and surrounding blanks; empty when unknown.
         model: Likewise.
         orientation: 1 to 8; 1 when unknown.
         time: ISO 8601 local time, or None.
         focal_mm: Focal length, or None.
         focal_35mm: Rounded 35 mm equivalent, or None.
         focal_plane_px_per_mm: FocalPlaneXResolution per millimetre, or None.
-        width: The picture's width when it was taken (PixelXDimension), or None.
+        width: The image's width as taken (PixelXDimension), or None.
         height: Likewise.
         gps: Position, or None when EXIF has none.
-        serial: Of the camera's body; empty when unknown.
-        exposure_ev: Exposure value at ISO 100 that shutter, aperture and sensitivity are right for, or None.
+        serial: Serial number of the camera body; empty when unknown.
+        exposure_ev: Exposure value at ISO 100, from shutter, aperture and sensitivity, or None.
     """
 
     make: str = ""
@@ -72,10 +72,10 @@ class Exif:
 
 
 def read_exif(picture: Image.Image) -> Exif:
-    """Read a picture's EXIF. Never raises: what cannot be read is left at its default.
+    """Read an image's EXIF; never raises, and leaves what cannot be read at its default.
 
     Args:
-        picture: Opened and not yet loaded (Pillow turns a TIFF, and forgets its orientation, when it loads).
+        picture: Opened and not yet loaded (on loading, Pillow rotates a TIFF and drops its orientation).
     """
     base = _tags(picture, None)
     tags = {**base, **_tags(picture, ExifTags.IFD.Exif)}
@@ -107,7 +107,7 @@ def _tags(picture: Image.Image, ifd: int | None) -> dict[int, Any]:
 
 
 def _number(value: Any, low: int | float, high: int | float) -> float | None:
-    """A finite number within bounds, else None; sequences of one count as their element."""
+    """A finite number within bounds, else None; a sequence of one element counts as that element."""
     if isinstance(value, (tuple, list)) and len(value) == 1:
         value = value[0]
     if isinstance(value, (str, bytes, bool)) or value is None:
@@ -182,7 +182,7 @@ def _gps(tags: Mapping[int, Any]) -> Gps | None:
 
 
 def _degrees(value: Any, reference: Any, negative: str) -> float:
-    """Degrees, minutes, seconds (or fewer of them) to signed degrees; NaN when they are none."""
+    """Convert degrees, minutes, seconds (or fewer of them) to signed degrees; NaN if they are invalid."""
     parts = value if isinstance(value, (tuple, list)) else (value,)
     numbers = [_number(part, -1e6, 1e6) for part in parts]
     if not 1 <= len(numbers) <= 3 or any(number is None for number in numbers):
