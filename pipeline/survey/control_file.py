@@ -1,8 +1,8 @@
-"""Files of surveyed points and of where photos show them: ODM's ``gcp_list.txt``, and a CSV with a header.
+"""Read control files, surveyed points and their marks in photos: ODM's ``gcp_list.txt``, and a CSV with a header.
 
-ODM (docs.opendronemap.org, "Ground Control Points"): the first line names the CRS, then one observation a line,
-``geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extra…]``, blanks or tabs between. ``#`` begins a comment. What is
-read is plain text from elsewhere: everything has a limit, and every refusal names the line.
+ODM (docs.opendronemap.org, "Ground Control Points"): the first line names the CRS, then one observation per line,
+``geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extra…]``, separated by blanks or tabs. ``#`` begins a comment. The
+text is untrusted: everything has a limit, and every error names the line.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from splatpipe.pipeline.survey.survey_text import (
 Role = Literal["control", "check"]
 MAX_POINTS = 10_000
 MAX_NAME = 255
-SAME_PLACE_M = 1e-3  # lines of one point repeat its coordinates; within a millimetre they do
-SEA_LEVEL_M = 20.0  # a height of exactly 0 is one, where other points lie so near to it; else nobody measured it
+SAME_PLACE_M = 1e-3  # lines of one point must repeat its coordinates to within a millimetre
+SEA_LEVEL_M = 20.0  # a height of exactly 0 counts as measured if another point is this close to 0, else as unknown
 SIGMA_BOUNDS_M = (1e-4, 1e3)
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "name": ("name", "label", "point", "point_name", "gcp", "gcp_name", "id"),
@@ -56,7 +56,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 }
 _NEEDED = ("x", "y", "photo", "px", "py")  # columns of a table
 _OF_MARKS = ("photo", "px", "py")
-_NEEDED_OF_POINTS = ("name", "x", "y")  # of one without marks
+_NEEDED_OF_POINTS = ("name", "x", "y")  # columns of a table without marks
 ROLES: Mapping[str, Role] = {
     "control": "control",
     "gcp": "control",
@@ -68,7 +68,7 @@ ROLES: Mapping[str, Role] = {
 
 @dataclass(frozen=True)
 class Mark:
-    """Where a photo shows a point: the file's pixel coordinates in the stored grid, as written."""
+    """A point's mark in a photo: the file's pixel coordinates in the stored grid, as written."""
 
     photo: str
     x: float
@@ -83,9 +83,9 @@ class SurveyedPoint:
         name: As written, or ``point N`` where lines have no name.
         x: Easting or longitude, in the file's CRS.
         y: Northing or latitude.
-        z: Height; None where nobody measured it.
-        sigma_m: Horizontal (each of two) and vertical standard deviation; None where the file states none.
-        role: None where the file leaves it open.
+        z: Height; None where not measured.
+        sigma_m: Horizontal (per axis) and vertical standard deviation; None where the file states none.
+        role: None where the file does not state it.
         marks: In the file's order.
     """
 
@@ -100,12 +100,12 @@ class SurveyedPoint:
 
 @dataclass(frozen=True)
 class ControlFile:
-    """What a control file says.
+    """The contents of a control file.
 
     Attributes:
-        crs: Its text.
+        crs: The CRS as written.
         points: In the order of their first lines.
-        zero_heights: Points whose height 0.0 was taken as unknown.
+        zero_heights: Points whose height of 0.0 was treated as unknown.
     """
 
     crs: str
@@ -127,13 +127,13 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A control file as it is written, for those who change it line by line.
+    """A control file as written, for editing it line by line.
 
     Attributes:
-        lines: All of it, numbered from 1.
-        header: Number of the header's line; None in ODM's list.
+        lines: All lines, numbered from 1.
+        header: Line number of the header; None in ODM's list.
         crs: As written.
-        rows: Its observations.
+        rows: The observations.
     """
 
     lines: tuple[tuple[int, str], ...]
@@ -158,7 +158,7 @@ def read_control_file(path: Path) -> ControlFile:
     """Read a file of control and check points.
 
     Raises:
-        SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
+        SplatpipeError: if it is not such a file; the message names the line, the hint what is expected there.
     """
     table = read_table(path)
     with line_errors(path, _KIND):
@@ -166,10 +166,10 @@ def read_control_file(path: Path) -> ControlFile:
 
 
 def read_points_file(path: Path) -> ControlFile:
-    """Read surveyed points that need not be marked yet: a control file, or a CSV with no more than name,x,y,z.
+    """Read surveyed points that need not be marked yet: a control file, or a CSV with only name,x,y,z.
 
     Raises:
-        SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
+        SplatpipeError: if it is not such a file; the message names the line, the hint what is expected there.
     """
     table = read_table(path, _NEEDED_OF_POINTS)
     with line_errors(path, _POINTS):
@@ -177,23 +177,23 @@ def read_points_file(path: Path) -> ControlFile:
 
 
 def read_table(path: Path, needed: Sequence[str] = _NEEDED) -> Table:
-    """Read a control file's lines; they may be of no observation yet.
+    """Read a control file's lines; it may have no observations yet.
 
     Args:
         path: The file.
-        needed: Columns without which a line is no header.
+        needed: Columns that a header must have.
 
     Raises:
-        SplatpipeError: if it is no such file.
+        SplatpipeError: if it is not such a file.
     """
     return parse_table(read_lines(path, _KIND if needed == _NEEDED else _POINTS), path, needed)
 
 
 def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[str] = _NEEDED) -> Table:
-    """The same of numbered lines; the path is for messages.
+    """Parse numbered lines of a control file; the path is for messages.
 
     Raises:
-        SplatpipeError: if they are no such file's.
+        SplatpipeError: if they are not a control file's.
     """
     kind = _KIND if needed == _NEEDED else _POINTS
     written = written_lines(lines, path, kind)
@@ -246,12 +246,12 @@ def _is_header(line: str, needed: Sequence[str]) -> bool:
     columns = find_columns(next(csv.reader([line], delimiter=delimiter)), COLUMNS)
     if set(needed) <= set(columns) or set(_NEEDED) <= set(columns):
         return True
-    # Points alone: targets in the photos are to be found, or marks made.
+    # Points only: targets are to be detected in the photos, or marks made by hand.
     return set(_NEEDED_OF_POINTS) <= set(columns) and not set(_OF_MARKS) & set(columns)
 
 
 def _require_no_header(number: int, line: str) -> None:
-    """Refuse a table's header that lacks columns, which would pass for a line of ODM's list."""
+    """Reject a CSV header that lacks columns: it would pass for a line of ODM's list."""
     columns = find_columns(next(csv.reader([line], delimiter=delimiter_of(line))), COLUMNS)
     missing = [name for name in _NEEDED if name not in columns]
     if missing and len(columns) >= len(_NEEDED) - 2:

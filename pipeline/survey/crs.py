@@ -1,13 +1,13 @@
-"""The exact way between coordinates in a CRS and WGS 84 latitude, longitude and height; nothing is guessed in silence.
+"""Exact conversion between coordinates in a CRS and WGS 84 latitude, longitude, height; nothing is guessed silently.
 
-PROJ does the mathematics (pyproj). By itself it falls back silently: to a rougher operation where a grid is missing, to
-a "ballpark" one where it knows none, and it leaves a height as it is where the geoid's grid is missing. So the
-operation is chosen here, named with its accuracy, and refused where a better one lacks its grid, unless the user
+PROJ does the mathematics (pyproj). By default it falls back silently: to a less accurate operation where a grid is
+missing, to a "ballpark" one where it knows none, and it leaves heights unchanged where the geoid grid is missing. So
+the operation is chosen here, named with its accuracy, and refused where a better one lacks its grid, unless the user
 accepts that.
 
 Coordinates are always east (or longitude) first, whatever the axis order of the CRS says, as in the files of ODM.
 
-Heights are kept as they are stated: in metres, in the datum `Crs.vertical`. Only `undulation` tells of another datum.
+Heights are kept as stated: in metres, in the datum `Crs.vertical`. Only `undulation` relates them to another datum.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ __all__ = [
 ]
 
 WGS84_3D = "EPSG:4979"
-MAX_OUTSIDE_KM = 300.0  # of a CRS's area of use: surveyors do stay in their zone across a border
-STRETCH = 0.05  # a projected length that differs more from the true one is of another part of the earth
-AROUND_DEG = 0.05  # of the points: where operations are compared
-MOST_ROUNDS = 10  # of the iteration to the exact inverse; each gains four digits
-TOLERANCE_M = 1e-6  # of it: float64 has 1e-9 m at a northing of 5,000 km
+MAX_OUTSIDE_KM = 300.0  # distance from a CRS's area of use: surveyors do stay in their zone across a border
+STRETCH = 0.05  # a projected length that differs more from the true one belongs to another part of the earth
+AROUND_DEG = 0.05  # around the points: where operations are compared
+MOST_ROUNDS = 10  # iterations to the exact inverse; each gains four digits
+TOLERANCE_M = 1e-6  # of the iteration: float64 resolves 1e-9 m at a northing of 5,000 km
 METRES_A_DEGREE = 111_000.0
 EARTH_RADIUS_KM = 6371.0
 GRIDS_SHOWN = 4
@@ -72,11 +72,11 @@ class Operation:
     """The operation between a CRS and WGS 84 (EPSG:4979) around a place.
 
     Attributes:
-        name: PROJ's.
-        accuracy_m: As EPSG states it; None where it does not.
+        name: PROJ's name for it.
+        accuracy_m: As stated by EPSG; None where it states none.
         definition: The PROJ pipeline from the CRS to longitude, latitude, height.
-        best: Whether no better one lacks a grid.
-        note: What was assumed, a sentence or empty.
+        best: False where a better operation exists but its grid is missing.
+        note: What was assumed: a sentence, or empty.
     """
 
     name: str
@@ -93,7 +93,7 @@ class GeodeticPoints:
 
     Attributes:
         geodetic: Latitude, longitude (degrees, WGS 84), height in metres as stated, in the CRS's vertical datum.
-        operation: What brought them there.
+        operation: The operation that converted them.
     """
 
     geodetic: Float64[np.ndarray, "n 3"]
@@ -106,12 +106,12 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
     Args:
         crs: The CRS.
         latitude: Of the place, degrees.
-        longitude: The same.
-        approximate: Take the best of those whose grids are there, though a better one lacks its grid; and a datum of
-            WGS 84's ellipsoid for WGS 84 where EPSG has no operation.
+        longitude: Likewise.
+        approximate: Accept the best operation whose grids are installed although a better one lacks its grid, and treat
+            a datum on WGS 84's ellipsoid as WGS 84 where EPSG has no operation.
 
     Raises:
-        SplatpipeError: if the place is far outside of the CRS's area, a grid is missing, or PROJ knows no operation.
+        SplatpipeError: if the place is far outside the CRS's area, a grid is missing, or PROJ knows no operation.
     """
     _require_near(crs, latitude, longitude)
     group = _quiet_group(crs.horizontal, latitude, longitude)
@@ -134,11 +134,11 @@ def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool 
 
     Args:
         points: Easting (or longitude), northing (or latitude), height in the CRS's units; a height may be NaN.
-        crs: Theirs.
+        crs: Their CRS.
         approximate: As in ``open_operation``.
 
     Raises:
-        SplatpipeError: as ``open_operation``, and if a point is not on the earth or far outside of the CRS's area.
+        SplatpipeError: as ``open_operation``, and if a point is not on the earth or far outside the CRS's area.
     """
     latitude, longitude = _rough_place(points, crs)
     _require_no_degrees(points, crs, latitude, longitude)
@@ -151,11 +151,11 @@ def to_geodetic(points: Float64[np.ndarray, "n 3"], crs: Crs, approximate: bool 
 
 
 def geodetic_by(operation: Operation, crs: Crs, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """As ``to_geodetic``, by an operation that is open already; points that it does not reach are infinite.
+    """As ``to_geodetic``, with an operation that is already open; points outside its reach are infinite.
 
-    It is the exact inverse of ``from_geodetic``, sought by iteration: a change of datum is one in space, so it needs a
-    height above the CRS's own ellipsoid, which the stated one need not be; and PROJ's rotations of small angles do not
-    undo each other to better than a millimetre.
+    This is the exact inverse of ``from_geodetic``, computed by iteration: a datum shift is three-dimensional, so it
+    needs a height above the CRS's own ellipsoid, which the stated height need not be; and PROJ's small-angle rotations
+    invert each other only to about a millimetre.
     """
     stated = points[:, 2] * crs.height_unit_m
     wanted = np.stack([points[:, 0], points[:, 1], np.where(np.isfinite(stated), stated, 0.0)])

@@ -1,4 +1,4 @@
-"""Coordinate reference systems as surveyors' files and options name them. The text may be hostile, so it has limits."""
+"""Parse coordinate reference systems as named in surveyors' files and options; input may be hostile, so is limited."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _UTM = re.compile(r"WGS\s?84\s*/?\s*UTM\s*(?:zone\s*)?(\d{1,2})\s*([NS])", re.IG
 
 @dataclass(frozen=True)
 class Crs:
-    """A projected or geographic CRS, with what is known of the heights in it.
+    """A projected or geographic CRS, with what is known about its heights.
 
     Attributes:
-        text: Its shortest statement; ``parse_crs`` takes it again.
-        name: For people.
+        text: Its shortest form; ``parse_crs`` accepts it again.
+        name: Human-readable name.
         vertical: Datum of its heights: ``ellipsoidal``, ``EPSG:n`` of a vertical CRS, or ``unknown``.
-        height_unit_m: Of its heights.
-        area: Where it is meant for: west, south, east, north in degrees; None where that is not stated.
-        assumed: What its text leaves open, a sentence or empty.
-        horizontal: What pyproj has of it, with heights above its own ellipsoid.
+        height_unit_m: Unit of its heights in metres.
+        area: Area of use: west, south, east, north in degrees; None where not stated.
+        assumed: What was assumed where its text is incomplete: a sentence, or empty.
+        horizontal: The pyproj CRS, with heights above its own ellipsoid.
     """
 
     text: str
@@ -58,7 +58,7 @@ class Crs:
 
     @property
     def unit_m(self) -> float:
-        """Of its eastings and northings; 1 for degrees, which have none."""
+        """Unit of eastings and northings in metres; 1 for degrees."""
         return 1.0 if self.is_geographic else float(self.horizontal.axis_info[0].unit_conversion_factor)
 
 
@@ -69,7 +69,7 @@ def parse_crs(text: str) -> Crs:
         text: ``EPSG:n``, ``EPSG:n+m`` (m: its heights), ``+proj=…`` or ``WGS84 UTM 33N``.
 
     Raises:
-        SplatpipeError: if it is none of these, unknown to PROJ, or neither projected nor geographic.
+        SplatpipeError: if it has none of these forms, is unknown to PROJ, or is neither projected nor geographic.
     """
     text = " ".join(text.split()) if len(text) <= LONGEST_TEXT else text
     if len(text) > LONGEST_TEXT or not text.isascii() or not text.isprintable():
@@ -107,10 +107,10 @@ def parse_vertical(text: str) -> str:
 
 
 def checked(text: str, kind: str) -> str:
-    """The shortest statement of a CRS (``kind`` is ``crs``) or of a vertical datum, for a configuration's validator.
+    """The shortest form of a CRS (``kind`` is ``crs``) or of a vertical datum, for a configuration's validator.
 
     Raises:
-        ValueError: if it is none, with the hint.
+        ValueError: if the text is invalid; includes the hint.
     """
     try:
         return parse_crs(text).text if kind == "crs" else parse_vertical(text)
@@ -127,7 +127,7 @@ def utm_of(latitude: float, longitude: float) -> Crs:
 
 
 def same_datum(a: str, b: str) -> bool:
-    """Whether two vertical datums are one: the same, or the same in another unit (NAVD88 in metres and in feet)."""
+    """Whether two vertical datums are the same, possibly in different units (NAVD88 in metres and in feet)."""
     if a == b or not (a.startswith("EPSG:") and b.startswith("EPSG:")):
         return a == b
     datums = [_authority(text.removeprefix("EPSG:")).datum for text in (a, b)]
@@ -135,7 +135,7 @@ def same_datum(a: str, b: str) -> bool:
 
 
 def describe_vertical(vertical: str) -> str:
-    """A vertical datum for people."""
+    """A vertical datum in human-readable form."""
     return (
         f"{vertical} ({_authority(vertical.removeprefix('EPSG:')).name})" if vertical.startswith("EPSG:") else vertical
     )
@@ -151,7 +151,7 @@ def _from_epsg(code: str, heights: str | None) -> Crs:
         vertical, unit_m = (f"EPSG:{authority[1]}" if authority else UNKNOWN), _height_unit(upper)
     elif len(crs.axis_info) == 3 and not crs.is_geocentric:
         vertical = ELLIPSOIDAL
-    elif crs.is_projected:  # who measures eastings in feet means heights in feet
+    elif crs.is_projected:  # eastings in feet imply heights in feet
         unit_m = float(crs.axis_info[0].unit_conversion_factor)
     text, name = f"EPSG:{int(code)}", crs.name
     if heights is not None:
@@ -168,7 +168,7 @@ def _from_epsg(code: str, heights: str | None) -> Crs:
 
 
 def _from_proj(text: str) -> Crs:
-    """A PROJ string: of allowed parameters only, since some of PROJ's name files, and pipelines are no CRS."""
+    """Parse a PROJ string with allowed parameters only: some of PROJ's name files, and a pipeline is not a CRS."""
     keys = dict(token.removeprefix("+").partition("=")[::2] for token in text.split(" "))
     if match := _EPSG.fullmatch(keys.get("init", "")):
         return _from_epsg(match[1], match[2])

@@ -1,4 +1,4 @@
-"""Where photos are missing along a flight: the way goes on straight, but for several photos nothing was taken."""
+"""Find missing photos along a flight: gaps in an otherwise straight path where several photos should have been."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from jaxtyping import Float64
 from splatpipe.pipeline.survey.swapped_positions import PositionEvidence
 
 LEAST_PHOTOS = 6
-LONG_STEP, LONG_PAUSE = 2.2, 2.5  # times the usual ones: two photos and more are missing
-BY_NUMBER_PAUSE = 2.2  # is enough where numbers are missing, too
-LEAST_NUMBERS = 2  # missing, to say so
-REGULAR = 0.8  # of the names count on by one: then a number that is left out tells
-SPEEDS = (0.5, 2.0)  # of the usual speed: slower, somebody paused or changed the battery; faster, the times are wrong
-LONGEST_TURN = 1.3  # times the longest way between two lines elsewhere: no turn is as long
-TURN_STEP = 1.5  # times the usual step: it leads to the next line
-AHEAD = 0.1  # cosine between the way before, the gap, and the way after: an orbit turns by as much in four photos
-WINDOW = 8  # steps before and after that tell what is usual
-FURTHEST_MISSING = 50  # photos; more are another flight
+LONG_STEP, LONG_PAUSE = 2.2, 2.5  # times the usual ones: at least two photos are missing
+BY_NUMBER_PAUSE = 2.2  # suffices where numbers are missing, too
+LEAST_NUMBERS = 2  # missing, to report a gap
+REGULAR = 0.8  # of the names increase by one: then a skipped number is evidence
+SPEEDS = (0.5, 2.0)  # of the usual speed: slower is a pause or a battery change; faster means the times are wrong
+LONGEST_TURN = 1.3  # times the longest step between two flight lines elsewhere: no turn is as long
+TURN_STEP = 1.5  # times the usual step: a longer one leads to the next flight line
+AHEAD = 0.1  # cosine between the path before, the gap, and the path after: an orbit turns by as much in four photos
+WINDOW = 8  # steps before and after that define what is usual
+FURTHEST_MISSING = 50  # photos; a larger gap is another flight
 
 
 @dataclass(frozen=True)
 class MissingStrip:
-    """Photos that are not there.
+    """A run of missing photos.
 
     Attributes:
-        before: The photo (number) taken before them.
-        after: The one after.
-        missing: How many, as well as can be told.
-        apart_m: Between the two; NaN without positions.
-        usual_m: Between photos elsewhere.
+        before: Index of the photo taken before them.
+        after: Index of the photo taken after them.
+        missing: Estimated number of missing photos.
+        apart_m: Distance between the two; NaN without positions.
+        usual_m: Distance between photos elsewhere.
         numbers: Whether their numbers are missing in the names, too.
     """
 
@@ -46,11 +46,11 @@ class MissingStrip:
 
 
 def find_missing(names: Sequence[str], flight: PositionEvidence) -> list[MissingStrip]:
-    """Gaps along the way.
+    """Find gaps along the flight path.
 
     Args:
-        names: Of the photos.
-        flight: Their places and times.
+        names: The photos' names.
+        flight: Their positions and times.
     """
     order = flight.order()
     numbers = _numbers(names)
@@ -79,7 +79,7 @@ def find_missing(names: Sequence[str], flight: PositionEvidence) -> list[Missing
 
 
 def _goes_on(way: Float64[np.ndarray, "m 3"], k: int, usual_m: float) -> bool:
-    """Whether the way before, across the gap and after it leads on, and the gap is long."""
+    """Whether the path keeps its direction before, across and after the gap, and the gap is long."""
     across = way[k + 1] - way[k]
     length = float(np.linalg.norm(across))
     if length < LONG_STEP * usual_m or not 0 < k < len(way) - 2:
@@ -89,7 +89,7 @@ def _goes_on(way: Float64[np.ndarray, "m 3"], k: int, usual_m: float) -> bool:
 
 
 def _other_turns(steps: Float64[np.ndarray, " m"], k: int) -> float:
-    """The longest step elsewhere that leads to another line; endless where there is none to compare with."""
+    """The longest step elsewhere that leads to another flight line; infinite where there is none."""
     others = np.delete(steps, k)
     turns = others[others > TURN_STEP * float(np.median(others))]
     return float(turns.max()) if len(turns) else float("inf")
@@ -100,7 +100,7 @@ def _as_fast(speed: float, usual: float, pauses: float) -> bool:
 
 
 def _by_numbers(names: Sequence[str], numbers: Sequence[int] | None, flight: PositionEvidence) -> list[MissingStrip]:
-    """Without positions: numbers that are left out, where the photos on both sides hardly match."""
+    """Gaps without positions: skipped numbers where the photos on both sides have few matches."""
     if numbers is None or len(names) < LEAST_PHOTOS:
         return []
     beside = [flight.matches.get((k, k + 1), 0) for k in range(len(names) - 1)]
@@ -114,7 +114,7 @@ def _by_numbers(names: Sequence[str], numbers: Sequence[int] | None, flight: Pos
 
 
 def _numbers(names: Sequence[str]) -> list[int] | None:
-    """The last number in each name; None unless most names count on by one."""
+    """The last number in each name; None unless most numbers increase by one."""
     found = [re.search(r"(\d{2,9})\D*$", name.rpartition(".")[0] or name) for name in names]
     if any(match is None for match in found):
         return None

@@ -1,4 +1,4 @@
-"""What the positions of a flight have in common: a receiver's slow error, and a vertical datum of its own."""
+"""Errors shared by all positions of a flight: a receiver's slow error, and a vertical datum of its own."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, SharedErrors, SimilarityFit, offset_step_sigmas
 from splatpipe.pipeline.survey.crs_names import UNKNOWN
 
-LEAST_PHOTOS = 3  # of a flight with an offset of its own; fewer say nothing about it
-MOST_FLIGHTS = 100  # with offsets of their own, the largest
-APART_SIGMAS = 3.0  # flights that differ by more do not differ by their receivers' errors: another datum, another base
-UNBOUND_M = 1e4  # a standard deviation that binds nothing
+LEAST_PHOTOS = 3  # of a flight with its own offset; fewer do not determine it
+MOST_FLIGHTS = 100  # with offsets of their own: the largest
+APART_SIGMAS = 3.0  # a larger difference is not receiver error, but another datum or another base
+UNBOUND_M = 1e4  # a standard deviation that imposes no constraint
 
 
 def shared_errors(records: Sequence[Mapping[str, Any]], sigmas: Float64[np.ndarray, "n 3"]) -> SharedErrors | None:
-    """The flights of some positions, each with an offset of its own; None where there is one flight.
+    """Group positions into flights, each with its own offset; None for a single flight or if all are too small.
 
     Args:
         records: Of ``positions.json``.
-        sigmas: Their standard deviations, metres: what a receiver errs by, it errs by for a whole flight.
+        sigmas: Their standard deviations, metres; a receiver's error is shared by a whole flight.
     """
     flights = np.array([record.get("flight", 0) for record in records], dtype=np.int64)
     numbers, counts = np.unique(flights, return_counts=True)
@@ -43,7 +43,7 @@ def shared_errors(records: Sequence[Mapping[str, Any]], sigmas: Float64[np.ndarr
 
 
 def reference_flight(points: Correspondences) -> int:
-    """The flight with the best positions, of these the largest: where flights are apart, it says where the frame is."""
+    """The flight with the most accurate positions, the largest if tied; it sets the frame where flights are apart."""
     assert points.shared is not None
     counts = points.shared.membership().sum(axis=1)
     accuracy = np.linalg.norm(points.shared.sigmas, axis=1)
@@ -51,9 +51,9 @@ def reference_flight(points: Correspondences) -> int:
 
 
 def declared_datum(records: Sequence[Mapping[str, Any]], points: Correspondences) -> str:
-    """The vertical datum that the positions which set the frame's heights declare; ``unknown`` where they do not agree.
+    """The vertical datum declared by the positions that set the frame's heights; ``unknown`` if they disagree.
 
-    These are the reference flight's, where there are several.
+    These are the reference flight's positions where there are several flights.
     """
     leading = np.ones(len(records), dtype=bool)
     if points.shared is not None:
@@ -63,7 +63,7 @@ def declared_datum(records: Sequence[Mapping[str, Any]], points: Correspondences
 
 
 def unbound(points: Correspondences) -> Correspondences:
-    """The same with nothing known of the flights' offsets but that of the reference."""
+    """The same correspondences with all flights' offsets unconstrained except the reference flight's."""
     if points.shared is None:
         return points
     sigmas = np.full_like(points.shared.sigmas, UNBOUND_M)
@@ -73,13 +73,13 @@ def unbound(points: Correspondences) -> Correspondences:
 
 
 def bound(points: Correspondences, fit: SimilarityFit) -> Correspondences:
-    """The same, where flights that are apart are bound to nothing and all others by their receivers' accuracy.
+    """The same, with flights that are apart unconstrained and all others constrained by their receivers' accuracy.
 
-    Heights and the horizontal are judged each by itself: flights in two vertical datums agree horizontally.
+    Heights and horizontal position are judged separately: flights in two vertical datums agree horizontally.
 
     Args:
         points: With the flights' accuracy.
-        fit: Of the unbound points.
+        fit: The fit of the unconstrained points.
     """
     if points.shared is None:
         return points
@@ -96,8 +96,8 @@ def bound(points: Correspondences, fit: SimilarityFit) -> Correspondences:
 def flights_json(
     records: Sequence[Mapping[str, Any]], points: Correspondences, offsets: Float64[np.ndarray, "g 3"]
 ) -> list[dict[str, JSON]]:
-    """Of each flight with an offset of its own: number, photos, offset (metres), and whether it is apart in the
-    horizontal and in height."""
+    """Number, photos, offset (metres) and whether it is apart horizontally and in height, for each flight with an
+    offset of its own."""
     if points.shared is None:
         return []
     flights = []
@@ -116,7 +116,7 @@ def flights_json(
 
 
 def tell_flights_apart(flights: Sequence[Mapping[str, Any]], report: Reporter) -> None:
-    """Say which flights are elsewhere by far more than their positions are wrong."""
+    """Warn about flights whose offset far exceeds the accuracy of their positions."""
     for flight in flights:
         name = f"flight {flight['flight'] + 1} ({flight['photos']} photos, from {flight['first']} on)"
         east, north, up = flight["offset_m"]

@@ -1,8 +1,8 @@
-"""Flights: which photos share a receiver's error, since they were taken in one go by one aircraft.
+"""Group photos into flights: photos that share a receiver's error because one aircraft took them in one go.
 
-A receiver's error changes slowly, and a take-off sets its heights anew: positions of one flight agree with each other
-far better than with another flight's. A flight ends where the aircraft (or the source of its positions) is another
-one, where no photo was taken for long, and where the take-off's altitude steps.
+A receiver's error changes slowly, and each take-off resets its heights: positions of one flight agree with each other
+far better than with another flight's. A flight ends where the aircraft (or the source of its positions) changes, where
+no photo was taken for a long time, and where the take-off altitude jumps.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-LEAST_GAP_S = 180.0  # a battery is not changed faster
-GAP_INTERVALS = 20.0  # who takes a photo a minute by hand pauses longer in a flight
-TAKEOFF_STEP_M = 1.0  # less is the barometer's drift
-TAKEOFF_NOISES = 6.0  # times the spread in a flight: receivers that write noisy altitudes do not start flights
-LEAST_PLATEAU = 3  # photos that a step of the take-off's altitude is judged by, on each side
-CANDIDATES = 20  # steps between neighbours that are looked at closer, the largest first
-MOST_FLIGHTS = 1000  # of one device without a pause: more are nonsense, and cost time
+LEAST_GAP_S = 180.0  # a battery change takes at least this long
+GAP_INTERVALS = 20.0  # times the usual interval: manual capture at a photo a minute has longer pauses within a flight
+TAKEOFF_STEP_M = 1.0  # smaller steps are barometer drift
+TAKEOFF_NOISES = 6.0  # times the spread within a flight: noisy altitudes must not start new flights
+LEAST_PLATEAU = 3  # photos on each side needed to judge a step of the take-off altitude
+CANDIDATES = 20  # steps between neighbours that are examined, the largest first
+MOST_FLIGHTS = 1000  # of one device without a pause: more are implausible, and cost time
 MAD_TO_SIGMA = 1.4826  # of Gaussian noise
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """What tells a photo's flight.
+    """What identifies a photo's flight.
 
     Attributes:
-        device: The aircraft or camera, the source of the position, an id of the flight: another text, another flight.
-        time_s: When it was taken, of any epoch; NaN where not known.
-        takeoff_m: Altitude of the take-off: the photo's less its height above take-off; NaN where not known.
+        device: The aircraft or camera, the source of the position, a flight id: any difference is another flight.
+        time_s: Capture time in seconds, from any epoch; NaN where unknown.
+        takeoff_m: Take-off altitude: the photo's altitude less its height above take-off; NaN where unknown.
     """
 
     device: tuple[str, ...]
@@ -43,7 +43,7 @@ def tell_flights(stamps: Sequence[Stamp]) -> list[int]:
     """The number of each photo's flight, counted from 0 in the order of the photos.
 
     Args:
-        stamps: Of the photos, in the order of their names; photos without a time stay with their device's others.
+        stamps: One per photo, in the order of their names; photos without a time join their device's first flight.
     """
     flights: list[list[int]] = []
     takeoffs = np.array([stamp.takeoff_m for stamp in stamps])
@@ -72,7 +72,7 @@ def _split_at_gaps(ordered: list[int], stamps: Sequence[Stamp]) -> list[list[int
 
 
 def _split_at_steps(run: list[int], takeoffs: Float64[np.ndarray, " n"]) -> list[list[int]]:
-    """Cut where the median of the take-off's altitude before and after differs most, as long as it does by far."""
+    """Cut repeatedly at the clearest step of the take-off altitude, while there is a significant one."""
     if not np.isfinite(takeoffs[run]).all():
         return [run]
     done: list[list[int]] = []
@@ -88,9 +88,9 @@ def _split_at_steps(run: list[int], takeoffs: Float64[np.ndarray, " n"]) -> list
 
 
 def _best_cut(values: Float64[np.ndarray, " n"]) -> int:
-    """Where two levels describe the altitudes best (least absolute deviations), 0 where one does.
+    """Index where two levels describe the altitudes best (least absolute deviations); 0 where one level suffices.
 
-    It is looked for where neighbours differ most.
+    Only the largest steps between neighbours are tried.
     """
     cuts = np.arange(LEAST_PLATEAU, len(values) - LEAST_PLATEAU + 1)
     largest = cuts[np.argsort(-np.abs(np.diff(values))[cuts - 1], kind="stable")[:CANDIDATES]]

@@ -1,4 +1,4 @@
-"""The sparse model as georef needs it: camera centres, rotations and points, and its files as they are."""
+"""The sparse model as georef uses it (camera centres, rotations and points), and copies of its files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.photos.names import match_names
 
-RAY_STEP = 1e-5  # of x/z: a hundredth of a pixel, for differences
+RAY_STEP = 1e-5  # step in x/z for finite differences: about a hundredth of a pixel
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class ModelView:
     """A photo in the model.
 
     Attributes:
-        camera: COLMAP's, with its distortion.
+        camera: COLMAP's camera, with its distortion.
         cam_from_model: Pose.
-        scale: Pixels of the camera to one of the photo.
+        scale: Camera pixels per photo pixel.
     """
 
     camera: pycolmap.Camera
@@ -35,12 +35,12 @@ class ModelView:
     scale: float
 
     def ray(self, pixel: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
-        """x/z and y/z of the ray through a pixel of the photo; not finite where the lens model has none."""
+        """x/z and y/z of the ray through a pixel of the photo; not finite where the lens model is undefined."""
         found = self.camera.cam_from_img((pixel * self.scale)[None])
         return np.full(2, np.nan) if found is None else np.asarray(found, np.float64).reshape(2)
 
     def pixels_by_ray(self, ray: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "2 2"]:
-        """Derivative of the photo's pixels by a ray's x/z and y/z; not finite where the lens model has none."""
+        """Derivative of the photo's pixels by a ray's x/z and y/z; not finite where the lens model is undefined."""
         around = np.tile(np.append(ray, 1.0), (4, 1))
         around[:, :2] += RAY_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
         shown = self.camera.img_from_cam(around) if np.isfinite(ray).all() else None
@@ -50,22 +50,22 @@ class ModelView:
         return np.asarray((shown[::2] - shown[1::2]).T / (2.0 * RAY_STEP * self.scale))
 
     def pixel(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 2"]:
-        """Where the photo shows a point of the model; not finite behind the camera."""
+        """Project a point of the model into the photo, in pixels; not finite behind the camera."""
         pixels, _ = project_through_lens(self.camera, self.cam_from_model, point[None])
         return np.asarray(pixels[0] / self.scale)
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """What georef needs of a sparse model, its photos sorted by name.
+    """The parts of a sparse model that georef uses, photos sorted by name.
 
     Attributes:
-        names: Of the registered photos, as ingest has them; as the model has them where ingest does not know them.
+        names: Registered photos by ingest's names; by the model's names where ingest does not know them.
         centres: Camera centres.
         cam_from_model: Rotations.
-        points: Of the sparse cloud.
-        image_ids: COLMAP's numbers of the photos.
-        reconstruction: What COLMAP has of all this.
+        points: The sparse cloud.
+        image_ids: COLMAP's image ids of the photos.
+        reconstruction: The COLMAP reconstruction behind all this.
     """
 
     names: list[str]
@@ -79,15 +79,15 @@ class SparseModel:
         """A photo's camera.
 
         Args:
-            index: Of the photo.
-            width: Of the photo that pixels are stated in; the model may have been made from smaller ones.
+            index: Index of the photo.
+            width: Width of the photo in which pixels are given; the model may have been made from smaller photos.
         """
         image = self.reconstruction.images[self.image_ids[index]]
         camera = self.reconstruction.cameras[image.camera_id]
         return ModelView(camera, np.asarray(image.cam_from_world().matrix(), np.float64), camera.width / width)
 
     def gsd(self, scale: float) -> float | None:
-        """Ground sampling distance in a world that is so many times larger: the median of the photos' medians."""
+        """Ground sampling distance (GSD) in a world ``scale`` times larger: the median of the photos' medians."""
         sizes = []
         for number in self.image_ids:
             image = self.reconstruction.images[number]
@@ -104,7 +104,7 @@ def read_model(path: Path, photos: Iterable[str]) -> SparseModel:
     """Read a sparse model.
 
     Args:
-        path: Its folder.
+        path: The model's folder.
         photos: The names that ingest gave the photos.
 
     Raises:
@@ -123,7 +123,7 @@ def read_model(path: Path, photos: Iterable[str]) -> SparseModel:
 
 
 def model_of(reconstruction: pycolmap.Reconstruction, photos: Iterable[str]) -> SparseModel:
-    """What georef needs of a reconstruction; the names are those that ingest gave the photos."""
+    """Extract what georef uses from a reconstruction; ``photos`` are the names that ingest gave the photos."""
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
     poses = np.stack([np.asarray(image.cam_from_world().matrix(), dtype=np.float64) for image in images])
     rotations = poses[:, :, :3]
@@ -139,7 +139,7 @@ def model_of(reconstruction: pycolmap.Reconstruction, photos: Iterable[str]) -> 
 
 
 def copy_model(source: Path, target: Path, may_link: bool) -> None:
-    """The model's files as they are: linked where that is allowed (never a user's own) and possible, else copied."""
+    """Copy the model's files unchanged; link them where that is allowed (never for a user's own) and possible."""
     target.mkdir(parents=True, exist_ok=True)
     for path in sorted(source.iterdir()):
         if path.is_file() and not path.name.startswith("."):

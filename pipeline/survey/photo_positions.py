@@ -1,8 +1,8 @@
-"""Where each photo was taken, how the camera was turned, and how well both are known.
+"""Each photo's position and camera angles, and their accuracies.
 
-From three sources, the first that states a thing: the file of positions, EXIF (where corrected positions are written
-back), XMP. Angles are from the file, then the gimbal's in XMP, then the ``Camera:`` tags. Accuracies are from the file,
-then XMP, then EXIF, else what the receiver's kind of fix gives.
+Each value comes from the first of three sources that states it: the position file, EXIF (where corrected positions are
+written back), XMP. Angles are from the file, then the gimbal's in XMP, then the ``Camera:`` tags. Accuracies are from
+the file, then XMP, then EXIF, else the default for the receiver's type of fix.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FIXED, SINGLE = 50, 16  # drone-dji:RtkFlag (DJI's user manuals); 32 to 49 are k
 FLOAT = range(32, 50)
 # Horizontal (per axis) and vertical standard deviations, metres, where a photo does not state its own.
 DEFAULT_SIGMAS_M = {"fixed": (0.02, 0.03), "float": (0.5, 1.0), "single": (3.0, 5.0), None: (3.0, 5.0)}
-LEAST_SIGMA_M = 0.005  # stated accuracies below are the receiver's noise, not the camera's position
+LEAST_SIGMA_M = 0.005  # smaller stated accuracies are the receiver's noise, not the accuracy of the camera's position
 VERTICAL_OVER_HORIZONTAL = 1.5  # of GNSS errors, where only the horizontal one is stated
 DATUM_STEP_M = 1.0  # EXIF and XMP altitudes further apart than this are not roundings of one value
 NOWHERE = "states a position that is none on Earth"
@@ -45,12 +45,12 @@ class Position:
         name: The photo.
         latitude: Degrees north, WGS84.
         longitude: Degrees east, WGS84.
-        altitude_m: As stated. None when there is none.
+        altitude_m: As stated; None when there is none.
         altitude_source: ``file``, ``exif`` or ``xmp``; None when there is none.
         relative_altitude_m: Above the take-off point, by the drone.
         sigma_horizontal_m: Standard deviation in east and in north each.
         sigma_vertical_m: Standard deviation of the altitude.
-        rtk: ``fixed``, ``float``, ``single``; None when the drone says nothing of it.
+        rtk: ``fixed``, ``float``, ``single``; None when the drone does not state it.
         yaw_deg: Of the camera (gimbal).
         pitch_deg: Likewise.
         roll_deg: Likewise.
@@ -61,7 +61,7 @@ class Position:
         source: Of latitude and longitude: ``file``, ``exif`` or ``xmp``.
         sigma_source: Of the standard deviations: ``file``, ``xmp``, ``exif``, or ``default``.
         vertical: Datum of the altitude: ``ellipsoidal``, ``EPSG:n`` or ``unknown``. EXIF's AltitudeRef declares none.
-        flight: Number of the flight, from 0: photos of one share their receiver's error.
+        flight: Number of the flight, from 0: photos of one flight share their receiver's error.
     """
 
     name: str
@@ -92,9 +92,9 @@ class PositionList:
 
     Attributes:
         positions: Sorted by the photos' names.
-        wrong: Why a stated position is none, by photo: the end of a sentence that starts with its name.
+        wrong: Why a stated position is unusable, by photo: the end of a sentence that starts with the photo's name.
         altitude_step_m: Median of EXIF's altitude less XMP's where both are given, else None.
-        orientations: EXIF orientation of every photo that has another than 1, by name.
+        orientations: EXIF orientation of every photo where it is not 1, by name.
     """
 
     positions: tuple[Position, ...]
@@ -109,11 +109,11 @@ class PositionList:
 
 
 def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlace] | None = None) -> PositionList:
-    """Take positions and angles from the photos' metadata, and from the file of positions.
+    """Read positions and angles from the photos' metadata and from the position file.
 
     Args:
-        photos: Those that take part, sorted by name.
-        places: What the file says, by photo.
+        photos: The photos in use, sorted by name.
+        places: Entries of the position file, by photo.
     """
     found: list[Position] = []
     stamps: list[Stamp] = []
@@ -149,7 +149,7 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
 
 
 def positions_json(positions: PositionList) -> JSON:
-    """What ``positions.json`` holds."""
+    """The contents of ``positions.json``."""
     value = {
         "positions": [asdict(position) for position in positions.positions],
         "orientations": dict(positions.orientations),
@@ -158,7 +158,7 @@ def positions_json(positions: PositionList) -> JSON:
 
 
 def is_on_earth(latitude: float, longitude: float) -> bool:
-    """Whether a position can be meant: finite, within bounds, and not the 0, 0 of a receiver without a fix."""
+    """Whether a position is plausible: finite, within bounds, and not the 0, 0 of a receiver without a fix."""
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
         return False
     if abs(latitude) > 90.0 or abs(longitude) > 180.0:
@@ -167,11 +167,11 @@ def is_on_earth(latitude: float, longitude: float) -> bool:
 
 
 def _position(photo: CheckedPhoto, gps: Gps, source: str, place: FilePlace | None) -> Position:
-    """All but the angles."""
+    """The photo's position without its angles."""
     xmp = photo.xmp
     altitudes = {
         "file": place.altitude_m if place is not None else None,
-        # Positions that were corrected afterwards (PPK) are written to EXIF: it comes before XMP.
+        # Post-processed positions (PPK) are written to EXIF, so it takes precedence over XMP.
         "exif": _exif_altitude(photo.exif.gps),
         "xmp": _xmp_altitude(xmp),
     }
@@ -209,7 +209,7 @@ def _rtk(xmp: Mapping[str, str]) -> str | None:
 
 
 def _vertical(xmp: Mapping[str, str], rtk: str | None, place: FilePlace | None, source: str | None) -> str:
-    """The datum that the file's CRS, RTK or Pix4D's tags declare."""
+    """The vertical datum declared by the file's CRS, by RTK or by Pix4D's tags."""
     if place is not None:
         return place.vertical
     if source is None:
@@ -227,7 +227,7 @@ def _camera(photo: CheckedPhoto) -> tuple[str, str]:
 
 
 def _conventions(photos: Sequence[CheckedPhoto]) -> dict[tuple[str, str], Convention]:
-    """Where each camera's ``Camera:Pitch`` is counted from."""
+    """The zero of each camera's ``Camera:Pitch``."""
     pitches: dict[tuple[str, str], list[float]] = {}
     for photo in photos:
         pitch = xmp_number(photo.xmp, "Camera:Pitch", -360.0, 360.0)
@@ -254,7 +254,7 @@ def _angles(
 
 
 def _sigmas(photo: CheckedPhoto, rtk: str | None, place: FilePlace | None) -> tuple[str, float, float]:
-    """Where they are from, horizontal, vertical."""
+    """Source of the standard deviations, then horizontal and vertical in metres."""
     xmp, exif = photo.xmp, photo.exif.gps
     east = xmp_number(xmp, "drone-dji:RtkStdLon", 1e-6, 1000.0)
     north = xmp_number(xmp, "drone-dji:RtkStdLat", 1e-6, 1000.0)

@@ -1,4 +1,4 @@
-"""The surveyed points of a capture: from the control file to rays of the model's cameras, every one with its role."""
+"""The surveyed points of a capture: from the control file to rays of the model's cameras, each point with its role."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from splatpipe.pipeline.survey.crs import Crs, parse_crs
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
 
-LEAST_FOR_CHECKS = 6  # points, from which on some are kept as check points
-EVERY_NTH = 3  # of them
-OUTSIDE_SHARE = 0.3  # of the marks beyond their photos: they were made in photos of another size
-MARK_TOLERANCE = 10.0  # times their sigma
-LEAST_TOLERANCE_PX = 5.0  # of marks; SfM's own errors at the border of a photo
+LEAST_FOR_CHECKS = 6  # points: with at least as many, some are kept as check points
+EVERY_NTH = 3  # point becomes a check point
+OUTSIDE_SHARE = 0.3  # of the marks outside their photos: above, they were made in photos of another size
+MARK_TOLERANCE = 10.0  # times the marks' sigma
+LEAST_TOLERANCE_PX = 5.0  # of marks: SfM's own errors at the edge of a photo
 FIT_TOLERANCE = 8.0  # times the model's mean reprojection error
 
 
@@ -36,8 +36,8 @@ class Sighting:
         photo: Its name.
         pixel: In the stored grid; (0, 0) is the top-left corner of the first pixel.
         index: Of the photo in the model; None where the photo has no pose.
-        agrees: Whether the mark took part in the point's place.
-        automatic: Whether a target was found there, and nobody marked it.
+        agrees: Whether the mark was used to triangulate the point.
+        automatic: Whether it is a detected target rather than a mark made by hand.
     """
 
     photo: str
@@ -53,10 +53,10 @@ class SurveyPoint:
 
     Attributes:
         surveyed: As in the file.
-        role: What it is for.
-        why: Where it is left out: the reason, a clause.
+        role: Control point, check point, or left out.
+        why: The reason if it is left out, as a clause.
         sightings: Its marks, in the order of the photos' names.
-        found: Its place in the model; None where its marks do not tell it.
+        found: Its triangulated position in the model; None where its marks do not determine it.
     """
 
     surveyed: SurveyedPoint
@@ -80,10 +80,10 @@ class Survey:
     """All points.
 
     Attributes:
-        file: What the control file says.
+        file: The contents of the control file.
         crs: Its CRS.
-        name: Of the file, for messages.
-        points: In its order.
+        name: The file's name, for messages.
+        points: In the file's order.
     """
 
     file: ControlFile
@@ -96,11 +96,11 @@ class Survey:
         return replace(self, points=tuple(points))
 
     def of_role(self, role: str) -> list[SurveyPoint]:
-        """The points of a role."""
+        """The points that have a given role."""
         return [point for point in self.points if point.role == role]
 
 
-# Pixels by point and photo, of a survey whose hand-made marks are located already.
+# Returns pixels by point and photo, for a survey whose manual marks are already located.
 TargetFinder = Callable[[Survey], Mapping[str, Mapping[str, tuple[float, float]]]]
 
 
@@ -116,14 +116,14 @@ def load_survey(
 
     Args:
         path: The file.
-        config: Roles, and what pixels mean.
+        config: Roles and the pixel convention.
         photos: All photos of the capture by name.
         model: The sparse model.
-        report: Takes warnings of marks and photos that cannot be used.
-        find_targets: Gives marks of points that targets in the photos are.
+        report: Receives warnings about marks and photos that cannot be used.
+        find_targets: Returns marks of points that are targets in the photos.
 
     Raises:
-        SplatpipeError: if the file is none, or not of these photos.
+        SplatpipeError: if it is not a control file, or does not belong to these photos.
     """
     file = read_control_file(path)
     try:
@@ -161,7 +161,7 @@ def _with_targets(
     photos: Mapping[str, Photo],
     config: GeorefConfig,
 ) -> list[SurveyPoint]:
-    """The points with what targets tell of them; where somebody marked a photo, that counts."""
+    """Add detected targets to the points' marks; a manual mark in the same photo takes precedence."""
     index, result = {photo: k for k, photo in enumerate(model.names)}, []
     for point in points:
         marked = {sighting.photo for sighting in point.sightings}
@@ -179,7 +179,7 @@ def _with_targets(
 
 
 def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], mark_sigma_px: float) -> SurveyPoint:
-    """A point with its place by its marks, in a model; left out where they do not tell it."""
+    """Triangulate a point in the model from its marks; left out where they do not determine it."""
     placed = [k for k, sighting in enumerate(point.sightings) if sighting.index is not None]
     if len(placed) < 2:
         return point.left_out(_why_unseen(point, len(placed)))
@@ -213,7 +213,7 @@ def _rays(sightings: Sequence[Sighting], model: SparseModel, photos: Mapping[str
 def residual_px(
     sighting: Sighting, place: Float64[np.ndarray, " 3"], model: SparseModel, photos: Mapping[str, Photo]
 ) -> Float64[np.ndarray, " 2"] | None:
-    """Where a photo shows a place of the model less where the mark is; None where it does not show it."""
+    """Reprojection error: a place of the model projected into a photo, less its mark (pixels); None if not visible."""
     if sighting.index is None:
         return None
     residual = model.view(sighting.index, photos[sighting.photo].width).pixel(place) - np.array(sighting.pixel)
@@ -280,13 +280,13 @@ def _tell_marks(
 
 
 def missing_photos(names: Sequence[str]) -> str:
-    """How photos are told that a file names and the capture does not have."""
+    """Phrase for messages about photos that a file names and the capture does not have."""
     many = "1 photo that is" if len(names) == 1 else f"{len(names)} photos that are"
     return f"{many} not in this capture: {some(names)}"
 
 
 def _tell_overruled(points: Sequence[SurveyPoint], name: str, setting: str, report: Reporter) -> None:
-    """Say that the option, which may be left from an earlier call, goes before the roles that the file states."""
+    """Report that the option, possibly left from an earlier call, overrides the roles that the file states."""
     usable = [point for point in points if point.role != "left_out"]
     stated = {point.name for point in usable if point.surveyed.role == "check"}
     if any(point.surveyed.role for point in usable) and stated != {p.name for p in usable if p.role == "check"}:
@@ -329,14 +329,14 @@ def _tell_unusable(
 
 
 def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]:
-    """Roles by the option, the file, or for six points and more every third.
+    """Assign roles by the option, else by the file, else every third point of at least six is a check point.
 
     Args:
-        points: With role ``control``, or left out.
+        points: Each with role ``control``, or left out.
         setting: `georef.check_points`.
 
     Raises:
-        SplatpipeError: if it names points that are not there.
+        SplatpipeError: if it names points that are not in the control file.
     """
     usable = [point.name for point in points if point.role != "left_out"]
     setting = setting.strip()
