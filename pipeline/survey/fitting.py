@@ -1,4 +1,4 @@
-"""The fit of positions to the model: who takes part, how noisy they are, what holds the rotation, and its worth."""
+"""Fit the model to photo positions: inliers, noise, what constrains the rotation, and the uncertainty."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from splatpipe.pipeline.survey.receiver_noise import NoisyFit, ReceiverNoise, fi
 from splatpipe.pipeline.survey.uncertainty import Uncertainty, uncertainty_of
 
 MIN_POSITIONS = 3
-MAX_SIGMA_SCALE = 0.2  # a scale known less well is no scale
-MAX_SIGMA_ROTATION_RAD = math.radians(15.0)  # a direction likewise
-DOUBTFUL_UP_RAD = math.radians(2.5)  # where errors drift, positions that tell it less well may be wrong about it
+MAX_SIGMA_SCALE = 0.2  # a less certain scale is unusable
+MAX_SIGMA_ROTATION_RAD = math.radians(15.0)  # likewise for a direction
+DOUBTFUL_UP_RAD = math.radians(2.5)  # where errors drift, an up direction less certain than this may be wrong
 CONTRADICTION = 2.0  # joint sigmas between the positions' directions and those of the cameras
-SLOW = 0.5  # of a correlation, from which on what is said of the accuracy rests on how errors drift
-OUTLIER_NOISES = 6.0  # times the noise of all
-OUTLIER_SIGMAS = 3.0  # an error within what the position states is none
+SLOW = 0.5  # correlation above which the stated accuracy depends on how errors drift
+OUTLIER_NOISES = 6.0  # times the noise of all positions
+OUTLIER_SIGMAS = 3.0  # times the stated sigma: a smaller error is not an outlier
 ROUNDS = 4
 COLLAPSE = math.log(1.5)  # of the scale from the robust fit's, which noise of half of that cannot make
 
@@ -38,12 +38,12 @@ class NoPlaceError(Exception):
 
 @dataclass(frozen=True)
 class Directions:
-    """What besides positions tells how the model is turned.
+    """Information on the model's rotation other than positions.
 
     Attributes:
         prior: The directions.
         source: Their name, for messages.
-        of_gimbal: Whether a gimbal measured them; else how cameras are held, which is a habit.
+        of_gimbal: Whether a gimbal measured them; else they are assumed from how cameras are usually held.
     """
 
     prior: DirectionPrior
@@ -53,17 +53,17 @@ class Directions:
 
 @dataclass(frozen=True)
 class PositionFit:
-    """The model by its positions.
+    """The model's placement by its positions.
 
     Attributes:
         noisy: The similarity and the noise.
-        inliers: Which positions took part.
-        residuals: Transformed less stated, the flights' own errors taken off.
+        inliers: Which positions were used.
+        residuals: Transformed less stated, with the flights' own errors removed.
         uncertainty: Of the frame.
-        held_by: What told directions besides the positions; empty where these took no part.
-        alone_rad: How well the positions alone tell the rotation about its weakest axis.
-        contradicted_rad: By how much the positions alone would turn the model against the directions, where that is
-            more than both can be wrong by; else 0.
+        held_by: Source of directions used besides the positions; empty where none were used.
+        alone_rad: Standard deviation of the rotation about its weakest axis from the positions alone.
+        contradicted_rad: Rotation by which the positions alone deviate from the directions, where that is more than the
+            errors of both explain; else 0.
     """
 
     noisy: NoisyFit
@@ -87,14 +87,14 @@ def fit_positions(
 
     Args:
         points: The cameras and their positions, in the order in which they were taken.
-        flights: Of each.
-        robust: Who agrees with whom, and a similarity to begin with.
-        max_error_m: Positions further off take no part; None for those that are off by far more than the noise.
-        directions: Take part where they are better than the positions.
-        places: Of the model's points.
+        flights: Flight number of each.
+        robust: The inliers and an initial similarity.
+        max_error_m: Positions further off are excluded; None excludes those that are off by far more than the noise.
+        directions: Used where they are better than the positions.
+        places: Positions of the model's points.
 
     Raises:
-        NoPlaceError: if scale or rotation are known too poorly.
+        NoPlaceError: if scale or rotation is too poorly determined.
     """
     inliers = robust.inliers if robust.inliers.sum() >= MIN_POSITIONS else np.ones(len(points), dtype=bool)
     fit = _fitted(points, flights, inliers, robust.similarity, directions, places)
@@ -107,7 +107,7 @@ def fit_positions(
 
 
 def require_determined(fit: PositionFit, points: Correspondences) -> None:
-    """Refuse a frame whose scale or directions are as good as unknown.
+    """Reject a frame whose scale or directions are practically unknown.
 
     Raises:
         NoPlaceError: with the reason.
@@ -135,7 +135,7 @@ def require_determined(fit: PositionFit, points: Correspondences) -> None:
 def taken_order(
     names: Sequence[str], records: Mapping[str, Mapping[str, Any]], times: Mapping[str, str | None]
 ) -> list[str]:
-    """Photos in the order in which they were taken, flight by flight; those of one time, or none, by their names."""
+    """Photos in the order in which they were taken, flight by flight; those with equal or no times by name."""
     return sorted(names, key=lambda name: (int(records[name].get("flight", 0)), times[name] or "", name))
 
 
@@ -147,12 +147,12 @@ def _fitted(
     directions: Directions,
     places: Float64[np.ndarray, "m 3"],
 ) -> PositionFit:
-    """The fit of some positions: by themselves if they can, else with the directions."""
+    """Fit the inliers: by positions alone if they suffice, else with the directions."""
     chosen = points.only(inliers)
     before = _before(flights[inliers])
     correlated, alone = True, fit_with_noise(chosen, before, start)
     if abs(math.log(alone.similarity.scale / start.scale)) > COLLAPSE:
-        # A walk is as smooth as slow errors are: with a scale of nothing, all of it would be error.
+        # A walk is as smooth as slow errors: with a scale near zero, all of it could be explained as error.
         correlated, alone = False, fit_with_noise(chosen, before, start, correlated=False)
     covariance = alone.covariance[:3, :3]
     weakest = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
@@ -164,8 +164,8 @@ def _fitted(
     with_prior = drifting or weakest > wanted
     noisy = alone
     if with_prior:
-        # What contradicts by so many sigmas shows that the noise is of another kind than was taken: its share of the
-        # answer goes down by as much, and all that is said of the accuracy as well (Birge, Phys. Rev. 40, 1932).
+        # A contradiction of so many sigmas shows that the noise model is wrong: the positions' weight is reduced
+        # accordingly, and so is the stated accuracy (Birge, Phys. Rev. 40, 1932).
         doubt = max(1.0, ratio) if drifting else 1.0
         prior = replace(directions.prior, sigma_rad=directions.prior.sigma_rad / doubt)
         _, axes = np.linalg.eigh(covariance)
@@ -183,7 +183,7 @@ def _fitted(
 
 
 def _contradiction(alone: NoisyFit, directions: Directions) -> tuple[float, float]:
-    """The angle between the positions' rotation and the directions, and how many joint sigmas that is."""
+    """The angle (radians) between the positions' rotation and the directions, and the same in joint sigmas."""
     prior = directions.prior
     across = turn_between(prior.source @ alone.similarity.rotation.T, prior.target)
     axes = slice(0, 3) if len(prior.source) > 1 else slice(0, 2)  # one direction says nothing about turns around it
@@ -194,7 +194,7 @@ def _contradiction(alone: NoisyFit, directions: Directions) -> tuple[float, floa
 
 
 def _before(flights: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Of each position, the one before it in its flight."""
+    """Index of each position's predecessor in its flight; -1 for none."""
     before = np.arange(len(flights), dtype=np.int64) - 1
     before[np.flatnonzero(np.diff(flights, prepend=-1))] = -1
     return before

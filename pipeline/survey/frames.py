@@ -36,22 +36,22 @@ FRAME_KINDS = ("enu", "arbitrary")
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a model lies.
+    """A model's placement in the world.
 
     Attributes:
         kind: ``enu``: the world is local east-north-up in metres about ``origin``. ``arbitrary``: up is +z, but scale,
-            place and heading mean nothing.
+            position and heading are meaningless.
         world_from_model: From the model's frame to the world's.
         origin: The world's zero on the earth; None when arbitrary.
-        vertical_datum: Of the world's heights, which are as they were stated: ``ellipsoidal``, ``EPSG:n``, or
-            ``unknown`` unless somebody declared it.
-        crs: The CRS that coordinates are read out in, as ``parse_crs`` takes it; empty for the UTM zone of ``origin``.
-        metres: Whether an arbitrary frame has metres all the same, by scale bars.
-        approximate_crs: The user accepts it though a grid of it is missing.
-        residuals: ``rmse_horizontal_m``, ``rmse_vertical_m``, ``rmse_m`` of the photos that took part, how many there
-            are, the standard deviations of scale and rotation, and east, north, up of each photo by name (metres).
+        vertical_datum: Of the world's heights, which are as stated: ``ellipsoidal``, ``EPSG:n``, or ``unknown`` if not
+            declared.
+        crs: The CRS of output coordinates, as ``parse_crs`` accepts it; empty for the UTM zone of ``origin``.
+        metres: Whether an arbitrary frame is nevertheless in metres, by scale bars.
+        approximate_crs: Whether the user accepts the CRS although one of its grids is missing.
+        residuals: ``rmse_horizontal_m``, ``rmse_vertical_m``, ``rmse_m`` of the photos used, how many there are, the
+            standard deviations of scale and rotation, and east, north, up of each photo by name (metres).
         left_out: Photos whose position is off, sorted.
-        note: In a sentence, what the frame was made from.
+        note: What the frame was computed from, as a sentence.
     """
 
     kind: Literal["enu", "arbitrary"]

@@ -1,6 +1,6 @@
 """WGS84: geodetic coordinates, earth-centred ones (ECEF, EPSG:4978) and the local east-north-up frame. All in float64.
 
-Formulas: geodetic to ECEF is exact (Hofmann-Wellenhof et al., GNSS, 2008, ch. 8); the way back is Bowring's (Survey
+Formulas: geodetic to ECEF is exact (Hofmann-Wellenhof et al., GNSS, 2008, ch. 8); the inverse is Bowring's (Survey
 Review 28, 1985), iterated until it is exact to rounding.
 """
 
@@ -68,8 +68,8 @@ class Origin:
     Attributes:
         latitude: Degrees north, WGS84.
         longitude: Degrees east, WGS84.
-        height_m: In the vertical datum of the positions it was made from; taken for ellipsoidal in the formulas, which
-            moves nothing within the local frame by more than a part in 100,000.
+        height_m: In the vertical datum of the positions it was computed from; treated as ellipsoidal in the formulas,
+            which changes nothing within the local frame by more than a part in 100,000.
     """
 
     latitude: float

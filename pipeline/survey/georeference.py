@@ -1,4 +1,4 @@
-"""`georef.json`: where a splat is, for programs that read no more than JSON, matrices and PROJ pipelines."""
+"""`georef.json`: a splat's georeference, for programs that only handle JSON, matrices and PROJ pipelines."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ PERCENTILES = (1.0, 99.0)  # of the sparse points: the rest may lie kilometres a
 
 
 def scene_box(points: Float64[np.ndarray, "n 3"], centres: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "2 3"]:
-    """The box that the scene fills: its sparse points but for the outermost, and the cameras.
+    """The scene's bounding box: its sparse points without the outermost, and the cameras.
 
     Args:
         points: Sparse points, world units.
-        centres: Camera centres, the same.
+        centres: Camera centres, likewise.
 
     Returns:
         Least and largest coordinates.
@@ -33,7 +33,7 @@ def scene_box(points: Float64[np.ndarray, "n 3"], centres: Float64[np.ndarray, "
 
 
 def georeference(frame: Frame, box: Float64[np.ndarray, "2 3"]) -> dict[str, Any]:
-    """What `georef.json` says.
+    """The contents of `georef.json`.
 
     Args:
         frame: georef's.
@@ -67,7 +67,7 @@ def georeference(frame: Frame, box: Float64[np.ndarray, "2 3"]) -> dict[str, Any
 
 
 def accuracy_in_words(accuracy_m: float | None) -> str:
-    """The accuracy that PROJ states of an operation, to two significant digits; 0 means a conversion without error.
+    """Phrase PROJ's accuracy of an operation, to two significant digits; 0 means a conversion without error.
 
     Args:
         accuracy_m: Metres; None where PROJ does not know it.
@@ -82,7 +82,7 @@ def accuracy_in_words(accuracy_m: float | None) -> str:
 
 
 def accuracy_line(georeferenced: Mapping[str, Any]) -> str:
-    """In what CRS and by which operation, a sentence or two, of a `georef.json` that has an origin."""
+    """One or two sentences on the CRS and the operation of a `georef.json` that has an origin."""
     crs, operation = georeferenced["crs"], georeferenced["crs"]["operation"]
     accuracy = accuracy_in_words(operation["accuracy_m"])
     best = "" if operation["best"] else "; a better one lacks its grid"

@@ -1,4 +1,4 @@
-"""The frame that a model lies in, from the positions that its photos state."""
+"""Determine the model's frame from its photos' positions."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.level import Positions, known_directions
 from splatpipe.pipeline.survey.model import SparseModel
 
-ORIGIN_DIGITS = 5  # degrees: a metre; the origin then stays where it is when some photos come or go
-SWAPPED_NOISE = 0.5  # of the residuals: what fits twice as well with swapped coordinates has them swapped
-POOR_NOISES = 2.0  # times what positions state: worth a warning
-LINE_RAD = math.radians(60.0)  # positions that tell the rotation about an axis no better lie along it
+ORIGIN_DIGITS = 5  # degrees: about a metre, so that the origin stays put when a few photos are added or removed
+SWAPPED_NOISE = 0.5  # of the residuals: if swapped coordinates fit twice as well, they are swapped
+POOR_NOISES = 2.0  # times the stated sigmas: worth a warning
+LINE_RAD = math.radians(60.0)  # if the rotation about an axis is no better determined, positions lie along that axis
 NADIR_PITCH_DEG = -60.0
 HEIGHT_TOLERANCE = 0.1  # of the height above ground, against what the drone measured
 
@@ -51,16 +51,16 @@ HEIGHT_TOLERANCE = 0.1  # of the height above ground, against what the drone mea
 def georeference(
     model: SparseModel, positions: Positions, max_error_m: float | Literal["auto"], photos: Mapping[str, Photo]
 ) -> tuple[Frame, PositionFit]:
-    """The frame from positions, in the vertical datum that these declare.
+    """Determine the frame from positions, in the vertical datum that these declare.
 
     Args:
         model: The sparse model.
-        positions: What the photos state.
+        positions: The photos' stated positions.
         max_error_m: Positions further off are left out; ``auto``: those that are off by far more than the noise of all.
-        photos: All photos of the capture by name; they tell the order in which they were taken.
+        photos: All photos of the capture by name; their times give the order in which they were taken.
 
     Raises:
-        NoPlaceError: if they do not determine one.
+        NoPlaceError: if the positions do not determine a frame.
     """
     limit = None if max_error_m == "auto" else max_error_m
     usable = [name for name in model.names if _altitude(positions.by_name.get(name)) is not None]
@@ -101,7 +101,7 @@ def georeference(
 
 
 def _bound(points: Correspondences, limit: float | None) -> Correspondences:
-    """Which flights are apart, from a fit in which each has any offset; none where that determines nothing."""
+    """Determine which flights are apart, by a fit with free offsets; none where that fit is undetermined."""
     try:
         return bound(points, robust_similarity(unbound(points), limit))
     except ValueError:
@@ -120,13 +120,15 @@ def _robust(points: Correspondences, limit: float | None, prior: DirectionPrior)
 def _require_unswapped(
     points: Correspondences, geodetic: Float64[np.ndarray, "n 3"], limit: float | None, noise: float
 ) -> None:
-    """Refuse positions that fit far better with latitude and longitude swapped; a flat flight fits both ways a little.
+    """Reject positions that fit far better with latitude and longitude swapped.
+
+    A flat flight fits both ways to some degree.
 
     Args:
         points: The cameras, and their positions as stated.
         geodetic: The latter, as latitude and longitude (degrees) and height (metres).
         limit: As for the fit.
-        noise: What the residuals of the positions as stated are, over their sigmas.
+        noise: Residuals of the positions as stated, over their sigmas.
     """
     swapped = geodetic[:, [1, 0, 2]]
     if np.abs(swapped[:, 0]).max() > 90.0:
@@ -158,7 +160,7 @@ def _why_few(model: SparseModel, positions: Positions, usable: int) -> str:
 
 
 def _origin(geodetic: Float64[np.ndarray, "n 3"]) -> Origin:
-    """A rounded median; longitudes are taken about the first, as they may straddle 180°."""
+    """A rounded median; longitudes are taken relative to the first, as they may straddle 180°."""
     first = geodetic[0, 1]
     longitude = first + float(np.median((geodetic[:, 1] - first + 180.0) % 360.0 - 180.0))
     return Origin(
@@ -190,7 +192,7 @@ def _rms(residuals: Float64[np.ndarray, "n k"]) -> float:
 
 
 def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Positions, report: Reporter) -> None:
-    """Say how well the positions place the model; warn of what is wrong with them, or weak about the fit."""
+    """Report how well the positions place the model; warn about wrong positions or a weak fit."""
     report.note(f"Placed by the photos' positions: {fit.uncertainty.sentence()}.")
     _tell_noise(fit, frame, positions, report)
     _tell_directions(fit, report)
@@ -213,7 +215,7 @@ def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Position
 
 
 def _tell_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Reporter) -> None:
-    """Warn of positions that scatter by far more than they state."""
+    """Warn about positions that scatter by far more than their stated sigmas."""
     used = [positions.by_name[name] for name in frame.residuals["photos"]]
     factors = fit.uncertainty.noise.factors
     if float(factors.max()) > POOR_NOISES:
@@ -230,7 +232,7 @@ def _tell_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Re
 
 
 def _tell_directions(fit: PositionFit, report: Reporter) -> None:
-    """Warn of directions that are not the positions'."""
+    """Warn about directions that do not come from the positions."""
     if fit.contradicted_rad > 0.0:
         report.warning(
             f"The photos' positions would rotate the model by {math.degrees(fit.contradicted_rad):.0f}° against"

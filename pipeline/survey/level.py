@@ -1,4 +1,4 @@
-"""Which way is up, and north where a gimbal tells it: from how the cameras were held."""
+"""Determine up, and north where gimbal angles give it, from the cameras' orientations."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from splatpipe.pipeline.survey.model import SparseModel
 
 MIN_ANGLES = 3
 GIMBAL_SIGMA_RAD = math.radians(3.0 * math.sqrt(2.0))  # of each of three axes: 3° of the rotation about any
-GIMBAL_SPREAD_RAD = math.radians(15.0)  # angles that agree less with the model are in another convention
+GIMBAL_SPREAD_RAD = math.radians(15.0)  # angles that deviate more from the model are in another convention
 UP_SIGMA_RAD = math.radians(5.0)
 
 
@@ -38,7 +38,7 @@ class Positions:
     Attributes:
         by_name: Records by photo name.
         orientations: EXIF orientations by photo name where they are not 1.
-        wrong: Why a photo's position counts as none, by photo name.
+        wrong: Why a photo's position is unusable, by photo name.
     """
 
     by_name: Mapping[str, Mapping[str, Any]]
@@ -47,7 +47,7 @@ class Positions:
 
 
 def arbitrary_frame(model: SparseModel, positions: Positions, reason: str) -> Frame:
-    """Up is +z; scale and place stay the model's."""
+    """An arbitrary frame: up is +z; scale and position stay the model's."""
     gimbal = gimbal_rotation(model, positions)
     if gimbal is not None:
         similarity, source = Similarity(1.0, gimbal, np.zeros(3)), "the gimbal's angles"
@@ -58,7 +58,7 @@ def arbitrary_frame(model: SparseModel, positions: Positions, reason: str) -> Fr
 
 
 def known_directions(model: SparseModel, positions: Positions) -> Directions:
-    """What tells the rotation where positions tell it worse, or not at all."""
+    """Directions that give the rotation where positions determine it less well, or not at all."""
     gimbal = gimbal_rotation(model, positions)
     if gimbal is not None:
         return Directions(DirectionPrior(gimbal, np.eye(3), GIMBAL_SIGMA_RAD), "the gimbal's angles", of_gimbal=True)

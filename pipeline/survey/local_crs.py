@@ -1,7 +1,7 @@
-"""A CRS for programs without PROJ: the way from the world's metres as a polynomial, exact to a tenth of a millimetre.
+"""A CRS for programs without PROJ: a polynomial of the world's metres, exact to a tenth of a millimetre.
 
-Over a few kilometres a projection is a power series that dies out fast: its terms of fourth order are some (L / R)³ L,
-for a scene L = 10 km wide and the earth's radius R well below a millimetre.
+Over a few kilometres a projection is a power series that converges fast: its fourth-order terms are about (L / R)³ L,
+which for a scene L = 10 km wide and the earth's radius R is well below a millimetre.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class LocalCrs:
     """Coordinates = origin + Σ coefficient · eᵃ nᵇ uᶜ, with e, n, u = east, north, up over ``scale_m``.
 
     Attributes:
-        id: As PROJ knows it.
-        name: For people.
-        heights: Vertical datum of the heights, for people.
-        labels: Of the three coordinates, as they are given: easting or longitude first.
+        id: Identifier that PROJ accepts.
+        name: Human-readable name.
+        heights: Vertical datum of the heights, human-readable.
+        labels: Of the three coordinates, in order: easting or longitude first.
         geographic: Whether the first two are degrees.
         origin: Coordinates of the world's zero.
         scale_m: Metres.
@@ -55,7 +55,7 @@ class LocalCrs:
         return np.asarray(self.origin + _terms(local / self.scale_m, self.powers) @ self.coefficients)
 
     def facts(self) -> dict[str, Any]:
-        """As JSON, for a script that evaluates it."""
+        """The polynomial as JSON, for a script that evaluates it."""
         return {
             "id": self.id,
             "name": self.name,

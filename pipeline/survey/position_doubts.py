@@ -1,4 +1,4 @@
-"""What the photos' positions make doubtful before anything is matched: from their metadata alone."""
+"""Doubtful photo positions, detected before matching from metadata alone."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from splatpipe.pipeline.survey.photo_positions import (
     xmp_place,
 )
 
-CONTRADICTION_M = 1.0  # between a photo's EXIF and XMP: no rounding
-CONTRADICTION_TIMES = 6.0  # what they differ by in most photos, whose EXIF was corrected afterwards (PPK)
-ANOTHER_PLACE_M = 10.0  # in most photos: no correction
+CONTRADICTION_M = 1.0  # between a photo's EXIF and XMP: too large for rounding
+CONTRADICTION_TIMES = 6.0  # times the difference in most photos, whose EXIF may have been post-processed (PPK)
+ANOTHER_PLACE_M = 10.0  # in most photos: too large for a correction
 WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
-RTK_SHARE = 0.5  # of the photos with a fix: then the others have lost it
+RTK_SHARE = 0.5  # of the photos with a fix: above, the others have lost it
 ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
 LEAST_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
 
 
 def position_doubts(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Doubt]:
-    """What is doubtful, one entry a kind.
+    """List what is doubtful, one entry per kind.
 
     Args:
-        photos: Those that take part.
-        positions: What was read of them.
+        photos: The photos in use.
+        positions: Their positions as read.
     """
     return [
         *_none_on_earth(positions),
@@ -92,7 +92,7 @@ def _missing(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Do
 
 
 def _contradicting(photos: Sequence[CheckedPhoto]) -> list[Doubt]:
-    """Photos whose EXIF and XMP state different places, where those of most agree."""
+    """Photos whose EXIF and XMP state different positions, where most photos' agree."""
     apart: dict[str, float] = {}
     for photo in photos:
         gps, other = photo.exif.gps, xmp_place(photo.xmp)
@@ -164,7 +164,7 @@ def _datum(vertical: str, source: str | None) -> str:
 
 
 def _lost_fix(positions: Sequence[Position]) -> list[Doubt]:
-    """Photos without the fix that most have; by the receiver's own word, else by its standard deviations."""
+    """Photos without the fix that most have, by the receiver's RTK flag, else by its standard deviations."""
     if not positions:
         return []
     fixed = {each.name: _is_fixed(each) for each in positions}

@@ -1,9 +1,9 @@
-"""Files of where photos were taken: ODM's ``geo.txt``, and a CSV with a header.
+"""Read files of photo positions: ODM's ``geo.txt``, and a CSV with a header.
 
 ODM (docs.opendronemap.org, "Image geolocation files"): the first line names the CRS, then a photo a line, ``image_name
 geo_x geo_y [geo_z] [yaw pitch roll] [horz_accuracy vert_accuracy]``, strictly by position: angles count with at least
-seven fields, accuracies are the eighth and the ninth, and angles 0 0 0 mean unknown. ``#`` begins a comment. What is
-read is plain text from elsewhere: everything has a limit, and every refusal names the line.
+seven fields, accuracies are the eighth and the ninth, and angles 0 0 0 mean unknown. ``#`` begins a comment. The text
+is untrusted: everything has a limit, and every error names the line.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ KIND = TableKind("file of positions", EXPECTED, max_bytes=64 << 20, max_lines=1_
 
 @dataclass(frozen=True)
 class PhotoPlace:
-    """What the file says of a photo.
+    """A photo's entry in the file.
 
     Attributes:
-        line: Of the file, from 1.
+        line: Line number in the file, from 1.
         name: The photo, as written.
         x: Easting or longitude, in the file's CRS.
         y: Northing or latitude.
         z: Height; None where there is none.
         angles_deg: Yaw, pitch and roll, as written; None where they are unknown.
-        sigma_m: Horizontal (each of two) and vertical standard deviation; None where the file states none.
+        sigma_m: Horizontal (per axis) and vertical standard deviation; None where the file states none.
     """
 
     line: int
@@ -96,7 +96,7 @@ def read_position_file(path: Path) -> PositionFile:
     """Read a file of photos' positions.
 
     Raises:
-        SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
+        SplatpipeError: if it is not such a file; the message names the line, the hint what is expected there.
     """
     lines = read_lines(path, KIND)
     written = written_lines(lines, path, KIND)
@@ -120,7 +120,7 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[tuple[int, 
         raise LineError(first, "the first line must state the CRS, but it is a photo's")
     rows: list[tuple[int, Mapping[str, str]]] = []
     for number, line in written[1:]:
-        # A name with blanks is one field where tabs part the fields.
+        # A name with blanks is one field where tabs separate the fields.
         fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 2 else line.split()
         if len(fields) < 3:
             raise LineError(number, f"{len(fields)} fields, but at least 3 are needed")
@@ -132,7 +132,7 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[tuple[int, 
 
 
 def _header(line: str) -> dict[str, int]:
-    """The columns of a header; nothing where the line is none."""
+    """The columns of a header; empty where the line is not a header."""
     columns = find_columns(next(csv.reader([line], delimiter=delimiter_of(line))), COLUMNS)
     return columns if {"name", "x", "y"} <= set(columns) else {}
 
@@ -161,7 +161,7 @@ def _angles(
 
 
 def _sigma(number: int, value: float | None) -> float | None:
-    """An accuracy; 0 is how programs write that they have none."""
+    """A standard deviation; programs write 0 where they have none."""
     if value is None or value == 0.0:
         return None
     if not SIGMA_BOUNDS_M[0] <= value <= SIGMA_BOUNDS_M[1]:

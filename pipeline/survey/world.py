@@ -1,9 +1,9 @@
-"""A georeferenced scene's way out: from its local metres into a CRS, and onto the earth.
+"""Convert a georeferenced scene's local metres into a CRS, and place the scene on the earth.
 
-The exact path is local → earth-centred (ECEF) by one float64 4×4 → latitude, longitude, height → CRS by PROJ; nothing
-projected is ever in float32. Heights stay as they were stated: where their datum is not the ellipsoid, the 4×4 of that
-path takes them for ellipsoidal all the same, so that they come back as stated, and the matrix that places the scene on
-the earth is one of its own, raised by the geoid where its grid is there and labelled approximate where it is not.
+The exact path is local → earth-centred (ECEF) by one float64 4×4 → latitude, longitude, height → CRS by PROJ; projected
+coordinates are never float32. Heights stay as stated: where their datum is not the ellipsoid, the 4×4 of that path
+still treats them as ellipsoidal, so that they come back as stated. The matrix that places the scene on the earth is a
+separate one, raised by the geoid where its grid is installed and labelled approximate where it is not.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from splatpipe.pipeline.survey.crs import (
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin, ecef_from_geodetic
 
-STEP_M = 100.0  # of the central differences: their error of third order is 1e-12 of a length, float64's 1e-11
-BOX_STEPS = 9  # samples along each side of the scene: errors are quadratic, so largest at its border
+STEP_M = 100.0  # of the central differences: their third-order error is 1e-12 of a length, float64's is 1e-11
+BOX_STEPS = 9  # samples along each side of the scene: errors are quadratic, so largest at its edges
 AUTO = "auto"
 
 
@@ -43,9 +43,9 @@ class Placement:
 
     Attributes:
         matrix: From local to ECEF, metres.
-        approximate: Whether its heights may be off, for want of a datum or of the geoid's grid.
-        largest_error_m: Against the exact path over the scene; None where it is not known.
-        note: Why, a sentence or two.
+        approximate: Whether its heights may be off because the datum or the geoid's grid is missing.
+        largest_error_m: Against the exact path over the scene; None where unknown.
+        note: The reason, a sentence or two.
     """
 
     matrix: Float64[np.ndarray, "4 4"]
@@ -61,7 +61,7 @@ class Tangent:
     Attributes:
         matrix: From local metres to the CRS's units; float64 is needed.
         largest_error_m: Horizontally, over the scene, against the exact path.
-        largest_height_error_m: The same of heights: the earth's curvature.
+        largest_height_error_m: The same for heights: the earth's curvature.
     """
 
     matrix: Float64[np.ndarray, "4 4"]
@@ -71,12 +71,12 @@ class Tangent:
 
 @dataclass(frozen=True)
 class GridScale:
-    """What a length is in a projected CRS, at the origin.
+    """The scale of lengths in a projected CRS, at the origin.
 
     Attributes:
         projection: Grid length over length on the ellipsoid.
-        ground: Grid length over length on the ground, at the origin's height: the projection's times the height's.
-        convergence_deg: From true to grid north, clockwise.
+        ground: Grid length over length on the ground at the origin's height: projection factor times height factor.
+        convergence_deg: Meridian convergence: from true to grid north, clockwise.
     """
 
     projection: float
@@ -86,7 +86,7 @@ class GridScale:
 
 @dataclass(frozen=True)
 class World:
-    """A local frame and the CRS that its coordinates are read out in.
+    """A local frame and the CRS of its output coordinates.
 
     Attributes:
         origin: Of the local east-north-up frame.
@@ -102,30 +102,30 @@ class World:
 
     @property
     def heights(self) -> str:
-        """Vertical datum of the heights that are read out: the CRS's, or the local ones as they are."""
+        """Vertical datum of output heights: the CRS's, or that of the local heights."""
         return self.vertical if self.crs.vertical == UNKNOWN else self.crs.vertical
 
     def crs_from_local(self, local: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """East, north, up (metres) to the CRS: easting (longitude), northing (latitude), height, in its units."""
+        """Convert east, north, up (metres) to easting (longitude), northing (latitude), height in the CRS's units."""
         geodetic = self.origin.geodetic_from_enu(local)
         geodetic[:, 2] += self._raise(geodetic)
         return from_geodetic(self.operation, self.crs, geodetic)
 
     def local_from_crs(self, coordinates: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """The CRS to east, north, up (metres): exactly what ``crs_from_local`` undoes."""
+        """Convert CRS coordinates to east, north, up (metres): the exact inverse of ``crs_from_local``."""
         geodetic = geodetic_by(self.operation, self.crs, coordinates)
         geodetic[:, 2] -= self._raise(geodetic)
         return self.origin.enu_from_geodetic(geodetic)
 
     def _raise(self, geodetic: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """What heights in the CRS are above the local ones (metres)."""
+        """Heights in the CRS less the local ones (metres)."""
         if self.heights == self.vertical or same_datum(self.heights, self.vertical):
             return np.zeros(len(geodetic))
         place = geodetic[:, 0], geodetic[:, 1]
         return np.asarray(undulation(self.vertical, *place) - undulation(self.heights, *place))
 
     def placement(self, box: Float64[np.ndarray, "2 3"]) -> Placement:
-        """Where the local frame is on the earth.
+        """The local frame's placement on the earth.
 
         Args:
             box: Least and largest east, north, up of the scene, metres.
@@ -149,7 +149,7 @@ class World:
         return Placement(matrix, False, _longest(off), note)
 
     def tangent(self, box: Float64[np.ndarray, "2 3"]) -> Tangent:
-        """The matrix that is closest to the exact path at the origin, and how far it is off over the scene.
+        """The matrix closest to the exact path at the origin, and its largest errors over the scene.
 
         Args:
             box: Least and largest east, north, up of the scene, metres.
@@ -163,7 +163,7 @@ class World:
         return Tangent(matrix, _longest(off[:, :2]), _longest(off[:, 2:]))
 
     def grid_scale(self) -> GridScale | None:
-        """Lengths in the CRS against those on the ground; None in a geographic CRS, which has none."""
+        """Scale of lengths in the CRS against the ground; None in a geographic CRS, which has no lengths."""
         if self.crs.is_geographic:
             return None
         on_ellipsoid = replace(self, origin=replace(self.origin, height_m=0.0))
@@ -181,8 +181,8 @@ def open_world(frame: Frame) -> World:
     """The world of a georeferenced frame.
 
     Raises:
-        SplatpipeError: if its CRS cannot be used there: as ``open_operation``, and where its heights cannot be brought
-            into the CRS's datum.
+        SplatpipeError: if its CRS cannot be used there: as ``open_operation``, and where its heights cannot be
+            converted to the CRS's datum.
         ValueError: if the frame is arbitrary.
     """
     if frame.origin is None:
@@ -191,15 +191,15 @@ def open_world(frame: Frame) -> World:
     crs = parse_crs(frame.crs) if frame.crs else utm_of(origin.latitude, origin.longitude)
     operation = open_operation(crs, origin.latitude, origin.longitude, frame.approximate_crs)
     world = World(origin, frame.vertical_datum, crs, operation)
-    world.crs_from_local(np.zeros((1, 3)))  # the geoid's grids are looked for now
+    world.crs_from_local(np.zeros((1, 3)))  # fails now if the geoid's grids are missing
     return world
 
 
 def in_crs(frame: Frame, asked: str, stated: str = "", approximate: bool = False) -> Frame:
-    """A frame with the CRS that its coordinates are to be read out in, which is tried.
+    """Set the CRS of a frame's output coordinates, after checking that it can be used.
 
     Args:
-        frame: Georeferenced; an arbitrary one stays as it is.
+        frame: Georeferenced; an arbitrary one is returned unchanged.
         asked: `georef.crs`; ``auto`` for the control file's, or the UTM zone where its heights are not the frame's.
         stated: The control file's; empty without one.
         approximate: `georef.approximate_crs`.
