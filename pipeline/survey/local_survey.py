@@ -1,4 +1,4 @@
-"""The frame of a model by control, with the photos' positions where there are any."""
+"""Set a model's frame by ground control, with the photos' positions where there are any."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.surveyed_points import Survey
 
 MIN_CONTROL = 3  # without positions
-START_SHARE = 0.05  # of the control's extent: what a hypothesis may miss a point by
+START_SHARE = 0.05  # of the control's extent: the largest miss of an inlier to a hypothesis
 OFFSET_SIGMA_M = 2.0  # of a flight's positions at least: a base station's coordinates
-OFFSET_SIGMAS = 3.0  # times theirs
-DATUM_SIGMA_M = 1000.0  # of heights: nothing says that those of control and of receivers have one datum
-LEAST_EXTENT_M = 0.01  # of control points that are several
-MISFIT_SHARE = 0.25  # of the control's extent: a fit that is off by more is none
+OFFSET_SIGMAS = 3.0  # times the positions' sigmas
+DATUM_SIGMA_M = 1000.0  # of heights: those of control and of receivers need not share a datum
+LEAST_EXTENT_M = 0.01  # of control points, to count as several
+MISFIT_SHARE = 0.25  # of the control's extent: a fit that is off by more is rejected
 
 
 @dataclass(frozen=True)
 class Stations:
-    """The photos' positions that take part.
+    """The photos' positions that are used.
 
     Attributes:
         names: Of the photos.
-        indices: Of them in the model.
+        indices: The photos' indices in the model.
         geodetic: Latitude, longitude, height.
         sigmas: Standard deviations of east, north, up, metres.
         group: Index of the flight.
@@ -56,7 +56,7 @@ class Stations:
         return len(self.names)
 
     def offset_sigmas(self) -> Float64[np.ndarray, "k 3"]:
-        """What a flight's positions may be off together."""
+        """Standard deviations (metres) of the offset that all positions of a flight share."""
         own = np.array([np.median(self.sigmas[self.group == k], axis=0) for k in range(len(self.flights))])
         result = np.maximum(OFFSET_SIGMA_M, OFFSET_SIGMAS * own.reshape(-1, 3))
         result[:, 2] = DATUM_SIGMA_M
@@ -65,12 +65,12 @@ class Stations:
 
 @dataclass(frozen=True)
 class Targets:
-    """Where the survey has its points, in the order of its points.
+    """The surveyed positions of the survey's points, in its order.
 
     Attributes:
-        enu: East, north, up; up is 0 where it is not known.
-        sigmas: Of the survey; infinite where it is not known.
-        geodetic: Latitude, longitude, height (NaN where it is not known).
+        enu: East, north, up; up is 0 where unknown.
+        sigmas: Of the survey; infinite where unknown.
+        geodetic: Latitude, longitude, height (NaN where unknown).
     """
 
     enu: Float64[np.ndarray, "n 3"]
@@ -80,7 +80,7 @@ class Targets:
 
 @dataclass(frozen=True)
 class LocalSurvey:
-    """Where the world's zero is, and what is known in it.
+    """The world's origin, and the known positions in it.
 
     Attributes:
         origin: Of the world.
@@ -96,7 +96,7 @@ class LocalSurvey:
 
 
 def stations_of(model: SparseModel, positions: Positions, frame: Frame | None) -> Stations:
-    """The positions that the fit of positions believes; none where it did not succeed."""
+    """The inliers of the fit of positions; none where the fit failed."""
     left_out = set() if frame is None else set(frame.left_out)
     rows = []
     for index, name in enumerate(model.names):
@@ -118,10 +118,10 @@ def stations_of(model: SparseModel, positions: Positions, frame: Frame | None) -
 
 
 def _worse_than_stated(frame: Frame) -> Float64[np.ndarray, " 2"]:
-    """How many times worse than stated the positions count, horizontally and in height; never better than that.
+    """Factors, at least 1, by which positions count as worse than stated, horizontally and in height.
 
-    Of errors that each position carries on from the one before, many are worth as few: their mean errs as that of
-    independent ones does that are larger by the root of (1 + r) / (1 - r).
+    The mean of many errors with correlation r between neighbours is as uncertain as that of independent errors that are
+    larger by the square root of (1 + r) / (1 - r).
     """
     told = frame.residuals.get("uncertainty", {})
     factors = np.array(told.get("noise_over_stated", [1.0, 1.0]), dtype=np.float64)
@@ -130,7 +130,7 @@ def _worse_than_stated(frame: Frame) -> Float64[np.ndarray, " 2"]:
 
 
 def locate_survey(survey: Survey, config: GeorefConfig) -> Float64[np.ndarray, "n 3"]:
-    """Latitude, longitude and height (NaN where it is not known) of the survey's points."""
+    """Latitude, longitude and height (NaN where unknown) of the survey's points."""
     stated = [[p.surveyed.x, p.surveyed.y, math.nan if p.surveyed.z is None else p.surveyed.z] for p in survey.points]
     return to_geodetic(np.array(stated, dtype=np.float64), survey.crs, config.approximate_crs).geodetic
 
@@ -165,7 +165,7 @@ def make_site(
 def observed_in(
     site: LocalSurvey, survey: Survey, model: SparseModel, scale: float, mark_sigma_px: float
 ) -> JointObservations:
-    """Control (first, in the survey's order) and positions, with sigmas that hold the marks' as well."""
+    """Control (first, in the survey's order) and positions, with sigmas that include the marks'."""
     chosen = [k for k, point in enumerate(survey.points) if point.role == "control" and point.found is not None]
     found = [survey.points[k].found for k in chosen]
     source = np.array([each.xyz for each in found if each is not None], dtype=np.float64).reshape(-1, 3)
@@ -190,7 +190,7 @@ def observed_in(
 def start_similarity(
     site: LocalSurvey, survey: Survey, model: SparseModel, positions: Positions, frame: Frame | None
 ) -> tuple[Similarity, Priors]:
-    """World from model, near the truth, and what else holds the fit.
+    """An initial world-from-model similarity, and what else constrains the fit.
 
     Raises:
         NoPlaceError: if there are neither positions nor enough control.
@@ -235,7 +235,7 @@ def _place(survey: Survey, index: int) -> Float64[np.ndarray, " 3"]:
 def _levelled(
     source: Float64[np.ndarray, "n 3"], target: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"]
 ) -> Similarity:
-    """Scale, heading and place by horizontal control of a model that how its cameras are held has levelled."""
+    """Scale, heading and position by horizontal control, for a model levelled by its cameras' orientations."""
     level = rotation_to_up(up)
     flat = source @ level.T
     a, b = flat[:, 0] + 1j * flat[:, 1], target[:, 0] + 1j * target[:, 1]
@@ -250,10 +250,10 @@ def _levelled(
 
 
 def require_fit(fit: JointFit, observed: JointObservations, survey: Survey) -> None:
-    """Refuse control that has another shape than the model.
+    """Reject control whose shape differs from the model's.
 
     Raises:
-        SplatpipeError: if it misses the model by a good part of its own extent.
+        SplatpipeError: if it misses the model by a large part of its own extent.
     """
     control = observed.is_control
     if control.sum() < MIN_CONTROL:
@@ -278,6 +278,6 @@ def require_fit(fit: JointFit, observed: JointObservations, survey: Survey) -> N
 
 
 def with_sigmas_times(observed: JointObservations, factor: float) -> JointObservations:
-    """The same with control that is less accurate by a factor."""
+    """The same observations, with the control's sigmas multiplied by a factor."""
     scale = np.where(observed.is_control, factor, 1.0)[:, None]
     return replace(observed, sigmas=observed.sigmas * scale)

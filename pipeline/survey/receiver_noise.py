@@ -1,10 +1,10 @@
-"""The noise of a receiver's positions, told from the residuals of the model that they place, and the place's worth.
+"""Estimate the noise of a receiver's positions from the residuals of the fitted model, and the fit's accuracy.
 
-A receiver's error changes slowly. What residuals look like then says little about how far the whole is off: 75
-positions of one minute are not 75 witnesses. So the error of a position is a process that each position carries on from
-the one before (autoregressive, of first order), horizontally and in height each with its own size and correlation.
-These four numbers are those of restricted maximum likelihood (Patterson and Thompson 1971), which counts what the fit
-itself took of the residuals; the fit is generalised least squares with them.
+A receiver's error changes slowly, so residuals say little about how far the whole model is off: 75 positions from one
+minute are not 75 independent observations. The error is therefore modelled as a first-order autoregressive process
+along the positions, with its own size and correlation horizontally and in height. These four numbers are estimated by
+restricted maximum likelihood (Patterson and Thompson 1971), which accounts for the degrees of freedom that the fit
+itself uses; the fit is generalised least squares with them.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from splatpipe.pipeline.geometry.similarity import (
 )
 
 CORRELATIONS = np.array([*np.arange(0.0, 0.9, 0.05), 0.9, 0.925, 0.95, 0.97, 0.98, 0.99])
-UNPROVEN = 2.0  # of minus twice the likelihood, that a correlation has to gain (Akaike 1974): else there is none
+UNPROVEN = 2.0  # least gain in minus twice the log-likelihood for a correlation to be accepted (Akaike 1974)
 GROUP_OF_AXIS = np.array([0, 0, 1])  # east, north; up
 PLACE = np.arange(4, SIMILARITY)  # of the unknowns
 ROUNDS = 40
 SETTLED = 1e-9  # of a step, in radians and relative to the extent
-SEARCHED_ROUNDS = 3  # in which every correlation is tried; from there on the neighbours of the one found
+SEARCHED_ROUNDS = 3  # in which every correlation is tried; later ones try only the neighbours of the best
 FACTOR_ROUNDS = 2  # each; the rounds of the fit do the rest
-LEAST_FACTOR = 1e-6  # of the stated sigmas: exact positions have no noise to tell
+LEAST_FACTOR = 1e-6  # of the stated sigmas: exact positions have no noise to estimate
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 
 
@@ -43,8 +43,8 @@ class ReceiverNoise:
 
     Attributes:
         factors: Its standard deviation horizontally and in height, over the stated one.
-        correlations: Of it with that of the position before, likewise.
-        degrees: Of freedom that the factors were told from; fewer where errors are correlated.
+        correlations: With the error of the position before, likewise.
+        degrees: Degrees of freedom behind the factors; fewer where errors are correlated.
     """
 
     factors: Float64[np.ndarray, " 2"]
@@ -59,8 +59,8 @@ class NoisyFit:
     Attributes:
         similarity: Source to target.
         noise: Of the positions.
-        covariance: Of a rotation vector (radians, about the target's axes), the scale's logarithm, and the place of the
-            points' mean (target's units).
+        covariance: Of a rotation vector (radians, about the target's axes), the scale's logarithm, and the position of
+            the points' mean (target's units).
         centre: That mean, in the target.
         offsets: The error that each group shares (target less truth).
     """
@@ -83,17 +83,17 @@ def fit_with_noise(
 ) -> NoisyFit:
     """Fit a similarity and the noise of its points together, from a similarity near it.
 
-    Points that are far off have to be left out before; what is left of them is weighted down by Cauchy's weights. The
-    place is where the residuals' mean is zero: of an error that drifts, the likelihood would have it return from there
-    to a mean which lies outside of all positions.
+    Gross outliers must be removed beforehand; remaining ones are down-weighted by Cauchy's weights. The position is
+    where the residuals' mean is zero: for a drifting error, the likelihood would assume a return to a mean that lies
+    outside all positions.
 
     Args:
         points: At least 3; fewer than 8 keep their stated sigmas, unless they show that these are too small.
-        before: Of each point, an earlier one whose error it carries on, -1 for none.
-        start: Near the answer.
-        prior: Directions that take part.
-        correlated: Whether errors may be carried on.
-        held: Leave the similarity as it is, and tell the noise about it.
+        before: For each point, its predecessor in the error process, -1 for none.
+        start: Initial similarity, near the solution.
+        prior: Directions to include in the fit.
+        correlated: Whether errors may be correlated.
+        held: Keep the similarity fixed, and estimate only the noise.
     """
     similarity = start
     offsets = np.zeros((0 if points.shared is None else len(points.shared.sigmas), 3))
@@ -127,7 +127,7 @@ def fit_with_noise(
 def _mean_residual(
     points: Correspondences, similarity: Similarity, offsets: Float64[np.ndarray, "g 3"]
 ) -> Float64[np.ndarray, " 3"]:
-    """Of the three coordinates, by the stated sigmas and Cauchy's weights."""
+    """Mean residual of the three coordinates, weighted by the stated sigmas and Cauchy's weights."""
     residuals = similarity.apply(points.source) - points.without(offsets).target
     weights = _cauchy((residuals / points.sigmas).reshape(-1, 1)).reshape(-1, 3) / points.sigmas**2
     return np.asarray((weights * residuals).sum(axis=0) / weights.sum(axis=0))
@@ -136,7 +136,7 @@ def _mean_residual(
 def _variance_of_mean(
     points: Correspondences, before: Int64[np.ndarray, " n"], noise: ReceiverNoise
 ) -> Float64[np.ndarray, " 3"]:
-    """Of the mean of the positions' own errors; those of a chain have a part in common."""
+    """Variance of the mean of the positions' own errors, which are correlated along a chain."""
     weights = 1.0 / points.sigmas**2
     shares = noise.factors[GROUP_OF_AXIS] * points.sigmas * weights / weights.sum(axis=0)
     carried, total = np.zeros_like(shares), np.zeros(3)
@@ -170,12 +170,12 @@ def _told(
 
 @dataclass(frozen=True)
 class _ResidualRows:
-    """The linear problem: a row a coordinate, over its stated sigma; the last column is the residual.
+    """The linear problem: one row per coordinate, over its stated sigma; the last column is the residual.
 
     Attributes:
-        own: Of each coordinate.
-        past: Of the coordinate that it carries on; zeros where there is none.
-        follows: Whether there is one.
+        own: Row of each coordinate.
+        past: Row of its predecessor; zeros where there is none.
+        follows: Whether there is a predecessor.
         group: 0 horizontally, 1 in height.
     """
 
@@ -214,14 +214,14 @@ def _whitened(rows: _ResidualRows, noise: ReceiverNoise) -> Float64[np.ndarray, 
 
 
 def _cauchy(whitened: Float64[np.ndarray, "m p"]) -> Float64[np.ndarray, " m"]:
-    """Weights by how far each point's three coordinates are off together."""
+    """Cauchy weights by the joint residual of each point's three coordinates."""
     normed = np.sqrt((whitened[:, -1].reshape(-1, 3) ** 2).mean(axis=1))
     typical = max(float(np.median(normed)) / MEDIAN_OF_CHI3, 1e-12)
     return np.repeat(1.0 / (1.0 + (normed / (CAUCHY * typical)) ** 2), 3)
 
 
 def _held(points: Correspondences, similarity: Similarity, prior: DirectionPrior | None) -> Float64[np.ndarray, "p p"]:
-    """The information of what is known besides the positions: of shared errors, and of directions."""
+    """The information matrix of prior knowledge besides the positions: shared errors and directions."""
     shared = np.zeros(0) if points.shared is None else 1.0 / points.shared.sigmas.ravel() ** 2
     held = np.diag(np.concatenate([np.zeros(SIMILARITY), shared]))
     if prior is not None:
@@ -233,7 +233,7 @@ def _held(points: Correspondences, similarity: Similarity, prior: DirectionPrior
 def _pull(
     points: Correspondences, similarity: Similarity, offsets: Float64[np.ndarray, "g 3"], prior: DirectionPrior | None
 ) -> Float64[np.ndarray, " p"]:
-    """The gradient of the same."""
+    """The gradient of the same prior terms."""
     pull = np.zeros(SIMILARITY + offsets.size)
     if points.shared is not None:
         pull[SIMILARITY:] = (offsets / points.shared.sigmas**2).ravel()
@@ -245,7 +245,7 @@ def _pull(
 
 @dataclass(frozen=True)
 class _Group:
-    """Products of a group's rows, from which those of any correlation are made."""
+    """Products of a group's rows, from which those for any correlation are computed."""
 
     first: Float64[np.ndarray, "p p"]
     own: Float64[np.ndarray, "p p"]
@@ -255,7 +255,7 @@ class _Group:
     following: int
 
     def products(self, correlations: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "k p p"]:
-        """Of its whitened rows, of factor 1, for some correlations."""
+        """Products of its whitened rows, with factor 1, for the given correlations."""
         by = correlations[:, None, None]
         carried = self.own - by * (self.mixed + self.mixed.T) + by**2 * self.past
         return np.asarray(self.first + carried / (1.0 - by**2))
@@ -268,7 +268,7 @@ def _grouped(rows: _ResidualRows, group: int) -> _Group:
 
 
 def _tried(noise: ReceiverNoise, count: int, done: int) -> list[Float64[np.ndarray, " _"]]:
-    """The correlations that are tried in a round, of each group; few points do not tell them."""
+    """The correlations to try in a round, for each group; a few points do not determine them."""
     if count < REDUNDANT:
         return [CORRELATIONS[:1]] * 2
     if done < SEARCHED_ROUNDS:
@@ -316,7 +316,7 @@ def _profile(
 
 
 def _inverse(information: Float64[np.ndarray, "*k p p"]) -> Float64[np.ndarray, "*k p p"]:
-    """Of matrices whose unknowns are of different sizes; a direction that nothing determines becomes huge, not zero."""
+    """Invert matrices with unknowns of different sizes; an undetermined direction becomes huge, not zero."""
     sizes = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
     outer = sizes[..., :, None] * sizes[..., None, :]
     values, vectors = np.linalg.eigh(information / outer)

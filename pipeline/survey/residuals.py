@@ -1,4 +1,4 @@
-"""What residuals at surveyed points say: root mean squares, means, and the intervals that so few of them allow."""
+"""Statistics of residuals at surveyed points: RMSE, means, and confidence intervals for small samples."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def accuracy_table(residuals: Float64[np.ndarray, "n 3"]) -> dict[str, Any] | No
     """A group's table in `accuracy.json` and `metrics.json`.
 
     Args:
-        residuals: East, north, up (metres), estimated less surveyed; NaN where nobody measured it.
+        residuals: East, north, up (metres), estimated less surveyed; NaN where not measured.
 
     Returns:
         Root mean squares (``horizontal`` and ``3d``: of the vectors' lengths), means, and the 95 % intervals of the
-        horizontal and the vertical one, taking the residuals for independent and normal; None without points. What is
-        not known is None.
+        horizontal and the vertical one, assuming independent and normal residuals; None without points. Unknown values
+        are None.
     """
     if not len(residuals):
         return None

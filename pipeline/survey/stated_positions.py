@@ -1,4 +1,4 @@
-"""What the file of positions says of the photos that are there, on the earth."""
+"""The position file's entries for photos of the capture, as WGS 84 positions."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class FilePlace:
 
 @dataclass(frozen=True)
 class FilePlaces:
-    """The photos of the file.
+    """The photos in the file.
 
     Attributes:
-        by_name: Those that are there, by the photo's name.
-        unknown: Names in the file that no photo has.
-        note: The CRS and the way from it to WGS 84, a sentence.
+        by_name: Entries for photos of the capture, by the photo's name.
+        unknown: Names in the file that match no photo.
+        note: The CRS and the operation from it to WGS 84, as a sentence.
     """
 
     by_name: Mapping[str, FilePlace]
@@ -52,15 +52,15 @@ class FilePlaces:
 
 
 def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False) -> FilePlaces:
-    """Read a file of positions.
+    """Read a position file.
 
     Args:
         path: The file.
-        photos: Names of the photos that take part.
-        approximate: Take a CRS though the grid of its best way to WGS 84 is missing.
+        photos: Names of the photos in use.
+        approximate: Accept a CRS although the grid of its best operation to WGS 84 is missing.
 
     Raises:
-        SplatpipeError: if it is no such file, names no photo that is there, or its CRS cannot be used.
+        SplatpipeError: if it is not such a file, names none of the photos, or its CRS cannot be used.
     """
     file = read_position_file(path)
     find = NameFinder(photos)
@@ -93,7 +93,7 @@ def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False)
 
 
 def _gimbal_angles(rows: Sequence[PhotoPlace]) -> list[tuple[float, float, float] | None]:
-    """The photos' angles as a gimbal's, whichever of the two conventions the file has."""
+    """The photos' angles in the gimbal's convention, whichever of the two conventions the file uses."""
     known = [row.angles_deg for row in rows if row.angles_deg is not None]
     if tell_convention(angles[1] for angles in known) == "gimbal":
         return [row.angles_deg for row in rows]

@@ -1,7 +1,7 @@
-"""Photos whose positions were swapped: neither the way of the flight nor what the photos show agrees with them.
+"""Find photos whose positions were swapped, since neither the flight path nor the image matches agree with them.
 
-Photos that show the same thing were taken near each other, and the better they match the nearer; and who flies takes
-the short way from photo to photo. Each swap of two positions is tried against both.
+Photos that show the same thing were taken near each other, the nearer the better they match; and a flight takes the
+short path from photo to photo. Each swap of two positions is tested against both.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from splatpipe.pipeline.sfm.pairs import Pair
 FURTHEST = 4.0  # times the usual distance of photos that match: a false match must not outweigh all others
 LEAST_PARTNERS = 3  # that each of the two matches
 LEAST_NEARER = 0.02  # of the two photos' distances to their partners; right ones give 0.003 at most
-CLEARLY_NEARER = 0.08  # where no times tell the way
-LEAST_SHORTER, CLEARLY_SHORTER = 0.3, 1.5  # of the way, in usual steps between two photos
-HARDLY_NEARER = 0.008  # is enough where the way is clearly shorter
-MOST_SWAPS = 20  # more are no swaps but chaos
-MOST_PHOTOS = 3000  # all pairs of photos are looked at
+CLEARLY_NEARER = 0.08  # where no times give the path
+LEAST_SHORTER, CLEARLY_SHORTER = 0.3, 1.5  # reduction of the path, in usual steps between two photos
+HARDLY_NEARER = 0.008  # suffices where the path is clearly shorter
+MOST_SWAPS = 20  # more are not swaps but disorder
+MOST_PHOTOS = 3000  # all pairs of photos are tested
 
 
 @dataclass(frozen=True)
 class PositionEvidence:
-    """What is known of the photos' places.
+    """Evidence on where the photos were taken.
 
     Attributes:
-        places_m: (n, 3) east, north, up; NaN where not known.
-        times_s: When each was taken, NaN where not known.
-        matches: Keypoints that agree, by pair.
+        places_m: (n, 3) east, north, up; NaN where unknown.
+        times_s: Capture time of each, NaN where unknown.
+        matches: Number of matching keypoints, by pair.
     """
 
     places_m: Float64[np.ndarray, "n 3"]
@@ -39,7 +39,7 @@ class PositionEvidence:
     matches: Mapping[Pair, int]
 
     def order(self) -> Int64[np.ndarray, " m"]:
-        """Photos with place and time, in the order in which they were taken; equal times in the photos' order."""
+        """Photos with position and time, in the order in which they were taken; equal times in the photos' order."""
         known = np.flatnonzero(np.isfinite(self.places_m).all(axis=1) & np.isfinite(self.times_s))
         return np.asarray(known[np.argsort(self.times_s[known], kind="stable")], np.int64)
 
@@ -91,7 +91,7 @@ def _best_swap(
 
 
 def _nearer(places: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, "n n"]) -> Float64[np.ndarray, "n n"]:
-    """By what share two photos come nearer to those that they match, if they swap positions."""
+    """Relative reduction of two photos' distances to the photos they match, if they swap positions."""
     distances = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
     if not (weights > 0.0).any():
         return np.zeros_like(weights)
@@ -99,12 +99,12 @@ def _nearer(places: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, "n 
     distances = np.minimum(distances / usual, FURTHEST)
     own = (weights * distances).sum(axis=1)
     now = own[:, None] + own[None, :]
-    there = weights @ distances  # [a, b]: photo a at the place of b
+    there = weights @ distances  # [a, b]: photo a at the position of b
     return np.asarray((now - there - there.T - 2.0 * weights * distances) / np.maximum(now, 1e-9))
 
 
 def _shorter(places: Float64[np.ndarray, "n 3"], order: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "n n"]:
-    """By how many usual steps the way through all photos gets shorter, if two swap positions."""
+    """Reduction of the path through all photos, in usual steps, if two swap positions."""
     way = places[order]
     steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
     usual = max(float(np.median(steps)), 1e-6)

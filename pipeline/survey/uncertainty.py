@@ -1,4 +1,4 @@
-"""How well positions place a model: its coordinates, north, up and scale, in figures and in a sentence."""
+"""Accuracy of a model placed by positions: its coordinates, north, up and scale, in figures and in a sentence."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from splatpipe.pipeline.survey.receiver_noise import NoisyFit, ReceiverNoise
 
 NORMAL_95 = 1.959964
 LEAST_DEGREES = 3.0  # of freedom that intervals count on: of strongly correlated errors, effective ones run out
-MOST_PLACES = 2000  # of the model that its coordinates are judged at
+MOST_PLACES = 2000  # of the model where the accuracy of its coordinates is evaluated
 DIGITS = 6
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard deviations of a frame that positions gave, and what a truth lies within in 95 of 100 cases.
+    """Standard deviations and 95 % bounds of a frame computed from positions.
 
     Attributes:
-        offset_m: East, north, up, of the middle of the cameras; with what the receiver's error has in common.
+        offset_m: East, north, up of the cameras' centre, including the receiver's common error.
         north_rad: Of the heading.
-        up_rad: Of the angle between what the frame has for up and what is up (root mean square).
+        up_rad: Of the angle between the frame's up and true up (root mean square).
         scale: Relative.
         weakest_rad: Of the rotation about its weakest axis.
         coordinates_m: Horizontal (of each coordinate) and in height, of a typical place of the model.
-        common_m: Horizontally and in height: what all positions may be off together, in the former.
+        common_m: Horizontally and in height: the error common to all positions, included in ``coordinates_m``.
         noise: Of the positions.
         covariance: Of rotation vector, scale's logarithm and place, without the common part.
     """
@@ -45,7 +45,7 @@ class Uncertainty:
     covariance: Float64[np.ndarray, "7 7"]
 
     def sentence(self) -> str:
-        """As people are told it."""
+        """The accuracy as a sentence for the user."""
         across, height = self.coordinates_m.tolist()
         metres = f"about {_metres(across)}"
         if not 0.67 < height / max(across, 1e-12) < 1.5:
@@ -54,7 +54,7 @@ class Uncertainty:
         return f"coordinates good to {metres}, {angles}, scale to {_percent(self.scale)}"
 
     def as_json(self) -> dict[str, Any]:
-        """As `frame.json` and `accuracy.json` hold it: standard deviations, 95 % bounds, the noise, the sentence."""
+        """The entry in `frame.json` and `accuracy.json`: standard deviations, 95 % bounds, noise and the sentence."""
         horizontal, vertical = (student_95(float(degrees)) for degrees in self.noise.degrees)
         weakest = max(horizontal, vertical)
         times = np.array([horizontal, horizontal, vertical])
@@ -81,18 +81,18 @@ def uncertainty_of(
     places: Float64[np.ndarray, "m 3"],
     stated: Float64[np.ndarray, " 2"],
 ) -> Uncertainty:
-    """What a fit of positions is worth.
+    """Estimate the accuracy of a fit of positions.
 
-    Residuals do not show what all positions are off together. What a receiver states of its positions is said of their
-    whole error, so what the residuals do not show of that is taken to be common to them: a flight whose positions agree
-    to 0.4 m of stated 3 m lies somewhere within 3 m. Positions that scatter by more than they state have shown it all.
+    Residuals do not show an error common to all positions. A receiver's stated accuracy covers the whole error, so the
+    part that the residuals do not show is assumed to be common: a flight whose positions agree to 0.4 m of stated 3 m
+    lies somewhere within 3 m. If positions scatter by more than stated, the residuals show all of it.
 
     Args:
         fit: Of the positions.
-        source: Places of the cameras that took part, in the model.
-        places: Of the model's points.
-        stated: What the positions state, horizontally and in height (metres); zeros where flights' offsets are part of
-            the fit, and hold it already.
+        source: Positions of the cameras used, in the model.
+        places: Positions of the model's points.
+        stated: Stated accuracy, horizontally and in height (metres); zeros where the fit includes the flights' offsets,
+            which already account for it.
     """
     spread = 2.0 * np.sqrt(2.0 / np.maximum(fit.noise.degrees, 1.0))
     shown = fit.noise.factors**2 * (1.0 + spread)  # its upper bound: noise as stated leaves nothing
@@ -118,7 +118,7 @@ def uncertainty_of(
 
 
 def student_95(degrees: float) -> float:
-    """What Student's t stays within in 95 of 100 cases (Abramowitz and Stegun, Handbook, 1964, 26.7.5)."""
+    """Two-sided 95 % quantile of Student's t (Abramowitz and Stegun, Handbook, 1964, 26.7.5)."""
     z, n = NORMAL_95, max(degrees, LEAST_DEGREES)
     first = (z**3 + z) / 4.0
     second = (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0
