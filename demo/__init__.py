@@ -1,4 +1,4 @@
-"""The demo capture: 40 rendered photos of a house, their truth, and the generator that made them."""
+"""The demo capture: 40 rendered photos of a house, their ground truth, and their generator."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ CAPTURE = Path(__file__).parent / "capture"
 
 
 def capture_path() -> Path:
-    """The folder with the photos; ``truth.json``, ``gcp_list.txt``, ``rtk.json`` and ``surface.ply`` lie beside it."""
+    """The photos' folder; ``truth.json``, ``gcp_list.txt``, ``rtk.json`` and ``surface.ply`` lie beside it."""
     return CAPTURE / "photos"

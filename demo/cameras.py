@@ -1,4 +1,4 @@
-"""Lens and flight of the demo capture.
+"""The lens and the flight of the demo capture.
 
 Camera frame: x right, y down, z forward; pixel centres at +0.5; world: east, north, up in metres.
 """
@@ -16,14 +16,14 @@ Array = NDArray[np.float64]
 SEED = 7
 
 
-UNDISTORT_STEPS = 30  # each leaves a third of the error at the corner of the strongest lens here
+UNDISTORT_STEPS = 30  # each reduces the error at the corner of the strongest lens here to a third
 
 
 @dataclass(frozen=True)
 class BrownLens:
-    """Brown's lens (COLMAP's FULL_OPENCV without its denominator); with k alone COLMAP's SIMPLE_RADIAL.
+    """Brown's lens model (COLMAP's FULL_OPENCV without its denominator); with k alone, COLMAP's SIMPLE_RADIAL.
 
-    The ray (x, y, 1) is seen at pixel f (x', y') + (cx, cy), with x' = x (1 + k r^2 + k2 r^4 + k3 r^6) + 2 p1 x y
+    The ray (x, y, 1) projects to pixel f (x', y') + (cx, cy), with x' = x (1 + k r^2 + k2 r^4 + k3 r^6) + 2 p1 x y
     + p2 (r^2 + 2 x^2) and y' = y (1 + k r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y.
     """
 
@@ -40,7 +40,7 @@ class BrownLens:
 
     @property
     def is_simple(self) -> bool:
-        """Whether SIMPLE_RADIAL says all of it."""
+        """Whether SIMPLE_RADIAL describes the lens exactly."""
         return not (self.k2 or self.k3 or self.p1 or self.p2)
 
     def scaled(self, factor: float) -> BrownLens:
@@ -55,7 +55,7 @@ class BrownLens:
         )
 
     def project(self, points_cam: Array) -> Array:
-        """Camera-frame points (n, 3), z > 0, to pixels (n, 2)."""
+        """Project camera-frame points (n, 3), z > 0, to pixels (n, 2)."""
         x, y = (points_cam[:, :2] / points_cam[:, 2:]).T
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k + r2 * (self.k2 + r2 * self.k3))
@@ -64,7 +64,7 @@ class BrownLens:
         return np.stack([self.f * xd + self.cx, self.f * yd + self.cy], axis=1)
 
     def undistort(self, xd: Any, yd: Any) -> tuple[Any, Any]:
-        """(x, y) of the rays that are seen at (pixel - principal point) / f, NumPy's or Dr.Jit's: a fixed point."""
+        """Undistort (pixel - principal point) / f to (x, y) of the ray by fixed-point iteration; NumPy or Dr.Jit."""
         x, y = xd, yd
         for _ in range(UNDISTORT_STEPS):
             r2 = x * x + y * y
@@ -75,7 +75,7 @@ class BrownLens:
         return x, y
 
     def colmap(self) -> dict[str, Any]:
-        """COLMAP's name of the model, the size, and its parameters, as ``truth.json`` has them."""
+        """COLMAP's name of the model, the size and the parameters, as in ``truth.json``."""
         size = {"width": self.width, "height": self.height}
         if self.is_simple:
             return {"model": "SIMPLE_RADIAL", **size, "params": [self.f, self.cx, self.cy, self.k]}
@@ -83,10 +83,10 @@ class BrownLens:
         return {"model": "FULL_OPENCV", **size, "params": params}
 
 
-# The Zenmuse P1 with 35 mm, as Pix4D's database of cameras has it: of rays up to 0.6 beside the axis.
+# The Zenmuse P1 with 35 mm, from Pix4D's camera database: for rays up to 0.6 off the axis.
 P1_CORNER, P1_RADIAL, P1_TANGENTIAL = 0.6007, (-0.047957, 0.0205183, -0.0972836), (0.00179669, -0.00139674)
 BROWN_TIMES = (
-    2.0  # SIMPLE_RADIAL leaves 3.8 px RMS and 14 px at worst of it at the demo's size, as of the P1 at its own
+    2.0  # SIMPLE_RADIAL then errs by 3.8 px RMS and 14 px at most at the demo's size, as for the P1 at its own
 )
 BROWN_OFFSET_PX = (16.0, -12.0)  # of the principal point: 20 px
 
@@ -107,7 +107,7 @@ LENSES = {"simple": BrownLens, "brown": brown_lens}
 
 @dataclass(frozen=True)
 class Pose:
-    """A photo's place.
+    """A photo's position and orientation.
 
     Attributes:
         name: File name.
@@ -150,7 +150,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Orbit:
-    """A ring of photos that look at a point above the plot's centre."""
+    """A ring of photos aimed at a point above the plot's centre."""
 
     count: int
     radius_m: float
@@ -168,7 +168,7 @@ NADIR_HEADING_DEG = 73.0  # along the ridge
 
 
 def flight() -> list[Pose]:
-    """The 40 poses in order of time: low orbit, high orbit, two strips straight down; with a pilot's unsteadiness."""
+    """The 40 poses in order of time: low orbit, high orbit, two nadir strips; with a pilot's unsteadiness."""
     rng = np.random.default_rng(SEED)
     poses: list[Pose] = []
     for orbit in (LOW, HIGH):

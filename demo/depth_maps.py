@@ -1,9 +1,9 @@
-"""Depth maps as perfect as can be, of the capture's photos: ``python -m splatpipe.demo.depth_maps OUT [--noise]``.
+"""Ground-truth depth maps of the capture's photos: ``python -m splatpipe.demo.depth_maps OUT [--noise]``.
 
-For whoever builds a surface out of depth maps, and is to be judged apart from how these are made: the true depth along
-the ray of every pixel's centre, beside the photo as the pinhole camera sees it. With ``--noise`` they err as measured
-ones do. Each photo's file ``NAME.npz`` holds ``depth`` (float32, metres along z, 0 where there is none), ``confidence``
-(uint8, other photos that see the same place), ``name``, ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` and
+They serve to test surface reconstruction apart from depth estimation: the true depth along the ray of every pixel's
+centre, beside the photo of the pinhole camera. With ``--noise`` they have errors like measured ones. Each photo's
+file ``NAME.npz`` holds ``depth`` (float32, metres along z, 0 where there is none), ``confidence`` (uint8, number of
+other photos that see the same place), ``name``, ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` and
 ``cam_from_world`` (4 × 4; local east, north, up in metres); ``NAME.png`` beside it is the photo.
 """
 
@@ -28,20 +28,20 @@ from splatpipe.pipeline.photos.resampling import resample
 from splatpipe.pipeline.photos.undistortion import pinhole_camera
 
 SEED = 20261123
-BLOCK = 4  # pixels, a side, that share a confidence
-SAME_DEPTH = 0.002  # relative: a photo that sees something else there sees it farther off, or nearer, by more
+BLOCK = 4  # pixels a side that share a confidence
+SAME_DEPTH = 0.002  # relative: a larger difference means that the other photo sees something else there
 PARALLAX_PX = 0.3  # standard deviation of the noise
-BASELINE_RANK = 4  # a photo's neighbour, by distance, whose baseline the parallax is of
-NOISE_REACH_PX = 1.5  # sigma of what neighbouring pixels share, as windows of some 7 pixels leave it
+BASELINE_RANK = 4  # rank by distance of the neighbouring photo whose baseline defines the parallax
+NOISE_REACH_PX = 1.5  # sigma of the noise's correlation, as matching windows of some 7 pixels produce it
 HOLES, HOLE_REACH_PX = 0.10, 6.0
 OUTLIERS, OUTLIER_REACH_PX = 0.02, 2.0
 OUTLIER_SHARE = (0.6, 1.6)  # of the true depth
-CONFIRMED = 0.7  # of the photos that see a place, those that confirm a noisy depth
+CONFIRMED = 0.7  # share of the photos that see a place which confirm a noisy depth
 UNLIMITED_MEGAPIXELS = 1e6
 
 
 def true_cameras(lens: BrownLens | None = None) -> tuple[pycolmap.Camera, list[Camera]]:
-    """The lens of the capture, and its photos' pinhole cameras, in name order, as ``undistort`` would choose them."""
+    """The capture's lens, and its photos' pinhole cameras, in name order, as ``undistort`` would choose them."""
     source = pycolmap.Camera(camera_id=1, **(lens or BrownLens()).colmap())
     target = pinhole_camera(source, UNLIMITED_MEGAPIXELS, 1)
     focal, middle = (target.focal_length_x, target.focal_length_y), (target.principal_point_x, target.principal_point_y)
@@ -52,12 +52,12 @@ def true_cameras(lens: BrownLens | None = None) -> tuple[pycolmap.Camera, list[C
 def confirmations(
     cameras: Sequence[Camera], depths: Sequence[Float32[np.ndarray, "h w"]], number: int
 ) -> UInt8[np.ndarray, "h w"]:
-    """How many other photos see what each pixel of one sees, told at one pixel of each block for all of it.
+    """Number of other photos that see the place at each pixel, sampled at one pixel per block.
 
     Args:
         cameras: Of all photos, of one size.
-        depths: Their maps, 0 where there is nothing.
-        number: Of the photo.
+        depths: Their depth maps, metres, 0 where there is nothing.
+        number: Index of the photo.
     """
     here, own = cameras[number], depths[number]
     y, x = np.mgrid[BLOCK // 2 : here.height : BLOCK, BLOCK // 2 : here.width : BLOCK]
@@ -79,14 +79,14 @@ def noisy(
     baseline_m: float,
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
-    """A depth map with errors: parallax that neighbouring pixels share, patches without depth, patches of nonsense.
+    """Add errors to a depth map: correlated parallax noise, patches without depth, patches of outliers.
 
     Args:
         camera: Of the map.
-        depth: True, 0 where there is nothing.
-        confidence: True.
-        baseline_m: To the photo that the parallax is to.
-        rng: Of this map.
+        depth: True depth, metres, 0 where there is nothing.
+        confidence: True confidence.
+        baseline_m: Distance to the photo that defines the parallax.
+        rng: Random numbers of this map.
     """
     error = _field(depth.shape, NOISE_REACH_PX, rng) * PARALLAX_PX
     share = np.clip(1.0 + error * depth / (camera.fx * baseline_m), 0.5, 2.0)  # dz = z² dx / (f b)
@@ -101,7 +101,7 @@ def noisy(
 
 
 def _field(shape: tuple[int, ...], reach_px: float, rng: np.random.Generator) -> Float64[np.ndarray, "h w"]:
-    """Normal noise of mean 0 and deviation 1 that pixels share over a reach."""
+    """Normal noise of mean 0 and standard deviation 1, correlated over a reach."""
     field = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), reach_px)
     return np.asarray(field / field.std())
 
@@ -109,7 +109,7 @@ def _field(shape: tuple[int, ...], reach_px: float, rng: np.random.Generator) ->
 def _patches(
     shape: tuple[int, ...], share: float, reach_px: float, rng: np.random.Generator
 ) -> Bool[np.ndarray, "h w"]:
-    """Patches that cover a share of a picture."""
+    """Random patches that cover a share of an image."""
     field = _field(shape, reach_px, rng)
     return np.asarray(field > np.quantile(field, 1.0 - share))
 

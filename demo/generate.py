@@ -1,9 +1,9 @@
 """Render the demo capture: ``python -m splatpipe.demo.generate --work /tmp/demo-renders --out demo/capture``.
 
-Needs ``pip install 'splatpipe[demo]'`` and an LLVM shared library (``apt-get install libllvm19`` and, where it is not
-found, ``DRJIT_LIBLLVM_PATH``). About a CPU minute a photo at 64 paths a pixel. Renders are kept in ``--work`` and taken
-from there when they exist: an interrupted run goes on, and exposure, noise, JPEG and metadata can be made anew without
-rendering. Everything is seeded.
+Requires ``pip install 'splatpipe[demo]'`` and an LLVM shared library (``apt-get install libllvm19``, and if it is not
+found, ``DRJIT_LIBLLVM_PATH``). About a CPU minute per photo at 64 paths per pixel. Renders are kept in ``--work`` and
+reused: an interrupted run resumes, and exposure, noise, JPEG and metadata can be redone without rendering. Everything
+is seeded.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ SHOT_NOISE, READ_NOISE = 2.0e-5, 1.0e-6  # variance per unit of light, and in th
 GPS_SIGMA_M = (1.5, 1.5, 3.0)
 RTK_SIGMA_M = (0.02, 0.02, 0.03)
 MARK_SIGMA_PX = 0.3
-PHOTO_BUDGET_BYTES = 7_150_000  # at 1200 x 900; larger photos have as much a pixel
-CALIBRATED_FOCAL_PX = 853.0  # the maker's calibration, 0.2 % off, as they are
+PHOTO_BUDGET_BYTES = 7_150_000  # at 1200 x 900; larger photos get the same per pixel
+CALIBRATED_FOCAL_PX = 853.0  # the maker's calibration, 0.2 % off, as is usual
 RTK_XMP = {
     "GpsStatus": "RTK",
     "AltitudeType": "RtkAlt",
@@ -50,21 +50,21 @@ RTK_XMP = {
 
 
 def unbiased(rng: np.random.Generator, count: int, sigmas: tuple[float, ...]) -> Array:
-    """Normal errors (count, len(sigmas)) whose mean is zero and whose RMS is exactly sigma in each column."""
+    """Normal errors (count, len(sigmas)) with zero mean and an RMS of exactly sigma in each column."""
     errors = rng.standard_normal((count, len(sigmas)))
     errors -= errors.mean(axis=0)
     return np.asarray(errors / np.sqrt((errors**2).mean(axis=0)) * np.array(sigmas))
 
 
 def develop(radiance: Array, exposure_ev: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Radiance (h, w, 3) to an 8-bit sRGB photo: exposure, sensor noise, soft highlights."""
+    """Develop radiance (h, w, 3) to an 8-bit sRGB photo: exposure, sensor noise, soft highlights."""
     light = radiance * GAIN * 2**exposure_ev * WHITE_BALANCE
     light = light + rng.standard_normal(light.shape) * np.sqrt(SHOT_NOISE * light + READ_NOISE)
     return coded(light)
 
 
 def coded(light: Array) -> NDArray[np.uint8]:
-    """Light on the sensor (h, w, 3) to 8-bit sRGB, with soft highlights."""
+    """Encode light on the sensor (h, w, 3) as 8-bit sRGB, with soft highlights."""
     light = np.where(light < 0.7, light, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.3))
     light = np.clip(light, 0, 1)
     values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
@@ -72,7 +72,7 @@ def coded(light: Array) -> NDArray[np.uint8]:
 
 
 def compress(photos: list[NDArray[np.uint8]], budget: float) -> list[bytes]:
-    """All photos as JPEG, at the best common quality that keeps within the budget (bytes in all)."""
+    """Encode all photos as JPEG, at the best common quality within the budget (total bytes)."""
     for quality in range(94, 40, -1):
         files = []
         for photo in photos:
@@ -86,7 +86,7 @@ def compress(photos: list[NDArray[np.uint8]], budget: float) -> list[bytes]:
 
 
 def render_all(scene: Renderer, poses: list[Pose], lens: BrownLens, spp: int, work: Path) -> list[Path]:
-    """Render what is not there yet; returns the files with radiance as float16."""
+    """Render what does not exist yet; return the files with radiance as float16."""
     work.mkdir(parents=True, exist_ok=True)
     tag = f"{spp}" if lens == BrownLens() else f"{spp}.{sha256(repr(lens).encode()).hexdigest()[:8]}"
     files = [work / f"{pose.name}.{tag}.npy" for pose in poses]
@@ -100,7 +100,7 @@ def render_all(scene: Renderer, poses: list[Pose], lens: BrownLens, spp: int, wo
 
 
 def _flight_attributes(pose: Pose, lens: BrownLens, barometer_m: float, rng: np.random.Generator) -> dict[str, str]:
-    """DJI's XMP about angles and height; angles to 0.1 degrees with the gimbal's own error."""
+    """DJI's XMP attributes of angles and height; angles to 0.1 degrees, with the gimbal's error."""
     yaw, pitch, roll = np.array([pose.yaw_deg, pose.pitch_deg, pose.roll_deg]) + rng.normal(0, 0.2, 3)
     flight_yaw = yaw + rng.normal(0, 1.0)
     return {
@@ -127,7 +127,7 @@ def _flight_attributes(pose: Pose, lens: BrownLens, barometer_m: float, rng: np.
 def write_photos(
     out: Path, renders: list[Path], poses: list[Pose], lens: BrownLens, origin: Origin
 ) -> list[dict[str, object]]:
-    """Develop, compress and tag the photos, write ``rtk.json``; returns each photo's entry in truth.json."""
+    """Develop, compress and tag the photos, write ``rtk.json``; return each photo's entry in truth.json."""
     rng = np.random.default_rng(SEED)
     count = len(poses)
     exposures = unbiased(rng, count, (EXPOSURE_SIGMA_EV,))[:, 0]
@@ -172,7 +172,7 @@ def write_photos(
 def write_survey(
     out: Path, scene: DemoScene, renderer: Renderer, poses: list[Pose], lens: BrownLens, origin: Origin
 ) -> list[dict[str, object]]:
-    """Write ``gcp_list.txt``; returns the points' entries in truth.json."""
+    """Write ``gcp_list.txt``; return the points' entries in truth.json."""
     rng = np.random.default_rng(SEED + 1)
     exact = sightings(scene.points, poses, lens, renderer.first_hit)
     marks = {
@@ -195,7 +195,7 @@ def write_survey(
 
 
 def write_surface(path: Path, scene: DemoScene) -> None:
-    """The scene's triangles as binary PLY, east, north, up, with 16-bit indices."""
+    """Write the scene's triangles as binary PLY, east, north, up, with 16-bit indices."""
     vertices, triangles = surface_of(scene)
     assert len(vertices) < 2**16
     header = (

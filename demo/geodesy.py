@@ -1,4 +1,4 @@
-"""Local east-north-up metres to WGS84 and UTM."""
+"""Convert local east-north-up metres to WGS84 and UTM."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .mesh import Array
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the local frame touches the ellipsoid's normal: WGS84 degrees and ellipsoidal height (EPSG:4979)."""
+    """Origin of the local frame: WGS84 degrees and ellipsoidal height (EPSG:4979)."""
 
     latitude: float = 47.8412
     longitude: float = 13.5127
@@ -20,7 +20,7 @@ class Origin:
     utm_epsg: int = 32633
 
     def geodetic(self, enu: Array) -> Array:
-        """East, north, up (n, 3) to latitude, longitude, ellipsoidal height (n, 3)."""
+        """Convert east, north, up (n, 3) to latitude, longitude, ellipsoidal height (n, 3)."""
         pipeline = (
             "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84"
             f" +lat_0={self.latitude} +lon_0={self.longitude} +h_0={self.height_m}"
@@ -31,7 +31,7 @@ class Origin:
         return np.stack([latitude, longitude, height], axis=1)
 
     def utm(self, enu: Array) -> Array:
-        """East, north, up (n, 3) to UTM easting, northing and ellipsoidal height (n, 3)."""
+        """Convert east, north, up (n, 3) to UTM easting, northing and ellipsoidal height (n, 3)."""
         latitude, longitude, height = self.geodetic(enu).T
         easting, northing = Transformer.from_crs(4326, self.utm_epsg, always_xy=True).transform(longitude, latitude)
         return np.stack([easting, northing, height], axis=1)

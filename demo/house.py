@@ -47,7 +47,7 @@ class HouseWindow:
 
 
 def add_window(b: Builder, wall: Plane, w: HouseWindow, seed: int, reveal: Painter) -> None:
-    """Reveal, pane with a room behind, frame, mullions, sill, shutters."""
+    """Add a window: reveal, pane with a room behind, frame, mullions, sill, shutters."""
     depth = -0.16
     corners = [(w.left, w.low), (w.right, w.low), (w.right, w.high), (w.left, w.high)]
     for (u0, v0), (u1, v1) in zip(corners, corners[1:] + corners[:1], strict=True):
@@ -79,7 +79,7 @@ def add_wall(
     paint: Painter,
     seed: int,
 ) -> None:
-    """A wall with its windows."""
+    """Add a wall with its windows."""
     b.wall(wall, outline, [w.hole for w in windows], paint)
     for k, window in enumerate(windows):
         add_window(b, wall, window, seed + k, paint)
@@ -127,7 +127,7 @@ def _walls(b: Builder) -> None:
 
 
 def add_window_bars(b: Builder, attic: Plane, seed: int) -> None:
-    """The cross in an attic window; its place varies a little."""
+    """Add the cross in an attic window; its position varies slightly."""
     middle = 4.47 + 0.01 * (seed % 3)
     b.box(attic, (middle, EAVES + 1.1, 0.0), (middle + 0.06, EAVES + 2.0, 0.045), FRAME)
     b.box(attic, (4.0, EAVES + 1.52, 0.0), (5.0, EAVES + 1.58, 0.04), FRAME)
@@ -247,7 +247,7 @@ def _annex(b: Builder) -> None:
 
 
 def add_house(b: Builder) -> None:
-    """Everything that belongs to the building."""
+    """Add everything that belongs to the building."""
     _walls(b)
     _roof(b)
     _chimneys(b)

@@ -1,4 +1,4 @@
-"""Faces with textures: small tools to build a scene out of planar polygons, boxes and displaced spheres."""
+"""Textured faces: tools to build a scene out of planar polygons, boxes and displaced spheres."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .textures import Image, Painter, TextureTile
 
 Array = NDArray[np.float64]
 Numbers = Sequence[Any] | NDArray[Any] | float | int  # what np.asarray takes; ArrayLike is more than beartype can check
-MARGIN = 3  # texels painted beyond a face, so that bilinear lookups at its border never meet a neighbour in the atlas
+MARGIN = 3  # texels painted beyond a face, so that bilinear lookups at its border never hit a neighbour in the atlas
 LEAF_OCTAVES = ((1.3, 0.5), (0.6, 0.55), (0.3, 0.5), (0.15, 0.3))  # wavelength in metres, strength
-FAR_TEXEL_M = 0.05  # lumps with texels of this size stand far away and get no fine leaves
+FAR_TEXEL_M = 0.05  # lumps with texels of this size are far away and get no fine leaves
 ATLAS_WIDTH = 4096
 ATLAS_HEIGHT = 8192
 
@@ -28,10 +28,10 @@ class Face:
         vertices: (n, 3), metres.
         triangles: (m, 3), counter-clockwise seen from outside.
         uv_m: (n, 2), metres from the tile's lower left corner.
-        paint: What is on it.
+        paint: Its painter.
         texel_m: Texel size.
         gloss: Whether it is glazed or lacquered.
-        given_normals: (n, 3), unit; to look smooth across its border.
+        given_normals: (n, 3), unit; for smooth shading across its border.
     """
 
     vertices: Array
@@ -43,7 +43,7 @@ class Face:
     given_normals: Array | None = None
 
     def normals(self) -> Array:
-        """Unit normals at the vertices, (n, 3): as given, or the mean of the triangles', weighted by area."""
+        """Unit normals at the vertices, (n, 3): as given, or the area-weighted mean of the triangles' normals."""
         if self.given_normals is not None:
             return self.given_normals
         corners = self.vertices[self.triangles]
@@ -77,7 +77,7 @@ class Plane:
         return np.asarray(self.origin + a * self.u + b * self.v + c * self.n)
 
     def at(self, a: float | int, b: float | int, c: float | int = 0.0) -> Plane:
-        """The same axes about another origin."""
+        """A plane with the same axes and another origin."""
         return Plane(self.point(a, b, c), self.u, self.v)
 
 
@@ -94,7 +94,7 @@ class Builder:
     def polygon(
         self, plane: Plane, outline: Numbers, paint: Painter, gloss: bool = False, texel_m: float = 0.0
     ) -> None:
-        """A polygon, star-shaped about its mean; ``outline`` (n, 2) counter-clockwise in the plane."""
+        """Add a polygon, star-shaped about its mean; ``outline`` (n, 2) counter-clockwise in the plane."""
         corners = np.asarray(outline, float)
         low = corners.min(axis=0)
         points = np.vstack([corners, corners.mean(axis=0)]) if len(corners) > 4 else corners
@@ -114,7 +114,7 @@ class Builder:
         gloss: bool = False,
         texel_m: float = 0.0,
     ) -> None:
-        """The rectangle between two corners."""
+        """Add the rectangle between two corners."""
         (a, b), (c, d) = low, high
         self.polygon(plane, [(a, b), (c, b), (c, d), (a, d)], paint, gloss, texel_m)
 
@@ -127,7 +127,7 @@ class Builder:
         gloss: bool = False,
         top: Painter | None = None,
     ) -> None:
-        """A box between two corners in the plane's coordinates; ``top``, if given, is on the face of greatest c."""
+        """Add a box between two corners in plane coordinates; ``top``, if given, paints the face of greatest c."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         u, v, n = plane.u, plane.v, plane.n
         self.rect(plane.at(0, 0, z1), (x0, y0), (x1, y1), top or paint, gloss)
@@ -140,7 +140,7 @@ class Builder:
     def prism(
         self, plane: Plane, outline: Numbers, depth: float, sides: Painter, caps: Painter, gloss: bool = False
     ) -> None:
-        """A polygon pulled ``depth`` along the plane's normal."""
+        """Add a polygon extruded by ``depth`` along the plane's normal."""
         corners = np.asarray(outline, float)
         self.polygon(plane.at(0, 0, depth), corners, caps, gloss)
         self.polygon(Plane(plane.origin, -plane.u, plane.v), (corners * (-1, 1))[::-1], caps, gloss)
@@ -149,7 +149,7 @@ class Builder:
             self.rect(side, (0, 0), (float(np.linalg.norm(end - start)), depth), sides, gloss)
 
     def wall(self, plane: Plane, outline: Numbers, holes: Iterable[Sequence[float]], paint: Painter) -> None:
-        """A convex polygon with rectangular holes ``(u0, v0, u1, v1)``; its sides may slope only above the holes."""
+        """Add a convex polygon with rectangular holes (u0, v0, u1, v1); its sides may slope only above the holes."""
         corners = np.asarray(outline, float)
         holes = list(holes)
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -179,7 +179,7 @@ class Builder:
 
 
 def lattice_noise(xyz: Array, wavelength_m: float, seed: int) -> Image:
-    """Smooth random field in space, about unit variance, for points of shape (..., 3)."""
+    """Smooth random field in space, of about unit variance, for points of shape (..., 3)."""
     scaled = xyz / wavelength_m + 100.0
     cell = np.floor(scaled).astype(np.int64).astype(np.uint32)
     t = scaled - np.floor(scaled)
@@ -192,7 +192,7 @@ def lattice_noise(xyz: Array, wavelength_m: float, seed: int) -> Image:
 
 
 def _hash(cell: NDArray[np.uint32], seed: int) -> Array:
-    """Lattice points (..., 3) to numbers in [-1, 1]: the finaliser of MurmurHash3 over mixed coordinates."""
+    """Hash lattice points (..., 3) to numbers in [-1, 1]: the finaliser of MurmurHash3 over mixed coordinates."""
     x = (
         cell[..., 0] * np.uint32(0x9E3779B1)
         ^ cell[..., 1] * np.uint32(0x85EBCA77)
@@ -281,11 +281,11 @@ class Lump:
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """What is rendered: one mesh with one texture.
+    """A mesh to render, with one texture.
 
     Attributes:
         vertices: (n, 3) float32, metres.
-        normals: (n, 3) float32, unit; shared by the triangles of a face, so that lumps and hills look round.
+        normals: (n, 3) float32, unit; shared by the triangles of a face, for smooth shading of lumps and hills.
         triangles: (m, 3) uint32.
         uv: (n, 2) float32; v grows with the texture's row.
         texture: (h, w, 3) uint8, sRGB.
@@ -301,11 +301,11 @@ class TexturedMesh:
 
 
 def paint_faces(faces: Sequence[Face], seed: int) -> list[TexturedMesh]:
-    """Paint every face into atlases and join the faces of one atlas; matt and glossy apart.
+    """Paint every face into atlases and join the faces of each atlas; matt and glossy faces are kept apart.
 
     Args:
         faces: In scene order, which decides each face's random numbers.
-        seed: Of the whole scene.
+        seed: Seed of the whole scene.
     """
     meshes = []
     for gloss in (False, True):

@@ -1,4 +1,4 @@
-"""EXIF and XMP as a DJI camera writes them, put into JPEG files without touching the pixels."""
+"""Write EXIF and XMP like a DJI camera's into JPEG files, without touching the pixels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DJI_ATTRIBUTE = re.compile(r'drone-dji:(\w+)="([^"]*)"')
 
 @dataclass(frozen=True)
 class GpsPosition:
-    """What the receiver says: WGS84 degrees, altitude in metres (here: above the ellipsoid)."""
+    """A GNSS receiver's position: WGS84 degrees, altitude in metres (here: above the ellipsoid)."""
 
     latitude: float
     longitude: float
@@ -53,13 +53,13 @@ def gps_tags(position: GpsPosition) -> dict[int, object]:
 
 
 def build_exif(size: tuple[int, int], taken: str, exposure_s: float, position: GpsPosition) -> bytes:
-    """An EXIF block.
+    """Build an EXIF block.
 
     Args:
         size: Width and height, pixels.
         taken: ``YYYY:MM:DD HH:MM:SS``.
         exposure_s: Exposure time.
-        position: Of the receiver.
+        position: Position from the receiver.
     """
     exif = Image.Exif()
     exif.update(
@@ -97,7 +97,7 @@ def build_exif(size: tuple[int, int], taken: str, exposure_s: float, position: G
 
 
 def position_attributes(position: GpsPosition) -> dict[str, str]:
-    """The receiver's part of DJI's XMP."""
+    """The position attributes of DJI's XMP."""
     return {
         "GpsLatitude": f"{position.latitude:+.9f}",
         "GpsLongitude": f"{position.longitude:+.9f}",
@@ -106,7 +106,7 @@ def position_attributes(position: GpsPosition) -> dict[str, str]:
 
 
 def build_xmp(taken: str, dji: Mapping[str, str]) -> bytes:
-    """An XMP packet with DJI's attributes."""
+    """Build an XMP packet with DJI's attributes."""
     date = taken.replace(":", "-", 2).replace(" ", "T")
     lines = "".join(f'\n   drone-dji:{key}="{value}"' for key, value in dji.items())
     return (
@@ -120,17 +120,17 @@ def build_xmp(taken: str, dji: Mapping[str, str]) -> bytes:
 
 
 def read_dji(jpeg: bytes) -> dict[str, str]:
-    """DJI's XMP attributes in a photo of this capture."""
+    """Read DJI's XMP attributes from a photo of this capture."""
     start, end = jpeg.find(b"<x:xmpmeta"), jpeg.find(b"</x:xmpmeta>")
     return dict(DJI_ATTRIBUTE.findall(jpeg[start:end].decode()))
 
 
 def with_metadata(jpeg: bytes, exif: bytes, xmp: bytes) -> bytes:
-    """The same JPEG with this EXIF and XMP in place of any APP0 and APP1 segment; the pixels' bytes stay.
+    """Replace a JPEG's APP0 and APP1 segments with this EXIF and XMP; the coded pixels are unchanged.
 
     Args:
         jpeg: A baseline or progressive JPEG file.
-        exif: As ``Image.Exif.tobytes`` gives it, with its ``Exif`` header.
+        exif: From ``Image.Exif.tobytes``, with its ``Exif`` header.
         xmp: The packet.
     """
     kept, at = [], 2
@@ -147,10 +147,10 @@ def _segment(payload: bytes) -> bytes:
 
 
 def write_rtk_variant(folder: Path) -> Path:
-    """Write the demo photos as an RTK drone would have left them: the same pixels, positions to 2 and 3 cm, RTK's tags.
+    """Write the demo photos as an RTK drone's: the same pixels, positions accurate to 2 and 3 cm, RTK tags.
 
     Args:
-        folder: Where to; made if missing.
+        folder: The target; created if missing.
 
     Returns:
         ``folder``.

@@ -1,10 +1,10 @@
-"""True orthographic pictures of the scene: ``python -m splatpipe.demo.orthographic --out /tmp/demo-orthographic``.
+"""True orthographic images of the scene: ``python -m splatpipe.demo.orthographic --out /tmp/demo-orthographic``.
 
-The house's plot from above and the house's four façades, by the renderer of the capture's photos: same light, same
-textures, no sensor noise, exposure 0 EV. Pixels are half of the photos' GSD, for pictures of any grid to be made from
-them by averaging. What it needs is what ``generate`` needs; about two CPU minutes at 8 paths a pixel. The pictures are
-too large for the repository: whoever compares with them renders them. Finished strips are kept in ``--out``: an
-interrupted run goes on.
+The house's plot from above and its four façades, by the renderer of the capture's photos: same light, same textures,
+no sensor noise, exposure 0 EV. The pixel size is half the photos' GSD, so that images on any grid can be made from
+them by averaging. Same requirements as ``generate``; about two CPU minutes at 8 paths per pixel. The images are too
+large for the repository: render them for comparisons. Finished strips are kept in ``--out``, so that an interrupted
+run resumes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .mesh import Array, Plane
 from .scene import build_scene, turned
 
 PIXEL_M = 0.014  # half of the photos' GSD
-TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # of what is seen from above; nothing within it is so high
-# Where a façade is looked at from: farther than annex, eaves and steps, nearer than trees, and the van in the south.
+TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # of the top view; nothing in it is higher
+# Distance that a façade is viewed from: beyond annex, eaves and steps, but nearer than trees and the van in the south.
 AHEAD_M = {"south": 4.0, "north": 5.5, "west": 5.5, "east": 5.5}
 MARGIN_M = 0.3  # around a wall
 STRIP_ROWS = 512
@@ -31,10 +31,10 @@ SEED = 20261123
 
 @dataclass(frozen=True, eq=False)
 class ParallelView:
-    """A picture by parallel rays.
+    """An orthographic view: an image by parallel rays.
 
     Attributes:
-        name: Of its files.
+        name: Name of its files.
         origin: Of the first pixel's first corner, from where rays start; east, north, up in metres.
         right: Unit vector along the rows.
         down: Unit vector along the columns.
@@ -53,7 +53,7 @@ class ParallelView:
 
     @property
     def ahead(self) -> Array:
-        """Where the rays go: a unit vector."""
+        """Direction of the rays, a unit vector."""
         return np.asarray(np.cross(self.right, self.down))
 
     def to_grid(self, points: Array) -> Array:
@@ -67,7 +67,7 @@ class ParallelView:
         return np.asarray(places @ axes + self.origin)
 
     def resampled(self, pixel_m: float) -> ParallelView:
-        """The same picture with pixels of another size."""
+        """The same view with another pixel size."""
         width, height = (round(count * self.pixel_m / pixel_m) for count in (self.width, self.height))
         return replace(self, pixel_m=pixel_m, width=width, height=height)
 
@@ -80,7 +80,7 @@ def top_view(pixel_m: float = PIXEL_M) -> ParallelView:
 
 
 def wall_planes() -> dict[str, tuple[Plane, float, float]]:
-    """The four walls of the house by their names: lower left corner, level and upright axis; length; greatest height.
+    """The four walls of the house by name: plane (lower left corner, level and upright axis), length, greatest height.
 
     In the world's axes; seen from outside, u points to the right and the plane's normal to the viewer.
     """
@@ -99,7 +99,7 @@ def wall_planes() -> dict[str, tuple[Plane, float, float]]:
 
 
 def facade_view(name: str, pixel_m: float = PIXEL_M) -> ParallelView:
-    """A wall of the house from before it, with a margin around."""
+    """The front view of a wall of the house, with a margin around it."""
     wall, span, high = wall_planes()[name]
     origin = wall.point(-MARGIN_M, high + MARGIN_M, AHEAD_M[name])
     size = (round(metres / pixel_m) for metres in (span + 2.0 * MARGIN_M, high + 2.0 * MARGIN_M))
@@ -107,7 +107,7 @@ def facade_view(name: str, pixel_m: float = PIXEL_M) -> ParallelView:
 
 
 def views(pixel_m: float = PIXEL_M) -> list[ParallelView]:
-    """All of them."""
+    """All orthographic views."""
     return [top_view(pixel_m), *(facade_view(name, pixel_m) for name in wall_planes())]
 
 

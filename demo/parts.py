@@ -1,4 +1,4 @@
-"""What each triangle of the true surface is: ground, a roof, a wall, or something else."""
+"""Classify the triangles of the true surface: ground, roof, wall or something else."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ PAINTS = {TILED: TILES, SLATED: SLATE, SHEETED: SHEET, BRICKS: BRICK}
 PLASTERS = (CREAM, NORTH_PLASTER)
 GROUND_M = 0.02  # targets lie 12 mm above the plot, which is level and at 0
 TARGET_REACH_M = 0.36  # from a target's centre to its corners, at most
-TARGET_OFF_M = 1e-3  # of its plane
+TARGET_OFF_M = 1e-3  # distance from its plane
 TARGETS_ON = {"roof": TILED, "wall": HOUSE, "ground": GROUND}
 FLAT = 0.9999  # upward part of the plot's normal
 
 
 def parts_of(triangles: Triangles) -> Int8[np.ndarray, " m"]:
-    """The part that each triangle is of, a constant of this module; targets count as what they lie on.
+    """Return each triangle's class, a constant of this module; targets count as the surface they lie on.
 
     Args:
-        triangles: Of ``true_surface``.
+        triangles: From ``true_surface``.
     """
     parts = np.full(len(triangles), OTHER, np.int8)
     up = unit_normals(triangles)[:, 2]
@@ -46,17 +46,17 @@ def parts_of(triangles: Triangles) -> Int8[np.ndarray, " m"]:
 
 
 def _rows(rows: dict[bytes, int], corners: Triangles) -> list[int]:
-    return [rows[key] for key in _keys(corners) if key in rows]  # slivers that are no triangles were left out
+    return [rows[key] for key in _keys(corners) if key in rows]  # degenerate slivers were left out
 
 
 def _keys(triangles: Triangles) -> list[bytes]:
-    """The same for the same three corners, whatever their order."""
+    """Keys that are equal for the same three corners in any order."""
     order = np.lexsort((triangles[..., 2], triangles[..., 1], triangles[..., 0]), axis=-1)
     in_order = np.take_along_axis(triangles, order[..., None], axis=1) + 0.0  # no negative zeros
     return [corners.astype(np.float32).tobytes() for corners in in_order]
 
 
 def unit_normals(triangles: Triangles) -> Float64[np.ndarray, "m 3"]:
-    """Unit normals, as the corners turn; zero for slivers."""
+    """Unit normals by the corners' winding; zero for slivers."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))

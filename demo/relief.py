@@ -1,4 +1,4 @@
-"""The first surface along parallel rays: the true surface model from above, a façade's true relief from before it."""
+"""The first surface along parallel rays: the true DSM from above, or a façade's true relief from the front."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Places = Float64[np.ndarray, "*n 3"]
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """What parallel rays through the centres of a grid's cells hit first.
+    """The first hits of parallel rays through the centres of a grid's cells.
 
     Attributes:
-        height: Towards the viewer; minus infinity where there is nothing.
-        triangle: Row of the triangle that is hit; -1 where there is none.
-        cosine: Between that triangle's normal and the rays, 0 to 1: what turns a difference of heights into a
-            distance normal to the surface; 0 where there is none.
+        height: Height towards the viewer, metres; minus infinity where there is nothing.
+        triangle: Row of the triangle hit; -1 where there is none.
+        cosine: Between that triangle's normal and the rays, 0 to 1: converts a height difference to a distance normal
+        to the surface; 0 where there is none.
     """
 
     height: Float64[np.ndarray, "h w"]
@@ -31,14 +31,14 @@ class Relief:
 
 
 def relief(corners: Triangles, width: int, height: int, cell_m: float, highest_m: float = np.inf) -> Relief:
-    """Rasterise triangles that are given in a grid's own coordinates; exact at the cells' centres.
+    """Rasterise triangles given in grid coordinates; exact at the cells' centres.
 
     Args:
         corners: Column, row (cells; the first cell's centre is (0.5, 0.5)) and height (metres) of their corners.
         width: Cells.
         height: Cells.
         cell_m: A cell's side.
-        highest_m: What is higher lies behind the viewer.
+        highest_m: The viewer's height; anything higher lies behind the viewer.
     """
     highest = np.full((height, width), -np.inf)
     hit = np.full((height, width), -1, np.int32)
@@ -76,11 +76,11 @@ def _cosines(corners: Triangles, cell_m: float) -> Float64[np.ndarray, " m"]:
 def surface_model(
     triangles: Triangles, to_grid: Callable[[Places], Places], width: int, height: int, cell_m: float
 ) -> Relief:
-    """The true surface model on any north-up grid, of a CRS, too.
+    """The true DSM on any north-up grid, including that of a CRS.
 
     Args:
         triangles: East, north, up in metres.
-        to_grid: From there to column, row (cells) and height (metres) of the grid.
+        to_grid: Converts these to column, row (cells) and height (metres) of the grid.
         width: Cells.
         height: Cells.
         cell_m: A cell's side.
@@ -89,9 +89,9 @@ def surface_model(
 
 
 def relief_in(view: ParallelView, triangles: Triangles) -> Relief:
-    """What an orthographic view sees; heights are metres towards the viewer from the plane where its rays start."""
+    """The relief in an orthographic view; heights are metres towards the viewer from the plane where rays start."""
     places = view.to_grid(triangles) * [1.0, 1.0, -1.0]
-    ahead = (places[..., 2] <= 0.0).any(axis=1)  # what lies behind the viewer is not seen
+    ahead = (places[..., 2] <= 0.0).any(axis=1)  # anything behind the viewer is not seen
     found = relief(places[ahead], view.width, view.height, view.pixel_m, highest_m=0.0)
     rows = np.append(np.flatnonzero(ahead), -1).astype(np.int32)
     return Relief(found.height, rows[found.triangle], found.cosine)

@@ -17,9 +17,9 @@ SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG = 46.0, 222.0
 SUN_RADIUS_DEG = 0.2679
 TURBIDITY = 3.5
 GOLDEN = 1.32471795724474602596  # the plastic number, of the R2 sequence
-BOUNCES = 3  # surfaces a path may meet
+BOUNCES = 3  # surfaces that a path may hit
 PIXEL_FILTER_PX = 0.45  # sigma of the Gaussian pixel filter
-RADIANCE_CAP, INDIRECT_CAP = 4.0, 0.4  # the sun mirrored in lacquer would otherwise leave single bright pixels
+RADIANCE_CAP, INDIRECT_CAP = 4.0, 0.4  # the sun's reflection in lacquer would otherwise produce single bright pixels
 
 
 def load_mitsuba() -> Any:
@@ -31,7 +31,7 @@ def load_mitsuba() -> Any:
 
 
 class Renderer:
-    """The scene on Mitsuba's side."""
+    """The scene in Mitsuba."""
 
     def __init__(self, scene: DemoScene) -> None:
         self.mi = load_mitsuba()
@@ -43,7 +43,7 @@ class Renderer:
         self.scene = self.mi.load_dict({"type": "scene", "sky": {**light, "sun_scale": 0.0}, **parts})
 
     def _sun_irradiance(self, light: dict[str, Any]) -> Array:
-        """Of a surface that faces the sun, (3,): the disc's radiance, by Mitsuba's model, times its solid angle."""
+        """Irradiance of a surface facing the sun, (3,): the disc's radiance in Mitsuba, times its solid angle."""
         import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
@@ -79,20 +79,20 @@ class Renderer:
         return shape
 
     def photo(self, pose: Pose, lens: BrownLens, spp: int, seed: int) -> NDArray[np.float32]:
-        """Radiance of each pixel, (h, w, 3): ``spp`` paths a pixel through a Gaussian pixel filter.
+        """Render radiance, (h, w, 3): ``spp`` paths per pixel through a Gaussian pixel filter.
 
         Args:
-            pose: Where the camera is.
+            pose: The camera's pose.
             lens: Its intrinsics; rays are bent by the distortion itself, no image is resampled.
-            spp: Samples a pixel.
-            seed: Of this photo.
+            spp: Samples per pixel.
+            seed: Seed of this photo.
         """
         import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
         rotation = mi.Matrix3f(pose.world_from_cam[:3, :3].tolist())
         origin = mi.Point3f(*(float(x) for x in pose.world_from_cam[:3, 3]))
-        dr.make_opaque(rotation, origin)  # literals would be compiled in, anew for each photo and sample
+        dr.make_opaque(rotation, origin)  # literals would be compiled in, again for each photo and sample
 
         def ray(px: Any, py: Any) -> Any:
             xd, yd = (px - lens.cx) / lens.f, (py - lens.cy) / lens.f
@@ -106,7 +106,7 @@ class Renderer:
         return self._picture(lens.width, lens.height, ray, spp, seed)
 
     def orthographic(self, view: ParallelView, spp: int, seed: int) -> NDArray[np.float32]:
-        """Radiance of each pixel, (h, w, 3), along parallel rays; as ``photo`` otherwise."""
+        """Render radiance, (h, w, 3), along parallel rays; otherwise as ``photo``."""
         import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
@@ -121,7 +121,7 @@ class Renderer:
     def _picture(
         self, width: int, height: int, ray: Callable[[Any, Any], Any], spp: int, seed: int
     ) -> NDArray[np.float32]:
-        """Mean radiance of each pixel, (h, w, 3), along the rays of places in it (pixels)."""
+        """Mean radiance of each pixel, (h, w, 3); ``ray`` converts pixel positions to rays."""
         import drjit as dr  # pyright: ignore[reportMissingImports] (extra: demo)
 
         mi = self.mi
@@ -176,7 +176,7 @@ class Renderer:
         return frame.to_world(mi.warp.square_to_uniform_cone(point, float(np.cos(np.deg2rad(SUN_RADIUS_DEG)))))
 
     def first_hit(self, origins: Array, directions: Array) -> Array:
-        """Metres to the first surface along rays, infinite where there is none; (n, 3), (n, 3) -> (n,)."""
+        """Distance in metres to the first surface along rays, infinite where there is none; (n, 3), (n, 3) -> (n,)."""
         mi = self.mi
         ray = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
         return np.array(self.scene.ray_intersect(ray).t, dtype=np.float64)

@@ -12,7 +12,7 @@ from .surroundings import add_surroundings
 from .textures import Painter, target
 
 SEED = 20261120
-PLOT_YAW_DEG = 17.0  # the house is turned against north, as houses are
+PLOT_YAW_DEG = 17.0  # the house is rotated against north, as most houses are
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class DemoScene:
 
 
 def _target_planes() -> list[tuple[str, Plane, float]]:
-    """Plane with its origin at each target's centre, and the target's size, in plot coordinates."""
+    """Each target's kind, plane with its origin at the target's centre, and size, in plot coordinates."""
     flat = [
         (-9.0, -14.2),
         (1.3, -13.6),
@@ -78,12 +78,12 @@ def _turn(plot_yaw_deg: float) -> Array:
 
 
 def turned(points: Array) -> Array:
-    """Plot coordinates (..., 3) to east, north, up."""
+    """Convert plot coordinates (..., 3) to east, north, up."""
     return np.asarray(points @ _turn(PLOT_YAW_DEG).T)
 
 
 def build_scene(seed: int = SEED) -> DemoScene:
-    """Build and paint the scene; some 20 s."""
+    """Build and paint the scene, in about 20 s."""
     builder = Builder()
     add_house(builder)
     add_surroundings(builder, seed)
@@ -102,10 +102,10 @@ def build_scene(seed: int = SEED) -> DemoScene:
 def building_corners(paint: Painter | None = None) -> Array:
     """The corners of the house's own triangles, (m, 3, 3), without painting it: the same as in the scene, to float32.
 
-    Targets lie 12 mm before its walls and roofs and do not belong to it.
+    Targets lie 12 mm in front of its walls and roofs and are not included.
 
     Args:
-        paint: Only those that are painted so; None for all.
+        paint: Only triangles with this painter; None for all.
     """
     builder = Builder()
     add_house(builder)

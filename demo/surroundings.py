@@ -1,4 +1,4 @@
-"""What is around the house: ground, van, shed, fence, trees, neighbours, hills. Plot coordinates as in house.py."""
+"""The house's surroundings: ground, van, shed, fence, trees, neighbours, hills. Plot coordinates as in house.py."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ LEAVES = {
 def _blend(
     base: Image, tile: TextureTile, area: tuple[float, float, float, float], paint: Painter, ragged: float = 0.0
 ) -> Image:
-    """Paint a rectangle (x0, y0, x1, y1) of the ground; a ragged border wanders by that many metres."""
+    """Paint a rectangle (x0, y0, x1, y1) of the ground; its border varies by ``ragged`` metres."""
     x0, y0, x1, y1 = area
     cols = np.flatnonzero((tile.u - NEAR > x0 - 2 * ragged) & (tile.u - NEAR < x1 + 2 * ragged))
     rows = np.flatnonzero((tile.v - NEAR > y0 - 2 * ragged) & (tile.v - NEAR < y1 + 2 * ragged))
@@ -349,7 +349,7 @@ def _trees(b: Builder) -> None:
     for k in range(46):
         turn, r = 2 * np.pi * (k + rng.uniform(0, 0.8)) / 46, rng.uniform(38, 88)
         x, y = r * np.cos(turn), r * np.sin(turn)
-        if abs(y + 20) < 7:  # the street stays free
+        if abs(y + 20) < 7:  # the street is kept free
             continue
         _tree(b, x, y, rng.uniform(6, 11), 900 + 7 * k, rng.choice(list(LEAVES)), 4)
 
@@ -389,7 +389,7 @@ def _facade(b: Builder, plane: Plane, size: tuple[float, float, float, float], s
 
 
 def add_surroundings(b: Builder, seed: int) -> None:
-    """Everything but the house."""
+    """Add everything except the house."""
     _ground(b, seed)
     _van(b, (6.9, -13.9), 1.5, "d9d9d4")
     _van(b, (-12.0, -18.0), 0.02, "5f7f9a")

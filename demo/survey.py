@@ -1,4 +1,4 @@
-"""What a surveyor adds to the photos: targets, where they are seen, and marks on them."""
+"""A survey of the capture: which photos see its targets, and the targets' image marks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def sightings(
 
 
 def gcp_list(epsg: int, utm: dict[str, Array], marks: Sightings) -> str:
-    """ODM's ground control file: the CRS, then ``x y z px py photo name`` a line."""
+    """Format ODM's ground control file: the CRS, then one line ``x y z px py photo name`` per mark."""
     lines = [f"EPSG:{epsg}"]
     for name, photos in marks.items():
         easting, northing, height = utm[name]

@@ -1,8 +1,8 @@
-"""Procedural surface textures: every face gets its own, rich in blobs at all scales and nowhere repeating.
+"""Procedural surface textures: unique for every face, rich in blobs at all scales, and never repeating.
 
 A painter is a function of a `TextureTile` (a rectangle of wall, roof, lawn ...) that returns sRGB reflectances in
 [0, 1].
-Contrast lies mostly at wavelengths of 0.2 m and more, which stay well sampled in photos of half the size; what is finer
+Contrast lies mostly at wavelengths of 0.2 m and more, which stay well sampled in photos of half the size; finer detail
 is kept faint.
 """
 
@@ -64,7 +64,7 @@ def noise(tile: TextureTile, wavelength_m: float | tuple[float, float]) -> Image
     """Smooth random field of about unit variance.
 
     Args:
-        tile: Where.
+        tile: The tile to cover.
         wavelength_m: Spacing of the random lattice, along u and v if two are given.
     """
     along_u, along_v = wavelength_m if isinstance(wavelength_m, tuple) else (wavelength_m, wavelength_m)
@@ -79,7 +79,7 @@ def noise(tile: TextureTile, wavelength_m: float | tuple[float, float]) -> Image
 
 
 def fractal(tile: TextureTile, longest_m: float, shortest_m: float, gain: float = 0.75) -> Image:
-    """Sum of octaves of noise, about unit variance; each octave is ``gain`` times the one above it."""
+    """Sum of octaves of noise, of about unit variance; each octave is ``gain`` times the one above it."""
     total = np.zeros(tile.shape, np.float32)
     power, amplitude, wavelength = 0.0, 1.0, longest_m
     while wavelength >= shortest_m:
@@ -98,7 +98,7 @@ def blobs(tile: TextureTile, wavelength_m: float, share: float) -> Image:
 
 @dataclass(frozen=True)
 class Cells:
-    """Bricks, tiles, planks: which cell a texel is in and where in it.
+    """Bricks, tiles or planks: each texel's cell and its position in that cell.
 
     Attributes:
         row, col: Cell indices, shape (h, w).
@@ -113,7 +113,7 @@ class Cells:
     edge_m: Image
 
     def values(self, rng: np.random.Generator) -> Image:
-        """One standard normal number a cell."""
+        """One standard normal number per cell."""
         table = rng.standard_normal((self.row.max() + 1, self.col.max() + 1)).astype(np.float32)
         return np.asarray(table[self.row, self.col], np.float32)
 
@@ -242,7 +242,7 @@ def target(tile: TextureTile) -> Image:
 
 
 def interior(wall: str, curtain: str) -> Painter:
-    """What is behind a window: a room in the dark, curtains at the sides, a lamp or plants on the sill, a blind."""
+    """The interior behind a window: a dark room, curtains at the sides, a lamp or plants on the sill, a blind."""
 
     def paint(tile: TextureTile) -> Image:
         width, height = float(tile.u.max()), float(tile.v.max())

@@ -1,4 +1,4 @@
-"""The truth about the demo capture: where its cameras stood, what its surface is, and how deep it lies."""
+"""Ground truth of the demo capture: camera poses, surface and depth maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Triangles = Float64[np.ndarray, "m 3 3"]
 
 
 def true_poses() -> Poses:
-    """``cam_from_world`` of each photo by its name; east, north, up in metres."""
+    """``cam_from_world`` of each photo by name; east, north, up in metres."""
     photos = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["photos"]
     return {photo["name"]: np.array(photo["cam_from_world"]) for photo in photos}
 
@@ -29,12 +29,12 @@ def true_surface() -> Triangles:
 
 
 def centre(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 3"]:
-    """Where a camera stands in the world."""
+    """A camera's centre in the world."""
     return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
 
 
 def truth_from_model(poses: Mapping[str, Float64[np.ndarray, "4 4"]]) -> Similarity:
-    """The least-squares similarity that takes a model's camera centres to the true ones.
+    """The least-squares similarity transform from a model's camera centres to the true ones.
 
     Args:
         poses: ``cam_from_world`` of the model's photos by their names, which are the capture's; at least three.
@@ -50,7 +50,7 @@ def truth_from_model(poses: Mapping[str, Float64[np.ndarray, "4 4"]]) -> Similar
 
 
 def depth_map(camera: Camera, triangles: Triangles) -> Float64[np.ndarray, "h w"]:
-    """How deep the first triangle lies on each pixel's ray, along the view axis; infinite where there is none.
+    """Depth of the first triangle on each pixel's ray, along the view axis; infinite where there is none.
 
     Exact at the pixel's centre, also for triangles that reach behind the camera: the edges are tested as planes through
     its centre (Olano and Greer: "Triangle Scan Conversion using 2D Homogeneous Coordinates", 1997).
@@ -80,7 +80,7 @@ def depth_map(camera: Camera, triangles: Triangles) -> Float64[np.ndarray, "h w"
 
 
 def _may_be_seen(camera: Camera, corners: Triangles) -> Bool[np.ndarray, " m"]:
-    """Triangles of which no side of the frustum has all corners outside."""
+    """Triangles that do not lie entirely outside any one side of the frustum."""
     x, y, z = (corners[..., axis] for axis in range(3))
     column, row = x * camera.fx + z * camera.cx, y * camera.fy + z * camera.cy  # times depth: no division by it
     sides = (z, column, z * camera.width - column, row, z * camera.height - row)

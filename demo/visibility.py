@@ -1,4 +1,4 @@
-"""Which of the capture's photos truly see a place."""
+"""True visibility: which of the capture's photos see a place."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from splatpipe.demo.depth_maps import load, true_cameras
 from splatpipe.demo.truth import Triangles, depth_map
 from splatpipe.pipeline.geometry.camera import Camera
 
-BEHIND_M = 0.03  # what a photo sees may lie so far before a place that it sees: less than half a pixel's slant
-LEAST_COSINE = 0.087  # of 85°: from flatter, a surface is seen as a line
-HALF = 2  # over this, the size of photos that depths are made at where none are given
-FEWEST = 3  # photos that tell a place's position with something to spare
+BEHIND_M = 0.03  # tolerance by which a photo's depth may be less than a visible place's: less than half a pixel's slant
+LEAST_COSINE = 0.087  # of 85°: at flatter angles, a surface is seen as a line
+HALF = 2  # divisor of the photos' size for computed depths
+FEWEST = 3  # photos that determine a place's position with redundancy
 
 
 @dataclass(frozen=True, eq=False)
 class TrueView:
-    """A photo's camera and what it truly sees, metres along its axis; infinite where there is nothing."""
+    """A photo's camera and its true depth map, metres along its axis; infinite where there is nothing."""
 
     camera: Camera
     depth: Float32[np.ndarray, "h w"]
 
 
 def true_sights(surface: Triangles, folder: Path | None = None) -> list[TrueView]:
-    """All photos of the capture.
+    """Load or compute the true views of all photos of the capture.
 
     Args:
         surface: All triangles.
-        folder: What ``demo.depth_maps`` wrote; None to make depths here, at half the size, in a CPU minute.
+        folder: Output of ``demo.depth_maps``; None to compute depths here, at half the size, in a CPU minute.
     """
     if folder is not None:
         held = [load(path) for path in sorted(folder.glob("*.npz"))]
@@ -45,10 +45,10 @@ def true_sights(surface: Triangles, folder: Path | None = None) -> list[TrueView
 def photos_that_see(
     places: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"], sights: Iterable[TrueView]
 ) -> UInt8[np.ndarray, " n"]:
-    """How many photos see each place of a surface.
+    """Count the photos that see each place of a surface.
 
     Args:
-        places: East, north, up.
+        places: East, north, up in metres.
         normals: Unit normals there, to either side.
         sights: The photos.
     """
@@ -64,7 +64,7 @@ def photos_that_see(
 def _is_first(
     depth: Float32[np.ndarray, "h w"], pixels: Float64[np.ndarray, "n 2"], expected: Float64[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Whether nothing lies before places: by the farthest of the four pixels about each."""
+    """Whether nothing occludes places, judged by the farthest of the four pixels around each."""
     farthest = cv2.dilate(depth, np.ones((2, 2), np.uint8), anchor=(1, 1), borderType=cv2.BORDER_REPLICATE)
     column, row = np.clip(np.floor(pixels + 0.5).astype(np.intp), 0, np.array(depth.shape[::-1]) - 1).T
     return np.asarray(expected <= farthest[row, column] + BEHIND_M)

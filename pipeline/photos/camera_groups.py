@@ -1,4 +1,4 @@
-"""Which photos share a camera, and what is known of its focal length before calibration."""
+"""Group photos by camera, and derive each camera's prior focal length from metadata."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from splatpipe.pipeline.photos.sensors import sensor_size_mm
 from splatpipe.pipeline.photos.xmp import xmp_number
 
 MODEL = "SIMPLE_RADIAL"
-DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's guess where nothing is known: a lens of 43 mm on 35 mm film
-FOCAL_BOUNDS = (0.2, 30.0)  # of the longer side; a value outside is no focal length of a camera
+DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's default guess: a lens of 43 mm on 35 mm film
+FOCAL_BOUNDS = (0.2, 30.0)  # of the longer side; a value outside is not a camera's focal length
 ASPECT_TOLERANCE = 0.01
-SHAPE_TOLERANCE = 0.03  # between a sensor's specified shape and that of the pictures that use all of it
+SHAPE_TOLERANCE = 0.03  # between a sensor's specified aspect ratio and that of the images that use all of it
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
-WIDEST_SENSOR = 1.51  # width over height; wider pictures are cut from a sensor of 4:3
-PANORAMA = 2.5  # wider still, no sensor's shape
+WIDEST_SENSOR = 1.51  # width over height; wider images are cropped from a 4:3 sensor
+PANORAMA = 2.5  # no sensor has this aspect ratio or a larger one
 CAMERAS_TOLD = 10  # on the console; the report has them all
-EQUIVALENT_TOLERANCE = 0.05  # of the 35 mm equivalent, which is rounded; what differs by more is digital zoom
-ZOOM_TOLERANCE = 0.01  # of the focal length: within it photos share a lens, as focus and heat move it by as much
-CALIBRATION_STRAY = 0.15  # from the sensor's focal length: more is another unit, or another mode of the camera
+EQUIVALENT_TOLERANCE = 0.05  # of the 35 mm equivalent, which is rounded; a larger difference is digital zoom
+ZOOM_TOLERANCE = 0.01  # of the focal length: within it photos share a camera, as focus and heat change it by as much
+CALIBRATION_STRAY = 0.15  # from the focal length by sensor size: more means another unit, or another mode of the camera
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Focal:
 
     Attributes:
         px: Its value.
-        source: Where it is from, as FOCAL_SOURCES.
+        source: Its source, one of FOCAL_SOURCES.
         has_prior: Whether it is more than a guess.
     """
 
@@ -45,7 +45,7 @@ class Focal:
 
 
 # In order of trust. A maker's calibration comes first. Rounded 35 mm equivalents err by up to 5 %.
-# FocalPlaneXResolution of a photo that was resized afterwards may or may not have been changed with it, so comes last.
+# FocalPlaneXResolution of a photo that was resized afterwards may not have been updated, so comes last.
 FOCAL_SOURCES = (
     "xmp-calibrated",
     "sensor-table",
@@ -58,19 +58,19 @@ FOCAL_SOURCES = (
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """Photos that were taken by one camera with one setting of its lens.
+    """Photos taken by one camera with one lens setting.
 
     Attributes:
-        model: COLMAP's camera model to start from.
+        model: COLMAP's camera model, the initial one.
         width: Of the stored grid, pixels.
         height: Likewise.
-        params: The model's parameters to start from: focal length, principal point, distortion.
-        focal_px: The focal length to start from.
-        focal_source: Where it is from.
+        params: The model's initial parameters: focal length, principal point, distortion.
+        focal_px: The initial focal length, pixels.
+        focal_source: Its source, one of FOCAL_SOURCES.
         has_prior: Whether it is more than a guess.
         make: From EXIF; empty when unknown.
         model_name: Likewise.
-        photos: How many there are.
+        photos: Number of photos.
     """
 
     model: str
@@ -86,10 +86,10 @@ class CameraGroup:
 
 
 def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> Focal:
-    """The most trustworthy focal length that a photo's metadata give.
+    """Return the most trustworthy focal length that a photo's metadata give.
 
     Args:
-        exif: Its EXIF; the size in it is the picture's before any resizing.
+        exif: Its EXIF; the size in it is the image's before any resizing.
         xmp: Its XMP properties.
         width: Of the stored grid, pixels.
         height: Likewise.
@@ -115,12 +115,12 @@ def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> 
 
 
 def _is_credible(calibrated: float | None, nominal: float | None) -> bool:
-    """Whether a maker's calibration can be of this lens and picture, as far as anything else tells."""
+    """Whether a maker's calibration agrees with the nominal focal length, where both are known."""
     return calibrated is None or nominal is None or abs(calibrated / nominal - 1.0) <= CALIBRATION_STRAY
 
 
 def refused_calibrations(photos: Sequence[CheckedPhoto]) -> list[str]:
-    """Names of photos whose stated calibration is far from what their lens and sensor give."""
+    """Names of photos whose stated calibration is far from the focal length by lens and sensor."""
     return [
         photo.name
         for photo in photos
@@ -130,13 +130,13 @@ def refused_calibrations(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 
 def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], dict[str, int]]:
-    """Group photos by body (make, model, serial number), size, zoom, and whether the drone took their distortion out.
+    """Group photos by body (make, model, serial number), size, zoom, and whether the drone removed their distortion.
 
-    Photos held upright have the grid of the others where EXIF turns them, and are of the same group; where their pixels
-    were turned, they are of another with the same focal length to begin with.
+    Portrait photos that only EXIF rotates have the same stored grid as the others, and are in the same group; if their
+    pixels were rotated, they are in another group with the same initial focal length.
 
     Args:
-        photos: Those that take part, sorted by name.
+        photos: The photos in use, sorted by name.
 
     Returns:
         The groups in the order of their first photos, and each photo's group by its name.
@@ -156,9 +156,9 @@ def group_cameras(photos: Sequence[CheckedPhoto]) -> tuple[list[CameraGroup], di
 
 
 def _by_zoom(photos: list[CheckedPhoto]) -> list[list[CheckedPhoto]]:
-    """Photos of one body by the zoom: around the focal length that most of them have, then around that of most others.
+    """Group photos of one body by zoom: around the most frequent focal length, then around that of the rest, and so on.
 
-    A zoom states every step of its motor. A camera a step would be one a photo, which no photo can calibrate.
+    A zoom lens reports every step of its motor. A camera per step would be one per photo, which cannot be calibrated.
     """
     left, groups = list(photos), []
     while left:
@@ -171,7 +171,7 @@ def _by_zoom(photos: list[CheckedPhoto]) -> list[list[CheckedPhoto]]:
 
 
 def _same_zoom(zoom: tuple[float | None, float | None], other: tuple[float | None, float | None]) -> bool:
-    """By focal length in millimetres and as 35 mm equivalent; the latter alone tells of digital zoom."""
+    """Compare focal lengths in millimetres and as 35 mm equivalents; only the latter include digital zoom."""
     return all(
         mine is theirs if mine is None or theirs is None else abs(mine - theirs) <= tolerance * theirs
         for mine, theirs, tolerance in zip(zoom, other, (ZOOM_TOLERANCE, EQUIVALENT_TOLERANCE), strict=True)
@@ -181,9 +181,9 @@ def _same_zoom(zoom: tuple[float | None, float | None], other: tuple[float | Non
 def describe_cameras(
     photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int]
 ) -> list[JSON]:
-    """A row a camera for people: its name, photos, pixels, focal length with its source, and what size EXIF speaks of.
+    """One row per camera for reports: name, photos, size, focal length with its source, and the size in EXIF.
 
-    ``exif_size`` is None where that is the photos' size, or not stated; ``cropped`` tells that it has another shape.
+    ``exif_size`` is None if it equals the photos' size or is not stated; ``cropped``: its aspect ratio differs.
     """
     first = {camera_of[photo.name]: photo for photo in reversed(photos)}
     rows = []
@@ -207,13 +207,13 @@ def describe_cameras(
 
 
 def camera_name(make: str, model: str) -> str:
-    """What people call a camera."""
+    """A camera's display name."""
     told = model if model.casefold().startswith(make.casefold()) else f"{make} {model}"
     return told.strip() or "unknown camera"
 
 
 def tell_cameras(rows: Sequence[JSON], report: Reporter) -> None:
-    """Name the cameras where there are several, and what was made of EXIF that speaks of another picture size."""
+    """Report the cameras if there are several, and how EXIF that states another image size was handled."""
     if len(rows) > 1:
         for row in rows[:CAMERAS_TOLD]:
             zoom = f", {row['focal_mm']:g} mm" if row["focal_mm"] else ""
@@ -239,7 +239,7 @@ def tell_cameras(rows: Sequence[JSON], report: Reporter) -> None:
 
 
 def cameras_json(groups: Sequence[CameraGroup]) -> JSON:
-    """What ``cameras.json`` holds."""
+    """The content of ``cameras.json``."""
     return {"cameras": [asdict(group) for group in groups]}
 
 
@@ -264,9 +264,9 @@ def _group(photos: Sequence[CheckedPhoto]) -> CameraGroup:
 
 
 def picture_scale(exif: Exif, width: int, height: int) -> float | None:
-    """Stored pixels per pixel of the picture that the camera took; None when the picture was cropped.
+    """Stored pixels per pixel of the image that the camera took; None if the image was cropped.
 
-    A turn by 90° in between does not matter. Without a size in EXIF the picture counts as the camera's own.
+    A rotation by 90° does not matter. Without a size in EXIF the scale is 1.
     """
     if exif.width is None or exif.height is None:
         return 1.0
@@ -283,7 +283,7 @@ def _from_sensor(exif: Exif, width: int, height: int) -> float | None:
     if size is None or exif.focal_mm is None:
         return None
     longer, shorter = max(width, height), min(width, height)
-    # A picture that is narrower than the sensor was cut at its sides, a wider one at top and bottom.
+    # An image narrower than the sensor was cropped at its sides, a wider one at top and bottom.
     used_mm = size[1] * longer / shorter
     if used_mm > size[0] * (1.0 - SHAPE_TOLERANCE):
         used_mm = size[0]
@@ -291,7 +291,7 @@ def _from_sensor(exif: Exif, width: int, height: int) -> float | None:
 
 
 def _from_35mm(focal_35mm: float | None, longer: int, aspect: float) -> float | None:
-    """By the diagonal of the sensor (which is how the equivalent is defined), not of a 16:9 picture cut from it."""
+    """Convert by the sensor's diagonal (which defines the equivalent), not that of a 16:9 image cropped from it."""
     if focal_35mm is None:
         return None
     shape = aspect if aspect <= WIDEST_SENSOR else 4 / 3

@@ -1,4 +1,4 @@
-"""Checks one photo: read once, hashed, decoded whole, its metadata taken."""
+"""Check one photo: read it once, hash it, decode it in full, and extract its metadata."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from splatpipe.pipeline.photos.scan import Candidate, ExcludedPhoto
 from splatpipe.pipeline.photos.xmp import find_packet, parse_xmp
 
 MAX_FILE_BYTES = 2 << 30
-LARGE_PIXELS = 40_000_000  # pictures beyond are decoded one at a time: some hundred megabytes each
-DRAFT = 8  # libjpeg reads every coefficient of a JPEG whatever the scale it then computes pixels at
+LARGE_PIXELS = 40_000_000  # larger images are decoded one at a time: some hundred megabytes each
+DRAFT = 8  # libjpeg reads every coefficient of a JPEG, whatever the scale of the pixels that it computes
 FINGERPRINT_STEP = 8
 TAG_ORIENTATION = 274
 TAG_BITS_PER_SAMPLE = 258
@@ -31,13 +31,13 @@ TAG_DNG_VERSION = 50706
 DEEP_GREY_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 COLOUR_MODES = ("RGB", "RGBA")
 READ_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *DEEP_GREY_MODES)
-RANGE_QUANTILES = (0.001, 0.999)  # of a deep picture's values: hot and dead pixels must not set the range
+RANGE_QUANTILES = (0.001, 0.999)  # of a deep image's values: hot and dead pixels must not set the range
 _one_large_at_a_time = threading.Lock()
 
 
 @dataclass(frozen=True)
 class PictureLimits:
-    """What a picture may measure: ``min_side`` (the longer side, pixels) and ``max_pixels``."""
+    """Limits on an image's size: ``min_side`` (of the longer side, pixels) and ``max_pixels``."""
 
     min_side: int
     max_pixels: int
@@ -45,7 +45,7 @@ class PictureLimits:
 
 @dataclass(frozen=True)
 class CheckedPhoto:
-    """A photo that was decoded to its end.
+    """A photo that was decoded in full.
 
     Attributes:
         name: As in the scan.
@@ -53,10 +53,10 @@ class CheckedPhoto:
         sha256: Of the file.
         width: Of the stored grid, pixels.
         height: Likewise.
-        fingerprint: Equal for pictures with equal pixels, and hardly ever otherwise.
-        plain: An 8-bit RGB or grey picture that every reader takes as it is.
-        transparent: Has pixels that are more transparent than not.
-        deep_range: Lowest and highest value of a picture with more than 8 bits a channel, else None.
+        fingerprint: Equal for images with equal pixels, and hardly ever otherwise.
+        plain: Whether it is an 8-bit RGB or grey image that every reader supports.
+        transparent: Whether it has pixels with an opacity below half.
+        deep_range: Lowest and highest value of an image with more than 8 bits per channel, else None.
         exif: Its EXIF.
         xmp: Its XMP properties.
     """
@@ -100,21 +100,21 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
 
 
 def deep_pixels(data: bytes, picture: Image.Image, orientation: int) -> Shaped[np.ndarray, "h w *channels"] | None:
-    """The values of a picture with more than 8 bits a channel, in the stored grid.
+    """Decode the values of an image with more than 8 bits per channel, in the stored grid.
 
     Args:
         data: The file.
         picture: The file, opened and not yet loaded.
-        orientation: EXIF's, 1 to 8.
+        orientation: EXIF orientation, 1 to 8.
 
     Returns:
-        (h, w) grey, or (h, w, 3 or 4) RGB or RGBA; None for a picture of 8 bits, or one that Pillow alone can read.
+        (h, w) grey, or (h, w, 3 or 4) RGB or RGBA; None for an 8-bit image, or one that only Pillow can read.
     """
     if picture.mode in DEEP_GREY_MODES:
         return np.asarray(load_stored(picture, orientation))
     if picture.mode not in COLOUR_MODES or _bits(data, picture) <= 8:
         return None
-    # Pillow keeps the upper byte of 16-bit colours. OpenCV keeps both, but fails on TIFFs that ask to be turned.
+    # Pillow keeps only the upper byte of 16-bit colours. OpenCV keeps both, but fails on TIFFs with an orientation.
     encoded = np.frombuffer(_without_turn(data) if picture.format == "TIFF" else data, np.uint8)
     pixels: Any = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype == np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
@@ -124,7 +124,7 @@ def deep_pixels(data: bytes, picture: Image.Image, orientation: int) -> Shaped[n
 
 
 def stored_orientation(exif: Exif, picture: Image.Image) -> int:
-    """The orientation that Pillow goes by when it loads a TIFF (its own tag alone), else EXIF's."""
+    """The orientation that Pillow applies when it loads a TIFF (its own tag only), else EXIF's."""
     if picture.format != "TIFF":
         return exif.orientation
     value = _tiff_tag(picture, TAG_ORIENTATION, 1)
@@ -142,7 +142,7 @@ def _read_once(path: Path) -> tuple[bytes, str]:
 
 
 def _refusal(picture: Image.Image, limits: PictureLimits) -> str:
-    """Why an opened picture is not to be decoded; empty when it is."""
+    """Why an opened image must not be decoded; empty if it may be."""
     width, height = picture.size
     if width * height > limits.max_pixels:
         return f"claims {width} × {height} pixels, more than ingest.max_megapixels={limits.max_pixels / 1e6:g} allows"
@@ -199,7 +199,7 @@ class _Facts:
 
 
 def _load(data: bytes, picture: Image.Image, orientation: int) -> np.ndarray | Image.Image:
-    """Decode the whole file: values of a deep picture, or a picture of 8 bits, a JPEG at a reduced scale."""
+    """Decode the whole file: the values of a deep image, or an 8-bit image, which for a JPEG has a reduced scale."""
     deep = deep_pixels(data, picture, orientation)
     if deep is not None:
         return deep
@@ -208,7 +208,7 @@ def _load(data: bytes, picture: Image.Image, orientation: int) -> np.ndarray | I
 
 
 def _deep_facts(values: np.ndarray) -> _Facts | None:
-    """None where no pixel has a value (a float picture of NaN)."""
+    """The facts of a deep image; None if no pixel has a value (a float image of NaN)."""
     sample = values[::FINGERPRINT_STEP, ::FINGERPRINT_STEP]
     finite = sample[..., :3][np.isfinite(sample[..., :3])] if values.ndim == 3 else sample[np.isfinite(sample)]
     if finite.size == 0:
@@ -224,7 +224,7 @@ def _plain_facts(loaded: Image.Image, size: tuple[int, int]) -> _Facts:
     transparent = False
     if loaded.has_transparency_data:
         transparent = bool((np.asarray(loaded.convert("RGBA"))[:, :, 3] < 128).any())
-    step = FINGERPRINT_STEP if loaded.size == size else 1  # a JPEG comes at a reduced scale
+    step = FINGERPRINT_STEP if loaded.size == size else 1  # a JPEG is decoded at a reduced scale
     sample = np.asarray(loaded)[::step, ::step]
     return _Facts(_fingerprint(loaded.mode, size, sample), transparent, None)
 
@@ -246,7 +246,7 @@ def _tiff_tag(picture: Image.Image, tag: int, default: Any) -> Any:
     tags: Mapping[int, Any] = getattr(picture, "tag_v2", {})
     try:
         return tags.get(tag, default)
-    except Exception:  # Pillow decodes a tag when it is asked for, and raises almost anything on hostile ones
+    except Exception:  # Pillow decodes tags lazily, and raises almost anything on hostile ones
         return default
 
 

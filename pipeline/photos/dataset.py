@@ -153,10 +153,10 @@ def split_views(names: Sequence[str], every: int, views: str) -> Split:
         names: Names of all views.
         every: Every n-th in name order, starting with the first, is held out; 0 for none.
         views: Names to hold out instead, separated by commas; empty for the rule above. Case, suffix and folder may be
-            left out where one photo alone is alike.
+            left out where the name still matches only one photo.
 
     Raises:
-        SplatpipeError: if a name is unknown or not clear, or if nothing is left to train on.
+        SplatpipeError: if a name is unknown or ambiguous, or if nothing is left to train on.
     """
     ordered = sorted(names)
     if views.strip():
@@ -182,7 +182,7 @@ def split_views(names: Sequence[str], every: int, views: str) -> Split:
 
 @dataclass(frozen=True)
 class Split:
-    """Which photos are trained on and which are held out: decided once, for all who ask.
+    """The split into training and held-out photos, decided once per run.
 
     Attributes:
         train: Names to train on, in name order.
@@ -199,10 +199,10 @@ class Split:
 
 
 def load_split(path: Path) -> Split:
-    """Read what `split` left.
+    """Read the split that the stage `split` wrote.
 
     Raises:
-        StageError: if it is not that.
+        StageError: if it is missing or broken.
     """
     try:
         fields = json.loads(path.read_text(encoding="utf-8"))

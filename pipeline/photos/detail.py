@@ -1,8 +1,8 @@
-"""What a photo's pixels say of its focus and exposure, read fast and at places that other photos show, too.
+"""Measure a photo's sharpness and brightness, fast and at places that other photos also show.
 
-How much fine detail a photo has depends on what it shows: a lawn has more than a wall, whatever the focus. So detail is
-measured in small patches, in four directions (a shaken photo loses it in one), as the energy of the finest scales over
-that of coarser ones in the same patch. The patch of another photo that shows the same thing tells what is normal there.
+How much fine detail a photo has depends on its subject: a lawn has more than a wall, whatever the focus. So detail is
+measured in small patches, in four directions (motion blur removes it in one), as the energy of the finest scales over
+that of coarser ones in the same patch. Patches of other photos at the same place show what is normal there.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.convert import read_8bit
 from splatpipe.pipeline.photos.photo_list import open_picture, read_checked
 
-LEAST_SIDE_PX = 2000  # a JPEG is decoded at the half, quarter or eighth that still has so many
-PATCH = 32  # pixels: the coarse band has its three longest waves in it
+LEAST_SIDE_PX = 2000  # a JPEG is decoded at the half, quarter or eighth that still has as many
+PATCH = 32  # pixels: the coarse band includes its three longest waves
 DIRECTIONS = 4  # of 45° each
-COARSE, FINE = (0.05, 0.14), (0.2, 0.42)  # waves a pixel; JPEG leaves little beyond
+COARSE, FINE = (0.05, 0.14), (0.2, 0.42)  # cycles per pixel; JPEG keeps little beyond
 QUIET = 0.35  # grey levels: standard deviation of rounding and of JPEG's own noise, in a band
-WHITE, BLACK = 250, 5  # grey levels from which on, and down to which, there is no drawing left
+WHITE, BLACK = 250, 5  # grey levels from which up, and down to which, no detail is left
 PATCH_LEVEL_PX = 9  # side of the square whose mean is a place's brightness
-DARKEST = 1.0 / 4096.0  # linear; below, a ratio of two means nothing
-SIGNATURE = 48  # side of the small picture by which a photo is known again when it was saved anew
+DARKEST = 1.0 / 4096.0  # linear; below, a ratio of two levels is meaningless
+SIGNATURE = 48  # side of the thumbnail by which a re-saved photo is recognized
 
 
 @dataclass(frozen=True)
 class Brightness:
-    """How bright a photo is as a whole.
+    """Overall brightness of a photo.
 
     Attributes:
         mean_level: Mean grey level, 0 to 255.
-        white: Share of pixels without drawing in the lights.
-        black: Likewise in the shadows.
+        white: Share of pixels without detail in the highlights.
+        black: Share of pixels without detail in the shadows.
     """
 
     mean_level: float
@@ -45,7 +45,7 @@ class Brightness:
 
 
 def read_grey(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"]:
-    """A photo's grey levels in the stored grid, at full size or, for a large JPEG, at an even part of it.
+    """Read a photo's grey levels in the stored grid, at full size or, for a large JPEG, at 1/2, 1/4 or 1/8 of it.
 
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
@@ -61,7 +61,7 @@ def read_grey(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"]:
 
 
 def brightness_of(grey: UInt8[np.ndarray, "h w"]) -> Brightness:
-    """How bright a picture is as a whole."""
+    """Measure the overall brightness of an image."""
     counts = np.bincount(grey[::2, ::2].ravel(), minlength=256).astype(np.float64)
     total = counts.sum()
     mean = float((counts * np.arange(256)).sum() / total)
@@ -69,7 +69,7 @@ def brightness_of(grey: UInt8[np.ndarray, "h w"]) -> Brightness:
 
 
 def signature_of(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "side side"]:
-    """The picture at a few dozen pixels a side, whatever its shape."""
+    """Reduce an image to a thumbnail of ``SIGNATURE`` pixels a side, whatever its aspect ratio."""
     small = cv2.resize(grey, (SIGNATURE, SIGNATURE), interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.float32)
 
@@ -77,14 +77,14 @@ def signature_of(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "side si
 def detail_at(
     grey: UInt8[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
 ) -> Float32[np.ndarray, "n directions"]:
-    """Energy of fine waves over that of coarse ones around places, by direction, as natural logarithms.
+    """Natural logarithm of the energy of fine waves over that of coarse ones around places, by direction.
 
     Args:
-        grey: The picture.
-        places: x, y in its pixels. Direction 0 is of waves that run along x, further ones turn from x towards y.
+        grey: The image.
+        places: x, y in its pixels. Direction 0 is of waves along x; the others turn from x towards y.
 
     Returns:
-        NaN for places whose patch does not lie inside.
+        The logarithms; NaN for places whose patch does not lie inside the image.
     """
     values = np.full((len(places), DIRECTIONS), np.nan, np.float32)
     inside, patches = _patches(grey, places, PATCH)
@@ -101,9 +101,9 @@ def detail_at(
 
 
 def levels_at(grey: UInt8[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Float32[np.ndarray, " n"]:
-    """How bright places are, as binary logarithm of linear light; NaN at the border.
+    """Brightness of places as binary logarithm of linear light; NaN at the border.
 
-    Linear by the transfer function of sRGB (IEC 61966-2-1), which cameras write by and large.
+    Linearized with the transfer function of sRGB (IEC 61966-2-1), which most cameras roughly use.
     """
     values = np.full(len(places), np.nan, np.float32)
     inside, patches = _patches(grey, places, PATCH_LEVEL_PX)
@@ -117,7 +117,7 @@ def levels_at(grey: UInt8[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
 def _patches(
     grey: UInt8[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"], side: int
 ) -> tuple[Int64[np.ndarray, " m"], Float32[np.ndarray, "m side side"]]:
-    """Rows of the places whose square lies inside, and these squares."""
+    """Rows of the places whose square lies inside the image, and these squares."""
     corner = np.floor(places).astype(np.int64) - side // 2
     height, width = grey.shape
     fits = (corner >= 0).all(axis=1) & (corner + side <= (width, height)).all(axis=1)
@@ -128,7 +128,7 @@ def _patches(
 
 
 def _bands() -> tuple[Float32[np.ndarray, "waves directions"], Float32[np.ndarray, "waves directions"]]:
-    """Which waves of a patch's half spectrum each direction's coarse and fine band take, coarse first."""
+    """Weights of a patch's half spectrum in each direction's coarse and fine band, coarse first."""
     y, x = np.meshgrid(np.fft.fftfreq(PATCH), np.fft.rfftfreq(PATCH), indexing="ij")
     length = np.hypot(x, y)
     sector = np.rint(np.arctan2(y, x) / (np.pi / DIRECTIONS)).astype(np.int64) % DIRECTIONS

@@ -1,4 +1,4 @@
-"""Pictures of a dataset as arrays, in their stored grid: EXIF orientation is never applied."""
+"""Read a dataset's images as arrays, in their stored grid: EXIF orientation is never applied."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_image(path: Path, flags: int) -> Pixels:
     """Decode an image file in its stored grid.
 
     Args:
-        path: A JPEG or PNG that `undistort` left.
+        path: A JPEG or PNG that `undistort` wrote.
         flags: OpenCV's IMREAD flags.
 
     Raises:
@@ -44,7 +44,7 @@ def read_image(path: Path, flags: int) -> Pixels:
 
 
 def load_colour(view: View) -> Pixels:
-    """A view's photo, (h, w, 3) RGB, 8 bits.
+    """Read a view's photo, (h, w, 3) RGB, 8 bits.
 
     Raises:
         StageError: if it cannot be read or is not of its camera's size.
@@ -55,12 +55,12 @@ def load_colour(view: View) -> Pixels:
 
 
 def load_mask(view: View) -> Mask | None:
-    """A view's mask, (h, w), True where the photo counts; None where it has none."""
+    """Read a view's mask, (h, w), True where the photo counts; None if it has none."""
     return None if view.mask_path is None else _load_mask(view, view.mask_path)
 
 
 def reduced_sky(view: View, max_megapixels: float) -> Mask | None:
-    """A view's drawn sky, (h, w), at the size of ``reduced_view``, True where it is; None where nobody drew it."""
+    """Read a view's sky mask, (h, w), at the size of ``reduced_view``, True in the sky; None if it has none."""
     if view.sky_path is None:
         return None
     camera = reduced_camera(view.camera, max_megapixels)
@@ -83,7 +83,7 @@ def reduced_camera(camera: Camera, max_megapixels: float | None, level: int = 0)
 
 
 def reduced_view(view: View, max_megapixels: float | None, level: int = 0) -> tuple[Camera, Pixels, Mask | None]:
-    """A view at the size that training and evaluation ask for, by one area filter from the dataset's photo.
+    """Read a view at the size for training or evaluation, reduced from the dataset's photo by one area filter.
 
     Args:
         view: Of the dataset.
@@ -91,7 +91,7 @@ def reduced_view(view: View, max_megapixels: float | None, level: int = 0) -> tu
         level: As for ``reduced_camera``.
 
     Returns:
-        Its camera, its photo (h, w, 3), and its mask (h, w) or None; a pixel counts where all below it do.
+        Its camera, its photo (h, w, 3), and its mask (h, w) or None; a pixel counts if all that it covers do.
 
     Raises:
         StageError: if the photo or its mask cannot be read or is not of its camera's size.
@@ -103,7 +103,7 @@ def reduced_view(view: View, max_megapixels: float | None, level: int = 0) -> tu
 def reduced_views(
     view: View, max_megapixels: float | None, levels: Sequence[int]
 ) -> Iterator[tuple[Camera, Pixels, Mask | None]]:
-    """``reduced_view`` at some levels, one after the other, from one decode.
+    """Yield ``reduced_view`` at several levels from one decode.
 
     Raises:
         StageError: as ``reduced_view``.
@@ -126,8 +126,8 @@ def _load_mask(view: View, path: Path) -> Mask:
 
 
 def reduced_mask(mask: Mask, size: tuple[int, int]) -> Mask:
-    """True where all below is."""
-    # Not by a share of 1: OpenCV's weights add up to as little as 0.999, but those of nothing are exactly zero.
+    """Reduce a mask to (width, height): True where all pixels covered are True."""
+    # Not tested for a share of 1: OpenCV's weights may add up to only 0.999, but a sum of zeros is exactly zero.
     return np.asarray(cv2.resize((~mask).astype(np.float32), size, interpolation=cv2.INTER_AREA) == 0.0)
 
 

@@ -1,9 +1,9 @@
-"""A JPEG written strip by strip, so that a large picture is never held whole.
+"""Write a JPEG strip by strip, so that a large image is never held whole in memory.
 
-A JPEG's blocks of 8 × 8 pixels are coded one by one, but for their mean, which is told as the difference to the block
-before; a restart marker begins anew (ITU-T T.81, B.2.4.4 and F.1.1.5.1). So strips of whole rows of blocks, each coded
-as a picture of its own with the same tables, are one picture with such a marker between them: the same pixels as if it
-had been coded in one piece.
+A JPEG's blocks of 8 × 8 pixels are coded independently, except for their mean, which is coded as the difference from
+the previous block; a restart marker resets it (ITU-T T.81, B.2.4.4 and F.1.1.5.1). So strips of whole rows of blocks,
+each coded as an image with the same tables, become one image when joined by such markers: its pixels are the same as
+if it had been coded at once.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OPTIONS = (
     *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
 )
 BLOCK = 8  # pixels a side, with full chroma
-STRIP_PIXELS = 1 << 21  # coded at a time; smaller pictures are one strip: a plain file, and no marker in it
+STRIP_PIXELS = 1 << 21  # coded at a time; smaller images are one strip: a plain file without markers
 START_OF_FRAME, RESTART_INTERVAL, START_OF_SCAN = 0xC0, 0xDD, 0xDA
 FIRST_RESTART, RESTARTS = 0xD0, 8
 END = b"\xff\xd9"
@@ -32,12 +32,12 @@ Strip = UInt8[np.ndarray, "rows w 3"]
 
 
 def write_jpeg(path: Path, strips: Iterable[Strip], height: int) -> None:
-    """Write a picture that comes in strips.
+    """Write an image that is given in strips.
 
     Args:
         path: The file.
-        strips: BGR, from the top, of any heights and one width.
-        height: Of all of them together.
+        strips: BGR, from the top, of any heights and equal widths.
+        height: Total height, pixels.
 
     Raises:
         StageError: if a strip cannot be encoded.
@@ -54,12 +54,12 @@ def write_jpeg(path: Path, strips: Iterable[Strip], height: int) -> None:
 
 
 def _even(strips: Iterable[Strip]) -> Iterator[Strip]:
-    """The same rows in strips of equal heights, multiples of a block; the last one has what is left."""
+    """Regroup rows into strips of equal heights, multiples of a block; the last strip holds the rest."""
     kept: list[Strip] = []
     for strip in strips:
         rows = max(BLOCK, STRIP_PIXELS // strip.shape[1] // BLOCK * BLOCK)
         kept.append(strip)
-        while sum(map(len, kept)) > rows:  # not as soon as there are enough: only the last one may be shorter
+        while sum(map(len, kept)) > rows:  # not >=: only the last strip may be shorter
             joined = np.concatenate(kept)
             yield joined[:rows]
             kept = [joined[rows:]]
@@ -75,7 +75,7 @@ def _encoded(name: str, pixels: Strip) -> bytes:
 
 
 def _segments(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Marker, first byte and end of each segment up to the scan's."""
+    """Yield marker, first byte and end of each segment up to the start of scan."""
     at, marker = 2, 0
     while marker != START_OF_SCAN:
         marker, length = data[at + 1], struct.unpack(">H", data[at + 2 : at + 4])[0]
@@ -84,13 +84,13 @@ def _segments(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _parts(data: bytes) -> tuple[bytes, bytes]:
-    """What comes before the coded pixels, and those."""
+    """Split a JPEG into its header and its coded pixels."""
     *_, (_, _, scan) = _segments(data)
     return data[:scan], data[scan : -len(END)]
 
 
 def _head(head: bytes, strip: Strip, height: int) -> bytes:
-    """That of the first strip for the whole picture: its height, and how many blocks lie between markers."""
+    """Turn the first strip's header into that of the whole image: its height, and the blocks between markers."""
     changed = bytearray(head)
     across = -(-strip.shape[1] // BLOCK)
     for marker, first, end in _segments(head):

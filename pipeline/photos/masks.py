@@ -1,4 +1,4 @@
-"""Masks: which pixels of a photo do not count. Found by name, brought into the stored grid at full size."""
+"""Masks of ignored pixels: found by name, and converted to the photo's stored grid at full size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from splatpipe.pipeline.photos.scan import MASK_FOLDER, PHOTO_SUFFIXES
 
 ASPECT_TOLERANCE = 0.01
 IMAGE_FOLDER = "images"
-FEW_LABELS = 128  # a lossless mask with no value from here on holds labels (0 and 1, or classes): all but 0 count
+FEW_LABELS = 128  # a lossless mask with only lower values holds labels (0 and 1, or classes): all but 0 count
 HALF = 128
 QUARTER_TURNS = (5, 6, 7, 8)
 
@@ -32,8 +32,8 @@ class MaskFile:
     """A file below a ``masks/`` or ``sky_masks/`` folder.
 
     Attributes:
-        label: How to call it in a message.
-        key: The name that it stands for, without the last suffix: a photo's name with or without its own suffix.
+        label: Its name in messages.
+        key: Its name without the last suffix: a photo's name with or without its own suffix.
         path: Where it is.
     """
 
@@ -43,12 +43,12 @@ class MaskFile:
 
 
 def find_masks(root: Path, called: str = MASK_FOLDER) -> list[MaskFile]:
-    """Every file below a ``masks/`` folder inside or beside the photo folder.
+    """Find every file below a ``masks/`` folder inside or beside the photo folder.
 
-    ``masks/a/x.png`` inside or beside it and ``a/masks/x.png`` inside it stand for the photo ``a/x``.
+    ``masks/a/x.png`` inside or beside it and ``a/masks/x.png`` inside it belong to the photo ``a/x``.
 
     Args:
-        root: The photo folder, whose names it follows.
+        root: The photo folder, which photo names are relative to.
         called: The name of the folders.
     """
     found: list[MaskFile] = []
@@ -65,15 +65,15 @@ def find_masks(root: Path, called: str = MASK_FOLDER) -> list[MaskFile]:
 
 
 def match_masks(masks: Sequence[MaskFile], names: Sequence[str]) -> tuple[dict[str, MaskFile], list[MaskFile]]:
-    """Which mask is whose.
+    """Match masks with photos.
 
     Args:
         masks: As found.
-        names: Of all photos, also of those left out.
+        names: Of all photos, including those left out.
 
     Returns:
-        Mask by the photo's name, and the masks that no photo is found for. ``NAME.ext.png`` goes before ``NAME.png``.
-        A mask that is no photo's so is that of ``images/NAME``, as in COLMAP's folders.
+        The masks by photo name, and the masks without a photo. ``NAME.ext.png`` takes precedence over ``NAME.png``.
+        A mask that matches no photo this way is matched with ``images/NAME``, as in COLMAP's folders.
     """
     by_key: dict[str, MaskFile] = {}
     for mask in masks:
@@ -94,7 +94,7 @@ def _key(name: str, by_key: Mapping[str, MaskFile]) -> str | None:
 
 
 def _beside_images(name: str) -> str | None:
-    """A photo's name without the last folder called ``images``: as masks beside that folder call it."""
+    """A photo's name without the last folder called ``images``, as masks beside that folder are named; else None."""
     *folders, last = PurePosixPath(name).parts
     places = [place for place, folder in enumerate(folders) if folder.casefold() == IMAGE_FOLDER]
     if not places:
@@ -103,10 +103,10 @@ def _beside_images(name: str) -> str | None:
 
 
 def read_mask(mask: MaskFile, photo: CheckedPhoto, max_pixels: int) -> UInt8[np.ndarray, "h w"]:
-    """Decode a mask and bring it into its photo's stored grid at full size.
+    """Decode a mask and convert it to its photo's stored grid at full size.
 
-    A mask may be drawn in the stored grid or in the one that EXIF turns it to; its shape tells, and where both have one
-    shape (a half turn, a square) it counts as stored unless it has an orientation of its own.
+    A mask may be drawn in the stored grid or in the one that EXIF rotates it to; its aspect ratio decides. Where both
+    grids have the same one (a half turn, a square), it counts as stored unless it has an orientation of its own.
 
     Args:
         mask: The file.
@@ -114,17 +114,17 @@ def read_mask(mask: MaskFile, photo: CheckedPhoto, max_pixels: int) -> UInt8[np.
         max_pixels: Refuse a larger mask.
 
     Returns:
-        0 where ignored, else 255.
+        The mask: 0 where ignored, else 255.
 
     Raises:
-        MaskError: if it cannot be decoded or has another shape than the photo.
+        MaskError: if it cannot be decoded or has a different aspect ratio than the photo.
     """
     try:
         with open_picture(mask.path, max_pixels=max_pixels) as picture:
             exif = read_exif(picture)
             lossless = picture.format in ("PNG", "TIFF")
             grey = _grey(load_stored(picture, exif.orientation))
-    except Exception as error:  # Pillow's readers raise almost anything on broken pictures
+    except Exception as error:  # Pillow's readers raise almost anything on broken images
         raise MaskError(f"cannot be read ({' '.join(str(error).split())[:120]})") from error
     drawn = grey if exif.orientation == photo.exif.orientation else _to_stored(grey, exif.orientation, photo)
     if not _same_shape(drawn.size, (photo.width, photo.height)):
@@ -155,13 +155,13 @@ def _turn(picture: Image.Image, orientation: int) -> Image.Image:
 
 
 def _same_shape(first: tuple[int, int], second: tuple[int, int]) -> bool:
-    """Equal ratios of the sides, but for the rounding to whole pixels of the smaller one."""
+    """Whether the aspect ratios are equal, except for the smaller image's rounding to whole pixels."""
     scale = first[0] / second[0]
     return abs(first[1] - scale * second[1]) <= max(1.0, ASPECT_TOLERANCE * first[1])
 
 
 def _grey(picture: Image.Image) -> Image.Image:
-    """Brightness over black: what is transparent is ignored."""
+    """Convert a mask to grey over black: transparent pixels are ignored ones."""
     if picture.mode.startswith("I") or picture.mode == "F":
         values = np.nan_to_num(np.asarray(picture).astype(np.float64))
         factor = 255.0 / 65535.0 if values.max() > 255.0 else 1.0

@@ -1,4 +1,4 @@
-"""Photo names: which photo a name from elsewhere means."""
+"""Match names from elsewhere with photos."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ PHOTO_SUFFIXES = ("jpg", "jpeg", "jpe", "jfif", "mpo", "png", "tif", "tiff")
 
 
 def is_photo(path: PurePath) -> bool:
-    """Whether a file's name is a photo's."""
+    """Whether a file's suffix is a photo's."""
     return path.suffix.casefold().lstrip(".") in PHOTO_SUFFIXES
 
 
 class NameFinder:
-    """The photo that a name means: the same, else the only one alike but for case, then suffix, then folder.
+    """Find a photo by name: an exact match, else the only match ignoring case, then suffix, then folder.
 
-    Programs that export models differ in what of the path, and of the suffix, they keep; so do people.
+    Programs that export models differ in how much of the path and of the suffix they keep; so do people.
 
     Args:
         photos: Names of all photos.
@@ -32,20 +32,20 @@ class NameFinder:
             self._tables.append((key, table))
 
     def __call__(self, name: str) -> str | None:
-        """The photo's name; None where there is none, or several."""
+        """Return the photo's name; None if there is none, or if there are several."""
         found = (table.get(key(name)) for key, table in self._tables)
         return next((photo for photo in found if photo is not None), None)
 
 
 def match_names(names: Iterable[str], photos: Iterable[str]) -> dict[str, str]:
-    """The photos that a model's images mean, each photo at most once; names that are equal go first.
+    """Match a model's images with photos, each photo at most once; equal names take precedence.
 
     Args:
         names: Of the model's images.
         photos: Of all photos.
 
     Returns:
-        The photo's name by the image's, without the images that have none.
+        The photo's name by the image's name, without the images that match none.
     """
     known = set(photos)
     find = NameFinder(sorted(known))
@@ -76,12 +76,12 @@ NAMES_SHOWN = 10  # in one message; left_out.json has them all
 
 
 def some(names: Iterable[str], shown: int = NAMES_SHOWN) -> str:
-    """A list of names for a message: the first few, and how many more."""
+    """Format names for a message: the first few, and how many more."""
     listed = [printable(name) for name in names]
     more = f" and {len(listed) - shown} more" if len(listed) > shown else ""
     return ", ".join(listed[:shown]) + more
 
 
 def printable(name: str) -> str:
-    """A name without line breaks and other signs that would spoil a message."""
+    """Escape line breaks and other unprintable characters of a name."""
     return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in name)

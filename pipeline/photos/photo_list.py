@@ -1,6 +1,6 @@
-"""The checked photo list that ingest leaves, and how its photos and masks are read.
+"""The checked photo list that ingest writes, and reading of its photos and masks.
 
-Pixels stay in the stored grid: the EXIF orientation is kept as a number, for pictures that people look at, and never
+Pixels stay in the stored grid: the EXIF orientation is kept as a number for display only, and never
 applied to geometry. A photo is read from the user's folder when its file is plain 8-bit RGB or grey, else from the
 PNG that ingest converted it to.
 """
@@ -23,14 +23,14 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.source import find_model
 
-# MPO, a JPEG that carries a second picture, as DJI and phones write, is opened by Pillow's JPEG.
+# Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LIST_NAME = "photos.json"
 CONVERTED_DIR = "converted"
 MASK_DIR = "masks"
 STRIP_ROWS = 256  # of a photo, copied at a time
 SKY_DIR = "sky_masks"
-UNTURN = {  # the inverse of the turn that each EXIF orientation asks for
+UNTURN = {  # the inverse of the transposition that each EXIF orientation requires
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -43,7 +43,7 @@ UNTURN = {  # the inverse of the turn that each EXIF orientation asks for
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo that takes part.
+    """A photo in use.
 
     Attributes:
         name: Path relative to the photo folder, in POSIX form; also its name in COLMAP's files.
@@ -51,11 +51,11 @@ class Photo:
         width: Of the stored grid, pixels.
         height: Of the stored grid, pixels.
         camera: Index into the camera groups of ``ingest.cameras``.
-        time: When it was taken, ISO 8601 local time of the camera; None when EXIF does not say.
-        orientation: EXIF's, 1 to 8; how to turn the picture for people, and only for them.
+        time: When it was taken, ISO 8601 local time of the camera; None if EXIF does not state it.
+        orientation: EXIF orientation, 1 to 8; for display only.
         converted: The 8-bit PNG to read instead of the file, relative to the part; None when the file itself is plain.
         mask: The 8-bit PNG mask in the stored grid at full size, 0 where ignored, else 255; relative to the part.
-        sky_mask: The same of the sky, which is 255.
+        sky_mask: The sky mask likewise, 255 in the sky, else 0.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class PhotoList:
-    """The photos that take part, sorted by name."""
+    """The photos in use, sorted by name."""
 
     photos: tuple[Photo, ...]
 
@@ -91,7 +91,7 @@ def save_photo_list(photo_list: PhotoList, part: Path) -> None:
 
 
 def load_photo_list(part: Path) -> PhotoList:
-    """Read the photo list that ingest left.
+    """Read the photo list that ingest wrote.
 
     Args:
         part: The folder of the part ``ingest.photos``.
@@ -115,14 +115,14 @@ def photo_root(photos_dir: Path) -> Path:
 
 
 def photo_path(photo: Photo, part: Path, photos_dir: Path) -> Path:
-    """The file whose pixels stand for a photo: its own, or the one it was converted to."""
+    """The file that a photo's pixels are read from: its own, or the one it was converted to."""
     if photo.converted is not None:
         return _inside(part, photo.converted)
     return _inside(photo_root(photos_dir), photo.name)
 
 
 def photo_bytes(photo: Photo, part: Path, photos_dir: Path) -> bytes:
-    """The file whose pixels stand for a photo, read; its own only as it was when it was checked.
+    """Read the file that holds a photo's pixels; the user's own file must still be the one that was checked.
 
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
@@ -132,12 +132,12 @@ def photo_bytes(photo: Photo, part: Path, photos_dir: Path) -> bytes:
 
 
 def read_checked(path: Path, name: str, sha256: str | None = None) -> bytes:
-    """Read a file whole, and refuse another content than it had, whatever its size and its times are.
+    """Read a whole file, and refuse it if its content has changed, whatever its size and times.
 
     Args:
         path: The file.
-        name: What people call it.
-        sha256: Of its bytes when it was checked; None for a file of ours, which nobody else writes.
+        name: Its name in messages.
+        sha256: Of its bytes when it was checked; None for a file that splatpipe wrote itself.
 
     Raises:
         SplatpipeError: if it is gone or was replaced.
@@ -155,36 +155,36 @@ def decode(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h w
     """Read a photo's pixels.
 
     Args:
-        photo: One of the list's.
+        photo: One of the list.
         part: The folder of the part ``ingest.photos``.
         photos_dir: The user's folder.
 
     Returns:
-        RGB in the stored grid (no EXIF turn), writable.
+        RGB in the stored grid (EXIF orientation not applied), writable.
 
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
     """
     picture = open_decoded(photo, part, photos_dir)
     pixels = np.empty((photo.height, photo.width, 3), np.uint8)
-    for top in range(0, photo.height, STRIP_ROWS):  # Pillow makes two copies more of what it hands over at once
+    for top in range(0, photo.height, STRIP_ROWS):  # Pillow makes two more copies of what it converts at once
         pixels[top : top + STRIP_ROWS] = picture.rows(top, min(photo.height, top + STRIP_ROWS))
     return pixels
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedPhoto:
-    """A photo decoded as Pillow holds it, four bytes a pixel, from which rows are taken as arrays."""
+    """A photo decoded by Pillow, four bytes per pixel, from which rows are taken as arrays."""
 
     picture: Image.Image
 
     def rows(self, top: int, bottom: int) -> UInt8[np.ndarray, "rows w 3"]:
-        """Those rows, RGB in the stored grid."""
+        """Return the rows from ``top`` up to ``bottom``, RGB in the stored grid."""
         return np.asarray(self.picture.crop((0, top, self.picture.width, bottom)))
 
 
 def open_decoded(photo: Photo, part: Path, photos_dir: Path) -> DecodedPhoto:
-    """A photo's pixels as ``decode`` has them, without an array of all of them.
+    """Decode a photo as ``decode`` does, without an array of all its pixels.
 
     Raises:
         SplatpipeError: as ``decode``.
@@ -196,16 +196,16 @@ def open_decoded(photo: Photo, part: Path, photos_dir: Path) -> DecodedPhoto:
 
 
 def decode_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None:
-    """Read a photo's mask in the stored grid at full size: 0 where ignored, else 255; None when it has none.
+    """Read a photo's mask in the stored grid at full size: 0 where ignored, else 255; None if it has none.
 
     Raises:
-        SplatpipeError: if the mask is gone or has another size than the photo.
+        SplatpipeError: if the mask is gone or its size differs from the photo's.
     """
     return _decode_mask(photo, photo.mask, part)
 
 
 def decode_sky_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None:
-    """Read a photo's mask of the sky likewise: 255 where the sky is, else 0."""
+    """Read a photo's sky mask likewise: 255 in the sky, else 0."""
     return _decode_mask(photo, photo.sky_mask, part)
 
 
@@ -223,13 +223,13 @@ def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
 
     Args:
         source: A path or a binary file object.
-        max_pixels: Refuse a picture with more pixels before any of them is decoded.
+        max_pixels: Refuse an image with more pixels before any of them is decoded.
 
     Raises:
         ValueError: if it has more than ``max_pixels`` pixels.
-        OSError: if it is no such picture (Pillow's ``UnidentifiedImageError`` is one).
+        OSError: if it is not such an image (Pillow's ``UnidentifiedImageError`` is one).
     """
-    Image.MAX_IMAGE_PIXELS = None  # Pillow's limit is process wide and refuses 200 MP panoramas; ours is the line below
+    Image.MAX_IMAGE_PIXELS = None  # Pillow's limit is process-wide and refuses 200 MP panoramas; ours is checked below
     picture = Image.open(source, formats=PHOTO_FORMATS)
     if max_pixels is not None and picture.width * picture.height > max_pixels:
         raise ValueError(f"it has {picture.width} × {picture.height} pixels")
@@ -237,26 +237,26 @@ def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
 
 
 def load_stored(picture: Image.Image, orientation: int) -> Image.Image:
-    """Decode an opened picture whole, in the stored grid.
+    """Decode an opened image in full, in the stored grid.
 
     Args:
         picture: From ``open_picture``, not yet loaded.
         orientation: Its EXIF orientation, 1 to 8.
     """
     picture.load()
-    # Pillow turns a TIFF by its orientation while loading it, and no other format.
+    # Pillow applies the orientation while loading a TIFF, but for no other format.
     return unturn(picture, orientation) if picture.format == "TIFF" else picture
 
 
 def unturn(picture: Image.Image, orientation: int) -> Image.Image:
-    """Bring a picture that is turned for people (by an EXIF orientation, 1 to 8) back into the stored grid."""
+    """Convert an image to which an EXIF orientation (1 to 8) was applied back to the stored grid."""
     method = UNTURN.get(orientation)
     return picture if method is None else picture.transpose(method)
 
 
 def _picture(data: bytes, mode: str, name: str) -> Image.Image:
     try:
-        # What is read here was written by ingest or found plain by it: never a turned TIFF.
+        # Ingest wrote this file or found it plain: it is never a TIFF with an orientation.
         picture = open_picture(BytesIO(data))
         picture.load()
         return picture if picture.mode == mode else picture.convert(mode)

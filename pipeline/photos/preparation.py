@@ -1,4 +1,4 @@
-"""Photos made ready for every reader: checked, converted where they are odd, their masks in the stored grid."""
+"""Prepare photos for every reader: check them, convert unusual ones, and bring masks into the stored grid."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from splatpipe.pipeline.photos.photo_list import (
 )
 from splatpipe.pipeline.photos.scan import MASK_FOLDER, SKY_FOLDER, ExcludedPhoto, Scan
 
-MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly meant
+MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly intended
 T = TypeVar("T")
 R = TypeVar("R")
 
 
 @dataclass(frozen=True)
 class MaskKind:
-    """What masks are for: the name of the user's folders, and of the folder in the part."""
+    """A kind of mask: the name of the user's folders, and of the folder in the part."""
 
     folder: str
     part: str
@@ -43,13 +43,13 @@ SKIES = MaskKind(SKY_FOLDER, SKY_DIR)
 
 @dataclass(frozen=True)
 class Preparation:
-    """What every step of it needs.
+    """What every preparation step needs.
 
     Attributes:
         config: Ingest's options.
-        threads: That work at a time.
+        threads: Number of threads.
         part: The folder of the part `photos`.
-        report: Told of progress.
+        report: Receives progress and warnings.
     """
 
     config: IngestConfig
@@ -63,7 +63,7 @@ class Preparation:
 
 
 def check_photos(scan: Scan, work: Preparation) -> tuple[list[CheckedPhoto], list[ExcludedPhoto]]:
-    """Check what the scan found; the photos that can be used, and what cannot and why."""
+    """Check the scan's candidates; return the usable photos, and those excluded with the reason."""
     limits = PictureLimits(work.config.min_size, work.max_pixels)
     results = _in_threads(
         lambda candidate: check_photo(candidate, limits), scan.candidates, work, "checking photos", "photos"
@@ -75,7 +75,7 @@ def check_photos(scan: Scan, work: Preparation) -> tuple[list[CheckedPhoto], lis
 def convert_odd(
     photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int], work: Preparation
 ) -> dict[str, UInt8[np.ndarray, "h w"]]:
-    """Write the PNGs of photos that are not plain; returns the masks of transparent ones by name."""
+    """Write the PNGs of photos that are not plain; return the masks of transparent ones by name."""
     odd = [photo for photo in photos if not photo.plain]
     if not odd:
         return {}
@@ -101,7 +101,7 @@ def prepare_masks(
     opacity: Mapping[str, UInt8[np.ndarray, "h w"]],
     work: Preparation,
 ) -> set[str]:
-    """Write the masks of a kind, from its folder and from transparency; returns the names of masked photos."""
+    """Write the masks of a kind, from its folder and from transparency; return the names of masked photos."""
     files = find_masks(root, kind.folder) if work.config.masks else []
     matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
     if unused:
@@ -139,17 +139,17 @@ def _read(
 
 
 def converted_path(name: str) -> str:
-    """Where a photo's conversion lies in the part."""
+    """Path of a photo's converted PNG, relative to the part."""
     return f"{CONVERTED_DIR}/{name}.png"
 
 
 def mask_path(name: str, folder: str) -> str:
-    """Where a photo's mask lies in the part: as COLMAP looks for it below a mask folder."""
+    """Path of a photo's mask, relative to the part, by COLMAP's convention."""
     return f"{folder}/{name}.png"
 
 
 def _in_threads(function: Callable[[T], R], items: Sequence[T], work: Preparation, what: str, unit: str) -> list[R]:
-    """``function`` of each item, in their order; Pillow and hashlib work outside Python's lock."""
+    """Apply ``function`` to each item, in order; Pillow and hashlib release Python's global lock."""
     results: list[R] = []
     pool = ThreadPoolExecutor(max_workers=max(1, work.threads))
     try:

@@ -1,4 +1,4 @@
-"""Two lines through a point that part bright from dark, fitted to the pixels around it, blurred."""
+"""Fit two blurred lines through a point, which separate bright from dark, to the pixels around it."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ FIRST_BLUR_PX = 0.8
 BLUR_BOUNDS_PX = (0.25, 4.8)
 LONGEST_STEP = np.array([1.0, 1.0, 0.3, 0.3, np.inf, np.inf, 0.5])
 RING_PX, RING_STEPS = 2.8, 32
-NEAR_PX = 3.5  # of the first fit, about places
+NEAR_PX = 3.5  # radius of the first fit, around places
 NEAR_ROUNDS = 6
-AT_ONCE = 4096  # places, for the memory
+AT_ONCE = 4096  # places at a time, to save memory
 ROUNDS = 12
 LEAST_PIXELS = 14
 
 
 @dataclass(frozen=True)
 class LinePair:
-    """Two lines through a point, and what lies between them.
+    """Two lines through a point, and the brightness of the sectors between them.
 
     Attributes:
-        values: x, y, two angles, the middle brightness, half the contrast, the blur (of a hyperbolic tangent).
+        values: x, y, two angles, mean brightness, half the contrast, blur (width of a hyperbolic tangent).
     """
 
     values: Float64[np.ndarray, " 7"]
 
     def directions(self) -> Float64[np.ndarray, "2 2"]:
-        """Of the lines."""
+        """Unit vectors along the lines."""
         angles = self.values[2:4]
         return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
@@ -38,7 +38,7 @@ class LinePair:
 def sampled(
     grey: Float32[np.ndarray, "h w"], x: Float32[np.ndarray, "n m"], y: Float32[np.ndarray, "n m"]
 ) -> Float32[np.ndarray, "n m"]:
-    """Bilinear, in pieces that remap can take (fewer than 32,768 rows)."""
+    """Sample bilinearly, in pieces that remap supports (fewer than 32,768 rows)."""
     if len(x) == 0:
         return np.zeros_like(x)
     pieces = [
@@ -51,7 +51,7 @@ def sampled(
 def ring_about(
     grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"], radius: float
 ) -> Float64[np.ndarray, "n steps"]:
-    """Brightness on a circle about each place."""
+    """Brightness on a circle around each place."""
     angles = 2.0 * np.pi * np.arange(RING_STEPS) / RING_STEPS
     x = (places[:, 0, None] + radius * np.cos(angles)).astype(np.float32)
     y = (places[:, 1, None] + radius * np.sin(angles)).astype(np.float32)
@@ -61,7 +61,7 @@ def ring_about(
 def lines_about(
     grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
 ) -> tuple[Float64[np.ndarray, "k 7"], Float64[np.ndarray, " k"]]:
-    """Lines through places, fitted to the pixels near by, and the correlation with these, of places that have any."""
+    """Fit lines through places to nearby pixels; return them and their correlations, for places that have lines."""
     found, scores = [np.zeros((0, 7))], [np.zeros(0)]
     for first in range(0, len(places), AT_ONCE):
         values = _starts(grey, places[first : first + AT_ONCE])
@@ -72,7 +72,7 @@ def lines_about(
 
 
 def _starts(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "k 7"]:
-    """Lines where the ring about a place crosses its middle."""
+    """Initial lines, where the ring around a place crosses its mean brightness."""
     ring, half = ring_about(grey, places, RING_PX), RING_STEPS // 2
     ring = (ring[:, :half] + ring[:, half:]) / 2.0
     low, high = ring.min(axis=1), ring.max(axis=1)
@@ -84,7 +84,7 @@ def _starts(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
     at = np.nonzero(crosses)[1].reshape(-1, 2)
     rows = np.arange(len(at))[:, None]
     angles = np.pi / half * (at + (middle[:, None] - ring[rows, at]) / (after[rows, at] - ring[rows, at]))
-    # Bright lies between the first and the second line, or dark does.
+    # Either the bright or the dark sector lies between the first and the second line.
     sign = np.where(ring[rows[:, 0], (at[:, 0] + 1) % half] > middle, 1.0, -1.0)
     contrast = sign * (high[two] - low[two]) / 2.0
     blur = np.full(len(at), FIRST_BLUR_PX)
@@ -94,7 +94,7 @@ def _starts(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
 def _fit_near(
     grey: Float32[np.ndarray, "h w"], values: Float64[np.ndarray, "n 7"]
 ) -> tuple[Float64[np.ndarray, "n 7"], Float64[np.ndarray, " n"]]:
-    """Least squares over the pixels of a disc, all places at once, each with a damping of its own."""
+    """Fit lines by least squares over the pixels of a disc, all places at once, each with its own damping."""
     reach = int(NEAR_PX) + 1
     column, row = (v.ravel() for v in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
     disc = column**2 + row**2 <= NEAR_PX**2
@@ -120,12 +120,12 @@ def _fit_near(
 
 
 def fit_within(grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64[np.ndarray, " 2"]) -> LinePair | None:
-    """Least squares over the pixels within an ellipse; None where it has too few.
+    """Fit lines by least squares over the pixels within an ellipse; None if it has too few.
 
     Args:
-        grey: The picture.
-        lines: To begin with.
-        reach: Along the lines, which are conjugate diameters of the ellipse.
+        grey: The image.
+        lines: The initial lines.
+        reach: Half-length along each line, pixels; the lines are conjugate diameters of the ellipse.
     """
     around = pixels_within(grey, lines, reach)
     if around is None:
@@ -155,7 +155,7 @@ def _stepped(
     derivatives: Float64[np.ndarray, "n m 7"],
     damping: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 7"]:
-    """A step of Levenberg and Marquardt, bounded."""
+    """Take a bounded Levenberg-Marquardt step."""
     normal = np.einsum("nmi,nmj->nij", derivatives, derivatives)
     diagonal = np.einsum("nii->ni", normal) + 1e-9
     normal = normal + (damping[:, None] * diagonal)[:, :, None] * np.eye(7)
@@ -168,9 +168,9 @@ def _stepped(
 def model(
     values: Float64[np.ndarray, "n 7"], x: Float64[np.ndarray, "n m"], y: Float64[np.ndarray, "n m"]
 ) -> tuple[Float64[np.ndarray, "n m"], Float64[np.ndarray, "n m 7"]]:
-    """Brightness of two blurred edges' product, and its derivatives.
+    """Brightness of the product of two blurred edges, and its derivatives.
 
-    A blurred edge is nearly a hyperbolic tangent, which is cheap.
+    A blurred edge is approximated by a hyperbolic tangent, which is cheap.
     """
     cx, cy, first, second, middle, contrast, blur = (values[:, k, None] for k in range(7))
     dx, dy = x - cx, y - cy
@@ -195,7 +195,7 @@ def model(
 
 
 def correlation(seen: Float64[np.ndarray, "n m"], shown: Float64[np.ndarray, "n m"]) -> Float64[np.ndarray, " n"]:
-    """Of each row with the other's."""
+    """Correlation of corresponding rows."""
     a, b = seen - seen.mean(axis=1, keepdims=True), shown - shown.mean(axis=1, keepdims=True)
     return np.asarray((a * b).sum(axis=1) / np.maximum(np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1)), 1e-9))
 
@@ -203,7 +203,7 @@ def correlation(seen: Float64[np.ndarray, "n m"], shown: Float64[np.ndarray, "n 
 def pixels_within(
     grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64[np.ndarray, " 2"]
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]] | None:
-    """Pixels within the ellipse that has the lines' reaches as conjugate half diameters."""
+    """Return x, y and brightness of the pixels within the ellipse whose conjugate radii are the lines' reaches."""
     axes = lines.directions() * reach[:, None]
     span = np.abs(axes).sum(axis=0)
     height, width = grey.shape

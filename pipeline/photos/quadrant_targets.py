@@ -1,11 +1,11 @@
-"""Black-and-white quadrant targets in a photo, as surveyors paint and lay them out: their centres, sub-pixel.
+"""Detect the black-and-white quadrant targets that surveyors lay out or paint, with sub-pixel centres.
 
 Where two dark and two bright sectors meet, brightness has a saddle: the determinant of its Hessian is negative there
 (Sinzinger, "A model-based approach to junction detection using radial energy", 2008, and Geiger et al., "Automatic
 camera and range sensor calibration using a single shot", ICRA 2012, look for such corners on calibration boards). Few
-saddles pass a ring around them on which brightness crosses its middle four times and looks the same from the other
-side. To those a pair of lines through one point, blurred, is fitted by least squares, within what the target covers;
-how far that reaches is told by the contrast across the lines. What is no target fails one of these.
+saddles pass the next test: on a ring around them, brightness crosses its mean four times and is point-symmetric. To
+these, two blurred lines through one point are fitted by least squares, within the target's extent, which the contrast
+across the lines determines. Anything that is not a target fails one of these tests.
 """
 
 from __future__ import annotations
@@ -29,38 +29,38 @@ from splatpipe.pipeline.photos.quadrant_lines import (
     sampled,
 )
 
-SADDLE_SIGMA_PX = 1.0  # less lets noise in, more loses targets of 12 px seen aslant
+SADDLE_SIGMA_PX = 1.0  # less admits noise, more loses targets of 12 px seen obliquely
 LEAST_CONTRAST = 40.0  # of white over black, of 255
-BLURRED_SIGMA_PX = 1.5  # of a saddle that is found still: the lens's, the motion's and ours together
+BLURRED_SIGMA_PX = 1.5  # of a saddle that is still found: lens blur, motion blur and our smoothing together
 LEAST_SADDLE = LEAST_CONTRAST / (np.pi * BLURRED_SIGMA_PX**2)  # a quadrant's is contrast / (π σ²) at its centre
-MOST_SADDLES = 100_000  # of a piece, the strongest
+MOST_SADDLES = 100_000  # per tile, the strongest
 RINGS_PX = (2.0, RING_PX)
-LIKE_ITSELF = 0.75  # correlation of a ring with itself, turned by half
-RING_CONTRAST = 0.65  # of the least contrast: blur takes of it near the centre
-RING_DARK = 0.7  # darkest over brightest: above what a target is judged by, for the same reason
-ACROSS_PX = 1.5  # from a line to where its sides are looked at
-REACH_PX = 64  # along a line; a larger target is one whose lines go on at least so far
+LIKE_ITSELF = 0.75  # correlation of a ring with itself, rotated by 180°
+RING_CONTRAST = 0.65  # of the least contrast: blur reduces it near the centre
+RING_DARK = 0.7  # darkest over brightest: looser than MOST_DARK, for the same reason
+ACROSS_PX = 1.5  # from a line to where its sides are sampled
+REACH_PX = 64  # along a line; larger targets are followed only this far
 LEAST_REACH_PX = 2.5
-EVEN = 0.55  # of the reaches of a line to both sides
+EVEN = 0.55  # smallest ratio of a line's reaches in its two directions
 STEP_PX = 0.5
-TILE_PX, OVERLAP_PX = 2048, 2 * REACH_PX + 16  # large pictures are looked at in pieces, for the memory
-DIFFERENCES = 0.5  # of the contrast, from which on down a line has come to its end
+TILE_PX, OVERLAP_PX = 2048, 2 * REACH_PX + 16  # large images are searched in tiles, to save memory
+DIFFERENCES = 0.5  # of the contrast, below which a line has ended
 FIT_SHARE = 0.7  # of the reach, within which pixels are fitted: those of four triangles, too
 LEAST_FIT_PX = 2.2
-LARGEST_FIT_PX = 14.0  # more pixels tell hardly more
-MOST_MOVED_PX = 2.5  # from where the lines near by meet
+LARGEST_FIT_PX = 14.0  # more pixels add hardly any information
+MOST_MOVED_PX = 2.5  # from where the lines of the first fit meet
 APART_PX = 3.0  # one target has one centre
 NEAR_CORRELATION = 0.9  # of the first fit
-LEAST_CORRELATION = 0.975  # of one that lies alone: a shadow's edge may cross it
-CORRELATION_AMONG = 0.986  # of one with others like it around, as gravel, leaves and façades have them everywhere
+LEAST_CORRELATION = 0.975  # of an isolated target: a shadow's edge may cross it
+CORRELATION_AMONG = 0.986  # of one with similar patterns around it, which gravel, leaves and façades have everywhere
 AROUND_PX = (2.0, 16.0)  # beyond a target's corners
-MOST_AROUND = 0.5  # of a saddle's own strength: the strongest around one that lies alone
+MOST_AROUND = 0.5  # of a saddle's own strength: the strongest other one around an isolated target
 OWN_PX = 1.6  # from its centre
 LEAST_ANGLE_DEG = 18.0  # between the lines
 MOST_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
-LEAST_NEUTRAL = 0.75  # of white less black: the least colour's over the largest's
+LEAST_NEUTRAL = 0.75  # of white minus black: the smallest colour channel over the largest
 MOST_BLUR_PX = 1.6
-# A disc of 12 px covers the area of a square of 10.6 px, and blur takes some of it. Below, so few pixels differ that
+# A disc of 12 px has the area of a square of 10.6 px, and blur takes some of it. Smaller ones have so few pixels that
 # gravel correlates with 0.99.
 LEAST_SIZE_PX = 10.0
 UNEVEN = 0.15  # of the contrast, between the two dark sectors, or the two bright ones
@@ -68,13 +68,13 @@ UNEVEN = 0.15  # of the contrast, between the two dark sectors, or the two brigh
 
 @dataclass(frozen=True)
 class QuadrantTarget:
-    """A target found.
+    """A detected target.
 
     Attributes:
         x: Of its centre, pixels; (0, 0) is the top-left corner of the first pixel.
-        y: The same.
-        size_px: The root of the area that its lines span.
-        sigma_px: Standard deviation of x and y that the fit states.
+        y: Likewise.
+        size_px: Square root of the area that its lines span, pixels.
+        sigma_px: Standard deviation of x and y estimated by the fit, pixels.
         score: Correlation of the pixels with the fitted pattern.
     """
 
@@ -86,13 +86,13 @@ class QuadrantTarget:
 
 
 def find_quadrant_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
-    """Find targets in a picture.
+    """Find quadrant targets in an image.
 
     Args:
         pixels: RGB.
 
     Returns:
-        From the top down.
+        The targets, sorted from top to bottom.
     """
     found: list[QuadrantTarget] = []
     for top in range(0, max(pixels.shape[0] - OVERLAP_PX, 1), TILE_PX - OVERLAP_PX):
@@ -105,7 +105,7 @@ def find_quadrant_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTa
 
 
 def _found_in(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
-    """The targets in a piece of a picture."""
+    """Find the targets in a tile of an image."""
     if min(pixels.shape[:2]) < 4 * int(RINGS_PX[-1]):
         return []
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -124,7 +124,7 @@ def _found_in(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
 
 
 def _saddles(grey: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "n 2"]:
-    """Places of strong saddles, the strongest first; (0, 0) is the first pixel's centre."""
+    """Find positions of strong saddles, the strongest first; (0, 0) is the first pixel's centre."""
     smooth = cv2.GaussianBlur(grey, (0, 0), SADDLE_SIGMA_PX)
     saddle = _saddle_strengths(smooth)
     largest = cv2.dilate(saddle, np.ones((3, 3), np.uint8))
@@ -140,7 +140,7 @@ def _saddles(grey: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "n 2"]:
 
 def _saddle_strengths(smooth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """The negative determinant of the Hessian."""
-    # The kernels are 2 to the power of their orders too large.
+    # The kernels' scale is too large by 2 to the power of their order.
     xx, yy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, scale=0.25), cv2.Sobel(smooth, cv2.CV_32F, 0, 2, scale=0.25)
     saddle = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, scale=0.25)
     cv2.multiply(saddle, saddle, saddle)
@@ -152,7 +152,7 @@ def _saddle_strengths(smooth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray,
 def _to_level(
     smooth: Float32[np.ndarray, "h w"], rows: Int64[np.ndarray, " n"], columns: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 2"]:
-    """From pixels to where the brightness about them is level (a step of Newton), a pixel at most."""
+    """Offsets from pixels to the stationary points of brightness (one Newton step), a pixel at most."""
     patch = np.stack([[smooth[rows + y, columns + x] for x in (-1, 0, 1)] for y in (-1, 0, 1)]).astype(np.float64)
     gx, gy = (patch[1, 2] - patch[1, 0]) / 2.0, (patch[2, 1] - patch[0, 1]) / 2.0
     xx, yy = patch[1, 2] + patch[1, 0] - 2.0 * patch[1, 1], patch[2, 1] + patch[0, 1] - 2.0 * patch[1, 1]
@@ -162,7 +162,7 @@ def _to_level(
 
 
 def _ring_like(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Which places have two bright and two dark sectors around them, the same from both sides."""
+    """Whether places have two bright and two dark sectors around them, point-symmetrically."""
     good = np.ones(len(places), dtype=bool)
     for radius in RINGS_PX:
         chosen = np.flatnonzero(good)
@@ -187,7 +187,7 @@ def _ring_like(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 
 def _fitted(
     grey: Float32[np.ndarray, "h w"], pixels: UInt8[np.ndarray, "h w 3"], start: LinePair
 ) -> QuadrantTarget | None:
-    """The target whose lines begin so; None where there is none."""
+    """Fit the target that starts from these lines; None if there is none."""
     reach = _reach(grey, start)
     lines = None if reach is None else fit_within(grey, start, _fitted_part(reach))
     if lines is None or np.hypot(*(lines.values[:2] - start.values[:2])) > MOST_MOVED_PX:
@@ -201,7 +201,7 @@ def _fitted_part(reach: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
 
 
 def _reach(grey: Float32[np.ndarray, "h w"], lines: LinePair) -> Float64[np.ndarray, " 2"] | None:
-    """How far the contrast across each line goes, the mean of both ways; None where that is no target's."""
+    """Extent of the contrast along each line, the mean of both directions; None if it does not fit a target."""
     cx, cy, contrast = lines.values[0], lines.values[1], 2.0 * abs(lines.values[5])
     if contrast < LEAST_CONTRAST:
         return None
@@ -221,7 +221,7 @@ def _reach(grey: Float32[np.ndarray, "h w"], lines: LinePair) -> Float64[np.ndar
                 np.stack([x + aside[0], x - aside[0]]).astype(np.float32),
                 np.stack([y + aside[1], y - aside[1]]).astype(np.float32),
             )
-            # Positive as long as the sides are as the sectors at the centre have them.
+            # Positive as long as the sides match the sectors at the centre.
             sign = way * np.sign(lines.values[5]) * _side(directions, k)
             difference = sign * (sides[0] - sides[1]) / contrast
             ended = np.flatnonzero(difference[2:] < DIFFERENCES)
@@ -247,7 +247,7 @@ def _judged(
     lines: LinePair,
     reach: Float64[np.ndarray, " 2"],
 ) -> QuadrantTarget | None:
-    """The target, if its pixels are those of one."""
+    """Return the target if its pixels pass the tests, else None."""
     around = pixels_within(grey, lines, _fitted_part(reach))
     if around is None or lines.values[6] > MOST_BLUR_PX:
         return None
@@ -272,7 +272,7 @@ def _judged(
 
 
 def _alone(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: float) -> bool:
-    """Whether nothing around a target of a size is nearly as strong a saddle as its centre."""
+    """Whether no saddle around a target is nearly as strong as its centre."""
     corners = size_px / np.sqrt(2.0)
     reach = int(np.ceil(corners + AROUND_PX[1]))
     left, top = max(int(cx) - reach, 0), max(int(cy) - reach, 0)
@@ -289,7 +289,7 @@ def _alone(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: floa
 def _even(
     lines: LinePair, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, " n"]
 ) -> bool:
-    """Whether sectors across from each other are equally bright: cars and their shadows are not."""
+    """Whether opposite sectors are equally bright: those of cars and their shadows are not."""
     cx, cy, first, second, _, contrast = lines.values[:6].tolist()
     u = -np.sin(first) * (x - cx) + np.cos(first) * (y - cy) > 0.0
     v = np.sin(second) * (x - cx) - np.cos(second) * (y - cy) > 0.0
@@ -307,7 +307,7 @@ def _neutral(
     y: Float64[np.ndarray, " n"],
     shown: Float64[np.ndarray, " n"],
 ) -> bool:
-    """Whether what parts bright from dark is no colour."""
+    """Whether the difference between bright and dark is neutral in colour."""
     colours = pixels[y.astype(np.int64), x.astype(np.int64)].astype(np.float64)
     bright = shown > shown.mean()
     if not bright.any() or bright.all():

@@ -10,12 +10,12 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, UInt8
 
-MAX_SAMPLES = 16  # a side of a pixel; reductions by more are softened first
+MAX_SAMPLES = 16  # per side of a pixel; for larger reductions, the photo is reduced first
 STRIP_PIXELS = 1 << 21  # samples held at a time
-SINGLE_PIXELS = 1 << 18  # where a pixel has one sample: then strips need nothing of each other, and are the same bits
+SINGLE_PIXELS = 1 << 18  # with one sample per pixel: strips are then independent, and the result is identical
 PROJECTED = 1 << 16  # places projected at a time, in double precision
-MARGIN = 3  # rows around those that samples lie in: a cubic takes one before and two after
-ONE_TO_ONE = 1.1  # up to this reduction one sample a pixel, interpolated by a cubic, is sharper than several
+MARGIN = 3  # rows around those that samples lie in: a cubic uses one before and two after
+ONE_TO_ONE = 1.1  # up to this reduction, one cubic sample per pixel is sharper than several
 
 Rows = UInt8[np.ndarray, "rows w *channels"]
 
@@ -23,10 +23,10 @@ Rows = UInt8[np.ndarray, "rows w *channels"]
 def resample(
     photo: UInt8[np.ndarray, "h w *channels"], source: pycolmap.Camera, target: pycolmap.Camera
 ) -> UInt8[np.ndarray, "th tw *channels"]:
-    """What the target camera would have seen, standing and looking as the source did.
+    """Resample a photo to what the target camera would have seen from the same pose.
 
     Every pixel is the mean of samples spread over it, each interpolated in the full photo: an area filter through the
-    distortion, with no intermediate picture. Bounds the memory by working on strips of rows.
+    distortion, with no intermediate image. Works on strips of rows to bound memory.
 
     Args:
         photo: In the source camera's grid.
@@ -54,12 +54,12 @@ def resample(
 def resampled_strips(
     rows_of: Callable[[int, int], Rows], source: pycolmap.Camera, target: pycolmap.Camera
 ) -> Iterator[UInt8[np.ndarray, "rows tw 3"]]:
-    """What ``resample`` makes of a photo, from the top, strip by strip: neither photo nor result is held as an array.
+    """Yield the result of ``resample`` strip by strip, from the top, without an array of the photo or the result.
 
-    Where the whole photo is made smaller by one filter, it is one strip.
+    If the whole photo is reduced by one filter, the result is one strip.
 
     Args:
-        rows_of: The photo's rows from one on and before another, in the source camera's grid.
+        rows_of: Returns the photo's rows from the first up to the second argument, in the source camera's grid.
         source: Of any model.
         target: Pinhole.
     """
@@ -82,7 +82,7 @@ def _strips(
         bottom = min(target.height, top + rows)
         x, y = _sample_places(source, target, top, bottom, samples)
         first, last = _reach(y, source.height)
-        y -= np.float32(first)  # exact: a whole number off a larger one, or nothing
+        y -= np.float32(first)  # exact: a whole number is subtracted from a larger one, or zero
         strip = cv2.remap(rows_of(first, last), x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
         if samples > 1:
             strip = cv2.resize(strip, (target.width, bottom - top), interpolation=cv2.INTER_AREA)
@@ -90,7 +90,7 @@ def _strips(
 
 
 def _reach(y: np.ndarray, height: int) -> tuple[int, int]:
-    """The first row of the photo that samples at ``y`` look at, and the one after the last; all if one is nowhere."""
+    """The first row of the photo that samples at ``y`` use, and the one after the last; all if one is not finite."""
     low, high = float(y.min()), float(y.max())
     if not (math.isfinite(low) and math.isfinite(high)):
         return 0, height
@@ -99,7 +99,7 @@ def _reach(y: np.ndarray, height: int) -> tuple[int, int]:
 
 
 def _same_view(source: pycolmap.Camera, target: pycolmap.Camera) -> bool:
-    """Whether two pinhole cameras differ in size alone."""
+    """Whether two pinhole cameras differ only in size."""
     scaled = pycolmap.Camera(source.todict())
     scaled.rescale(target.width, target.height)
     intrinsics = [np.asarray(camera.calibration_matrix()) for camera in (scaled, target)]
@@ -107,7 +107,7 @@ def _same_view(source: pycolmap.Camera, target: pycolmap.Camera) -> bool:
 
 
 def _reduction(source: pycolmap.Camera, target: pycolmap.Camera) -> float:
-    """Photo pixels a target pixel, a side, at the target's centre and corners: the largest."""
+    """Largest number of photo pixels per target pixel, linear, at the target's centre, edge midpoints and corners."""
     width, height = target.width, target.height
     corners = np.array([[x, y] for x in (0.0, width / 2, width - 1.0) for y in (0.0, height / 2, height - 1.0)])
     here = _project(source, target, corners)
@@ -118,7 +118,7 @@ def _reduction(source: pycolmap.Camera, target: pycolmap.Camera) -> float:
 def _project(
     source: pycolmap.Camera, target: pycolmap.Camera, places: Float64[np.ndarray, "n 2"]
 ) -> Float64[np.ndarray, "n 2"]:
-    """Pixels of the target camera in the source camera; the centre of the first pixel is (0.5, 0.5) in both."""
+    """Map pixels of the target camera to the source camera; the first pixel's centre is (0.5, 0.5) in both."""
     rays = np.ones((len(places), 3))
     rays[:, 0] = (places[:, 0] - target.principal_point_x) / target.focal_length_x
     rays[:, 1] = (places[:, 1] - target.principal_point_y) / target.focal_length_y
@@ -130,8 +130,8 @@ def _sample_places(
 ) -> tuple[np.ndarray, np.ndarray]:
     """OpenCV's maps of the samples of target rows ``top`` to ``bottom``: ((bottom-top)*samples, width*samples) each.
 
-    The distortion is evaluated at the pixels' centres, one further on every side, and interpolated linearly between
-    them, where it is as good as straight.
+    The distortion is evaluated at the pixels' centres, plus one pixel on every side, and interpolated linearly between
+    them, where it is practically linear.
     """
     wide, high = target.width + 2, bottom - top + 2
     grids = np.empty((2, high, wide), np.float32)

@@ -1,4 +1,4 @@
-"""Finds the files of the photo folder that are photos, or pretend to be."""
+"""Find the files of the photo folder that are photos, or claim to be."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A file to be checked: its name (POSIX path relative to the photo folder) and where it is."""
+    """A file to be checked: its name (POSIX path relative to the photo folder) and its path."""
 
     name: str
     path: Path
@@ -36,7 +36,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class ExcludedPhoto:
-    """A photo that takes no part, and why: ``reason`` ends a sentence that starts with the name."""
+    """An excluded photo, and why: ``reason`` ends a sentence that starts with the name."""
 
     name: str
     reason: str
@@ -44,12 +44,12 @@ class ExcludedPhoto:
 
 @dataclass(frozen=True)
 class Scan:
-    """What a folder holds.
+    """The content of a photo folder.
 
     Attributes:
         candidates: Files to be checked, sorted by name.
-        left_out: Files that pretend to be photos and cannot be ones, sorted by name.
-        others: How many other files were passed over.
+        left_out: Files that claim to be photos but cannot be used, sorted by name.
+        others: Number of other files, which are ignored.
     """
 
     candidates: tuple[Candidate, ...]
@@ -58,11 +58,11 @@ class Scan:
 
 
 def scan_folder(root: Path) -> Scan:
-    """Look through a folder and the folders in it.
+    """Scan a folder recursively.
 
-    Hidden files and folders, ``masks/`` and ``sky_masks/`` are passed over, and so are links to folders (they may lead
-    in circles, and what they lead to is not what the run's digests pin). A file is a photo by its first bytes, whatever
-    it is called.
+    Hidden files and folders, ``masks/`` and ``sky_masks/`` are skipped, and so are links to folders (they may be
+    circular, and the run's digests do not cover their targets). A file is recognized as a photo by its first bytes,
+    whatever its name.
 
     Args:
         root: The folder that names are relative to.
@@ -102,12 +102,12 @@ def scan_folder(root: Path) -> Scan:
 
 
 def _name(path: Path, root: Path) -> str:
-    """The POSIX path relative to the root; bytes that are no UTF-8 show as ``\\xNN``."""
+    """The POSIX path relative to the root; bytes that are not UTF-8 show as ``\\xNN``."""
     return os.fsencode(path.relative_to(root).as_posix()).decode("utf-8", errors="backslashreplace")
 
 
 def _why_not(path: Path) -> str | None:
-    """None for a candidate; why not for what pretends to be a photo; an empty text for any other file."""
+    """None for a candidate; the reason for a file that claims to be a photo; an empty text for any other file."""
     suffix = path.suffix.casefold()
     pretends = suffix in PHOTO_SUFFIXES or suffix in RAW_SUFFIXES or suffix in OTHER_PICTURES
     try:
@@ -135,7 +135,7 @@ def _why_not_name(relative: Path) -> str | None:
         str(relative).encode()
     except UnicodeEncodeError:
         return "has a name that is not UTF-8: rename it"
-    # Masks and converted photos are called NAME.png, and file systems take 255 bytes.
+    # Masks and converted photos are called NAME.png, and file systems allow 255 bytes.
     return "has a name that is too long: rename it" if len(relative.name.encode()) > MAX_NAME_BYTES else None
 
 
@@ -146,7 +146,7 @@ def _claim(suffix: str) -> str:
 
 
 def _kind(head: bytes) -> str:
-    """``photo`` for what is read, the format's name for other pictures, empty for no picture."""
+    """``photo`` for a supported format, the format's name for other images, empty for anything else."""
     if head.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", *TIFF_HEADS)):
         return "photo"
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":

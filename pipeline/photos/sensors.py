@@ -1,7 +1,7 @@
-"""Sensor sizes of drones' cameras, for focal lengths in pixels where a photo's metadata has only millimetres.
+"""Sensor sizes of drone cameras, for focal lengths in pixels where a photo's metadata have only millimetres.
 
 Sizes are those of the makers' specifications (or of the sensor type they name: 1/2.3", 1", 4/3, APS-C), in millimetres,
-in landscape. The 1/2.3" of DJI's FC300S and FC330 was checked against calibrations.
+in landscape. The 1/2.3" size of DJI's FC300S and FC330 was checked against calibrations.
 """
 
 from __future__ import annotations

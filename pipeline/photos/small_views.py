@@ -1,8 +1,8 @@
-"""Photos for those who look at them small: decoded small where they are large, so that 20 megapixels cost little.
+"""Decode photos at small sizes for viewing, so that 20 megapixels cost little.
 
 A JPEG's blocks can be decoded at a half, a quarter or an eighth of their size: most of the time and nearly all of the
-memory of a large photo are saved. What is decoded so still has twice the wanted size at least, and the area filter that
-trainings use does the rest. Photos that are not that large are decoded whole: nothing changes for them.
+memory of a large photo are saved. The decoded image still has at least twice the wanted size, and the area filter that
+training uses does the rest. Smaller photos are decoded at full size: for them nothing changes.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import Mask, Pixels, load_mask, read_image, reduced_camera, reduced_mask
 
-ROOM = 2  # a side of what is decoded is so many of the wanted one at least: below, its own filter would show
+ROOM = 2  # the decoded image is at least this many times the wanted size: below, the decoder's own filter would show
 STEPS = (
     (8, cv2.IMREAD_REDUCED_COLOR_8),
     (4, cv2.IMREAD_REDUCED_COLOR_4),
     (2, cv2.IMREAD_REDUCED_COLOR_2),
 )
-JPEG_BEGINS = b"\xff\xd8"  # anything else is decoded whole before it is made smaller
+JPEG_BEGINS = b"\xff\xd8"  # anything else is decoded at full size before it is reduced
 
 
 def small_view(view: View, max_megapixels: float) -> tuple[Camera, Pixels, Mask | None]:
-    """A view as ``reduced_view`` has it, to look at rather than to train on.
+    """Read a view as ``reduced_view`` does, for viewing rather than for training.
 
     Args:
         view: Of the dataset.
-        max_megapixels: Its size at most.
+        max_megapixels: Its maximum size.
 
     Returns:
         Its camera at that size, the photo (h, w, 3) RGB, and its mask.
 
     Raises:
-        StageError: if a picture cannot be read or is not of its camera's size.
+        StageError: if an image cannot be read or does not have its camera's size.
     """
     camera, full = reduced_camera(view.camera, max_megapixels), view.camera
     size = (camera.width, camera.height)
@@ -50,7 +50,7 @@ def small_view(view: View, max_megapixels: float) -> tuple[Camera, Pixels, Mask 
         )
     mask = load_mask(view)
     if camera is not full:
-        # Its last column may reach beyond the photo, by less than a factor: so the scale is given, not the size alone.
+        # The last column may reach beyond the photo, by less than ``factor`` pixels: so pass the scale, not the size.
         across, down = (factor * small / large for small, large in zip(size, (full.width, full.height), strict=True))
         pixels = np.asarray(cv2.resize(pixels, None, fx=across, fy=down, interpolation=cv2.INTER_AREA), np.uint8)
         mask = None if mask is None else reduced_mask(mask, size)
@@ -58,15 +58,15 @@ def small_view(view: View, max_megapixels: float) -> tuple[Camera, Pixels, Mask 
 
 
 def read_small(path: Path, size: tuple[int, int], wanted: tuple[int, int]) -> tuple[int, Pixels]:
-    """Decode a photo, made smaller meanwhile where it is a JPEG of far more than the wanted size.
+    """Decode a photo, at a reduced scale if it is a JPEG much larger than the wanted size.
 
     Args:
         path: The photo.
         size: Its width and height.
-        wanted: Those that are asked for.
+        wanted: The wanted width and height.
 
     Returns:
-        By what its sides were divided, rounded up; and the pixels, BGR.
+        The factor by which its sides were divided (rounded up), and the pixels, BGR.
 
     Raises:
         StageError: if it cannot be read.
@@ -78,7 +78,7 @@ def read_small(path: Path, size: tuple[int, int], wanted: tuple[int, int]) -> tu
 
 
 def _is_jpeg(path: Path) -> bool:
-    """By its content: names are the user's. What cannot be opened is told by who decodes it."""
+    """Whether the file's content is a JPEG, whatever its name; if it cannot be opened, the decoder reports it."""
     try:
         with path.open("rb") as file:
             return file.read(len(JPEG_BEGINS)) == JPEG_BEGINS

@@ -1,4 +1,4 @@
-"""Photos as pinhole cameras see them, and the sparse model that fits these."""
+"""Undistort photos to pinhole cameras, and convert the sparse model accordingly."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from splatpipe.pipeline.photos.names import match_names, some
 from splatpipe.pipeline.photos.photo_list import Photo, decode_mask, decode_sky_mask, open_decoded
 from splatpipe.pipeline.photos.resampling import resample, resampled_strips
 
-SHAPE_TOLERANCE = 0.01  # between the shapes of a photo and of its camera in the model
-WHITE = 254.5  # of 255: a pixel counts only if nothing of it is masked, and is sky only if all of it is
+SHAPE_TOLERANCE = 0.01  # between the aspect ratios of a photo and of its camera in the model
+WHITE = 254.5  # of 255: a pixel counts only if no part of it is masked, and is sky only if all of it is
 LEAST_VIEWS = 2
 
 
@@ -45,7 +45,7 @@ class RegisteredPhoto:
 def place(
     model: pycolmap.Reconstruction, photos: Sequence[Photo], max_megapixels: float, report: Reporter
 ) -> list[RegisteredPhoto]:
-    """Find each image's photo and both its cameras; in name order of the photos.
+    """Find each image's photo and both its cameras, sorted by photo name.
 
     Raises:
         SplatpipeError: if fewer than two images of the model can be used.
@@ -87,13 +87,13 @@ def place(
 
 
 def read_flown(path: Path) -> pycolmap.Reconstruction:
-    """The model with the photos' own cameras.
+    """Read the sparse model with the photos' original cameras.
 
     Args:
         path: The part ``georef.model``.
 
     Raises:
-        SplatpipeError: if it is no model of COLMAP's.
+        SplatpipeError: if it is not a COLMAP model.
     """
     try:
         return pycolmap.Reconstruction(path)
@@ -105,7 +105,7 @@ def read_flown(path: Path) -> pycolmap.Reconstruction:
 
 
 def _camera_for(image: pycolmap.Image, photo: Photo) -> pycolmap.Camera | None:
-    """The model's camera in the photo's grid; None where they cannot belong together."""
+    """The model's camera scaled to the photo's grid; None if they cannot belong together."""
     camera = pycolmap.Camera(image.camera.todict())
     if not np.isfinite(camera.params).all() or camera.mean_focal_length() <= 0 or camera.width * camera.height == 0:
         return None
@@ -120,7 +120,7 @@ def _camera_for(image: pycolmap.Image, photo: Photo) -> pycolmap.Camera | None:
 
 
 def pinhole_camera(source: pycolmap.Camera, max_megapixels: float, number: int) -> pycolmap.Camera:
-    """The largest pinhole camera without blank borders (COLMAP's choice), reduced to the training resolution.
+    """Return the largest pinhole camera without blank borders (COLMAP's choice), reduced to training resolution.
 
     Args:
         source: Any camera model.
@@ -150,7 +150,7 @@ def write_view(view: RegisteredPhoto, inputs: Inputs, dataset: Path) -> None:
 
 
 def _write(path: Path, strips: Iterable[npt.NDArray[np.uint8]], height: int) -> None:
-    """Write a picture in the format of its name: PNG or TIFF without loss, and whole; anything else JPEG, in strips."""
+    """Write an image in the format of its suffix: lossless PNG or TIFF at once; anything else as JPEG in strips."""
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
     if suffix not in (".png", ".tif", ".tiff"):
@@ -163,13 +163,13 @@ def _write(path: Path, strips: Iterable[npt.NDArray[np.uint8]], height: int) -> 
 
 
 def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[RegisteredPhoto]) -> pycolmap.Reconstruction:
-    """The model seen by the pinhole cameras: what is observed in the undistorted photos, and nothing else.
+    """Convert the model to the pinhole cameras, with only the observations inside the undistorted photos.
 
-    Points that other programs export without observations stay.
+    Points that other programs export without observations are kept.
 
     Args:
-        model: As it came.
-        placed: The photos that take part.
+        model: The original model.
+        placed: The photos in use.
     """
     result = pycolmap.Reconstruction()
     observed: dict[int, list[tuple[int, int]]] = {}
@@ -198,7 +198,7 @@ def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[RegisteredPho
 
 
 def _observations(model: pycolmap.Reconstruction, view: RegisteredPhoto) -> tuple[list[int], npt.NDArray[np.float64]]:
-    """Points that a photo sees, and where the pinhole camera sees them (n, 2), within its frame."""
+    """Points that a photo observes, and their positions (n, 2) in the pinhole image, if inside it."""
     indices = view.image.get_observation_point2D_idxs()
     points = [view.image.points2D[index].point3D_id for index in indices]
     if not points:

@@ -1,7 +1,7 @@
-"""XMP of a photo as flat text properties, from untrusted bytes.
+"""Parse a photo's XMP to flat text properties, from untrusted bytes.
 
 Drones write their altitudes, angles and accuracies there (``drone-dji:``, ``Camera:``), as attributes or as elements.
-The packet is parsed without DTDs (no entity is ever declared, so none can be expanded or fetched) and within limits.
+The packet is parsed without DTDs (so that no entity can be declared, expanded or fetched) and within limits.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ PREFIX_OF_NAMESPACE = {
 
 
 class _RefusedError(Exception):
-    """The packet is past a limit or declares a document type."""
+    """The packet exceeds a limit or declares a document type."""
 
 
 class _Properties:
-    """Collects attributes and leaf elements as ``prefix:name`` -> text; the first of a name wins."""
+    """Collector of attributes and leaf elements as ``prefix:name`` -> text; the first of a name wins."""
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}
@@ -71,7 +71,7 @@ class _Properties:
 
 
 def find_packet(data: bytes) -> bytes:
-    """Cut the first XMP packet out of a file's or a segment's bytes; empty where there is none."""
+    """Extract the first XMP packet from a file's or a segment's bytes; empty if there is none."""
     start = data.find(PACKET_START)
     if start < 0:
         return b""
@@ -83,16 +83,16 @@ def parse_xmp(packet: bytes) -> Mapping[str, str]:
     """Read a packet's properties.
 
     Args:
-        packet: From ``<x:xmpmeta`` to ``</x:xmpmeta>``; whatever the file held.
+        packet: From ``<x:xmpmeta`` to ``</x:xmpmeta>``; untrusted.
 
     Returns:
         ``{"drone-dji:RelativeAltitude": "+39.80", …}``: known namespaces under the prefix used here, others under the
-        file's own. Empty when the packet is broken, declares a document type or goes past a limit.
+        file's own. Empty if the packet is broken, declares a document type or exceeds a limit.
     """
     if not packet or len(packet) > MAX_PACKET_BYTES:
         return {}
     properties = _Properties()
-    # Without namespace processing: packets whose prefixes are not declared are common, and readable this way.
+    # Without namespace processing: packets with undeclared prefixes are common, and can be read this way.
     parser = expat.ParserCreate()
     parser.buffer_text = True
     parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)
