@@ -241,7 +241,7 @@ def _quiet_group(
 ) -> TransformerGroup:
     south, north = max(latitude - AROUND_DEG, -90.0), min(latitude + AROUND_DEG, 90.0)
     area = AreaOfInterest(longitude - AROUND_DEG, south, longitude + AROUND_DEG, north)
-    with warnings.catch_warnings():  # that a grid is missing: it is told by an error of our own
+    with warnings.catch_warnings():  # about missing grids: we raise our own error
         warnings.simplefilter("ignore", UserWarning)
         try:
             return TransformerGroup(
@@ -256,7 +256,7 @@ def _quiet_group(
 
 
 def _rough_place(points: Float64[np.ndarray, "n 3"], crs: Crs) -> tuple[float, float]:
-    """Where the points are, to a kilometre: enough to choose the operation by."""
+    """Latitude and longitude of the points to about a kilometre: enough to choose the operation."""
     try:
         rough = pyproj.Transformer.from_crs(crs.horizontal, WGS84_3D, always_xy=True)
     except ProjError as error:  # a CRS of another planet, for one
@@ -269,7 +269,7 @@ def _rough_place(points: Float64[np.ndarray, "n 3"], crs: Crs) -> tuple[float, f
 
 
 def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
-    """Refuse a place far outside of the CRS's area or, where that is not stated, where it distorts lengths much."""
+    """Reject a place far outside the CRS's area or, where that is not stated, where it distorts lengths strongly."""
     place = (
         f"{abs(latitude):.4f}° {'N' if latitude >= 0 else 'S'}, {abs(longitude):.4f}° {'E' if longitude >= 0 else 'W'}"
     )
@@ -288,7 +288,7 @@ def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
 
 
 def _require_no_degrees(points: Float64[np.ndarray, "n 3"], crs: Crs, latitude: float, longitude: float) -> None:
-    """Refuse degrees that are stated as eastings and northings: those are metres from the false origin."""
+    """Reject degrees given as eastings and northings: those are metres from the false origin."""
     like_degrees = bool((np.abs(points[:, :2]) <= [360.0, 90.0]).all()) and not crs.is_geographic
     if like_degrees and crs.area is not None and _outside_km(crs.area, latitude, longitude) > 0.0:
         raise SplatpipeError(
@@ -331,7 +331,7 @@ def _lacks_grid(crs: Crs, group: TransformerGroup) -> SplatpipeError:
 
 
 def _like_wgs84(crs: Crs) -> bool:
-    """Whether its ellipsoid is WGS 84's to a millimetre: then its datum is a modern one, metres off at most."""
+    """Whether its ellipsoid is WGS 84's to a millimetre: then its datum is modern, and at most metres off."""
     ellipsoid = crs.horizontal.ellipsoid
     if ellipsoid is None:
         return False

@@ -1,4 +1,4 @@
-"""Where photos can be expected to show control points, before any mark: from the photos' own positions."""
+"""Predict where photos show control points before any mark is made, from the photos' own positions."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def expected_windows(
     photos: Mapping[str, Photo],
     settings: Mapping[str, JSON],
 ) -> dict[str, Window]:
-    """What of each photo with a pose is worth searching.
+    """The window of each posed photo that is worth searching.
 
     Args:
-        wanted: With scale bars or without the photos' positions it is all of every photo.
+        wanted: With scale bars, or without photo positions, every photo is searched whole.
         model: The sparse model.
-        positions: What the photos state.
+        positions: The photos' stated positions.
         photos: All photos of the capture by name.
         settings: georef's ``max_position_error_m`` and ``approximate_crs``.
     """
@@ -51,7 +51,7 @@ def expected_windows(
         limit = settings["georef.max_position_error_m"]
         frame, _ = georeference(model, positions, limit, photos)
         places = expected_enu(wanted, frame, model, bool(settings["georef.approximate_crs"]))
-    except (NoPlaceError, SplatpipeError):  # without positions, or a CRS that georef will tell of
+    except (NoPlaceError, SplatpipeError):  # without positions, or with a CRS that georef will report
         return whole
     stated = [r.get("sigma_horizontal_m") for r in positions.by_name.values()]
     sigmas = [float(sigma) for sigma in stated if sigma is not None]
@@ -65,9 +65,9 @@ def expected_windows(
 def expected_enu(
     wanted: WantedTargets, frame: Frame, model: SparseModel, approximate: bool
 ) -> Float64[np.ndarray, "n 3"]:
-    """East, north, up of the points in the frame of positions, with all heights moved to where the model's ground is.
+    """East, north, up of the points in the frame of positions, with all heights shifted to the model's ground.
 
-    Heights of receivers and of surveys differ by a datum that nobody states; the ground is the same.
+    Heights of receivers and of surveys may differ by an unstated datum; the ground is the same.
 
     Raises:
         SplatpipeError: if the CRS cannot be used.
@@ -91,7 +91,7 @@ def expected_enu(
 
 
 def free_enu(wanted: WantedTargets, approximate: bool) -> Float64[np.ndarray, "n 3"]:
-    """East, north, up of the points about their own middle; heights that are not known are NaN.
+    """East, north, up (metres) of the points about the first one and their median height; unknown heights are NaN.
 
     Raises:
         SplatpipeError: if the CRS cannot be used.
@@ -108,14 +108,14 @@ def free_enu(wanted: WantedTargets, approximate: bool) -> Float64[np.ndarray, "n
 def _window(
     places: Float64[np.ndarray, "n 3"], radius: float, model: SparseModel, index: int, photo: Photo
 ) -> Window | None:
-    """The part of a photo that may show places known to a radius (model units); None where it shows none."""
+    """The part of a photo that may show places known to within a radius (model units); None where it shows none."""
     view = model.view(index, photo.width)
     seen = places @ view.cam_from_model[:, :3].T + view.cam_from_model[:, 3]
     seen = seen[seen[:, 2] > radius * 0.25]
     if len(seen) == 0:
         return None
     reach = view.camera.mean_focal_length() / view.scale * radius / seen[:, 2]
-    # Without the lens's distortion, which is small beside the radius and folds pixels over far outside of the photo.
+    # Without lens distortion, which is small compared with the radius and folds pixels over far outside the photo.
     focal, middle = view.camera.mean_focal_length() / view.scale, np.array([photo.width, photo.height]) / 2.0
     pixels = middle + focal * seen[:, :2] / seen[:, 2:]
     low, high = np.maximum(pixels - reach[:, None], 0.0), pixels + reach[:, None]

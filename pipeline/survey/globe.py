@@ -1,4 +1,4 @@
-"""A georeferenced splat on the globe: its 3D Tiles, placed as exactly as its heights are known."""
+"""A georeferenced splat on the globe: its 3D Tiles, placed as accurately as its heights are known."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _EPSG = re.compile(r"EPSG:(\d{1,6})")
 
 
 def write_tiles_on_globe(folder: Path, scene: Scene, root: LevelNode) -> Placement:
-    """Write a scene's 3D Tiles where it lies.
+    """Write a scene's 3D Tiles at its place on the earth.
 
     Args:
-        folder: As of ``write_tiles``.
-        scene: With its place.
-        root: Of its levels, in its frame.
+        folder: As for ``write_tiles``.
+        scene: With its georeference.
+        root: Root of its levels, in its frame.
 
     Returns:
         How it was placed: ``approximate`` and ``note`` are for the user.
 
     Raises:
-        SplatpipeError: if it lies nowhere on the earth, or its CRS cannot be used there.
+        SplatpipeError: if it has no place on the earth, or its CRS cannot be used there.
         ValueError: as ``write_tiles``.
         OSError: as ``write_tiles``.
     """
@@ -46,10 +46,10 @@ def write_tiles_on_globe(folder: Path, scene: Scene, root: LevelNode) -> Placeme
 
 
 def esri_crs_of(world: World, box: Float64[np.ndarray, "2 3"]) -> EsriCrs | None:
-    """What Esri's programs show tiles in; None in a geographic CRS, whose degrees are no map.
+    """The CRS in which Esri's programs show tiles; None for a geographic CRS, whose degrees are not a map.
 
     Args:
-        world: The scene's.
+        world: The scene's world.
         box: Lowest and highest east, north, up of the scene, metres.
     """
     if world.crs.is_geographic:

@@ -1,4 +1,4 @@
-"""A splat and its cameras in the frame that people get them in."""
+"""A splat and its cameras in the world frame in which they are delivered."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def _in_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
 
 
 def facts_of(frame: Frame, antialias: bool) -> SceneFacts:
-    """What files say of a splat in the world frame.
+    """The facts that files state about a splat in the world frame.
 
     Args:
         frame: georef's.
-        antialias: Whether its opacities allow for the blur on screen.
+        antialias: Whether its opacities compensate for the screen-space blur.
     """
     origin, place = frame.origin, None
     if origin is not None:
@@ -58,7 +58,7 @@ def facts_of(frame: Frame, antialias: bool) -> SceneFacts:
 
 
 def frame_of(place: SplatOrigin) -> Frame:
-    """The frame of a splat that lies there, turned to z up, as ``open_world`` takes it."""
+    """The frame, z up, of a splat with this origin, for ``open_world``."""
     origin = Origin(place.latitude, place.longitude, place.height_m)
     return Frame(
         kind="enu",
@@ -71,14 +71,14 @@ def frame_of(place: SplatOrigin) -> Frame:
 
 
 def inside_first(gaussians: Gaussians, area: PlanArea | None) -> tuple[Gaussians, int | None]:
-    """A splat with what lies inside a boundary before its backdrop, so that programs can take the one alone.
+    """Sort a splat so that what lies inside a boundary comes before its backdrop, and can be used alone.
 
     Args:
         gaussians: In the world frame.
         area: The boundary; None without one.
 
     Returns:
-        The splat, and how many lie inside; None without a boundary, where nothing changes.
+        The splat, and how many Gaussians lie inside; None without a boundary, where nothing changes.
     """
     if area is None:
         return gaussians, None
@@ -88,18 +88,18 @@ def inside_first(gaussians: Gaussians, area: PlanArea | None) -> tuple[Gaussians
 
 
 def bounded_comments(inside: int | None, gaussians: int) -> list[str]:
-    """Header lines that tell how many Gaussians lie inside a boundary; none without one."""
+    """Header lines that state how many Gaussians lie inside a boundary; none without one."""
     if inside is None:
         return []
     return [f"boundary: the first {inside} Gaussians lie inside, the other {gaussians - inside} are a backdrop"]
 
 
 def georef_facts(frame: Frame, box: Float64[np.ndarray, "2 3"], boundary: Path | None) -> dict[str, Any]:
-    """What `georef.json` says beside what is handed over: where it lies, how surely, and a boundary if there is one.
+    """The `georef.json` next to a delivered scene: its place, its accuracy, and a boundary if there is one.
 
     Args:
         frame: georef's.
-        box: Of what is handed over, in the world frame.
+        box: Bounding box of what is delivered, in the world frame.
         boundary: `georef.boundary`; None where the run has no such part.
 
     Raises:

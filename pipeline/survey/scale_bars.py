@@ -1,4 +1,4 @@
-"""Scale bars: two targets and their distance a line, which give a model metres where no coordinates are known.
+"""Scale bars: two targets and their distance per line; they give a model metric scale without known coordinates.
 
 ``scale_bars.csv`` has the columns name_a, name_b, metres and, if known, sigma (metres).
 """
@@ -30,8 +30,8 @@ MAX_BARS = 1000
 MAX_NAME = 255
 LENGTH_BOUNDS_M = (1e-3, 1e5)
 SIGMA_BOUNDS_M = (1e-6, 1e3)
-STATED_SIGMA_M = 0.001  # of a bar whose file says none: a folding rule's
-WORST_AGREEMENT = 0.05  # between bars: relative, by which one may be off the median before it is left out
+STATED_SIGMA_M = 0.001  # of a bar whose file states none: a folding rule's
+WORST_AGREEMENT = 0.05  # relative deviation from the bars' median above which a bar is left out
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "a": ("name_a", "a", "from", "target_a", "marker_a", "start"),
     "b": ("name_b", "b", "to", "target_b", "marker_b", "end"),
@@ -51,9 +51,9 @@ class ScaleBar:
     """A distance between two targets.
 
     Attributes:
-        a: Name of the one.
-        b: Name of the other.
-        metres: Between their centres.
+        a: Name of the first.
+        b: Name of the second.
+        metres: Distance between their centres.
         sigma_m: Its standard deviation.
     """
 
@@ -65,13 +65,13 @@ class ScaleBar:
 
 @dataclass(frozen=True)
 class ModelScale:
-    """What bars say of a model's scale.
+    """A model's scale by scale bars.
 
     Attributes:
         metres_per_unit: Of the model.
         sigma: Relative standard deviation.
-        used: The bars that took part, by their order.
-        errors_m: Of each bar whose targets were found: the model's length less the stated one; NaN of others.
+        used: Indices of the bars used.
+        errors_m: The model's length less the stated one, for each bar whose targets were found; else NaN.
     """
 
     metres_per_unit: float
@@ -84,7 +84,7 @@ def read_scale_bars(path: Path) -> tuple[ScaleBar, ...]:
     """Read a file of scale bars.
 
     Raises:
-        SplatpipeError: if it is no such file: the message names the line, the hint what is expected there.
+        SplatpipeError: if it is not such a file; the message names the line, the hint what is expected there.
     """
     written = written_lines(read_lines(path, _KIND), path, _KIND)
     with line_errors(path, _KIND):
@@ -127,11 +127,11 @@ def _bar(number: int, cells: Sequence[str], places: Mapping[str, int]) -> ScaleB
 
 
 def scale_by(bars: Sequence[ScaleBar], places: Mapping[str, Float64[np.ndarray, " 3"]]) -> ModelScale | None:
-    """The scale that bars give a model; None where none of them has both targets found.
+    """Compute a model's scale from bars; None where no bar has both targets found.
 
     Args:
         bars: With names as in ``places``.
-        places: Of targets in the model.
+        places: Positions of targets in the model.
     """
     ratios, sigmas, index = [], [], []
     for k, bar in enumerate(bars):

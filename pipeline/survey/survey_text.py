@@ -1,4 +1,4 @@
-"""Plain text that surveyors' tables are, from untrusted files: everything has a limit, every refusal names its line."""
+"""Read surveyors' text tables from untrusted files: everything has a limit, and every error names its line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.errors import SplatpipeError
 
 MAX_LINE_CHARS = 2000
-LARGEST = 1e9  # of a coordinate, metres or pixels: beyond it there is neither an earth nor a photo
+LARGEST = 1e9  # of a coordinate, metres or pixels: larger ones are neither on the earth nor in a photo
 UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
 CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg)\s*[:=]\s*(\S.*)", re.IGNORECASE)
 GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "x/longitude")  # titles of x that name no other CRS
@@ -22,7 +22,7 @@ CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 class LineError(ValueError):
-    """What is wrong in a line (0: in the file as a whole), the end of a sentence."""
+    """An error in a line (0: in the file as a whole); the text is the end of a sentence."""
 
     def __init__(self, line: int, text: str, hint: str = "") -> None:
         super().__init__(text)
@@ -35,9 +35,9 @@ class TableKind:
 
     Attributes:
         what: Its name in messages.
-        expected: What such a file looks like, a hint.
-        max_bytes: It may not be larger.
-        max_lines: Nor have more lines.
+        expected: What such a file looks like, as a hint.
+        max_bytes: Largest accepted size.
+        max_lines: Largest accepted number of lines.
     """
 
     what: str
@@ -47,10 +47,10 @@ class TableKind:
 
 
 def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
-    """Numbered lines, from 1.
+    """Read a file's lines, numbered from 1.
 
     Raises:
-        SplatpipeError: if the file is no text, or too much of it.
+        SplatpipeError: if the file is not text, or too large.
     """
     name = f"The {kind.what} {path.name}"
     try:
@@ -72,7 +72,7 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
 
 
 def written_lines(lines: Sequence[tuple[int, str]], path: Path, kind: TableKind) -> list[tuple[int, str]]:
-    """Those that are neither blank nor comments.
+    """The lines that are neither blank nor comments.
 
     Raises:
         SplatpipeError: if there is none.
@@ -94,12 +94,12 @@ def line_errors(path: Path, kind: TableKind) -> Iterator[None]:
 
 
 def delimiter_of(line: str) -> str:
-    """What parts the cells of a header."""
+    """The delimiter between the cells of a header."""
     return max(",;\t", key=line.count)
 
 
 def find_columns(titles: Sequence[str], spellings: Mapping[str, Sequence[str]]) -> dict[str, int]:
-    """The place of each column that is known, by our name for it; the first of several."""
+    """The index of each known column, by our name for it; the first of several."""
     spelled = {spelling: key for key, each in spellings.items() for spelling in each}
     places: dict[str, int] = {}
     for place, title in enumerate(titles):
@@ -110,7 +110,7 @@ def find_columns(titles: Sequence[str], spellings: Mapping[str, Sequence[str]]) 
 
 
 def title_of(text: str) -> str:
-    """A column's title as spellings are compared."""
+    """Normalize a column's title for comparison with known spellings."""
     return text.strip().casefold().replace(" ", "_")
 
 
@@ -123,10 +123,10 @@ def is_number(text: str) -> bool:
 
 
 def number_in(line: int, what: str, text: str) -> float:
-    """A finite number that can be a coordinate; a decimal comma is one.
+    """Parse a finite number that can be a coordinate; a decimal comma is accepted.
 
     Raises:
-        LineError: if it is none.
+        LineError: if it is not such a number.
     """
     text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
     if not is_number(text) or abs(float(text)) > LARGEST:
@@ -142,13 +142,13 @@ def csv_rows(
 ) -> tuple[str, list[tuple[int, Mapping[str, str]]]]:
     """The CRS of a table with a header, and its rows by the columns' names, numbered by their lines.
 
-    The CRS stands in the line before the header, in a comment, or in a column; without, degrees are those of WGS 84.
+    The CRS is in the line before the header, in a comment, or in a column; without it, degrees are taken as WGS 84.
 
     Args:
-        lines: All of the file.
-        written: Those that say something.
-        header: Place of the header among them, 0 or 1.
-        columns: Titles of each column, in small letters.
+        lines: All lines of the file.
+        written: Those that are neither blank nor comments.
+        header: Index of the header among them, 0 or 1.
+        columns: Titles of each column, in lower case.
 
     Raises:
         LineError: if a line is broken, or the table names no CRS or two.

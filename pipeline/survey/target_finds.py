@@ -1,4 +1,4 @@
-"""What the stages before georef leave of control: its points without their marks, scale bars, targets in photos."""
+"""Control data from the stages before georef: points without their marks, scale bars, targets detected in photos."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class TargetFind:
     Attributes:
         photo: Its name.
         kind: ``quadrant``, or the dictionary of a coded one.
-        number: Its id; None of a quadrant target.
+        number: Its id; None for a quadrant target.
         x: Of its centre, pixels of the stored grid; (0, 0) is the top-left corner of the first pixel.
-        y: The same.
-        size_px: The root of its area.
+        y: Likewise.
+        size_px: The square root of its area.
         sigma_px: Standard deviation of x and y.
     """
 
@@ -40,11 +40,11 @@ class TargetFind:
 
 @dataclass(frozen=True)
 class WantedTargets:
-    """What targets are looked for.
+    """The points and scale bars whose targets are to be detected.
 
     Attributes:
         crs: Of the points; empty where there are none.
-        points: Name, x, y, z (None where nobody measured it) of control points.
+        points: Name, x, y, z (None where not measured) of control points.
         bars: Scale bars.
     """
 
@@ -57,7 +57,7 @@ class WantedTargets:
 
 
 def save_wanted(wanted: WantedTargets, path: Path) -> None:
-    """Write ``points.json``; the bytes depend on points and bars alone, and not on marks."""
+    """Write ``points.json``; its bytes depend only on points and bars, not on marks."""
     bars = [asdict(bar) for bar in wanted.bars]
     write_json(path, {"crs": wanted.crs, "points": [list(point) for point in wanted.points], "bars": bars})
 

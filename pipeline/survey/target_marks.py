@@ -1,9 +1,9 @@
-"""From targets in photos to marks of control points: which belong together, which point they are, which are refused.
+"""From targets in photos to marks of control points: group detections, identify their points, reject the rest.
 
-Finds of one target meet in a point of the model. A coded target is the point whose name ends in its number. Any other
-target is the point that lies where it is: points and targets are laid over each other as two constellations, first
-moved as a whole (photos' positions err together, and their heights may be in another datum), then by a similarity.
-What meets nowhere, has no point, or lies elsewhere than its point is refused.
+Rays of detections of one target meet in a point of the model. A coded target is the point whose name ends in its
+number. Any other target is matched by position: points and targets are aligned as two constellations, first by a
+translation (photos' positions share an error, and their heights may be in another datum), then by a similarity. Targets
+whose rays do not meet, that have no point, or that lie elsewhere than their point are rejected.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ NUMBERS = re.compile(r"\d+")
 
 @dataclass(frozen=True)
 class ExpectedPoints:
-    """Where the survey has its points.
+    """The surveyed positions of the points.
 
     Attributes:
-        names: Theirs.
-        enu: Metres; a height that is not known is NaN.
-        world_from_model: Of the photos' positions, roughly right; None where they give none.
+        names: The points' names.
+        enu: East, north, up in metres; an unknown height is NaN.
+        world_from_model: By the photos' positions, approximate; None where they give none.
     """
 
     names: tuple[str, ...]
@@ -43,11 +43,11 @@ class ExpectedPoints:
 
 @dataclass(frozen=True)
 class NamedTrack:
-    """A target that is known by name.
+    """A target with a name.
 
     Attributes:
         name: Of a control point, or of a scale bar's end.
-        track: Where it is, and where photos show it.
+        track: Its position and its detections in photos.
     """
 
     name: str
@@ -56,11 +56,11 @@ class NamedTrack:
 
 @dataclass(frozen=True)
 class TargetMarks:
-    """What became of the targets.
+    """Targets that were identified or rejected.
 
     Attributes:
         named: Those that are control points, or ends of scale bars.
-        refused: How many targets were not used, by the reason.
+        refused: Number of targets not used, by reason.
     """
 
     named: tuple[NamedTrack, ...]
@@ -84,14 +84,14 @@ def named_tracks(
     expected: ExpectedPoints | None,
     seeds: Mapping[str, Float64[np.ndarray, " 3"]],
 ) -> TargetMarks:
-    """Join targets with names.
+    """Assign names to targets.
 
     Args:
-        finds: In all photos.
+        finds: Detections in all photos.
         names: Of control points and ends of scale bars.
         scene: The sparse model, and all photos by name.
-        expected: Where the control points are; None where there are none.
-        seeds: Places in the model of points that somebody marked, by name.
+        expected: Surveyed positions of the control points; None where there are none.
+        seeds: Positions in the model of manually marked points, by name.
     """
     coded = coded_tracks(finds, *scene)
     by_number, refused = _by_number(coded, names)
@@ -115,7 +115,7 @@ def _by_place(
     expected: ExpectedPoints,
     seeds: Mapping[str, Float64[np.ndarray, " 3"]],
 ) -> tuple[dict[str, int], set[str]]:
-    """Targets by the points that lie where they are, and the names of those that have a number but lie elsewhere."""
+    """Targets matched to points by position, and the names of those whose number is a point that lies elsewhere."""
     row = {name: k for k, name in enumerate(expected.names)}
     known = {each.name: each.track.place for each in by_number if each.name in row}
     known |= {name: place for name, place in seeds.items() if name in row}
@@ -138,9 +138,9 @@ def _by_place(
 
 
 def _by_number(coded: Sequence[Track], names: Sequence[str]) -> tuple[list[NamedTrack], Counter[str]]:
-    """Coded targets by the names that state their dictionary and number, or their number alone.
+    """Coded targets matched to names that state their dictionary and number, or their number alone.
 
-    Where targets of two dictionaries have the number of a point, the dictionary counts that names more points.
+    Where targets of two dictionaries have a point's number, the dictionary that names more points is used.
     """
     refused: Counter[str] = Counter()
     numbers: defaultdict[int, list[str]] = defaultdict(list)

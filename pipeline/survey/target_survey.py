@@ -1,4 +1,4 @@
-"""Targets and scale bars in georeferencing: marks for the control file's points, and metres for a model."""
+"""Targets and scale bars in georeferencing: marks for the control file's points, and metric scale for a model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCALE_OFF = 3.0  # joint sigmas between the bars' scale and the frame's: worth a
 
 @dataclass(frozen=True)
 class TargetSurvey:
-    """Finds targets' names.
+    """Identifies detected targets.
 
     Attributes:
         wanted: Control points and scale bars.
@@ -47,11 +47,11 @@ class TargetSurvey:
     approximate_crs: bool
 
     def marks(self, seeds: Mapping[str, Float64[np.ndarray, " 3"]], report: Reporter) -> TargetMarks:
-        """The targets by their names; says what became of them.
+        """The targets by their names; reports which were used and which were not.
 
         Args:
-            seeds: Places of points that somebody marked.
-            report: Takes a note.
+            seeds: Positions of manually marked points, by name.
+            report: Receives notes.
         """
         ends = sorted({name for bar in self.wanted.bars for name in (bar.a, bar.b)})
         points = [name for name, *_ in self.wanted.points]
@@ -74,14 +74,14 @@ class TargetSurvey:
                 return ExpectedPoints(tuple(points), free_enu(self.wanted, self.approximate_crs), None)
             enu = expected_enu(self.wanted, self.frame, self.model, self.approximate_crs)
             return ExpectedPoints(tuple(points), enu, self.frame.world_from_model)
-        except SplatpipeError:  # of the CRS; it is told where control is placed
+        except SplatpipeError:  # about the CRS; reported where control is placed
             return None
 
 
 def marker_of(
     survey: TargetSurvey, control: Path, report: Reporter, seen: list[TargetMarks]
 ) -> Callable[[Survey], dict[str, dict[str, tuple[float, float]]]]:
-    """What gives a control file's points the marks that targets are, but for photos that are said not to show them."""
+    """Return the target finder for a control file's points; it skips photos marked as not showing a point."""
 
     def find(points: Survey) -> dict[str, dict[str, tuple[float, float]]]:
         seeds = {point.name: point.found.xyz for point in points.points if point.found is not None}
@@ -101,7 +101,7 @@ def marker_of(
 def scale_of(
     survey: TargetSurvey, found: TargetMarks, marked: Mapping[str, Float64[np.ndarray, " 3"]], report: Reporter
 ) -> ModelScale | None:
-    """What the scale bars say of the model; warns of bars that contradict the others or were not found."""
+    """The model's scale by the scale bars; warns about bars that contradict the others or were not found."""
     bars = survey.wanted.bars
     if not bars:
         return None
@@ -129,7 +129,7 @@ def scale_of(
 
 
 def scaled(frame: Frame, scale: ModelScale) -> Frame:
-    """An arbitrary frame with the bars' metres."""
+    """An arbitrary frame scaled to metres by the bars."""
     factor = scale.metres_per_unit / frame.world_from_model.scale
     old = frame.world_from_model
     similarity = Similarity(old.scale * factor, old.rotation, old.translation * factor)
@@ -139,7 +139,7 @@ def scaled(frame: Frame, scale: ModelScale) -> Frame:
 
 
 def compare(frame: Frame, scale: ModelScale, report: Reporter) -> None:
-    """Say how far the frame's metres are the bars'."""
+    """Report how well the frame's scale agrees with the bars'."""
     ratio = frame.world_from_model.scale / scale.metres_per_unit - 1.0
     bars = f"{_counted(scale)} (good to {scale.sigma:.3%})"
     what = f"According to {bars}, lengths in this result are {ratio:+.3%} off."
@@ -150,7 +150,7 @@ def compare(frame: Frame, scale: ModelScale, report: Reporter) -> None:
 
 
 def scale_json(bars: Sequence[ScaleBar], scale: ModelScale | None, frame: Frame) -> dict[str, JSON]:
-    """What ``accuracy.json`` holds of scale bars; nothing where none gave a scale.
+    """The scale bars' entry in ``accuracy.json``; empty where none gave a scale.
 
     Each bar's error is the length in the result less the stated one.
     """
@@ -179,7 +179,7 @@ def _counted(scale: ModelScale) -> str:
 
 
 def scale_summary(scale: ModelScale | None) -> dict[str, JSON]:
-    """Of the stage."""
+    """The scale bars' part of the stage's summary."""
     if scale is None:
         return {}
     errors = [None if not np.isfinite(error) else float(error) for error in scale.errors_m]

@@ -1,4 +1,4 @@
-"""Finds of one target in several photos: the point of the model where their rays meet."""
+"""Group detections of one target in several photos into the point of the model where their rays meet."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class Track:
 
     Attributes:
         kind: ``quadrant``, or its dictionary.
-        number: Of a coded one.
-        finds: One a photo, by the photos' names.
-        place: In the model.
+        number: Id of a coded target.
+        finds: One per photo, by the photos' names.
+        place: Position in the model.
     """
 
     kind: str
@@ -42,7 +42,7 @@ class Track:
 
 @dataclass(frozen=True)
 class _PosedFinds:
-    """Finds in photos that have a pose, with their rays."""
+    """Detections in photos that have a pose, with their rays."""
 
     finds: tuple[TargetFind, ...]
     rays: Rays
@@ -54,7 +54,7 @@ class _PosedFinds:
 
 
 def coded_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> list[Track]:
-    """Tracks of coded targets; of one number that meets in several places, the one that most photos show."""
+    """Tracks of coded targets; if a number occurs in several places, the one that most photos show."""
     groups: defaultdict[tuple[str, int], list[TargetFind]] = defaultdict(list)
     for find in finds:
         if find.number is not None:
@@ -69,7 +69,7 @@ def coded_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mappin
 
 
 def unnamed_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, Photo]) -> list[Track]:
-    """Tracks of targets that carry no number: which finds belong together is told by the geometry alone."""
+    """Tracks of targets without a number: detections are grouped by geometry alone."""
     seen = _seen(finds, model, photos)
     tracks: list[Track] = []
     if seen is None:
@@ -105,7 +105,7 @@ def _seen(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, 
 
 
 def _track(seen: _PosedFinds, least: int) -> Track | None:
-    """The target whose rays meet; None where too few photos' do."""
+    """The target where the rays meet; None where the rays of too few photos do."""
     found = triangulate(seen.rays, seen.tolerance_px)
     if found is None:
         return None
@@ -122,7 +122,7 @@ def _track(seen: _PosedFinds, least: int) -> Track | None:
 
 
 def _reach(seen: _PosedFinds, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
-    """The least and largest depth that each find's photo lets expect."""
+    """The smallest and largest plausible depth for each detection, by its photo."""
     depths: dict[str, tuple[float, float]] = {}
     for name, number in zip(model.names, model.image_ids, strict=True):
         image = model.reconstruction.images[number]

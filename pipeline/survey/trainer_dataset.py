@@ -1,6 +1,6 @@
 """A run's photos and cameras for other trainers, in the world frame: COLMAP's layout, nerfstudio's `transforms.json`.
 
-Both lie in one folder and share its `images/`: undistorted photos, as this run's training took them.
+Both lie in one folder and share its `images/`: undistorted photos, as used in this run's training.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from splatpipe.pipeline.photos.dataset import IMAGES, MASKS, MODEL, Points, View
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.handover import pose_in_world
 
-SPARSE_PLY = "sparse_pc.ply"  # nerfstudio's name of it
+SPARSE_PLY = "sparse_pc.ply"  # nerfstudio's name for it
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera that looks along −z, y up, from one along z, y down
 
 
@@ -27,9 +27,9 @@ def write_colmap(dataset: Path, frame: Frame, folder: Path) -> None:
     """Write `images/`, `masks/` and `sparse/0`, whose cameras are PINHOLE.
 
     Args:
-        dataset: The folder that `undistort` left.
+        dataset: The folder that `undistort` wrote.
         frame: georef's.
-        folder: Where to.
+        folder: Output folder.
 
     Raises:
         OSError: if it cannot be written.
@@ -48,10 +48,10 @@ def write_transforms(dataset: Path, frame: Frame, held_out: Collection[str], fol
     """Write `images/`, `masks/`, `transforms.json` and the sparse points as `sparse_pc.ply`.
 
     Args:
-        dataset: The folder that `undistort` left.
+        dataset: The folder that `undistort` wrote.
         frame: georef's.
         held_out: Names of the photos that were not trained on.
-        folder: Where to.
+        folder: Output folder.
 
     Raises:
         OSError: if it cannot be written.
@@ -118,7 +118,7 @@ def write_points_ply(path: Path, points: Points, frame: Frame) -> None:
 
 
 def _add_pictures(dataset: Path, folder: Path) -> None:
-    """Photos and masks by hard links where the disk allows: the run's own are never written again."""
+    """Hard-link photos and masks where the disk allows it: the run's own files are never rewritten."""
     for part in (IMAGES, MASKS):
         for source in sorted(path for path in (dataset / part).rglob("*") if path.is_file()):
             target = folder / source.relative_to(dataset)
