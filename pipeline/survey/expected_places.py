@@ -20,11 +20,11 @@ from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.target_finds import WantedTargets
 
 Window = tuple[int, int, int, int]  # left, top, right, bottom; the latter two exclusive
-LEAST_RADIUS_M = 8.0  # consumer receivers are off by several metres together, whatever they state
+LEAST_RADIUS_M = 8.0  # consumer receivers share an error of several metres, whatever they state
 RADIUS_SIGMAS = 4.0
-NEAR_M = 15.0  # around a point, whose sparse points tell the ground's height there
+NEAR_M = 15.0  # radius around a point in which sparse points give the ground's height
 LEAST_NEAR = 5
-WHOLE = 0.6  # of a photo's area: a window that covers more is the photo
+WHOLE = 0.6  # of a photo's area: a larger window becomes the whole photo
 
 
 def expected_windows(

@@ -232,7 +232,7 @@ def _tell_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Re
 
 
 def _tell_directions(fit: PositionFit, report: Reporter) -> None:
-    """Warn about directions that do not come from the positions."""
+    """Warn if the model's orientation comes from other directions than the positions."""
     if fit.contradicted_rad > 0.0:
         report.warning(
             f"The photos' positions would rotate the model by {math.degrees(fit.contradicted_rad):.0f}° against"

@@ -155,7 +155,7 @@ def _told(
     noise: ReceiverNoise,
     prior: DirectionPrior | None,
 ) -> NoisyFit:
-    """The fit with its covariance; noise below what slow errors hide is taken to be that."""
+    """The fit with its covariance, computed with a lower limit on the noise, since slow errors hide part of it."""
     least = LEAST_NOISE_FACTOR if len(points) >= REDUNDANT else 1.0
     cautious = ReceiverNoise(np.maximum(noise.factors, least), noise.correlations, noise.degrees)
     whitened = _whitened(_rows(points, before, similarity, offsets), cautious)[:, :-1]

@@ -127,7 +127,7 @@ def _bar(number: int, cells: Sequence[str], places: Mapping[str, int]) -> ScaleB
 
 
 def scale_by(bars: Sequence[ScaleBar], places: Mapping[str, Float64[np.ndarray, " 3"]]) -> ModelScale | None:
-    """Compute a model's scale from bars; None where no bar has both targets found.
+    """Compute a model's scale from bars; None if no bar has both targets found, or if no bar agrees with the median.
 
     Args:
         bars: With names as in ``places``.

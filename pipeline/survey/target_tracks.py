@@ -16,11 +16,11 @@ from splatpipe.pipeline.survey.target_finds import TargetFind
 
 LEAST_TOLERANCE_PX = 3.0
 FIT_TOLERANCE = 4.0  # times the model's mean reprojection error
-LEAST_UNNAMED = 3  # photos of a target that carries no number: two rays meet by chance
+LEAST_UNNAMED = 3  # photos of a target without a number: two rays can meet by chance
 LEAST_CODED = 2
-MOST_PARTNERS = 40  # of a find, to make hypotheses with
+MOST_PARTNERS = 40  # of a detection that are tried as hypotheses
 MOST_SEEDS = 4000
-BEYOND = 2.0  # how much farther, or nearer, than the sparse points that a photo shows a target may be
+BEYOND = 2.0  # factor by which a target may be farther or nearer than the sparse points in a photo
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _reach(seen: _PosedFinds, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
 def _group(
     seen: _PosedFinds, seed: int, free: Bool[np.ndarray, " n"], reach: Float64[np.ndarray, "n 2"]
 ) -> Bool[np.ndarray, " n"]:
-    """The finds that agree best on what a find shows: its ray meets others', and each meeting has its witnesses."""
+    """The largest set of detections whose rays meet at one point on the seed's ray, by photos, then by mean error."""
     directions, centres = seen.rays.directions(), seen.rays.centres()
     apart = np.array([find.photo != seen.finds[seed].photo for find in seen.finds])
     partners = np.flatnonzero(free & apart)
