@@ -92,7 +92,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
         return ExcludedPhoto(candidate.name, str(error))
     try:
         picture = open_picture(BytesIO(data))
-    except Exception as error:  # Pillow's readers raise almost anything on broken pictures
+    except Exception as error:  # Pillow's readers raise almost anything on broken images
         return ExcludedPhoto(candidate.name, _why_broken(error))
     with picture:
         reason = _refusal(picture, limits)
