@@ -135,7 +135,7 @@ def test_an_upward_import_and_a_stage_that_imports_a_stage_are_noticed(copy: Pat
 
 
 def test_an_option_without_docs_is_noticed(copy: Path) -> None:
-    replace(copy / "pipeline/sfm/options.py", r'^    """Models of fewer photos are dropped."""\n', "")
+    replace(copy / "pipeline/sfm/options.py", r'(^    min_model_size: .*\n)    """[^"]*"""\n', r"\1")
     test = "test_every_option_has_a_help_text"
     told = run(
         ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_config.py", "-k", test],
