@@ -131,7 +131,7 @@ def _train(made: Figures) -> str:
     done, planned = made["iterations"], made.get("planned_iterations")
     said = f"{count(made['gaussians'])} Gaussians after {count(done)}"
     said += f" of {count(planned)} iterations" if planned and planned != done else " iterations"
-    said += "(stopped when the loss was flat)" if made.get("flat_at") else ""
+    said += " (stopped when the loss was flat)" if made.get("flat_at") else ""
     return said + (f", on {made['device']}" if made.get("device") not in (None, "cpu") else "")
 
 
