@@ -20,6 +20,15 @@ CERT_INSIDE = "/etc/index-certificates.pem"  # separate from Debian's own, which
 DOCKERFILE = Path("docker") / "Dockerfile"
 DRIVERS = ("overlay", "vfs")  # the second works everywhere, but copies all files for every layer
 TOOLS = ("buildah", "debootstrap", "runc")
+# Of Debian's packages, the slim images have neither documentation (but licences) nor translations; apt keeps no caches.
+UNWANTED = ("usr/share/doc", "usr/share/info", "usr/share/lintian", "usr/share/locale", "usr/share/man")
+DPKG_SLIM = "".join(f"path-exclude /{folder}/*\n" for folder in UNWANTED) + "path-include /usr/share/doc/*/copyright\n"
+APT_CLEAN = """\
+DPkg::Post-Invoke { "rm -f /var/cache/apt/archives/*.deb /var/cache/apt/*.bin || true"; };
+Dir::Cache::pkgcache "";
+Dir::Cache::srcpkgcache "";
+Acquire::Languages "none";
+"""
 
 
 class Problem(Exception):
@@ -135,11 +144,24 @@ def _make_base(tools: ImageTools, base: str, folder: Path) -> None:
     for leftover in ("var/cache/apt/archives", "var/lib/apt/lists"):
         shutil.rmtree(folder / leftover)
         (folder / leftover / "partial").mkdir(parents=True)
+    _make_slim(folder)
     container = tools.buildah("from", "scratch")
     tools.buildah("add", "-q", container, folder, "/")
     tools.buildah("commit", "-q", container, base)
     tools.buildah("rm", container)
     shutil.rmtree(folder)
+
+
+def _make_slim(folder: Path) -> None:
+    """Leave out of a base, and of packages installed on it later, what Debian's slim images leave out."""
+    (folder / "etc" / "dpkg" / "dpkg.cfg.d" / "slim").write_text(DPKG_SLIM, encoding="utf-8")
+    (folder / "etc" / "apt" / "apt.conf.d" / "clean").write_text(APT_CLEAN, encoding="utf-8")
+    for unwanted in UNWANTED:
+        for path in (folder / unwanted).rglob("*"):
+            if not path.is_dir() and path.name != "copyright":
+                path.unlink()
+    for cache in (folder / "var" / "cache" / "apt").glob("*.bin"):
+        cache.unlink()
 
 
 def _index(work: Path) -> list[object]:
@@ -157,7 +179,7 @@ def _index(work: Path) -> list[object]:
     secret.write_text("[global]\n" + "\n".join(lines) + "\n", encoding="utf-8")
     secret.chmod(0o600)
     arguments: list[object] = ["--secret", f"id=pip,src={secret}"]
-    for place in sorted({place for value in settings.values() for place in _folders(value)}):
+    for place in sorted({place for value in settings.values() for place in _local_paths(value)}):
         arguments += ["-v", f"{place}:{place}:ro"]
     if certificate:
         arguments += ["-v", f"{certificate}:{CERT_INSIDE}:ro", "--build-arg", f"PIP_CERT={CERT_INSIDE}"]
@@ -165,9 +187,9 @@ def _index(work: Path) -> list[object]:
     return arguments
 
 
-def _folders(value: str) -> list[Path]:
-    """Return the local folders that a setting names; for an index, also the folder of its files."""
+def _local_paths(value: str) -> list[Path]:
+    """Return the local folders and files that a setting names; for an index, also the folder of its files."""
     words = value.split()
-    folders = [Path(word) for word in words if word.startswith("/")]
-    folders += [Path(word.removeprefix("file://")).parent for word in words if word.startswith("file:///")]
-    return [folder for folder in folders if folder.is_dir()]
+    paths = [Path(word) for word in words if word.startswith("/")]
+    paths += [Path(word.removeprefix("file://")).parent for word in words if word.startswith("file:///")]
+    return [path for path in paths if path.exists()]
