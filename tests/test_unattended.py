@@ -2,6 +2,7 @@
 
 import json
 import os
+import pkgutil
 import resource
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from splatpipe import pipeline, stages
 from splatpipe.pipeline.app.command_summary import for_the_user
 from splatpipe.pipeline.app.console import RunConsole, say, show_error
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S
@@ -293,3 +295,27 @@ def test_home_is_not_needed(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", "~nobody-of-that-name/x", "out"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
     assert done.returncode == 2 and "no home folder" in done.stderr
+
+
+def test_no_module_needs_a_home_or_a_known_user(tmp_path: Path) -> None:
+    """As for an arbitrary user in a container; libraries search for their caches and settings when imported."""
+    names = [
+        module.name
+        for package in (stages, pipeline)
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        if not module.name.endswith("__main__")
+    ]
+    assert len(names) > 300
+    text = (
+        "import importlib, os, pwd, tempfile\n"
+        "def unknown(uid): raise KeyError(uid)\n"
+        "pwd.getpwuid = unknown\n"
+        f"for name in {names}: importlib.import_module(name)\n"
+        "assert not os.listdir(tempfile.gettempdir()), os.listdir(tempfile.gettempdir())\n"
+    )
+    caches = ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in caches}
+    (tmp_path / "temporary").mkdir()
+    environment |= {"TMPDIR": str(tmp_path / "temporary"), "MPLCONFIGDIR": str(tmp_path / "matplotlib")}
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr

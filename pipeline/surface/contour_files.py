@@ -12,12 +12,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-from ezdxf.filemanagement import new as new_drawing
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.surface.contours import Contours
-from splatpipe.pipeline.surface.drawing_files import the_same_bytes
+from splatpipe.pipeline.surface.dxf import new_document, reproducible
 from splatpipe.pipeline.surface.grid import Grid
 from splatpipe.pipeline.surface.map_crs import MapCrs, unit_name
 from splatpipe.pipeline.surface.whole_file import whole_file
@@ -70,8 +69,8 @@ def write_dxf(path: Path, contours: Contours, crs: MapCrs) -> None:
         contours: In the CRS.
         crs: CRS of the contours.
     """
-    with the_same_bytes():
-        drawing = new_drawing(DXF_VERSION, units=DXF_UNITS.get(unit_name(crs.unit_m), 0))
+    with reproducible():
+        drawing = new_document(DXF_VERSION, units=DXF_UNITS.get(unit_name(crs.unit_m), 0))
         drawing.header["$MEASUREMENT"] = 1
         about = f"every {contours.interval:g}, {crs.described_heights()}; {crs.horizontal.name}"
         for name in (LAYER, INDEX_LAYER):

@@ -9,16 +9,10 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator
-from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 
 import numpy as np
-from ezdxf._options import options
-from ezdxf.document import Drawing as DxfDocument
-from ezdxf.enums import TextEntityAlignment
-from ezdxf.filemanagement import new as new_drawing
 from jaxtyping import UInt8
 from PIL import Image
 
@@ -35,6 +29,7 @@ from splatpipe.pipeline.surface.drawing import (
     Drawing,
     Stroke,
 )
+from splatpipe.pipeline.surface.dxf import DxfDocument, TextEntityAlignment, new_document, reproducible
 from splatpipe.pipeline.surface.whole_file import whole_file, write_whole_text
 
 DXF_VERSION = "R2000"  # the oldest with drawing units and images, so most programs read it
@@ -69,8 +64,8 @@ def write_dxf_drawing(path: Path, drawing: Drawing) -> None:
         OSError: if the disk is full or not writable.
     """
     mm = drawing.scale / 1000.0
-    with the_same_bytes():
-        document = new_drawing(DXF_VERSION, units=METRES)
+    with reproducible():
+        document = new_document(DXF_VERSION, units=METRES)
         document.header["$MEASUREMENT"] = 1
         for name in sorted(_layers_of(drawing)):
             colour, weight, _ = LAYERS[name]
@@ -114,17 +109,6 @@ def _attach_picture(document: DxfDocument, drawing: Drawing) -> None:
     )
     image.transparency = 0.0
     document.set_raster_variables(frame=0, quality=1, units="m")
-
-
-@contextmanager
-def the_same_bytes() -> Iterator[None]:
-    """Make ezdxf write neither dates nor random numbers, by its own options."""
-    before = options.write_fixed_meta_data_for_testing
-    options.write_fixed_meta_data_for_testing = True
-    try:
-        yield
-    finally:
-        options.write_fixed_meta_data_for_testing = before
 
 
 def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "h w 4"] | None, title: str) -> None:
