@@ -1,6 +1,7 @@
 """Shared by all tests: the location of the real photos, and a browser."""
 
 import fcntl
+import importlib.util
 import os
 import shutil
 import signal
@@ -10,10 +11,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import kornia  # noqa: F401
+import pycolmap  # noqa: F401
 import pytest
+import torch  # noqa: F401
+from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
-
-from splatpipe.demo import capture_path
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from patience import PATIENCE_S
@@ -30,6 +33,22 @@ DEMO = (
     "split.every=4",
 )
 WORKER = "PYTEST_XDIST_WORKER"  # set where tests run in several parallel processes
+
+
+def _modules_with_shapes() -> Iterator[str]:
+    """Yield the names of splatpipe's modules whose annotations give the shapes of arrays."""
+    namespace = importlib.util.find_spec("splatpipe")
+    assert namespace is not None and namespace.submodule_search_locations is not None, "splatpipe is not installed"
+    for folder in (child for place in namespace.submodule_search_locations for child in Path(place).iterdir()):
+        for path in folder.rglob("*.py"):
+            if b"jaxtyping" in path.read_bytes():
+                inside = path.relative_to(folder).with_suffix("").parts
+                yield ".".join(["splatpipe", folder.name, *(part for part in inside if part != "__init__")])
+
+
+# Tests check these annotations. All other modules are left to mypy: to instrument them, too, doubles the import time.
+# Libraries are imported before: from within an instrumented module, they would be compiled again.
+install_import_hook(list(_modules_with_shapes()), "beartype.beartype")
 
 
 def pytest_configure() -> None:
@@ -81,6 +100,8 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the whole demo capture with its control, at 0.1 megapixels: 26 dB. To be read only."""
+    from splatpipe.demo import capture_path
+
     out = shared_folder(tmp_path_factory) / "demo_run"
     sets = [part for text in DEMO for part in ("--set", text)]
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *sets]
