@@ -15,7 +15,7 @@ from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, Sparse
 from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, FacadesConfig, MeshConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
-from splatpipe.pipeline.train.options import GONE as GONE_OF_TRAIN
+from splatpipe.pipeline.train.options import REMOVED_OPTIONS as REMOVED_TRAIN_OPTIONS
 from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
 
@@ -23,19 +23,19 @@ from splatpipe.pipeline.web.options import ExportConfig
 class LineConfig(StageConfig):
     """Everything that affects the results, one section per stage."""
 
-    renamed: ClassVar[Mapping[str, str]] = {
+    renamed_options: ClassVar[Mapping[str, str]] = {
         "evaluate.every": "split.every",
         "evaluate.views": "split.views",
         "train.spread_weight": "train.distortion_weight",
     }
-    replaced: ClassVar[Mapping[str, Mapping[str, str | bool]]] = {
+    replaced_values: ClassVar[Mapping[str, Mapping[str, str | bool]]] = {
         "initialize.dense": {"off": False, "sweep": True},
         "train.density": {"error": "absolute", "mcmc": "absolute"},
         "train.exposure": {"bilateral": "affine"},
     }
-    gone: ClassVar[Mapping[str, str]] = {
-        **{old: f"It is now called {new}." for old, new in renamed.items()},
-        **{f"train.{name}": hint for name, hint in GONE_OF_TRAIN.items()},
+    removed_options: ClassVar[Mapping[str, str]] = {
+        **{old: f"It is now called {new}." for old, new in renamed_options.items()},
+        **{f"train.{name}": hint for name, hint in REMOVED_TRAIN_OPTIONS.items()},
         "initialize.dense_points": "At most 50,000 points are added.",
     }
 

@@ -329,9 +329,9 @@ def test_two_makers_of_one_block_are_refused_and_of_two_are_not(
 ) -> None:
     monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
     with locked_shard(undisturbed, "train.2"):
-        with pytest.raises(UsageError, match=r"is making train\.2 in"):
+        with pytest.raises(UsageError, match=r"is running train\.2 in"):
             block_line.make(scene, undisturbed, OPTIONS, "train.2")
-        with pytest.raises(UsageError, match=r"is making train\.2 in|is working in"):
+        with pytest.raises(UsageError, match=r"is running train\.2 in|is working in"):
             block_line.make(scene, undisturbed, OPTIONS)
         assert block_line.make(scene, undisturbed, OPTIONS, "train.1").ran == []  # it is there
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from splatpipe.pipeline.app.cli_runs import overrides, with_budgets
 from splatpipe.pipeline.engine.config import (
+    current_options,
     dump,
-    known,
     load_file,
     load_preset,
     option_help,
@@ -83,8 +83,8 @@ def test_the_line_is_whole() -> None:
         ({"train": {"iterations": -5}}, "train.iterations = -5"),
         ({"train": {"iterations": "many"}}, "train.iterations = 'many'"),
         ({"train": 5}, "train = 5"),
-        ({"evaluate": {"every": 4}}, "no option evaluate.every any more. It is now called split.every."),
-        ({"evaluate": {"views": "a"}}, "no option evaluate.views any more. It is now called split.views."),
+        ({"evaluate": {"every": 4}}, "The option evaluate.every no longer exists. It is now called split.every."),
+        ({"evaluate": {"views": "a"}}, "The option evaluate.views no longer exists. It is now called split.views."),
         ({"features": {"extractor": "aliked"}}, "features.extractor = 'aliked'"),
     ],
 )
@@ -99,14 +99,14 @@ def test_a_configuration_of_another_version_is_told_each_reason_once() -> None:
     with pytest.raises(UsageError) as caught:
         resolve(LineConfig, [old])
     told = caught.value.message
-    assert "There are no options train.lr_means, train.lr_sh any more. This is now set by constants" in told
-    assert "There is no option train.sh_limit any more. This was removed" in told
-    assert "train.spread_weight any more. It is now called train.distortion_weight." in told
-    assert told.count("any more") == 3
+    assert "The options train.lr_means, train.lr_sh no longer exist. This is now set by constants" in told
+    assert "The option train.sh_limit no longer exists. This was removed" in told
+    assert "train.spread_weight no longer exists. It is now called train.distortion_weight." in told
+    assert told.count("no longer exist") == 3
 
 
-def test_no_option_is_said_to_be_gone_that_is_there() -> None:
-    assert not set(LineConfig.gone) & set(option_names(LineConfig))
+def test_no_existing_option_is_reported_as_removed() -> None:
+    assert not set(LineConfig.removed_options) & set(option_names(LineConfig))
 
 
 @pytest.mark.parametrize("text", ["train", "train=5", "=5", ".=5", "train.=5", "", "iterations=5"])
@@ -147,7 +147,7 @@ def test_an_older_outs_options_are_taken_by_their_new_names_and_values() -> None
         "nothing": {"of": 1},
     }
     before = copy.deepcopy(table)
-    config = resolve(LineConfig, [known(LineConfig, table)])
+    config = resolve(LineConfig, [current_options(LineConfig, table)])
     assert (config.split.every, config.split.views) == (5, "a.jpg")
     assert (config.train.iterations, config.train.distortion_weight) == (900, 0.05)
     assert (config.train.density, config.train.exposure) == ("absolute", "affine")
@@ -162,7 +162,7 @@ def test_a_value_that_is_gone_is_refused_with_the_one_to_write() -> None:
 
 def test_a_wrong_value_in_an_out_is_refused_by_name() -> None:
     with pytest.raises(UsageError, match=r"train\.iterations = '7000'"):
-        resolve(LineConfig, [known(LineConfig, {"train": {"iterations": "7000"}})])
+        resolve(LineConfig, [current_options(LineConfig, {"train": {"iterations": "7000"}})])
 
 
 def test_an_unknown_preset_is_refused() -> None:

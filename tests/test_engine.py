@@ -175,7 +175,7 @@ def test_one_stage_alone(numbers: Path, out: Path) -> None:
 def test_one_stage_alone_needs_what_it_reads(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out), until="read")
     with (
-        pytest.raises(UsageError, match="reads what add leaves"),
+        pytest.raises(UsageError, match="needs the output of add"),
         open_session(request_of(numbers, out), lambda event: None) as runner,
     ):
         runner.run_alone("count")
@@ -521,8 +521,8 @@ def test_deliverables_are_files_that_are_there_and_that_a_stage_left(numbers: Pa
 
 def test_folder_is_at_work_as_long_as_a_session_is_open(numbers: Path, out: Path) -> None:
     with open_session(request_of(numbers, out), lambda event: None):
-        assert open_run_folder(out, arithmetic.LINE).at_work
-    assert not open_run_folder(out, arithmetic.LINE).at_work
+        assert open_run_folder(out, arithmetic.LINE).is_running
+    assert not open_run_folder(out, arithmetic.LINE).is_running
 
 
 def test_the_log_thins_the_progress_of_a_thing_and_keeps_what_begins(tmp_path: Path) -> None:

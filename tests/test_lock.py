@@ -18,7 +18,7 @@ import pytest
 
 from splatpipe.pipeline.engine import lock as engine_lock
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
-from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_shard, shards_being_made
+from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_shard, running_shards
 from splatpipe.pipeline.engine.machine import Mount
 
 ELSEWHERE = {"process": 4711, "host": "node7", "boot": "another", "turn": "first"}
@@ -39,7 +39,7 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(engine_lock, "PATIENCE_S", 0.2)
     monkeypatch.setattr(engine_lock, "SILENCE_S", 1.5)
     monkeypatch.setattr(engine_lock, "BEAT_S", 0.1)
-    monkeypatch.setattr(engine_lock, "LOOK_S", 0.02)
+    monkeypatch.setattr(engine_lock, "POLL_S", 0.02)
     (tmp_path / "stages").mkdir()
     return tmp_path
 
@@ -90,20 +90,20 @@ def test_a_second_one_is_refused_and_a_killed_one_is_no_hindrance(out: Path) -> 
         process.wait()
         assert (out / "stages" / LOCK_FILE).read_text()  # still signed
         told: list[str] = []
-        with locked(out, tell=told.append):
+        with locked(out, notify=told.append):
             assert told == []  # the kernel knows that it is dead: nothing to look for
 
 
 def test_who_waits_is_told_whom_for_and_goes_on_when_that_one_ends(out: Path) -> None:
     told: list[str] = []
 
-    def tell(text: str) -> None:
+    def notify(text: str) -> None:
         told.append(text)
         assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()
 
-    with holder(out) as process, locked(out, wait=True, tell=tell):
+    with holder(out) as process, locked(out, wait=True, notify=notify):
         assert process.wait(PATIENCE_S) == 0
     assert len(told) == 1 and f"process {process.pid}" in told[0]
 
@@ -140,14 +140,14 @@ def test_of_two_signatures_over_each_other_the_last_one_is_read(out: Path) -> No
     path.write_bytes(longer)
     with path.open("r+b") as file:
         file.write(own)
-    assert is_locked(out) is False and engine_lock._signed(path) is not None
+    assert is_locked(out) is False and engine_lock._read_signature(path) is not None
 
 
 def test_another_machine_that_died_is_outlasted(out: Path) -> None:
     (out / "stages" / LOCK_FILE).write_text(json.dumps(ELSEWHERE))
     told: list[str] = []
     began_s = time.monotonic()
-    with locked(out, tell=told.append):
+    with locked(out, notify=told.append):
         assert time.monotonic() - began_s >= engine_lock.SILENCE_S
     assert len(told) == 1 and "process 4711 on node7" in told[0]
 
@@ -156,12 +156,12 @@ def test_another_machine_at_work_is_waited_for(out: Path) -> None:
     told: list[str] = []
     with at_work_elsewhere(out) as over:
 
-        def tell(text: str) -> None:
+        def notify(text: str) -> None:
             told.append(text)
             if "waiting" in text:
                 over.set()
 
-        with locked(out, wait=True, tell=tell):
+        with locked(out, wait=True, notify=notify):
             assert "waiting" in told[-1]
 
 
@@ -170,7 +170,7 @@ def test_a_lock_that_is_given_back_elsewhere_is_taken_at_once(out: Path, monkeyp
     path = out / "stages" / LOCK_FILE
     path.write_text(json.dumps(ELSEWHERE))
     began_s = time.monotonic()
-    with locked(out, tell=lambda _: path.write_text("")):
+    with locked(out, notify=lambda _: path.write_text("")):
         assert time.monotonic() - began_s < PATIENCE_S
 
 
@@ -217,7 +217,7 @@ def test_two_that_sign_at_once_do_not_both_work(out: Path, monkeypatch: pytest.M
 def test_what_is_no_signature_holds_nobody_up(out: Path, left: str) -> None:
     (out / "stages" / LOCK_FILE).write_text(left, encoding="latin-1")
     assert not is_locked(out)
-    with locked(out, tell=pytest.fail):
+    with locked(out, notify=pytest.fail):
         assert is_locked(out)
 
 
@@ -232,9 +232,9 @@ def test_a_link_in_the_locks_place_is_not_followed(out: Path, tmp_path: Path) ->
 def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> None:
     with locked_shard(out, "train.1"), locked_shard(out, "train.2"):
         assert is_locked(out, "train.1") and not is_locked(out, "train.3") and not is_locked(out)
-        assert shards_being_made(out) == ["train.1", "train.2"]
+        assert running_shards(out) == ["train.1", "train.2"]
         with (
-            pytest.raises(UsageError, match=f"process {os.getpid()}\\) is making train.1 in"),
+            pytest.raises(UsageError, match=f"process {os.getpid()}\\) is running train.1 in"),
             locked_shard(out, "train.1"),
         ):
             pass
@@ -243,26 +243,26 @@ def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> N
     with locked(out), pytest.raises(UsageError, match="is working in"), locked_shard(out, "train.1"):
         pass
     assert all(path.read_bytes() == b"" for path in (out / "stages").glob(f"{LOCK_FILE}*"))
-    assert shards_being_made(out) == []
+    assert running_shards(out) == []
 
 
 def test_a_shard_made_on_another_machine_shuts_out_who_wants_it_or_all(out: Path) -> None:
     """On a file system where that machine's locks are invisible."""
     name = f"{LOCK_FILE}.train.1"
     with at_work_elsewhere(out, name) as over:
-        with pytest.raises(UsageError, match=r"node7.* is making train.1"), locked_shard(out, "train.1"):
+        with pytest.raises(UsageError, match=r"node7.* is running train.1"), locked_shard(out, "train.1"):
             pass
         with locked_shard(out, "train.2"):
             pass
-        with pytest.raises(UsageError, match=r"node7.* is making train.1"), locked(out):
+        with pytest.raises(UsageError, match=r"node7.* is running train.1"), locked(out):
             pass
         assert not is_locked(out)
 
-        def tell(text: str) -> None:
+        def notify(text: str) -> None:
             if "waiting" in text:
                 over.set()
 
-        with locked(out, wait=True, tell=tell):
+        with locked(out, wait=True, notify=notify):
             assert over.is_set() and (out / "stages" / name).read_bytes() == b""  # who died there holds up nobody else
 
 
@@ -270,7 +270,7 @@ def test_no_shard_is_made_while_another_machine_has_all(out: Path) -> None:
     with at_work_elsewhere(out) as over:
         with pytest.raises(UsageError, match=r"node7.* is working in"), locked_shard(out, "train.1"):
             pass
-        with locked_shard(out, "train.1", wait=True, tell=lambda text: over.set() if "waiting" in text else None):
+        with locked_shard(out, "train.1", wait=True, notify=lambda text: over.set() if "waiting" in text else None):
             assert over.is_set()
 
 
@@ -278,14 +278,14 @@ def test_of_a_shard_and_a_run_elsewhere_that_sign_at_once_the_shard_gives_way(
     out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The run signs after the look at its file and before the shard's own signature can be seen there."""
-    take = engine_lock._take
+    take = engine_lock._lock_and_sign
 
     def overtaken(path: Path, *how: object, **more: bool) -> object:
         signed = take(path, *how, **more)  # type: ignore[arg-type]
         (out / "stages" / LOCK_FILE).write_text(json.dumps(ELSEWHERE))
         return signed
 
-    monkeypatch.setattr(engine_lock, "_take", overtaken)
+    monkeypatch.setattr(engine_lock, "_lock_and_sign", overtaken)
     with pytest.raises(UsageError, match=r"node7.* is working in"), locked_shard(out, "train.1"):
         pass
     assert (out / "stages" / f"{LOCK_FILE}.train.1").read_bytes() == b""

@@ -129,7 +129,12 @@ def make_large(path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("make", "message"),
-    [(Path.exists, "is not there"), (Path.mkdir, "is a folder"), (os.mkfifo, "is no file"), (make_large, "too large")],
+    [
+        (Path.exists, "is not there"),
+        (Path.mkdir, "is a folder"),
+        (os.mkfifo, "not a regular file"),
+        (make_large, "too large"),
+    ],
 )
 def test_a_named_file_that_cannot_be_one_is_named(
     folder: Path, tmp_path: Path, make: Callable[[Path], object], message: str

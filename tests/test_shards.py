@@ -172,12 +172,12 @@ def test_two_writers_of_one_artifact_are_refused_and_of_two_are_not(
         assert process.stdout is not None
         process.stdout.readline()
         request = request_of(numbers, out, **slow)
-        with pytest.raises(UsageError, match=f"process {process.pid}\\) is making sum.2 in"):
+        with pytest.raises(UsageError, match=f"process {process.pid}\\) is running sum.2 in"):
             make_shard(request, 2)
         with pytest.raises(UsageError, match=f"process {process.pid}\\) is working in"):
             walk(request)
         assert is_locked(out, "sum.2") and not is_locked(out, "sum.1") and not is_locked(out)
-        assert statuses(request)["sum.2"].reason == "is being made"
+        assert statuses(request)["sum.2"].reason == "is running"
         assert make_shard(request, 1).ran == ["sum.1"]
         with alone(numbers, out, "sum.2", "--wait", **slow) as waiting:
             _, said = waiting.communicate()
@@ -199,7 +199,7 @@ def test_no_shard_is_made_beside_a_run_that_has_the_folder_to_itself(
 
 def test_a_shard_needs_what_its_stage_reads_and_a_number_that_there_is(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out), until="read")
-    with pytest.raises(UsageError, match="reads what divide leaves"):
+    with pytest.raises(UsageError, match="needs the output of divide"):
         make_shard(request_of(numbers, out), 1)
     walk(request_of(numbers, out), until="divide")
     with pytest.raises(UsageError, match="has no shard 4: it has 3 here"):
@@ -235,7 +235,7 @@ def test_clean_keeps_the_shards_that_are_asked_for(numbers: Path, out: Path) -> 
     walk(request, until="divide")
     make_shard(request, 2)
     line, store = status_of(request)
-    removed, _ = store.remove_stale(wanted for status in line_status(line, store) for wanted in status.wanted)
+    removed, _ = store.remove_stale(entry for status in line_status(line, store) for entry in status.to_keep)
     assert removed == 1 + 6 + 1 + 1  # the other division, its shards, what they were joined to, what that showed
     assert walk(request)[0].ran == ["sum.1", "sum.3", "sum", "show"]
 
@@ -261,10 +261,10 @@ def test_without_shards_the_stage_does_all_itself_and_a_part_that_counts_none_is
 
 
 def test_manifests_say_what_shards_took_and_were_thought_to_take(numbers: Path, out: Path) -> None:
-    def foresee(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
+    def forecast_needs(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
         return {"sum": Need(300, 9.0, 600), "sum.3": Need(100, 1.0, 10)}
 
-    outcome, _ = walk(replace(request_of(numbers, out, sum={"step_s": 0.05}), foresee=foresee))
+    outcome, _ = walk(replace(request_of(numbers, out, sum={"step_s": 0.05}), forecast_needs=forecast_needs))
     manifests = {name: artifact.manifest for name, artifact in outcome.artifacts.items()}
     assert manifests["sum.1"]["forecast"] == Need(300, 3.0, 200).as_json()
     assert manifests["sum.3"]["forecast"] == Need(100, 1.0, 10).as_json()

@@ -363,8 +363,8 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
 
     with CommandSummary(out, as_json) as done:
         line, store = status_of(existing(out))
-        with locked(store.out, tell=say):
-            keep = [wanted for status in line_status(line, store) for wanted in status.wanted]
+        with locked(store.out, notify=say):
+            keep = [entry for status in line_status(line, store) for entry in status.to_keep]
             removed, freed = store.remove_stale(keep)
         done.details = {"removed": removed, "freed_bytes": freed}
         say(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")

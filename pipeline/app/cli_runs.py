@@ -90,8 +90,8 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     if os.environ.get("SPLATPIPE_ISA"):  # an invalid one is reported now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s)
-    foresee = Forecaster(config, machine.threads)
-    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, foresee)
+    forecast_needs = Forecaster(config, machine.threads)
+    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, forecast_needs)
 
 
 def spent_s() -> float:

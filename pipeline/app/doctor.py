@@ -8,7 +8,7 @@ import platform
 import shutil
 from pathlib import Path
 
-from splatpipe.pipeline.engine.lock import is_locked, shards_being_made
+from splatpipe.pipeline.engine.lock import is_locked, running_shards
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes, mount_of
 from splatpipe.pipeline.engine.runner import versions
 from splatpipe.pipeline.engine.stage import JSON
@@ -75,7 +75,7 @@ def _file_system(place: Path) -> str:
 def _at_work(place: Path) -> str:
     if is_locked(place):
         return "a run"
-    return ", ".join(shards_being_made(place)) or "nobody"
+    return ", ".join(running_shards(place)) or "nobody"
 
 
 def _memory() -> str:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from splatpipe.pipeline.engine.errors import StageError
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
-LOOK_S = 0.2
+POLL_S = 0.2
 CHILDREN_MEMORY = "children_peak_memory_bytes"  # the metric with which a body reports its children's memory
 # Each child uses one core: thread pools of the numeric libraries would only compete with each other.
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -33,24 +33,24 @@ def die_with_parent(parent: int) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     else:
-        threading.Thread(target=_outlive_nobody, args=(parent,), daemon=True).start()
+        threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     if os.getppid() != parent:
         os._exit(1)
 
 
-def _outlive_nobody(parent: int) -> None:
+def _exit_with_parent(parent: int) -> None:
     while os.getppid() == parent:
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
     os._exit(1)
 
 
-def run_children(commands: Sequence[Sequence[str]], look: Callable[[], None], what: str) -> int:
+def run_children(commands: Sequence[Sequence[str]], poll: Callable[[], None], what: str) -> int:
     """Run commands in parallel to completion, one core each.
 
     Args:
         commands: ``module, *arguments`` each; the module gets our process ID as its first argument, for
             ``die_with_parent``.
-        look: Called a few times a second.
+        poll: Called a few times a second.
         what: What they are doing, for the message if one fails.
 
     Returns:
@@ -67,7 +67,7 @@ def run_children(commands: Sequence[Sequence[str]], look: Callable[[], None], wh
             child = subprocess.Popen(command, stdin=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD})
             running[child.pid] = child
         while running:
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
             for pid in list(running):
                 ended, status, usage = os.wait4(pid, os.WNOHANG)
                 if ended:
@@ -75,7 +75,7 @@ def run_children(commands: Sequence[Sequence[str]], look: Callable[[], None], wh
                     child.returncode = os.waitstatus_to_exitcode(status)
                     peak += usage.ru_maxrss * MAXRSS_BYTES
                     _check(child.returncode, what)
-            look()
+            poll()
     finally:
         for child in running.values():
             child.kill()

@@ -60,32 +60,32 @@ def load_file(path: Path) -> Table:
         ) from error
 
 
-def known(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
-    """An OUT's options under this version's names: those that another version named differently are converted.
+def current_options(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
+    """Convert an OUT's options to this version's names and values.
 
     Unknown options, e.g. those of a newer version, are dropped. Invalid values are kept, to be rejected later.
     """
-    taken: Table = copy.deepcopy(dict(table))
-    for old, new in getattr(model, "renamed", {}).items():
+    converted: Table = copy.deepcopy(dict(table))
+    for old, new in getattr(model, "renamed_options", {}).items():
         section, option = old.split(".")
-        if option in taken.get(section, {}):
-            taken = merge([_nested(new.split("."), taken[section].pop(option)), taken])
-    for dotted, values in getattr(model, "replaced", {}).items():
+        if option in converted.get(section, {}):
+            converted = merge([_nested(new.split("."), converted[section].pop(option)), converted])
+    for dotted, values in getattr(model, "replaced_values", {}).items():
         section, option = dotted.split(".")
-        value = taken.get(section, {}).get(option)
+        value = converted.get(section, {}).get(option)
         if isinstance(value, str) and value in values:
-            taken[section][option] = values[value]
-    return _named(model, taken)
+            converted[section][option] = values[value]
+    return _existing_options(model, converted)
 
 
-def _named(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
+def _existing_options(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
     """The entries of a table that the model has."""
     result: Table = {}
     for name, value in table.items():
         if name in model.model_fields:
             section = model.model_fields[name].annotation
             nested = isinstance(section, type) and issubclass(section, BaseModel) and isinstance(value, Mapping)
-            result[name] = _named(section, value) if nested else value  # type: ignore[arg-type]
+            result[name] = _existing_options(section, value) if nested else value  # type: ignore[arg-type]
     return result
 
 
@@ -152,25 +152,25 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
     try:
         return model.model_validate(merge(layers))
     except ValidationError as error:
-        gone: Mapping[str, str] = getattr(model, "gone", {})
-        replaced: Mapping[str, Mapping[str, JSON]] = getattr(model, "replaced", {})
+        removed: Mapping[str, str] = getattr(model, "removed_options", {})
+        replaced: Mapping[str, Mapping[str, JSON]] = getattr(model, "replaced_values", {})
         by_hint: dict[str, list[str]] = {}
         problems = []
-        for problem in _one_an_option(model, error):
+        for problem in _merged_by_option(model, error):
             dotted = ".".join(str(key) for key in problem["loc"])
-            if problem["type"] == "extra_forbidden" and dotted in gone:
-                by_hint.setdefault(gone[dotted], []).append(dotted)
+            if problem["type"] == "extra_forbidden" and dotted in removed:
+                by_hint.setdefault(removed[dotted], []).append(dotted)
             elif isinstance(problem["input"], str) and problem["input"] in (now := replaced.get(dotted, {})):
                 problems.append(
                     f"{dotted} = {problem['input']!r} no longer exists; write {json.dumps(now[problem['input']])}."
                 )
             else:
                 problems.append(_describe(model, dotted, problem["type"], problem["msg"], problem["input"]))
-        problems += [_gone(names, hint) for hint, names in by_hint.items()]
+        problems += [_removed_message(names, hint) for hint, names in by_hint.items()]
         raise UsageError(" ".join(problems), hint="`splatpipe options` lists every option with its default.") from error
 
 
-def _one_an_option(model: type[BaseModel], error: ValidationError) -> Iterable[dict[str, JSON]]:
+def _merged_by_option(model: type[BaseModel], error: ValidationError) -> Iterable[dict[str, JSON]]:
     """The problems, with those of an option that accepts several types merged into one."""
     known, found = set(option_names(model)), dict[tuple[JSON, ...], dict[str, JSON]]()
     for problem in error.errors():
@@ -181,15 +181,16 @@ def _one_an_option(model: type[BaseModel], error: ValidationError) -> Iterable[d
             place = place[:-1]
         before = found.get(place)
         message = problem["msg"]
-        told = message if before is None else f"{before['msg']}, or {message[0].lower()}{message[1:]}"
-        found[place] = {**problem, "loc": place, "msg": told}
+        text = message if before is None else f"{before['msg']}, or {message[0].lower()}{message[1:]}"
+        found[place] = {**problem, "loc": place, "msg": text}
     return found.values()
 
 
-def _gone(names: Sequence[str], hint: str) -> str:
+def _removed_message(names: Sequence[str], hint: str) -> str:
     """The message for removed options; an old configuration may name many that were removed for the same reason."""
-    told = f"is no option {names[0]}" if len(names) == 1 else f"are no options {', '.join(names)}"
-    return f"There {told} any more. {hint}"
+    if len(names) == 1:
+        return f"The option {names[0]} no longer exists. {hint}"
+    return f"The options {', '.join(names)} no longer exist. {hint}"
 
 
 def _describe(model: type[BaseModel], dotted: str, kind: str, message: str, value: JSON) -> str:

@@ -59,9 +59,9 @@ Sink = Callable[[Event], None]
 def parse_event(line: bytes) -> Event | None:
     """Parse a line of ``events.jsonl``; None if it is not a valid event, since the log is not trusted."""
     try:
-        told = json.loads(line)
-        if told["kind"] in get_args(Kind) and isinstance(told["data"], dict):
-            return Event(told["kind"], str(told["stage"]), told["data"], float(told["time_s"]))
+        record = json.loads(line)
+        if record["kind"] in get_args(Kind) and isinstance(record["data"], dict):
+            return Event(record["kind"], str(record["stage"]), record["data"], float(record["time_s"]))
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         pass
     return None

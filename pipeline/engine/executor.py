@@ -49,7 +49,7 @@ class Executor:
         Raises:
             SplatpipeError: what the body raised, or a StageError if the worker died.
         """
-        process = self._started()
+        process = self._running_worker()
         assert process.stdin is not None and process.stdout is not None
         with contextlib.suppress(BrokenPipeError):  # a worker that died on startup is explained below
             process.stdin.write(json.dumps({"task": asdict(task)}) + "\n")
@@ -109,13 +109,13 @@ class Executor:
             process.wait()
         _close(process)
 
-    def _started(self) -> subprocess.Popen[str]:
+    def _running_worker(self) -> subprocess.Popen[str]:
         if self._process is None:
             with self._log.open("a", encoding="utf-8") as log:
-                self._process = self._begun(log)
+                self._process = self._spawn(log)
         return self._process
 
-    def _begun(self, log: IO[str]) -> subprocess.Popen[str]:
+    def _spawn(self, log: IO[str]) -> subprocess.Popen[str]:
         try:
             return subprocess.Popen(
                 [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())],

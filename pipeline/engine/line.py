@@ -79,26 +79,26 @@ class Line:
         Raises:
             StageError: if the part that should give their number does not.
         """
-        pieces = self.pieces_of(stage, parts)
+        pieces = self.shard_stages(stage, parts)
         inputs = self.inputs_of(stage, parts)
         return [
             Job(piece, replace(inputs, stage=piece.name), Shard(number, len(pieces)))
             for number, piece in enumerate(pieces, 1)
         ]
 
-    def pieces_of(self, stage: Stage, parts: Mapping[str, Part]) -> list[Stage]:
-        """The stages that run each shard; empty as long as the part that gives their number is missing.
+    def shard_stages(self, stage: Stage, parts: Mapping[str, Part]) -> list[Stage]:
+        """The stages that run each shard; empty while the part that gives their number is missing.
 
         Raises:
             StageError: if that part does not give their number.
         """
         if stage.shards is None or stage.shards.counted_by not in parts:
             return []
-        count = _counted(parts[stage.shards.counted_by].path, stage.name)
+        count = _shard_count(parts[stage.shards.counted_by].path, stage.name)
         return [stage.shard(number) for number in range(1, count + 1)]
 
 
-def _counted(path: Path, stage: str) -> int:
+def _shard_count(path: Path, stage: str) -> int:
     try:
         count = json.loads(path.read_text(encoding="utf-8"))["shards"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -131,7 +131,7 @@ class StageStatus:
     shards: tuple[StageStatus, ...] = ()
 
     @property
-    def wanted(self) -> list[tuple[str, str]]:
+    def to_keep(self) -> list[tuple[str, str]]:
         """Names and keys of the artifacts to keep: the stage's own and its shards'."""
         return [(self.stage.name, self.key), *((shard.stage.name, shard.key) for shard in self.shards)]
 
@@ -144,7 +144,7 @@ def line_status(line: Line, store: Store) -> Iterator[StageStatus]:
         if missing:
             behind = sorted(set(map(stage_name, missing)))
             reason = f"waits for {', '.join(behind)}"
-            waiting = tuple(StageStatus(piece, "waiting", reason=reason) for piece in line.pieces_of(stage, parts))
+            waiting = tuple(StageStatus(piece, "waiting", reason=reason) for piece in line.shard_stages(stage, parts))
             yield StageStatus(stage, "waiting", reason=reason, shards=waiting)
             continue
         shards = tuple(_status(job, store) for job in line.shards_of(stage, parts))
@@ -161,7 +161,7 @@ def _status(job: Job, store: Store) -> StageStatus:
         return StageStatus(stage, "valid", key, artifact=artifact)
     earlier = store.artifacts(stage.name)
     if job.shard is not None and is_locked(store.out, stage.name):
-        return StageStatus(stage, "missing", key, "is being made")
+        return StageStatus(stage, "missing", key, "is running")
     return StageStatus(stage, "stale" if earlier else "missing", key, explain(job.inputs, earlier))
 
 

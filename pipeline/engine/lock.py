@@ -1,8 +1,8 @@
 """Locks an OUT: one splatpipe at a time works in it, whatever file system it is on.
 
-On one machine the kernel's lock decides (``flock``): it ends with the last process that holds it, however that dies.
-Other machines see it only where the file system propagates it (NFS does, as a lock on the file's bytes; not with
-``nolock``, nor 9p, nor most FUSE file systems). So the holder also signs the file with its machine's boot ID and
+On one machine the kernel's lock decides (``flock``): it ends with the last process that holds it, even a killed one.
+Other machines see it only where the file system propagates it (NFS does, as a lock on the file's bytes, unless mounted
+with ``nolock``; 9p and most FUSE file systems do not). So the holder also signs the file with its machine's boot ID and
 touches it every few seconds: a signature from another boot counts as long as it is touched. No two machines' clocks
 are compared.
 
@@ -34,14 +34,18 @@ PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
 BEAT_S = 4.0  # between touches; rare enough not to burden a server
 SILENCE_S = 20.0  # without a touch: five missed ones cannot be explained by a busy disk
 SETTLE_S = 1.0  # time for two machines that sign at once to see which was last
-LOOK_S = 0.25
+POLL_S = 0.25
 FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 LONGEST = 4096  # bytes read of a signature
 WIDTH = 1024  # bytes to which signatures are padded: of two written over each other, the last is intact
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in all containers of a machine
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
+
+
+def _no_message(_text: str) -> None:
+    """Discard a message."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +67,11 @@ class Holder:
     @staticmethod
     def here() -> Holder:
         """A new holder for this process."""
-        return Holder(os.getpid(), socket.gethostname(), _boot(), secrets.token_hex(8))
+        return Holder(os.getpid(), socket.gethostname(), _boot_id(), secrets.token_hex(8))
 
     @property
     def is_elsewhere(self) -> bool:
-        return self.boot != _boot()
+        return self.boot != _boot_id()
 
     def __str__(self) -> str:
         return f"process {self.process}" + (f" on {self.host}" if self.is_elsewhere else "")
@@ -110,9 +114,9 @@ class Hold:
     def close(self) -> None:
         """Remove the signature and release the lock."""
         self._over.set()
-        self._thread.join(LOOK_S)  # it may hang if a server does
+        self._thread.join(POLL_S)  # it may hang if a server does
         with suppress(OSError):  # a missing disk must not block the exit
-            if not self._taker and _signed(self._path) == self._holder:
+            if not self._taker and _read_signature(self._path) == self._holder:
                 os.ftruncate(self.descriptors[0], 0)
         for descriptor in self.descriptors:
             os.close(descriptor)
@@ -120,7 +124,7 @@ class Hold:
     def _beat(self) -> None:
         while not self._over.wait(BEAT_S):
             with suppress(OSError):
-                found = _signed(self._path)
+                found = _read_signature(self._path)
                 if found != self._holder and (found is not None or self._path.stat().st_size == 0):
                     self._taker = str(found or "unknown")  # replacing a silent shard removes its signature
                     return
@@ -128,14 +132,14 @@ class Hold:
 
 
 @contextmanager
-def locked(out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell = lambda _text: None) -> Iterator[Hold]:
+def locked(out: Path, *, folder: str = "stages", wait: bool = False, notify: Notify = _no_message) -> Iterator[Hold]:
     """Lock an OUT for writing.
 
     Args:
         out: Its folder.
         folder: Our folder in it that contains the lock file.
         wait: Wait for another splatpipe that works in it.
-        tell: Called with a message that names the process waited for.
+        notify: Called with a message that names the process being waited for.
 
     Yields:
         The hold.
@@ -145,44 +149,44 @@ def locked(out: Path, *, folder: str = "stages", wait: bool = False, tell: Tell 
         MachineError: if its file system has no locks, or cannot be written.
     """
     path = out / folder / LOCK_FILE
-    hold = _acquired(path, tell, wait=wait)
+    hold = _acquire(path, notify, wait=wait)
     try:
         for shard in sorted(path.parent.glob(f"{LOCK_FILE}.*")):
-            if _signed(shard) is not None:  # of a killed process, or of a machine that does not see our lock
-                _acquired(shard, tell, wait=wait).close()
+            if _read_signature(shard) is not None:  # of a killed process, or of a machine that does not see our lock
+                _acquire(shard, notify, wait=wait).close()
         yield hold
     finally:
         hold.close()
 
 
 @contextmanager
-def locked_shard(out: Path, shard: str, *, wait: bool = False, tell: Tell = lambda _text: None) -> Iterator[Hold]:
+def locked_shard(out: Path, shard: str, *, wait: bool = False, notify: Notify = _no_message) -> Iterator[Hold]:
     """Lock one shard of an OUT for writing, and share the OUT with other shards only.
 
     Args:
         out: Its folder.
         shard: By name, e.g. ``train.2``.
         wait: Wait for another process that runs the shard or has the OUT to itself.
-        tell: Called with a message that names the process waited for.
+        notify: Called with a message that names the process being waited for.
 
-        Yields:
-            The hold.
+    Yields:
+        The hold.
 
-        Raises:
-            UsageError: if another process runs it, or has the OUT to itself.
+    Raises:
+        UsageError: if another process runs it, or has the OUT to itself.
         MachineError: if its file system has no locks, or cannot be written.
     """
     path = out / "stages" / LOCK_FILE
-    waiting = _Queue(path, tell, wait)
-    with _explained(out):
+    waiting = _Queue(path, notify, wait)
+    with _lock_errors(out):
         shared = os.open(path, FLAGS, 0o666)
     try:
         while True:
-            with _explained(out):
+            with _lock_errors(out):
                 _wait_for(shared, waiting, fcntl.LOCK_SH)
-                silent = _outlast(path, waiting)
-            hold = _acquired(_shard_file(out, shard), tell, wait=wait)
-            other = _signed(path)
+                silent = _wait_for_silence(path, waiting)
+            hold = _acquire(_shard_file(out, shard), notify, wait=wait)
+            other = _read_signature(path)
             if other is None or other == silent or not other.is_elsewhere:
                 break
             hold.close()  # a machine that does not see our lock signed meanwhile and may not have noticed us
@@ -197,19 +201,19 @@ def locked_shard(out: Path, shard: str, *, wait: bool = False, tell: Tell = lamb
         hold.close()
 
 
-def _acquired(path: Path, tell: Tell, *, wait: bool) -> Hold:
+def _acquire(path: Path, notify: Notify, *, wait: bool) -> Hold:
     """Lock a file exclusively and sign it; raises what ``locked`` raises."""
-    with _explained(path.parents[1]):
+    with _lock_errors(path.parents[1]):
         descriptor = os.open(path, FLAGS, 0o666)
         try:
-            return Hold(path, descriptor, _take(path, descriptor, tell, wait=wait))
+            return Hold(path, descriptor, _lock_and_sign(path, descriptor, notify, wait=wait))
         except BaseException:
             os.close(descriptor)
             raise
 
 
 @contextmanager
-def _explained(out: Path) -> Iterator[None]:
+def _lock_errors(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -233,7 +237,7 @@ def is_locked(out: Path, shard: str = "") -> bool:
         return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # brief: a run that starts now waits longer
-        holder = _signed(path)
+        holder = _read_signature(path)
         touched_s = time.time() - os.fstat(descriptor).st_mtime
     except BlockingIOError:
         return True
@@ -244,17 +248,17 @@ def is_locked(out: Path, shard: str = "") -> bool:
     return holder is not None and holder.is_elsewhere and touched_s < SILENCE_S
 
 
-def shards_being_made(out: Path) -> list[str]:
+def running_shards(out: Path) -> list[str]:
     """Names of an OUT's shards that separate processes are currently running; checked without waiting."""
     names = sorted(path.name.removeprefix(f"{LOCK_FILE}.") for path in (out / "stages").glob(f"{LOCK_FILE}.*"))
     return [name for name in names if is_locked(out, name)]
 
 
-def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
+def _lock_and_sign(path: Path, descriptor: int, notify: Notify, *, wait: bool) -> Holder:
     """Lock the file against processes on this machine and others, sign it, and return the signature."""
-    waiting = _Queue(path, tell, wait)
+    waiting = _Queue(path, notify, wait)
     _wait_for(descriptor, waiting, fcntl.LOCK_EX)
-    _outlast(path, waiting)
+    _wait_for_silence(path, waiting)
     holder = Holder.here()
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"{json.dumps(asdict(holder))}\n".encode().ljust(WIDTH), 0)
@@ -262,17 +266,17 @@ def _take(path: Path, descriptor: int, tell: Tell, *, wait: bool) -> Holder:
     mount = mount_of(path)
     if mount is not None and mount.kind not in LOCAL_KINDS:
         time.sleep(SETTLE_S)
-        if (other := _signed(path)) not in (None, holder):
+        if (other := _read_signature(path)) not in (None, holder):
             raise _refusal(path, other)
     return holder
 
 
 @dataclass
 class _Queue:
-    """Tells the user, once, about the process being waited for."""
+    """Notifies the user, once, of the process being waited for."""
 
     path: Path
-    tell: Tell
+    notify: Notify
     allowed: bool
     announced: bool = False
 
@@ -285,7 +289,8 @@ class _Queue:
         if not self.allowed:
             raise _refusal(self.path, other)
         if not self.announced:
-            self.tell(f"Another splatpipe ({other or 'unknown'}) is {_doing(self.path)}: waiting for it to finish.")
+            name = f"Another splatpipe ({other or 'unknown'})"
+            self.notify(f"{name} is {_activity(self.path)}: waiting for it to finish.")
             self.announced = True
 
 
@@ -293,14 +298,14 @@ def _wait_for(descriptor: int, waiting: _Queue, kind: int) -> None:
     """Acquire the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``; the holder reported may be that of a shard."""
     path = waiting.path
     deadline_s = time.monotonic() + PATIENCE_S
-    while not _flocked(descriptor, path.parents[1], kind):
+    while not _try_flock(descriptor, path.parents[1], kind):
         if time.monotonic() > deadline_s:
-            shards = map(_signed, sorted(path.parent.glob(f"{path.name}.*")))
-            waiting.begin(_signed(path) or next(filter(None, shards), None))
-        time.sleep(LOOK_S if waiting.allowed else LOOK_S / 2)
+            shards = map(_read_signature, sorted(path.parent.glob(f"{path.name}.*")))
+            waiting.begin(_read_signature(path) or next(filter(None, shards), None))
+        time.sleep(POLL_S if waiting.allowed else POLL_S / 2)
 
 
-def _outlast(path: Path, waiting: _Queue) -> Holder | None:
+def _wait_for_silence(path: Path, waiting: _Queue) -> Holder | None:
     """Wait until a signature from another boot is removed, or has not been touched for ``SILENCE_S``.
 
     Returns:
@@ -309,19 +314,19 @@ def _outlast(path: Path, waiting: _Queue) -> Holder | None:
     Raises:
         UsageError: if it is still being touched and waiting is not allowed.
     """
-    other = _signed(path)
+    other = _read_signature(path)
     if other is None or not other.is_elsewhere:
         return None  # a signer on this machine must have been killed: it would still hold the lock
-    touched, silence_s = _touched(path), 0.0
-    waiting.tell(f"Looking for up to {SILENCE_S:.0f} s whether {other} is still {_doing(path)}.")
+    touched, silence_s = _mtime_ns(path), 0.0
+    waiting.notify(f"Checking for up to {SILENCE_S:.0f} s whether {other} is still {_activity(path)}.")
     while silence_s < SILENCE_S:
         began_s = time.monotonic()
-        time.sleep(LOOK_S)
-        now = _touched(path)
+        time.sleep(POLL_S)
+        now = _mtime_ns(path)
         # While a server does not answer, no touch arrives: a check that hangs counts as BEAT_S at most.
         silence_s += min(time.monotonic() - began_s, BEAT_S)
         if now != touched:
-            if (signed := _signed(path)) is None:
+            if (signed := _read_signature(path)) is None:
                 return None
             touched, silence_s, other = now, 0.0, signed
             waiting.begin(other)
@@ -332,7 +337,7 @@ def _refusal(path: Path, other: Holder | None) -> UsageError:
     hint = "Wait for it to finish (or use --wait), or choose another OUT."
     if other is not None and other.is_elsewhere:  # a server may keep a dead machine's lock: NFS 3 does until it is back
         hint += f" If {other.host} has crashed for good, remove {path}."
-    return UsageError(f"Another splatpipe ({other or 'unknown'}) is {_doing(path)}.", hint=hint)
+    return UsageError(f"Another splatpipe ({other or 'unknown'}) is {_activity(path)}.", hint=hint)
 
 
 def _shard_file(out: Path, shard: str) -> Path:
@@ -345,11 +350,11 @@ def _place(path: Path) -> str:
     return f"{shard} in {path.parents[1]}" if shard else str(path.parents[1])
 
 
-def _doing(path: Path) -> str:
-    return f"{'working in' if path.name == LOCK_FILE else 'making'} {_place(path)}"
+def _activity(path: Path) -> str:
+    return f"{'working in' if path.name == LOCK_FILE else 'running'} {_place(path)}"
 
 
-def _flocked(descriptor: int, out: Path, kind: int) -> bool:
+def _try_flock(descriptor: int, out: Path, kind: int) -> bool:
     """Try to acquire the kernel's lock, ``LOCK_SH`` or ``LOCK_EX``; False if another process holds it.
 
     Raises:
@@ -372,23 +377,23 @@ def _flocked(descriptor: int, out: Path, kind: int) -> bool:
     return True
 
 
-def _signed(path: Path) -> Holder | None:
+def _read_signature(path: Path) -> Holder | None:
     """The signer of the file, or None. The file is reopened so that NFS queries the server."""
     with suppress(OSError, ValueError, TypeError, KeyError, RecursionError):
         with path.open("rb") as file:
-            told = json.loads(file.read(LONGEST))
-        return Holder(int(told["process"]), str(told["host"])[:255], str(told["boot"]), str(told["turn"]))
+            read = json.loads(file.read(LONGEST))
+        return Holder(int(read["process"]), str(read["host"])[:255], str(read["boot"]), str(read["turn"]))
     return None
 
 
-def _touched(path: Path) -> int:
+def _mtime_ns(path: Path) -> int:
     """The file's mtime, ns, by its file system's clock; 0 if unreadable. Reopened so that NFS queries the server."""
     with suppress(OSError), path.open("rb") as file:
         return os.fstat(file.fileno()).st_mtime_ns
     return 0
 
 
-def _boot() -> str:
+def _boot_id() -> str:
     with suppress(OSError):
         return BOOT_ID.read_text(encoding="ascii").strip()
     return socket.gethostname()

@@ -171,9 +171,9 @@ def _memory_used(folder: Path) -> int | None:
 
 def _machine_memory(root: Path, name: str) -> int:
     """A value of ``/proc/meminfo`` in bytes; 0 if unknown."""
-    told = _field(_text(root / "proc/meminfo"), f"{name}:")
-    if told is not None:
-        return told << 10
+    size_kib = _field(_text(root / "proc/meminfo"), f"{name}:")
+    if size_kib is not None:
+        return size_kib << 10
     if name == "MemTotal" and "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
         return int(os.sysconf("SC_PHYS_PAGES")) * int(os.sysconf("SC_PAGE_SIZE"))
     return 0

@@ -35,15 +35,15 @@ class Need:
         return {**asdict(self), "cpu_seconds": round(self.cpu_seconds, 2)}
 
 
-Foresight = Callable[[Mapping[str, Summary]], Mapping[str, Need]]
+ForecastFunction = Callable[[Mapping[str, Summary]], Mapping[str, Need]]
 """Forecasts by stage from the summaries of finished stages; stages without a forecast are left out.
 
 A stage's forecast includes all of its shards, run one after the other; a shard may have its own, e.g. ``train.2``.
 """
 
 
-def unforeseen(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
-    """The foresight of a pipeline without forecasts."""
+def no_forecasts(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
+    """The forecast function of a pipeline that has none."""
     return {}
 
 
@@ -69,12 +69,12 @@ def used_with_shards(used: Mapping[str, JSON], shards: Sequence[Mapping[str, JSO
     if not shards:
         return dict(used)
     each = [used, *shards]
-    told = [
+    shards_used = [
         {"key": shard["key"], "disk_bytes": _disk_bytes(shard), **{name: shard[name] for name in used}}
         for shard in shards
     ]
     sums = {name: round(sum(float(one[name]) for one in each), 3) for name in ("seconds", "cpu_seconds")}
-    return {**sums, "peak_memory_bytes": max(int(one["peak_memory_bytes"]) for one in each), "shards": told}
+    return {**sums, "peak_memory_bytes": max(int(one["peak_memory_bytes"]) for one in each), "shards": shards_used}
 
 
 def _disk_bytes(manifest: Mapping[str, JSON]) -> int:

@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 AHEAD = 2  # finished results that may wait for a slower one before them
-LOOK_S = 0.3
+POLL_S = 0.3
 
 
 def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
@@ -40,20 +40,20 @@ def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threa
     pool.shutdown()
 
 
-def watched(function: Callable[[], Result], look: Callable[[], None], cancel: Callable[[], None]) -> Result:
-    """Run one long call in its own thread and return its result; this thread can report progress and be interrupted.
+def run_in_thread(function: Callable[[], Result], poll: Callable[[], None], cancel: Callable[[], None]) -> Result:
+    """Run one long call in a thread of its own and return its result; the caller can report progress meanwhile.
 
     Args:
         function: Should spend its time outside the GIL.
-        look: Called a few times a second while it runs.
-        cancel: Called when this thread is interrupted or ``look`` fails; the call is then not waited for.
+        poll: Called a few times a second while it runs.
+        cancel: Called when this thread is interrupted or ``poll`` fails; the call is then not waited for.
     """
     pool = ThreadPoolExecutor(1)
     job = pool.submit(function)
     try:
         while not job.done():
-            wait([job], LOOK_S)
-            look()
+            wait([job], POLL_S)
+            poll()
         return job.result()
     except BaseException:
         cancel()

@@ -1,4 +1,4 @@
-"""Number ranges shared by the options of several rooms."""
+"""Number ranges shared by the options of several packages."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
-from splatpipe.pipeline.engine.config import Table, known, load_file, resolve, settings_of
+from splatpipe.pipeline.engine.config import Table, current_options, load_file, resolve, settings_of
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.stage import Stage, stage_name
@@ -64,7 +64,7 @@ class RunFolder:
         return self.out.name
 
     @property
-    def at_work(self) -> bool:
+    def is_running(self) -> bool:
         """Whether a splatpipe is working in it now."""
         return is_locked(self.out)
 
@@ -96,7 +96,7 @@ class RunFolder:
             UsageError: if there are none, or they are invalid.
         """
         photos, table = self.settings()
-        return photos, resolve(model, [known(model, table), *above])
+        return photos, resolve(model, [current_options(model, table), *above])
 
     def contents(self, config: BaseModel | None, keys: Mapping[str, str], unfinished: Container[str] = ()) -> Contents:
         """For each stage, the artifact the last run made or would reuse, if consistent with those of earlier stages.
@@ -127,10 +127,10 @@ class RunFolder:
                 continue
             if key and folder.is_dir():
                 working[stage.name] = folder
-            working |= self._shards_at_work(stage, keys)
+            working |= self._shard_working_folders(stage, keys)
         return Contents(chosen, working)
 
-    def _shards_at_work(self, stage: Stage, keys: Mapping[str, str]) -> dict[str, Path]:
+    def _shard_working_folders(self, stage: Stage, keys: Mapping[str, str]) -> dict[str, Path]:
         """Working folders of a stage's shards that are known from events, by shard name."""
         if stage.shards is None:
             return {}
@@ -147,19 +147,19 @@ class RunFolder:
         Returns:
             Its parts and those of everything it was made from, by full name; missing ones are left out.
         """
-        made = next(filter(None, (_delivered(self.store, stage) for stage in stages)), None)
+        made = next(filter(None, (_delivered_artifact(self.store, stage) for stage in stages)), None)
         if made is None:
             return {}
         found = dict(made.parts)
-        asked = dict(made.manifest["inputs"]["reads"])
-        while asked:
-            name, digest = asked.popitem()
+        pending = dict(made.manifest["inputs"]["reads"])
+        while pending:
+            name, digest = pending.popitem()
             if name in found:
                 continue
             source = next((a for a in self.store.artifacts(name.split(".")[0]) if _has(a, name, digest)), None)
             if source is not None:
                 found |= {part: where for part, where in source.parts.items() if part not in found}
-                asked |= source.manifest["inputs"]["reads"]
+                pending |= source.manifest["inputs"]["reads"]
         return found
 
     def deliverables(self) -> list[str]:
@@ -208,7 +208,7 @@ def _agrees(artifact: Artifact, config: BaseModel | None, stage: Stage) -> bool:
     return (inputs["config"], inputs["borrowed"]) == settings_of(config, stage)
 
 
-def _delivered(store: Store, stage: Stage) -> Artifact | None:
+def _delivered_artifact(store: Store, stage: Stage) -> Artifact | None:
     """The artifact of a stage whose deliverables are in OUT, else its newest; None without any."""
     artifacts = store.artifacts(stage.name)
     for artifact in artifacts:

@@ -26,7 +26,7 @@ from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.line import Job, Line, explain, line_status
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
-from splatpipe.pipeline.engine.needs import Foresight, of_shard, unforeseen, used_with_shards
+from splatpipe.pipeline.engine.needs import ForecastFunction, no_forecasts, of_shard, used_with_shards
 from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary, stage_name
 from splatpipe.pipeline.engine.store import MIN_FREE_BYTES, Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.worker import Task
@@ -65,8 +65,8 @@ class Runner:
         sink: Receives the events.
         source_now: Returns the current digests of the external parts.
         save_config: Saves the configuration in OUT; called once it is known that something can run with it.
-        foresee: Forecasts what each stage will use; recorded beside what it did use.
-        outcome: What was done so far, also if the walk ends in an error.
+        forecast_needs: Forecasts each stage's resource use; recorded beside the measured use.
+        outcome: What was done so far, even if the walk ends in an error.
     """
 
     line: Line
@@ -76,7 +76,7 @@ class Runner:
     sink: Sink
     source_now: Callable[[], Mapping[str, str]]
     save_config: Callable[[BaseModel], None]
-    foresee: Foresight = unforeseen
+    forecast_needs: ForecastFunction = no_forecasts
     outcome: Outcome = field(default_factory=Outcome)
 
     def walk(self, *, until: str | None = None, rerun: frozenset[str] = frozenset()) -> Outcome:
@@ -89,42 +89,42 @@ class Runner:
         Raises:
             SplatpipeError: from the first stage that failed; earlier results are kept.
         """
-        with self._explained():
+        with self._plain_errors():
             self.store.recover()
             self.save_config(self.line.config)
         parts = dict(self.line.source)
         outcome = self.outcome
         needed = self.line.needed(until)
-        with self._reported([stage.name for stage in needed]):
+        with self._run_events([stage.name for stage in needed]):
             for stage in needed:
                 job = Job(stage, self.line.inputs_of(stage, parts))
-                artifact = self._found(job, anew=stage.name in rerun)
+                artifact = self._reuse(job, again=stage.name in rerun)
                 if artifact is None:
-                    artifact = self._make(job, parts, anew=stage.name in rerun)
+                    artifact = self._run_with_shards(job, parts, again=stage.name in rerun)
                 parts.update(artifact.parts)
-                with self._explained():
+                with self._plain_errors():
                     self.store.deliver(artifact, stage)
         return outcome
 
     def run_alone(self, name: str) -> Outcome:
-        """Run one stage again, valid or not, and besides it only those of its shards that are missing.
+        """Run one stage again, valid or not, and those of its shards that are missing.
 
         The stage that counts the shards is run if it is missing.
 
         Raises:
             UsageError: if a stage that it reads from is not valid.
         """
-        with self._explained():
+        with self._plain_errors():
             self.store.recover()
-        stage, parts, counting = self._ready(name)
-        with self._explained():
+        stage, parts, counting = self._prepare(name)
+        with self._plain_errors():
             self.save_config(self.line.config)
         needed = [*counting, stage]
-        with self._reported([each.name for each in needed]):
+        with self._run_events([each.name for each in needed]):
             for each in needed:
-                artifact = self._make(Job(each, self.line.inputs_of(each, parts)), parts)
+                artifact = self._run_with_shards(Job(each, self.line.inputs_of(each, parts)), parts)
                 parts.update(artifact.parts)
-                with self._explained():
+                with self._plain_errors():
                     self.store.deliver(artifact, each)
         return self.outcome
 
@@ -138,11 +138,11 @@ class Runner:
         Raises:
             UsageError: if there is no such shard, or a stage it reads from is not valid.
         """
-        with self._explained():
+        with self._plain_errors():
             self.store.recover(f"{name}.{number}")
-        stage, parts, counting = self._ready(name)
+        stage, parts, counting = self._prepare(name)
         if counting:
-            raise self._unready(name, counting)
+            raise self._not_ready(name, counting)
         jobs = self.line.shards_of(stage, parts)
         if not 1 <= number <= len(jobs):
             has = f"{len(jobs)} here" if stage.shards else "none"
@@ -151,11 +151,11 @@ class Runner:
                 hint=f"Omit --shard, or see splatpipe status {self.store.out}",
             )
         job = jobs[number - 1]
-        with self._reported([job.stage.name]):
-            self._found(job) or self._run(job, parts)
+        with self._run_events([job.stage.name]):
+            self._reuse(job) or self._run(job, parts)
         return self.outcome
 
-    def _ready(self, name: str) -> tuple[Stage, dict[str, Part], list[Stage]]:
+    def _prepare(self, name: str) -> tuple[Stage, dict[str, Part], list[Stage]]:
         """Return a stage, the parts of the valid stages before it, and the stage to run first, which counts its shards.
 
         Raises:
@@ -173,21 +173,21 @@ class Runner:
         missing = [earlier for earlier in self.line.stages if earlier.name in absent]
         counts = stage_name(stage.shards.counted_by) if stage.shards else ""
         if missing and [earlier.name for earlier in missing] != [counts]:
-            raise self._unready(name, missing)
+            raise self._not_ready(name, missing)
         for counting in missing:
-            self._ready(counting.name)
+            self._prepare(counting.name)
         return stage, parts, missing
 
-    def _unready(self, name: str, missing: Sequence[Stage]) -> UsageError:
+    def _not_ready(self, name: str, missing: Sequence[Stage]) -> UsageError:
         names = [stage.name for stage in missing]
         return UsageError(
-            f"The stage {name} reads what {', '.join(names)} leaves, which is missing or out of date.",
+            f"The stage {name} needs the output of {', '.join(names)}, which is missing or out of date.",
             hint=f"Run the pipeline up to there first: splatpipe run PHOTOS {self.store.out} --until {names[-1]}",
         )
 
     @contextmanager
-    def _reported(self, stages: Sequence[str]) -> Iterator[None]:
-        """Emit the events of a run's start and end, also if it fails."""
+    def _run_events(self, stages: Sequence[str]) -> Iterator[None]:
+        """Emit the events of a run's start and end, even if it fails."""
         began_s = time.monotonic()
         machine = {**asdict(self.machine), **describe_machine()}
         self.sink(Event("run_started", data={"stages": list(stages), "machine": machine, "versions": versions()}))
@@ -198,21 +198,21 @@ class Runner:
             ended = error
             raise
         finally:
-            told = {"message": "" if ended is None else str(ended), "hint": getattr(ended, "hint", "")}
+            ending = {"message": "" if ended is None else str(ended), "hint": getattr(ended, "hint", "")}
             seconds = round(time.monotonic() - began_s, 3)
             with suppress(OSError, MachineError):  # a full or taken-over OUT ended the run and is reported anyway
-                self.sink(Event("run_finished", data={"exit_code": exit_code(ended), **told, "seconds": seconds}))
+                self.sink(Event("run_finished", data={"exit_code": exit_code(ended), **ending, "seconds": seconds}))
 
-    def _found(self, job: Job, *, anew: bool = False) -> Artifact | None:
-        """The valid artifact of a job, reported as reused; None if it has to be made."""
-        artifact = None if anew else self.store.find(job.stage, job.inputs.key)
+    def _reuse(self, job: Job, *, again: bool = False) -> Artifact | None:
+        """The valid artifact of a job, reported as reused; None if the job has to run."""
+        artifact = None if again else self.store.find(job.stage, job.inputs.key)
         if artifact is not None:
             data = {"summary": artifact.summary, "seconds": artifact.manifest["seconds"], "key": artifact.key}
             self.sink(Event("stage_reused", job.stage.name, data))
             self.outcome.artifacts[job.stage.name] = artifact
         return artifact
 
-    def _make(self, job: Job, parts: Mapping[str, Part], *, anew: bool = False) -> Artifact:
+    def _run_with_shards(self, job: Job, parts: Mapping[str, Part], *, again: bool = False) -> Artifact:
         """Run a stage: first its missing shards, one after the other, then the body that joins them.
 
         A shard that fails with a StageError does not stop the others: the error is raised after they have run.
@@ -220,13 +220,13 @@ class Runner:
         Args:
             job: The stage's job.
             parts: The parts available.
-            anew: Run all shards again, also valid ones.
+            again: Run all shards again, even valid ones.
         """
         shards: list[Artifact] = []
         failures: list[tuple[str, StageError]] = []
         for shard in self.line.shards_of(job.stage, parts):
             try:
-                shards.append(self._found(shard, anew=anew) or self._run(shard, parts))
+                shards.append(self._reuse(shard, again=again) or self._run(shard, parts))
             except StageError as error:
                 failures.append((shard.stage.name, error))
         if failures:
@@ -244,7 +244,7 @@ class Runner:
         of = {"shard": asdict(job.shard)} if job.shard else {}
         self.sink(Event("stage_started", stage.name, {"reason": reason, "key": inputs.key, **of}))
         try:
-            with self._explained():
+            with self._plain_errors():
                 self._check_space()
                 partial = self.store.begin(stage, inputs.key)
                 result = self.executor.run(self._task(job, parts, shards, partial), self.sink)
@@ -255,12 +255,12 @@ class Runner:
                     **result,
                     "machine": {**asdict(self.machine), **describe_machine()},
                     "versions": versions(),
-                    **self._forecast(job),
+                    **self._recorded_forecast(job),
                 }
                 artifact = self.store.commit(stage, inputs, partial, summary, run)
         except (SplatpipeError, StopSignal, KeyboardInterrupt) as error:
             with suppress(OSError, MachineError):  # what cannot be logged has been shown
-                self.sink(self._failed(inputs, time.monotonic() - began_s, error))
+                self.sink(self._failure_event(inputs, time.monotonic() - began_s, error))
             raise
         outcome.ran.append(stage.name)
         outcome.failed = ""
@@ -285,19 +285,19 @@ class Runner:
             shards=[str(shard.folder) for shard in shards],
         )
 
-    def _forecast(self, job: Job) -> dict[str, JSON]:
+    def _recorded_forecast(self, job: Job) -> dict[str, JSON]:
         """The forecast of resource use, for the manifest; empty if there is none."""
-        needs = self.foresee({name: done.summary for name, done in self.outcome.artifacts.items()})
+        needs = self.forecast_needs({name: done.summary for name, done in self.outcome.artifacts.items()})
         name = stage_name(job.stage.name)
         need = of_shard(needs, name, job.shard) if job.shard else needs.get(name)
         return {} if need is None else {"forecast": need.as_json()}
 
-    def _failed(self, inputs: StageInputs, seconds: float, error: BaseException) -> Event:
+    def _failure_event(self, inputs: StageInputs, seconds: float, error: BaseException) -> Event:
         """The event of a stage's failure; built while the worker is alive, so that its peak memory can be read."""
-        told = (error.message, error.hint) if isinstance(error, SplatpipeError) else ("Stopped.", "")
-        data: dict[str, JSON] = {"message": told[0], "hint": told[1], "exit_code": exit_code(error), "key": inputs.key}
+        message, hint = (error.message, error.hint) if isinstance(error, SplatpipeError) else ("Stopped.", "")
+        data: dict[str, JSON] = {"message": message, "hint": hint, "exit_code": exit_code(error), "key": inputs.key}
         data |= {"seconds": round(seconds, 3), "peak_memory_bytes": self.executor.peak_memory_bytes()}
-        data["lasting"] = data["exit_code"] == EXIT_INPUT and self._source_stands()
+        data["lasting"] = data["exit_code"] == EXIT_INPUT and self._source_is_unchanged()
         return Event("stage_failed", inputs.stage, data)
 
     def _check_source(self, stage: Stage) -> None:
@@ -328,7 +328,7 @@ class Runner:
             )
 
     @contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _plain_errors(self) -> Iterator[None]:
         """Turn errors caused by a full, failing or missing disk, here or in the worker, into a plain message."""
         try:
             yield
@@ -344,7 +344,7 @@ class Runner:
                 self._check_space()
             raise
 
-    def _source_stands(self) -> bool:
+    def _source_is_unchanged(self) -> bool:
         """Whether the user's files are unchanged since the run began, so that the same error would recur."""
         try:
             now = self.source_now()

@@ -19,7 +19,7 @@ from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sin
 from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.line import Line
 from splatpipe.pipeline.engine.lock import locked, locked_shard
-from splatpipe.pipeline.engine.needs import Foresight, unforeseen
+from splatpipe.pipeline.engine.needs import ForecastFunction, no_forecasts
 from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_FILE, shard_events
 from splatpipe.pipeline.engine.runner import Runner
 from splatpipe.pipeline.engine.source import open_source
@@ -37,7 +37,7 @@ class Request:
         photos: The user's folder.
         out: Where the results go.
         machine: Device and threads.
-        foresee: Forecasts each stage's resource use, for the manifests.
+        forecast_needs: Forecasts each stage's resource use, for the manifests.
     """
 
     stages: Sequence[Stage]
@@ -45,7 +45,7 @@ class Request:
     photos: Path
     out: Path
     machine: Machine
-    foresee: Foresight = unforeseen
+    forecast_needs: ForecastFunction = no_forecasts
 
 
 @contextmanager
@@ -68,16 +68,17 @@ def open_session(request: Request, show: Sink, *, wait: bool = False, shard: str
     source = open_source(request.photos, request.out, request.stages, request.config)
     store = open_store(request.out, create=True)
 
-    def tell(message: str) -> None:
+    def notify(message: str) -> None:
         show(Event("note", data={"message": message}))
 
-    held = locked_shard(store.out, shard, wait=wait, tell=tell) if shard else locked(store.out, wait=wait, tell=tell)
-    events, said = store.out / EVENTS_FILE, store.out / LOG_FILE
+    lock = locked(store.out, wait=wait, notify=notify)
+    events, log_file = store.out / EVENTS_FILE, store.out / LOG_FILE
     if shard:
-        events, said = shard_events(store.out, shard), store.shards / f"{shard}.log"
-    with held as hold:
+        lock = locked_shard(store.out, shard, wait=wait, notify=notify)
+        events, log_file = shard_events(store.out, shard), store.shards / f"{shard}.log"
+    with lock as hold:
         log = _open_log(store, events)
-        executor = Executor(said, tuple(hold.descriptors), _worker_environment(request.machine.threads))
+        executor = Executor(log_file, tuple(hold.descriptors), _worker_environment(request.machine.threads))
         try:
 
             def sink(event: Event) -> None:
@@ -88,7 +89,7 @@ def open_session(request: Request, show: Sink, *, wait: bool = False, shard: str
             digests = partial(_digests, request, store, EventReporter("source", sink), remember=not shard)
             line = _open_line(request, digests())
             save = partial(_save_config, store, source.folder)
-            yield Runner(line, store, executor, request.machine, sink, digests, save, request.foresee)
+            yield Runner(line, store, executor, request.machine, sink, digests, save, request.forecast_needs)
         except BaseException:
             executor.stop()
             raise
@@ -108,10 +109,10 @@ def _open_log(store: Store, path: Path) -> EventLog:
 def status_of(request: Request) -> tuple[Line, Store]:
     """The pipeline and the store of an existing OUT, for reading its status only."""
     store = open_store(request.out, create=False)
-    return _open_line(request, _digests(request, store, EventReporter("source", _unheard), remember=False)), store
+    return _open_line(request, _digests(request, store, EventReporter("source", _discard), remember=False)), store
 
 
-def _unheard(_event: Event) -> None:
+def _discard(_event: Event) -> None:
     """Discard an event: reading the status reports no progress."""
 
 

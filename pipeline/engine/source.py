@@ -28,13 +28,13 @@ class RunSource:
         folder: The folder the user named.
         model: The COLMAP model in it, if it is a reconstruction and not just photos.
         named: The file of each single-file part, e.g. ``source.control``; None if there is none.
-        passed: Files to skip when collecting photos: those of single-file parts, used or not.
+        skipped: Files to skip when collecting photos: those of single-file parts, used or not.
     """
 
     folder: Path
     model: Path | None
     named: Mapping[str, Path | None] = field(default_factory=dict)
-    passed: frozenset[Path] = frozenset()
+    skipped: frozenset[Path] = frozenset()
 
     @property
     def part_files(self) -> dict[str, dict[str, Path]]:
@@ -52,7 +52,7 @@ class RunSource:
             os.path.relpath(path, self.folder): path
             for root in roots
             for path in walk_files(root)
-            if path not in self.passed
+            if path not in self.skipped
         }
         if len(photos) > MAX_SOURCE_FILES:
             raise SplatpipeError(
@@ -115,9 +115,9 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
     for section, option, file in listed:
         setting = str(getattr(getattr(config, section), option))
         named[file.part] = _choose(file, f"{section}.{option}", setting, beside)
-    passed = {path for paths in beside.values() for path in paths.values()}
-    passed |= {path for path in named.values() if path is not None}
-    return RunSource(folder, find_model(folder), named, frozenset(passed))
+    skipped = {path for paths in beside.values() for path in paths.values()}
+    skipped |= {path for path in named.values() if path is not None}
+    return RunSource(folder, find_model(folder), named, frozenset(skipped))
 
 
 def with_absolute_files(config: BaseModel, stages: Sequence[Stage]) -> BaseModel:
@@ -149,7 +149,7 @@ def _choose(file: NamedFile, option: str, setting: str, beside: Mapping[Path, Ma
     if setting == NONE:
         return None
     if setting != AUTO:
-        return _checked(Path(setting), option)
+        return _check_file(Path(setting), option)
     for files in beside.values():
         found = [files[name] for name in file.names if name in files]
         if len(found) > 1:
@@ -158,13 +158,13 @@ def _choose(file: NamedFile, option: str, setting: str, beside: Mapping[Path, Ma
                 hint=f"Choose one: --set {option}=PATH, or {option}=none.",
             )
         if found:
-            return _checked(found[0], option)
+            return _check_file(found[0], option)
     return None
 
 
-def _checked(path: Path, option: str) -> Path:
+def _check_file(path: Path, option: str) -> Path:
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "is no file" if path.exists() else "is not there"
+        what = "is a folder" if path.is_dir() else "is not a regular file" if path.exists() else "is not there"
         raise SplatpipeError(f"The file {path} of {option} {what}.", hint=f"Check the path, or set {option}=none.")
     if not os.access(path, os.R_OK):
         raise SplatpipeError(

@@ -21,10 +21,10 @@ class StageConfig(BaseModel):
     for no other stage, and its body writes empty parts.
 
     Attributes:
-        gone: Removed options by dotted name, each with a sentence on what replaces it.
+        removed_options: Removed options by dotted name, each with a sentence on what replaces it.
     """
 
-    gone: ClassVar[Mapping[str, str]] = {}
+    removed_options: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False, strict=True
@@ -160,7 +160,7 @@ def stage_name(name: str) -> str:
 
 
 def shards_first(names: Iterable[str]) -> list[str]:
-    """Order stage names as given, with each stage's shards, which are first known when they start, before it."""
+    """Order stage names as given, each stage's shards before it; a run names its shards only when they start."""
     listed = list(names)
     place = {name: at for at, name in enumerate(listed)}
     return sorted(listed, key=lambda name: (place.get(stage_name(name), len(listed)), name == stage_name(name)))

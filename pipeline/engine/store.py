@@ -53,7 +53,7 @@ class Artifact:
         }
 
     def deliverables(self, stage: Stage) -> dict[Path, Path]:
-        """The files of the stage's deliverables by path relative to OUT; a folder part stands for its contents."""
+        """The files of the stage's deliverables by path relative to OUT; for a folder part, all files in it."""
         files: dict[Path, Path] = {}
         for name in stage.deliverables:
             root = self.folder / stage.parts[name]

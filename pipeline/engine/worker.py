@@ -92,7 +92,7 @@ def execute(task: Task, send: IO[str]) -> None:
 
     lock = threading.Lock()
 
-    def tell(message: JSON) -> None:
+    def send_message(message: JSON) -> None:
         with lock:
             send.write(json.dumps(message) + "\n")
             send.flush()
@@ -103,7 +103,7 @@ def execute(task: Task, send: IO[str]) -> None:
         nonlocal children
         if event.kind == "metric" and event.data["name"] == CHILDREN_MEMORY:
             children = max(children, int(event.data["value"]))
-        tell({"event": asdict(event)})
+        send_message({"event": asdict(event)})
 
     started = _Usage.now()
     try:
@@ -111,20 +111,20 @@ def execute(task: Task, send: IO[str]) -> None:
         config_type: type[StageConfig] = getattr(__import__(module, fromlist=[name]), name)
         config = config_type.model_validate(task.config)
         body = load_body(task.entry)
-        _listen()  # again: importing pycolmap replaces our handlers
+        _install_handlers()  # again: importing pycolmap replaces our handlers
         summary = body(config, task.inputs(), Path(task.out), EventReporter(task.stage, sink))
     except KeyboardInterrupt:
-        tell({"failed": {"type": "KeyboardInterrupt"}})
+        send_message({"failed": {"type": "KeyboardInterrupt"}})
         raise
     except BaseException as error:
         traceback.print_exc(file=sys.stderr)
         sys.stderr.flush()
         failure = as_splatpipe_error(task.stage, error)
-        tell({"failed": {"type": type(failure).__name__, "message": failure.message, "hint": failure.hint}})
+        send_message({"failed": {"type": type(failure).__name__, "message": failure.message, "hint": failure.hint}})
     else:
         usage = started.until_now()
         usage["peak_memory_bytes"] += children
-        tell({"done": {"summary": dict(summary), **usage}})
+        send_message({"done": {"summary": dict(summary), **usage}})
 
 
 def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
@@ -145,7 +145,7 @@ def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
         return MachineError(
             f"The disk filled up in the stage {stage}.", "Free some space, then run again: it resumes from here."
         )
-    if isinstance(error, MemoryError) or any(said in text for said in NO_MEMORY):
+    if isinstance(error, MemoryError) or any(phrase in text for phrase in NO_MEMORY):
         return MachineError(
             f"The stage {stage} ran out of memory.",
             "Close other programs, or lower train.max_megapixels or train.max_gaussians.",
@@ -184,9 +184,9 @@ def _cpu_seconds() -> float:
 
 def peak_memory_bytes() -> int:
     """Peak resident memory of this process, bytes, since the stage began (where unsupported: since process start)."""
-    told = peak_memory_of("self")
-    if told is not None:
-        return told
+    peak_bytes = peak_memory_of("self")
+    if peak_bytes is not None:
+        return peak_bytes
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
@@ -228,7 +228,7 @@ def _interrupt(_number: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _listen() -> None:
+def _install_handlers() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the parent, which decides
     signal.signal(signal.SIGTERM, _interrupt)
 
@@ -236,7 +236,7 @@ def _listen() -> None:
 def main() -> None:
     """Serve the parent, whose process ID is on the command line, until it sends an exit request."""
     die_with_parent(int(sys.argv[1]))
-    _listen()
+    _install_handlers()
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     try:

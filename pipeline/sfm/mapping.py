@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import pycolmap
 
-from splatpipe.pipeline.engine.parallel import watched
+from splatpipe.pipeline.engine.parallel import run_in_thread
 from splatpipe.pipeline.sfm.completion import complete
 from splatpipe.pipeline.sfm.reduction import best_keypoints, write_reduced
 from splatpipe.pipeline.sfm.view_graph import read_verified
@@ -97,7 +97,7 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell
             complete(model, database, settings, stop)
         return largest_first(found)
 
-    return watched(work, lambda: tell(min(placed, total), total, doing), stop.cancel)
+    return run_in_thread(work, lambda: tell(min(placed, total), total, doing), stop.cancel)
 
 
 def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
@@ -121,7 +121,7 @@ def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tel
         with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
             return largest_first(pycolmap.global_mapping(database, folder, folder, global_options(options)))
 
-    return watched(work, lambda: tell(0, total, "placing all photos at once"), lambda: None)
+    return run_in_thread(work, lambda: tell(0, total, "placing all photos at once"), lambda: None)
 
 
 def _reduced(database: Path, folder: Path) -> Path:

@@ -68,12 +68,12 @@ def match_pairs(features: Path, work: Path, pairs: Sequence[Pair], seed: int, th
         with ExitStack() as stack:
             opened = [stack.enter_context(pycolmap.Database.open(place)) for place in places]
 
-            def look() -> None:
+            def poll() -> None:
                 done = sum(int(database.num_matched_image_pairs()) for database in opened)
                 report.progress(done, len(pairs), "matching", "pairs")
 
             commands = [(MATCHER, str(place), str(_list_of(place)), str(seed)) for place in places]
-            report.metric(CHILDREN_MEMORY, run_children(commands, look, "matching photos"))
+            report.metric(CHILDREN_MEMORY, run_children(commands, poll, "matching photos"))
         _join(features, places, work)
     finally:
         for place in places:

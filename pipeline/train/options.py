@@ -14,7 +14,7 @@ LARGEST_MEMORY = 1 << 50
 FILM_FROM_BUDGET_S = 600.0  # a shorter time budget has no time for a film
 _CONSTANT = "This is now set by constants: remove it."
 _NO_GAIN = "This was removed, as it never gave a measurable gain: remove it."
-GONE = {
+REMOVED_OPTIONS = {
     **dict.fromkeys(
         (
             *("sh_every", "ssim_weight", "exposure_decay", "coarse_until", "sky_opacity_weight"),

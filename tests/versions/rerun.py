@@ -16,7 +16,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.engine.config import known, load_file, resolve
+from splatpipe.pipeline.engine.config import current_options, load_file, resolve
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.runner import Outcome, Runner
@@ -30,7 +30,7 @@ from splatpipe.stages.options import LineConfig
 def main(job: Mapping[str, Any]) -> None:
     """Run the stages of a job, and those whose parts the earlier run lacks."""
     table = load_file(Path(job["earlier"]) / "config.toml")
-    config = resolve(LineConfig, [_taken(known(LineConfig, table))])
+    config = resolve(LineConfig, [_taken(current_options(LineConfig, table))])
     artifacts = _artifacts(Path(job["earlier"]))
     out = Path(job["out"])
     found = {}

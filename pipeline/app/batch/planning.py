@@ -71,14 +71,14 @@ class _CaptureForecast:
         planned: The capture without its jobs.
         needed: The requested stages.
         names: Those of them that are not valid.
-        foresee: Returns each stage's need for a number of threads.
+        forecast_needs: Returns each stage's need for a number of threads.
         shards: Missing shards by stage, for those of ``names`` whose number of shards is known.
     """
 
     planned: PlannedCapture
     needed: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
-    foresee: Callable[[int], Mapping[str, Need]] = field(default=lambda _threads: {})
+    forecast_needs: Callable[[int], Mapping[str, Need]] = field(default=lambda _threads: {})
     shards: Mapping[str, Sequence[Shard]] = field(default_factory=dict)
 
 
@@ -98,7 +98,7 @@ def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings)
     planned = tuple(_with_jobs(outlook, threads) for outlook in outlooks)
     for outlook in outlooks:
         if outlook.shards:
-            call.write_shards(outlook.planned.key, shard_jobs(outlook.shards, outlook.foresee(threads), threads))
+            call.write_shards(outlook.planned.key, shard_jobs(outlook.shards, outlook.forecast_needs(threads), threads))
     return BatchPlan(
         out=str(call.out),
         began_s=began_s,
@@ -148,11 +148,11 @@ def _outlook(capture: ListedCapture, planned: PlannedCapture, call: Call, settin
     if names and not planned.message:
         planned = _with_broken_file(planned, request)
     memory = available_memory_bytes() if settings.local else 0
-    foresee = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
+    forecast_needs = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
     # If the stage that counts the shards has to run, it will determine their number.
     counted = [each for each in statuses if each.stage.name in names] if first else []
     shards = {} if planned.message else missing_shards(counted)
-    return _CaptureForecast(planned, tuple(needed), () if planned.message else names, foresee, shards)
+    return _CaptureForecast(planned, tuple(needed), () if planned.message else names, forecast_needs, shards)
 
 
 def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCapture:
@@ -225,7 +225,7 @@ def _threads(outlooks: Sequence[_CaptureForecast], *, local: bool) -> int:
 
 def _of(outlook: _CaptureForecast, threads: int, names: Sequence[str]) -> dict[str, Need]:
     """The needs of stages; stages without a forecast count as almost nothing."""
-    foreseen = outlook.foresee(threads)
+    foreseen = outlook.forecast_needs(threads)
     return {name: foreseen.get(name, NOTHING) for name in names}
 
 

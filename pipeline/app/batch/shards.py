@@ -68,4 +68,4 @@ def tell_shards(call: Call, key: str, threads: int) -> None:
     request = existing(call.out / call.plan().capture(key).name)
     statuses = list(line_status(*status_of(request)))
     summaries = {each.stage.name: each.artifact.summary for each in statuses if each.artifact is not None}
-    call.write_shards(key, shard_jobs(missing_shards(statuses), request.foresee(summaries), threads))
+    call.write_shards(key, shard_jobs(missing_shards(statuses), request.forecast_needs(summaries), threads))

@@ -116,7 +116,7 @@ def read_report_inputs(out: Path) -> ReportInputs:
         UsageError: if there is no run in it.
     """
     run = open_run_folder(out, LINE)
-    history = read_history(run.out / EVENTS_FILE, running=run.at_work)
+    history = read_history(run.out / EVENTS_FILE, running=run.is_running)
     config, photos_dir = _configuration(run)
     unfinished = {name for name, stage in history.stages.items() if stage.state in BAD}
     contents = run.contents(config, history.keys, unfinished)

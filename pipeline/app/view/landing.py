@@ -48,7 +48,7 @@ def landing(run: RunFolder, marking: bool) -> dict[str, Any]:
     log = RunLog(run.out, EVENTS_FILE)
     log.read()
     names = fetchable(run)
-    at_work = run.at_work
+    at_work = run.is_running
     state = _state(log, at_work)
     return {
         "name": run.name,

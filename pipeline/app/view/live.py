@@ -69,7 +69,7 @@ class Live:
                 model["in_3d"] = source.rendering is not None
             return {
                 "name": self._run.name,
-                "at_work": self._run.at_work,
+                "at_work": self._run.is_running,
                 "finished": log.finished,
                 "started_s": log.started_s,
                 "last_s": log.last_s,

@@ -91,7 +91,7 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
     try:
         routes = [*(_marking(pages, options, say) if options.mark else ()), *pages.routes()]
         start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
-        start += "mark" if options.mark else "live" if run.at_work else ""
+        start += "mark" if options.mark else "live" if run.is_running else ""
         _take_signals_back()
 
         def ready() -> None:
