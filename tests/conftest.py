@@ -19,7 +19,7 @@ from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import PATIENCE_S
+from timeouts import TIMEOUT_S
 
 DEMO = (
     "features.extractor=opencv-sift",
@@ -158,7 +158,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., WatchedPage]]:
 
     def open_page(address: str, width: int = 1440, height: int = 900, touch: bool = False) -> WatchedPage:
         context = browser.new_context(viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch)
-        context.set_default_timeout(1000.0 * PATIENCE_S)
+        context.set_default_timeout(1000.0 * TIMEOUT_S)
         contexts.append(context)
         watched = WatchedPage(context.new_page())
         watched.open(address)

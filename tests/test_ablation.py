@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import wait_until
+from timeouts import wait_until
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import ablation

@@ -32,7 +32,7 @@ from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAG
 from splatpipe.stages.line import LINE
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import wait_until
+from timeouts import wait_until
 
 SLOW = ("--until", "features", "--set", "features.extractor=sift")
 

@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.children import run_children
 from splatpipe.pipeline.engine.errors import StageError
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import wait_until
+from timeouts import wait_until
 
 CODE = "timeit"  # runs its arguments as statements; the first of them is our process number, which does no harm
 SLEEP = (CODE, "import time, splatpipe.pipeline.engine.children as c; c.die_with_parent({parent}); time.sleep(300)")

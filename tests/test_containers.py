@@ -14,7 +14,7 @@ from splatpipe.pipeline.app.batch.plan import Call
 from splatpipe.pipeline.app.batch.snakemake_process import snakemake_environment
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import PATIENCE_S, wait_until
+from timeouts import TIMEOUT_S, wait_until
 
 DOCKER = Path(__file__).resolve().parents[1] / "docker"
 SLURM = DOCKER / "slurm.sh"
@@ -60,7 +60,7 @@ def slurm(tmp_path: Path, *arguments: object) -> subprocess.Popen[str]:
 
 def test_the_slurm_job_ends_with_the_exit_code_of_its_command(tmp_path: Path) -> None:
     process = slurm(tmp_path, tmp_path / "none", tmp_path / "out", "--preset", "preview")
-    _, told = process.communicate(timeout=PATIENCE_S)
+    _, told = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 1, told
     assert "There is no folder" in told
 
@@ -74,7 +74,7 @@ def test_the_slurm_job_hands_the_warning_on_waits_for_the_end_and_is_queued_agai
     process = slurm(tmp_path, capture_path(), out, "--preset", "preview")
     wait_until(lambda: (out / "events.jsonl").exists() or process.poll() is not None, "the run")
     process.send_signal(number)  # Slurm's B: the shell alone
-    _, told = process.communicate(timeout=PATIENCE_S)
+    _, told = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 143, told
     assert "Finished work is kept" in told, told
     assert (told_slurm.read_text() if told_slurm.exists() else "") == queued

@@ -19,7 +19,7 @@ from splatpipe.demo import capture_path
 from splatpipe.stages.line import LINE
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import PATIENCE_S, wait_until
+from timeouts import TIMEOUT_S, wait_until
 
 QUICK = (
     "features.extractor=opencv-sift",
@@ -245,7 +245,7 @@ def test_a_stopped_command_says_so_and_goes_on_later(
         wait_until(lambda: '"what": "training"' in events.read_text()[told_before:] or running.poll() is not None)
         assert running.poll() is None, running.stderr and running.stderr.read()
         running.send_signal(number)
-        _, said = running.communicate(timeout=PATIENCE_S)
+        _, said = running.communicate(timeout=TIMEOUT_S)
     assert running.returncode == code
     assert "Stopped" in said
     assert "Traceback" not in said

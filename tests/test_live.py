@@ -18,8 +18,8 @@ from playwright.sync_api import Page
 from splatpipe.demo import capture_path
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import PATIENCE_S, wait_until
 from served import Served, linked_copy, serving
+from timeouts import TIMEOUT_S, wait_until
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def training(demo_run: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.
     yield out, process
     hold(process, signal.SIGCONT)
     process.send_signal(signal.SIGTERM)
-    process.wait(timeout=PATIENCE_S)
+    process.wait(timeout=TIMEOUT_S)
 
 
 def hold(process: subprocess.Popen[bytes], how: signal.Signals = signal.SIGSTOP) -> None:
@@ -104,7 +104,7 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         wait_for_picture(page, SHOWS, 2)
         assert not np.array_equal(shown(page, "photo"), far)
         process.send_signal(signal.SIGTERM)
-        process.wait(timeout=PATIENCE_S)
+        process.wait(timeout=TIMEOUT_S)
         wait(page, lambda told: not told["at_work"])
         page.locator("#state.failed").wait_for()
         assert "train" in page.locator("#state").inner_text()
@@ -124,7 +124,7 @@ def choose(page: Page, number: int) -> None:
 
 def wait_for_picture(page: Page, shows: str, what: object) -> None:
     """Wait until the page shows it: rendering is slow on a busy machine."""
-    page.wait_for_function(shows, arg=what, timeout=1000.0 * PATIENCE_S)
+    page.wait_for_function(shows, arg=what, timeout=1000.0 * TIMEOUT_S)
 
 
 def follow_the_curves(page: Page, points: int) -> None:

@@ -22,7 +22,7 @@ from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_
 from splatpipe.pipeline.engine.machine import Mount
 
 ELSEWHERE = {"process": 4711, "host": "node7", "boot": "another", "turn": "first"}
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 HOLDS = """
 import sys
 from pathlib import Path
@@ -104,7 +104,7 @@ def test_who_waits_is_told_whom_for_and_goes_on_when_that_one_ends(out: Path) ->
         process.stdin.flush()
 
     with holder(out) as process, locked(out, wait=True, notify=notify):
-        assert process.wait(PATIENCE_S) == 0
+        assert process.wait(TIMEOUT_S) == 0
     assert len(told) == 1 and f"process {process.pid}" in told[0]
 
 
@@ -166,12 +166,12 @@ def test_another_machine_at_work_is_waited_for(out: Path) -> None:
 
 
 def test_a_lock_that_is_given_back_elsewhere_is_taken_at_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine_lock, "SILENCE_S", 10 * PATIENCE_S)
+    monkeypatch.setattr(engine_lock, "SILENCE_S", 10 * TIMEOUT_S)
     path = out / "stages" / LOCK_FILE
     path.write_text(json.dumps(ELSEWHERE))
     began_s = time.monotonic()
     with locked(out, notify=lambda _: path.write_text("")):
-        assert time.monotonic() - began_s < PATIENCE_S
+        assert time.monotonic() - began_s < TIMEOUT_S
 
 
 def test_who_slept_too_long_finds_its_place_taken_and_leaves_the_signature(out: Path) -> None:
@@ -179,7 +179,7 @@ def test_who_slept_too_long_finds_its_place_taken_and_leaves_the_signature(out: 
     with locked(out) as hold:
         hold.confirm()
         path.write_text(json.dumps(ELSEWHERE))
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + TIMEOUT_S
         with pytest.raises(MachineError, match=r"4711 on node7.* has taken over"):
             while time.monotonic() < deadline_s:
                 hold.confirm()
@@ -296,7 +296,7 @@ def test_of_a_shard_and_a_run_elsewhere_that_sign_at_once_the_shard_gives_way(
 def test_a_shards_maker_that_slept_finds_its_signature_taken_off(out: Path) -> None:
     with locked_shard(out, "train.1") as hold:
         (out / "stages" / f"{LOCK_FILE}.train.1").write_bytes(b"")
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + TIMEOUT_S
         with pytest.raises(MachineError, match=r"has taken over train.1 in"):
             while time.monotonic() < deadline_s:
                 hold.confirm()

@@ -31,7 +31,7 @@ from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import PATIENCE_S, wait_until
+from timeouts import TIMEOUT_S, wait_until
 
 QUICK = (
     *("features.extractor=opencv-sift", "features.max_image_size=700", "undistort.max_megapixels=0.03"),
@@ -190,7 +190,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
         wait_until(lambda: begun.search(events.read_text(), before) or running.poll() is not None, "the training")
         assert running.poll() is None, running.stderr and running.stderr.read()
         running.send_signal(signal.SIGINT)
-        _, said = running.communicate(timeout=PATIENCE_S)
+        _, said = running.communicate(timeout=TIMEOUT_S)
     assert running.returncode == 130 and "Traceback" not in said
     assert not list(copy_of_run.glob("report.html.*"))
     splatpipe("report", copy_of_run)

@@ -32,7 +32,7 @@ from splatpipe.pipeline.web.viewer_scene import ViewerRendering, viewer_scene, w
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
-from patience import wait_until
+from timeouts import wait_until
 
 COUNT, MOST_PER_NODE = 1200, 100
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up

@@ -17,8 +17,8 @@ from splatpipe.pipeline.app.view.files import NotThereError, open_inside, wanted
 from splatpipe.pipeline.app.view.log import MOST_POINTS, Curve, RunLog
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from patience import PATIENCE_S
 from served import Answer, Served, linked_copy, serving
+from timeouts import TIMEOUT_S
 
 SECRET = b"nobody may read this"
 WEB = {"index.html": b"<title>Web</title>", "viewer.js": b"0", "viewer.js.gz": b"1", "nodes/a1.spz": b"NGSP"}
@@ -350,7 +350,7 @@ def test_the_viewer_opens_from_here_with_its_splat_inside_or_beside_it(served: S
 def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> None:
     def view(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", *map(str, arguments), "--no-browser"]
-        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
 
     done = view(tmp_path)
     assert done.returncode == 2 and "does not contain a run" in " ".join(done.stderr.replace("│", " ").split())
@@ -385,7 +385,7 @@ def test_a_published_port_of_a_container_is_answered_and_the_host_is_checked_all
 def test_it_ends_when_asked_to(demo_run: Path, number: signal.Signals, code: int) -> None:
     with serving(demo_run) as server:
         server.process.send_signal(number)
-        assert server.process.wait(timeout=PATIENCE_S) == code
+        assert server.process.wait(timeout=TIMEOUT_S) == code
 
 
 def test_a_file_behind_a_link_or_a_pipe_is_not_there(tmp_path: Path) -> None:

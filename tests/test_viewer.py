@@ -33,7 +33,7 @@ from splatpipe.pipeline.web.viewer_scene import ViewerRendering, upright, viewer
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
-from patience import wait_until
+from timeouts import wait_until
 
 LIKE_OURS_DB = 25.0
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up

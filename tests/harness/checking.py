@@ -24,7 +24,7 @@ from training import Draws, Loss, step_complaints
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
 
-PATIENCE_S = 60
+TIMEOUT_S = 60
 """Far longer than all checks of one fault: detects endless loops."""
 
 
@@ -76,7 +76,7 @@ def in_a_process(library: CudaLibrary, truth: ReferenceResult, fault: int) -> st
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        signal.alarm(PATIENCE_S)
+        signal.alarm(TIMEOUT_S)
         controls(library).harness_fault(fault)
         os.write(writing, first_complaint(library, truth).encode()[:4000])
         os._exit(0)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from patience import PATIENCE_S
+from timeouts import TIMEOUT_S
 
 WRITTEN_INTO = ("events.jsonl", "splatpipe.log", ".lock")
 ADDRESS = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)")
@@ -104,7 +104,7 @@ def serving(out: Path, *options: object) -> Iterator[Served]:
     finally:
         process.send_signal(signal.SIGINT)
         try:
-            process.communicate(timeout=PATIENCE_S)
+            process.communicate(timeout=TIMEOUT_S)
         finally:
             process.kill()  # no effect if it has ended
 
