@@ -17,7 +17,7 @@ from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
 from splatpipe.pipeline.sfm.keypoints import Bytes, extract, single_threaded_opencv
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 
-LEAST_KEYPOINTS = 16  # COLMAP needs 15 inliers per pair; with fewer keypoints a photo can never be placed
+MIN_KEYPOINTS = 16  # COLMAP needs 15 inliers per pair; with fewer keypoints a photo can never be placed
 
 
 def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -62,7 +62,7 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
 
 
 def _check(photo_list: PhotoList, counts: list[int], report: Reporter) -> None:
-    poor = [photo.name for photo, count in zip(photo_list.photos, counts, strict=True) if count < LEAST_KEYPOINTS]
+    poor = [photo.name for photo, count in zip(photo_list.photos, counts, strict=True) if count < MIN_KEYPOINTS]
     if len(counts) - len(poor) < 2:
         raise SplatpipeError(
             "The photos have too little texture: they have hardly any keypoints.",

@@ -31,7 +31,7 @@ from splatpipe.pipeline.train.limits import (
 from splatpipe.stages.block_work import BEGINNING_S, BlockLoad
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import FEWEST_GAUSSIANS, LEAST_SHARE, MEGA, CaptureSize, CaptureWork
+from splatpipe.stages.work import FEWEST_GAUSSIANS, MEGA, MIN_SHARE, CaptureSize, CaptureWork
 
 SPEED_NUMBERS = 20_000  # in the text, without repeats, whose compression is timed
 SPEED_S = 0.008  # seconds of that compression on the reference machine of `costs.py`, otherwise idle
@@ -74,7 +74,7 @@ def needs_of(work: CaptureWork, speed: float) -> dict[str, Need]:
     if not budget:
         return needs
     others = sum(need.seconds(threads) for stage, need in needs.items() if stage != "train")
-    left = max(LEAST_SHARE * budget, budget - others)
+    left = max(MIN_SHARE * budget, budget - others)
     filled = work.filling(left, speed).needs(speed)
     whole_time = left / replace(filled["train"], cpu_seconds=1.0).seconds(threads)
     return {**filled, "train": replace(filled["train"], cpu_seconds=whole_time)}

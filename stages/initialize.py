@@ -29,7 +29,7 @@ NEIGHBOURS = 3
 SMALLEST_PER_EXTENT = 1e-6  # least size of a Gaussian, relative to the scene's extent
 TINY = 1e-12  # least extent, for a scene of one point at its camera
 QUERY_CHUNK = 65_536
-MOST_DENSE = 50_000  # dense points, spread evenly; density control adds finer detail where it pays
+MAX_DENSE = 50_000  # dense points, spread evenly; density control adds finer detail where it pays
 
 
 def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -74,7 +74,7 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
 
 def _dense(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter) -> DensePoints:
     """Return dense points from the training photos only: held-out views must not influence what they evaluate."""
-    cover = PointBudget(MOST_DENSE, None if area is None else area.contains)
+    cover = PointBudget(MAX_DENSE, None if area is None else area.contains)
     kept = set(load_split(inputs["split.views"]).train)
     used = [view for view in views if view.camera.name in kept]
     dataset, threads = inputs["undistort.dataset"], inputs.machine.threads

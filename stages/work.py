@@ -39,7 +39,7 @@ MEGA = 1e6
 USUAL_SHAPE = 0.72  # side ratio of photos if unknown: between the 4:3 and 3:2 of most cameras
 SIFT_WORK = {"opencv-sift": 1.0, "sift": 3.2}  # CPU seconds per pixel relative to OpenCV's: 2.4 on sceaux, 4.3 on demo
 SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # memory per thread, likewise
-MOST_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times max_features: several orientations, whole scales
+MAX_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times max_features: several orientations, whole scales
 NEIGHBOURS = 20  # per photo, behind `Costs.pairs`
 PHOTOS_OF_ONE_COST = 50  # up to this many photos, mapping costs the constant per photo; with more photos it costs more
 MAPPING_GROWTH = 0.5  # exponent of the number of photos in the mapping cost per photo
@@ -53,7 +53,7 @@ GROWTH_SAMPLES = 32  # of the number of Gaussians within a stretch of the traini
 PYRAMID = 4.0 / 3.0  # pixels of a photo's whole image pyramid over its own
 TARGETS_TILE = 2.4  # megapixels of a tile in which targets are searched
 START_SHARE = 0.2  # of the final number of Gaussians, at the start
-LEAST_SHARE = 0.1  # of a time budget that training always gets
+MIN_SHARE = 0.1  # of a time budget that training always gets
 FEWEST_GAUSSIANS = 1000  # however short the time
 PHOTO_BYTES = 3  # per decoded pixel
 PARALLEL = {
@@ -222,7 +222,7 @@ class CaptureWork:
     def keypoints(self) -> float:
         """Keypoints per photo."""
         options = self.config.features
-        most = MOST_KEYPOINTS[options.extractor] * options.max_features
+        most = MAX_KEYPOINTS[options.extractor] * options.max_features
         return min(most, self.costs.keypoints[options.extractor] * self.looked_at)
 
     @property

@@ -192,7 +192,7 @@ HOSTILE: dict[str, tuple[Any, str]] = {
         "collections within collections",
     ),
     "a link": (polygon(degrees, OUTLINE) | {"crs": {"type": "link", "properties": {"href": "http://x"}}}, "its CRS"),
-    "fine": ({"type": "Polygon", "coordinates": [ring_of(boundary_file.MOST_VERTICES + 2)]}, "more than 20,000 vert"),
+    "fine": ({"type": "Polygon", "coordinates": [ring_of(boundary_file.MAX_VERTICES + 2)]}, "more than 20,000 vert"),
 }
 
 
@@ -216,9 +216,9 @@ def test_a_large_file_is_not_read(tmp_path: Path) -> None:
 
 
 def test_the_finest_allowed_is_read_and_holds_what_it_should(tmp_path: Path) -> None:
-    value = {"type": "Polygon", "coordinates": [ring_of(boundary_file.MOST_VERTICES)]}
+    value = {"type": "Polygon", "coordinates": [ring_of(boundary_file.MAX_VERTICES)]}
     drawing = read_boundary(written(tmp_path, value))
-    assert len(drawing.polygons[0][0]) == boundary_file.MOST_VERTICES - 1 and drawing.crossing == ()
+    assert len(drawing.polygons[0][0]) == boundary_file.MAX_VERTICES - 1 and drawing.crossing == ()
 
 
 def test_polygons_have_their_features_names(tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def test_interval_that_is_none_is_refused(tmp_path: Path, interval: float) -> No
 def test_too_many_points_are_refused_before_they_fill_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tracing, "MOST_VERTICES", 50)
+    monkeypatch.setattr(tracing, "MAX_VERTICES", 50)
     with pytest.raises(SplatpipeError, match="more than 50 points"):
         traced(tmp_path / "dsm.tif", hill_grid(), 0.1)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.mvs.depth_maps import DepthMap
-from splatpipe.pipeline.mvs.filling import LEAST_CONFIDENCE, behind, filled
+from splatpipe.pipeline.mvs.filling import MIN_CONFIDENCE, behind, filled
 
 
 def both(off: float, size: tuple[int, int] = (60, 80)) -> tuple[DepthMap, DepthMap]:
@@ -15,7 +15,7 @@ def both(off: float, size: tuple[int, int] = (60, 80)) -> tuple[DepthMap, DepthM
     splat = (true * np.float32(1.0 + off)).astype(np.float32)
     splat[40:50] *= 1.5
     confidence = np.full(size, 9, np.uint8)
-    confidence[10:20, 25:] = LEAST_CONFIDENCE - 1
+    confidence[10:20, 25:] = MIN_CONFIDENCE - 1
     found = DepthMap(np.where(known, true, np.float32(0.0)), np.where(known, 3, 0).astype(np.uint8))
     return found, DepthMap(splat, confidence)
 

@@ -28,7 +28,7 @@ from splatpipe.pipeline.surface.openings import outlines, projections, recesses
 from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.sources import DepthSource
-from splatpipe.pipeline.surface.walls import LEAST_HEIGHT_M, Wall, find_walls
+from splatpipe.pipeline.surface.walls import MIN_HEIGHT_M, Wall, find_walls
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -167,7 +167,7 @@ def test_pieces_of_one_wall_are_joined_and_others_are_not() -> None:
 def test_fences_cars_and_crowns_are_no_walls() -> None:
     random = np.random.default_rng(1)
     fence = panel((0, 0), (12, 0), 0, 1.6)
-    van = panel((0, 9), (4.5, 9), 0.0, LEAST_HEIGHT_M + 0.3)
+    van = panel((0, 9), (4.5, 9), 0.0, MIN_HEIGHT_M + 0.3)
     turn = random.uniform(0, 2 * np.pi, 4000)
     round_m = 2.0 + random.normal(0.0, 0.2, 4000)
     places = np.column_stack([20 + round_m * np.cos(turn), round_m * np.sin(turn), random.uniform(1, 6, 4000)])
@@ -176,7 +176,7 @@ def test_fences_cars_and_crowns_are_no_walls() -> None:
     assert find_walls(joined(fence, van, crown, hedge)) == []
     clipped = joined(panel((0, 0), (12, 0), 0, 2.3, spread=0.06), panel((12, 0), (12, 9), 0, 2.3, spread=0.06))
     assert find_walls(clipped) == []  # low hedges that meet, of one height and as even as a gardener cuts them
-    low = joined(panel((0, 9), (4.5, 9), 0.0, LEAST_HEIGHT_M + 0.3), panel((4.5, 9), (4.5, 13), 0.0, 3.0))
+    low = joined(panel((0, 9), (4.5, 9), 0.0, MIN_HEIGHT_M + 0.3), panel((4.5, 9), (4.5, 13), 0.0, 3.0))
     assert [wall.name for wall in find_walls(low)] == ["east", "south"]  # a low one that belongs to a house
     assert find_walls(fence.select(np.zeros(0, np.int64))) == []
 

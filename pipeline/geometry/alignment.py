@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.geometry.correspondences import (
-    LEAST_NOISE_FACTOR,
+    MIN_NOISE_FACTOR,
     REDUNDANT,
     Correspondences,
     DirectionPrior,
@@ -52,8 +52,8 @@ OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors are never this large
 LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be estimated
 CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at about 1 in 10,000
 OUTLIER_SIGMAS = 3.0  # an error within the position's stated accuracy is not an outlier
-LEAST_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
-MOST_GROUPS = 20  # groups whose own triples are tried: one good group is enough
+MIN_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
+MAX_GROUPS = 20  # groups whose own triples are tried: one good group is enough
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: i
     steps = mean - mean[reference]
     covariance = np.linalg.pinv(_information(problem, weights, None), rcond=FREE, hermitian=True)
     variances = np.einsum("gkp,pq,gkq->gk", steps, covariance, steps) + 1.0 / own + 1.0 / own[reference]
-    return np.asarray(max(fit.noise, LEAST_NOISE_FACTOR) * np.sqrt(np.maximum(variances, 0.0)))
+    return np.asarray(max(fit.noise, MIN_NOISE_FACTOR) * np.sqrt(np.maximum(variances, 0.0)))
 
 
 def turn_about_axis(
@@ -264,7 +264,7 @@ def _refine(
         inliers = near
     chosen = points.only(inliers).at_noise(noise)
     information = _information(_Problem(chosen, similarity), _sigma_weights(chosen), prior)
-    factor = max(noise, LEAST_NOISE_FACTOR) if len(chosen) >= REDUNDANT else max(noise, 1.0)
+    factor = max(noise, MIN_NOISE_FACTOR) if len(chosen) >= REDUNDANT else max(noise, 1.0)
     sigma_rotation, _ = _weakest_rotation(information)
     return SimilarityFit(
         similarity=similarity,
@@ -287,7 +287,7 @@ def _reweighted(
     stated = points
     for _ in range(IRLS_ROUNDS):
         off = normed(_residuals(similarity, points.without(offsets)), points)
-        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, LEAST_NOISE)
+        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, MIN_NOISE)
         weights = _sigma_weights(points) / (1.0 + (off / (CAUCHY * noise)) ** 2)[:, None]
         points = stated.at_noise(noise)
         problem = _Problem(points, similarity)
@@ -344,7 +344,7 @@ def _triples(points: Correspondences) -> np.ndarray:
     if points.shared is None:
         return _triples_of(everyone, MAX_HYPOTHESES)
     groups = [np.flatnonzero(members) for members in points.shared.membership()]
-    large = sorted((group for group in groups if len(group) >= 3), key=len, reverse=True)[:MOST_GROUPS]
+    large = sorted((group for group in groups if len(group) >= 3), key=len, reverse=True)[:MAX_GROUPS]
     share = MAX_HYPOTHESES // (2 * max(1, len(large)))
     within = [_triples_of(group, share) for group in large]
     return np.concatenate([*within, _triples_of(everyone, MAX_HYPOTHESES // 2)])

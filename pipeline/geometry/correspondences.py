@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-LEAST_NOISE_FACTOR = 0.3  # GNSS errors drift slowly: residuals of one flight look better than the positions are
+MIN_NOISE_FACTOR = 0.3  # GNSS errors drift slowly: residuals of one flight look better than the positions are
 REDUNDANT = 8  # points; from this many on, the residuals give the noise better than the stated sigmas do
 
 
@@ -62,7 +62,7 @@ class Correspondences:
         """A copy for stated sigmas that are wrong by this factor while those of shared errors are right."""
         if self.shared is None:
             return self
-        return replace(self, shared=replace(self.shared, sigmas=self.shared.sigmas / max(noise, LEAST_NOISE_FACTOR)))
+        return replace(self, shared=replace(self.shared, sigmas=self.shared.sigmas / max(noise, MIN_NOISE_FACTOR)))
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ FREE = 1e-13  # an eigenvalue below this, relative to the largest, is rounding
 SIMILARITY = 7
 QUIET = 2.5  # times the stated sigmas: control that agrees this well is not searched for blunders
 CRITICAL, CRITICAL_FEW = 4.0, 24.0  # of a studentised residual; a little over Student's t at 1 in 1000, by its degrees
-MOST_PAIRED = 40  # points up to which pairs are tried, too
-LEAST_LEFT = 3
-MOST_SUSPECTS = 100  # points tried, those with the largest residuals; a blunder is among them
-MOST_FOUND = 50  # blunders: a file with more has some other fault
+MAX_PAIRED = 40  # points up to which pairs are tried, too
+MIN_LEFT = 3
+MAX_SUSPECTS = 100  # points tried, those with the largest residuals; a blunder is among them
+MAX_FOUND = 50  # blunders: a file with more has some other fault
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ def find_blunders(start: Similarity, observed: JointObservations, priors: Priors
     """
     found: list[int] = []
     candidates = np.flatnonzero(observed.is_control).tolist()
-    while len(candidates) - len(found) > LEAST_LEFT and 2 * len(found) < min(len(candidates), 2 * MOST_FOUND):
+    while len(candidates) - len(found) > MIN_LEFT and 2 * len(found) < min(len(candidates), 2 * MAX_FOUND):
         kept = _without(len(observed), found)
         if fit_jointly(start, observed.only(kept), priors).noise <= QUIET:
             break
@@ -196,7 +196,7 @@ def _worst(
     """The point, or else the pair, without which the others agree best; empty if these are not blunders."""
     left = [int(i) for i in np.flatnonzero(observed.is_control) if i not in found]
     for size in (1, 2):
-        if len(left) - size < LEAST_LEFT or (size == 2 and len(left) > MOST_PAIRED):
+        if len(left) - size < MIN_LEFT or (size == 2 and len(left) > MAX_PAIRED):
             break
         best: tuple[float, tuple[int, ...], JointFit] | None = None
         for subset in itertools.combinations(_suspects(start, observed, priors, left), size):
@@ -210,14 +210,14 @@ def _worst(
 
 def _suspects(start: Similarity, observed: JointObservations, priors: Priors, left: Sequence[int]) -> list[int]:
     """The points with the largest residuals, or all points where they are few."""
-    if len(left) <= MOST_SUSPECTS:
+    if len(left) <= MAX_SUSPECTS:
         return list(left)
     others = np.flatnonzero(observed.is_control & ~np.isin(np.arange(len(observed)), left))
     kept = _without(len(observed), others.tolist())
     residuals = fit_jointly(start, observed.only(kept), priors).residuals / observed.sigmas[kept]
     size = np.zeros(len(observed))
     size[kept] = (residuals**2).sum(axis=1)
-    return sorted(np.array(left)[np.argsort(-size[left], kind="stable")[:MOST_SUSPECTS]].tolist())
+    return sorted(np.array(left)[np.argsort(-size[left], kind="stable")[:MAX_SUSPECTS]].tolist())
 
 
 def _is_off(fit: JointFit, observed: JointObservations, index: int, least_m: float) -> bool:

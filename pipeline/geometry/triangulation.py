@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 MAX_PAIRS = 400  # hypotheses per point; with a third of its marks right, one pair in nine is right
 ROUNDS = 20
 TOLERANCE = 1e-12  # of a step, relative to the point's depth
-LEAST_PARALLAX_RAD = np.radians(1.0)  # below it the depth is a guess
+MIN_PARALLAX_RAD = np.radians(1.0)  # below it the depth is a guess
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def triangulate(rays: Rays, tolerance_px: float) -> TriangulatedPoint | None:
 def _meeting(rays: Rays) -> Float64[np.ndarray, " 3"] | None:
     """The point nearest to the rays; None if they are parallel or antiparallel, or meet behind a camera."""
     directions, centres = rays.directions(), rays.centres()
-    if np.arccos(np.clip(np.abs(directions @ directions.T), 0.0, 1.0)).max() < LEAST_PARALLAX_RAD:
+    if np.arccos(np.clip(np.abs(directions @ directions.T), 0.0, 1.0)).max() < MIN_PARALLAX_RAD:
         return None
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     point = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))

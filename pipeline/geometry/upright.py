@@ -26,16 +26,16 @@ STEADY = 0.997  # within about 4°: a gimbal, which points down better than the 
 PARALLEL = 0.9995  # within about 2°: nobody holds a camera this steady while walking
 SCATTERED = 0.5  # below this, the vectors mostly cancel
 GRID = 0.3  # least spread of the cameras along the image's height, over that along its width, of a survey
-LEAST_WIDTH = 0.2  # of the fan of the cameras' horizontal axes: a narrower one does not determine its plane
-MOST_THICKNESS = 0.35  # of that fan, over its width
+MIN_WIDTH = 0.2  # of the fan of the cameras' horizontal axes: a narrower one does not determine its plane
+MAX_THICKNESS = 0.35  # of that fan, over its width
 GROUND_POINTS = 5000
-LEAST_GROUND_POINTS = 50
+MIN_GROUND_POINTS = 50
 GROUND_SAMPLES = 500
 GROUND_COSINE = math.cos(math.radians(40.0))  # between the ground's normal and the cameras' mean view
 GROUND_THICKNESS = 0.015  # over the cameras' height above it
 GROUND_SHARE = 0.2  # of the points
 ROBUST_ROUNDS = 20
-LEAST_WEIGHT_RAD = 0.01
+MIN_WEIGHT_RAD = 0.01
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def up_from_cameras(
     """
     mean_up, mean_forward = axes.up.mean(axis=0), axes.forward.mean(axis=0)
     normal, thickness, width = _plane_normal(axes.right)
-    if width > LEAST_WIDTH and thickness < MOST_THICKNESS * width:
+    if width > MIN_WIDTH and thickness < MAX_THICKNESS * width:
         sign = float(np.sign(((axes.up - axes.forward) @ normal).sum())) or 1.0
         return UpEstimate(sign * normal, "the horizontal edges of the pictures")
     alike_up, alike_forward = float(np.linalg.norm(mean_up)), float(np.linalg.norm(mean_forward))
@@ -134,8 +134,8 @@ def up_without_orientation(
     (_, thickness, width), (normal, other_thickness, other_width) = (
         _plane_normal(axes.right) for axes in (upright, turned)
     )
-    is_plane = other_width > LEAST_WIDTH and other_thickness < MOST_THICKNESS * other_width
-    if not is_plane or (width > LEAST_WIDTH and thickness * other_width <= other_thickness * width):
+    is_plane = other_width > MIN_WIDTH and other_thickness < MAX_THICKNESS * other_width
+    if not is_plane or (width > MIN_WIDTH and thickness * other_width <= other_thickness * width):
         return up_from_cameras(upright, centres, points)
     light = np.einsum("nij,ni->nj", cam_from_world[:, :2], brighter()).sum(axis=0)
     return UpEstimate(
@@ -169,7 +169,7 @@ def mean_rotation(rotations: Float64[np.ndarray, "n 3 3"]) -> tuple[Float64[np.n
         mean = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
         cosines = (np.einsum("nij,ij->n", rotations, mean) - 1.0) / 2.0
         angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-        weights = 1.0 / np.maximum(angles, LEAST_WEIGHT_RAD)
+        weights = 1.0 / np.maximum(angles, MIN_WEIGHT_RAD)
     return mean, float(np.median(angles))
 
 
@@ -193,7 +193,7 @@ def _plane_normal(vectors: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarr
     weights = np.ones(len(vectors))
     for _ in range(ROBUST_ROUNDS):
         values, axes = np.linalg.eigh((vectors * weights[:, None]).T @ vectors / weights.sum())
-        weights = 1.0 / np.maximum(np.abs(vectors @ axes[:, 0]), LEAST_WEIGHT_RAD)
+        weights = 1.0 / np.maximum(np.abs(vectors @ axes[:, 0]), MIN_WEIGHT_RAD)
     return axes[:, 0], math.sqrt(max(float(values[0]), 0.0)), math.sqrt(max(float(values[1]), 0.0))
 
 
@@ -215,7 +215,7 @@ def _ground_normal(
     points: Float64[np.ndarray, "m 3"], centres: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " 3"] | None:
     """Upward normal of the plane with most points, by RANSAC from a fixed seed; None if no plane has enough."""
-    if len(points) < LEAST_GROUND_POINTS:
+    if len(points) < MIN_GROUND_POINTS:
         return None
     generator = np.random.Generator(np.random.PCG64(0))
     chosen = points[np.sort(generator.choice(len(points), min(len(points), GROUND_POINTS), replace=False))]

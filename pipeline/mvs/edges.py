@@ -18,7 +18,7 @@ AROUND_PX = 2 * REACH_PX + 1  # radius in which both sides of an edge are sample
 SIGMA_PX = REACH_PX + 1.0  # with this Gaussian weight
 BEHIND = 0.02  # of the depth: at least this much farther is another object,
 SAME = 0.01  # and within this much the same object
-LEAST_APART = 30.0  # of 441, between the colours of both sides: where these are alike, a pixel is not decidable
+MIN_APART = 30.0  # of 441, between the colours of both sides: where these are alike, a pixel is not decidable
 LIKER = 0.7  # a background pixel's colour difference from the background, over that from the foreground, at most
 
 Pixels = tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]
@@ -58,7 +58,7 @@ def pixels_behind(
     rows, columns = np.nonzero(at_edge)
     front, back = _sides(np.where(at_edge, np.float32(0.0), depth), depth, colour, (rows, columns))
     seen = colour[rows, columns].astype(np.float32)
-    told = (front.weight > 0.0) & (back.weight > 0.0) & (_apart(front.colour, back.colour) > LEAST_APART)
+    told = (front.weight > 0.0) & (back.weight > 0.0) & (_apart(front.colour, back.colour) > MIN_APART)
     wrong = told & (_apart(seen, back.colour) < LIKER * _apart(seen, front.colour))
     return rows[wrong], columns[wrong], back.depth[wrong]
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from splatpipe.pipeline.mvs.depth_maps import DepthMap
 
-LEAST_CONFIDENCE = 5  # of a rendered depth: with fewer, 3 in 4 on plain walls were more than 2 GSD off, else 1 in 8
+MIN_CONFIDENCE = 5  # of a rendered depth: with fewer, 3 in 4 on plain walls were more than 2 GSD off, else 1 in 8
 SAME = 0.02  # of the depth, within which both are on the same surface
 FEWEST = 1000  # pixels with both depths needed to estimate the offset
 
@@ -32,7 +32,7 @@ def filled(found: DepthMap, rendered: DepthMap) -> DepthMap:
     """
     if found.depth.shape != rendered.depth.shape:
         raise ValueError(f"depths of {found.depth.shape} and of {rendered.depth.shape} are not of one grid")
-    sure = rendered.confidence >= LEAST_CONFIDENCE
+    sure = rendered.confidence >= MIN_CONFIDENCE
     takes = sure & (found.confidence == 0)
     depth = np.where(takes, rendered.depth * np.float32(1.0 - behind(found, rendered)), found.depth)
     return DepthMap(depth.astype(np.float32), np.where(takes, rendered.confidence, found.confidence))
@@ -40,7 +40,7 @@ def filled(found: DepthMap, rendered: DepthMap) -> DepthMap:
 
 def behind(found: DepthMap, rendered: DepthMap) -> float:
     """Median offset of rendered behind photo depths, as a share of the depth; 0 if few pixels have both."""
-    both = (found.confidence > 0) & (rendered.confidence >= LEAST_CONFIDENCE)
+    both = (found.confidence > 0) & (rendered.confidence >= MIN_CONFIDENCE)
     share = rendered.depth[both].astype(np.float64) / found.depth[both] - 1.0
     share = share[np.abs(share) < SAME]
     return float(np.median(share)) if share.size >= FEWEST else 0.0

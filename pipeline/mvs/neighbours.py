@@ -15,8 +15,8 @@ from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 BEST_ANGLE_DEG = 10.0  # between two rays: a smaller angle is imprecise, with a larger one appearance differs too much
 NARROW_DEG = 4.0  # spread of the weight below the best angle
 WIDE_DEG = 10.0  # and above
-LEAST_SHARED = 8  # points; two photos with fewer overlap by chance or only at an edge
-LEAST_POINTS = 20  # a photo with fewer has no reliable depth range
+MIN_SHARED = 8  # points; two photos with fewer overlap by chance or only at an edge
+MIN_POINTS = 20  # a photo with fewer has no reliable depth range
 PERCENTILES = (1.0, 99.0)  # of the depths: the few wrong points lie outside
 DEEPEST = 1000.0  # maximum ratio of far to near end
 FARTHER = 10.0  # times farther than the farthest points: hills and trees behind have few; costs only a few more planes
@@ -74,7 +74,7 @@ def neighbours(tracks: SparseVisibility, cameras: Sequence[Camera], most: int) -
         points = np.repeat(own, lengths)
         weights = _angle_weights(tracks.xyz[points], centres[view], centres[others])
         shared = np.bincount(others, minlength=len(cameras))
-        score = np.where(shared >= LEAST_SHARED, np.bincount(others, weights, minlength=len(cameras)), 0.0)
+        score = np.where(shared >= MIN_SHARED, np.bincount(others, weights, minlength=len(cameras)), 0.0)
         score[view] = 0.0
         ranked = np.argsort(-score, kind="stable")[:most]
         found.append([int(other) for other in ranked if score[other] > 0.0])
@@ -107,7 +107,7 @@ def inverse_depths(tracks: SparseVisibility, view: int, camera: Camera, wider: f
     pose = camera.cam_from_world
     depths = tracks.xyz[tracks.seen[view]] @ pose[2, :3] + pose[2, 3]
     depths = depths[depths > 0.0]
-    if depths.size < LEAST_POINTS:
+    if depths.size < MIN_POINTS:
         return None
     near, far = (float(depth) for depth in np.percentile(depths, PERCENTILES))
     return 1.0 / (far * FARTHER), wider / max(near, far / DEEPEST)

@@ -20,7 +20,7 @@ from splatpipe.pipeline.raster import _native
 
 ITERATIONS = (6, 3, 1)  # from the coarsest size; each size is half the next
 BEGUN = (0, 1, 4)  # how often the perturbation was already reduced: the planes of larger sizes are nearly right
-LEAST_SIDE = 24  # pixels; a photo is not halved below this
+MIN_SIDE = 24  # pixels; a photo is not halved below this
 ALIKE = 0.5  # cost for the two best-matching photos up to which there is a depth
 FAR_END = 2.0  # times the smallest inverse depth; anything farther has no usable depth: clouds
 
@@ -51,7 +51,7 @@ def find_depths(
         plain: Whether pixels without texture get depths, too.
     """
     sizes = [(photo, list(others))]
-    while len(sizes) < len(ITERATIONS) and min(sizes[-1][0].grey.shape) >= 2 * LEAST_SIDE:
+    while len(sizes) < len(ITERATIONS) and min(sizes[-1][0].grey.shape) >= 2 * MIN_SIDE:
         sizes.append((sizes[-1][0].halved(), [other.halved() for other in sizes[-1][1]]))
     planes = np.zeros((3, *sizes[-1][0].grey.shape), np.float32)
     costs = np.zeros(planes.shape[1:], np.float32)

@@ -34,11 +34,11 @@ SMALLEST_PX = 12.0  # side of a black square
 LARGEST_SHARE = 0.9  # of the image's longer side
 TILE_PX, OVERLAP_PX = 1536, 160  # enlarged images are searched in tiles, to save memory; larger squares at full size
 SAMPLES = 3  # along a cell's side
-LEAST_CORRELATION = 0.7  # of the pixels with the dictionary's pattern
+MIN_CORRELATION = 0.7  # of the pixels with the dictionary's pattern
 # One square in 66 is a code of this dictionary by chance (250 codes, four rotations, 16 bits): eight times as many as
 # for any other. Windows of a façade reach 0.79; rendered targets of 20 px or more have at least 0.86.
-DENSEST, LEAST_OF_DENSEST = "DICT_4X4_250", 0.83
-LEAST_CONTRAST = 25.0  # of 255
+DENSEST, MIN_OF_DENSEST = "DICT_4X4_250", 0.83
+MIN_CONTRAST = 25.0  # of 255
 CENTRE_SIGMA_PX = 0.1
 
 
@@ -148,8 +148,8 @@ def _judged(
     )
     score = float(np.corrcoef(seen.ravel(), ideal.ravel())[0, 1]) if seen.std() > 0.0 else 0.0
     contrast = float(seen[ideal > 127].mean() - seen[ideal <= 127].mean())
-    least = LEAST_OF_DENSEST if name == DENSEST else LEAST_CORRELATION
-    if score < least or contrast < LEAST_CONTRAST:
+    least = MIN_OF_DENSEST if name == DENSEST else MIN_CORRELATION
+    if score < least or contrast < MIN_CONTRAST:
         return None
     centre = homography @ np.array([0.5, 0.5, 1.0])
     middle = centre[:2] / centre[2]

@@ -18,7 +18,7 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.convert import read_8bit
 from splatpipe.pipeline.photos.photo_list import open_picture, read_checked
 
-LEAST_SIDE_PX = 2000  # a JPEG is decoded at the half, quarter or eighth that still has as many
+MIN_SIDE_PX = 2000  # a JPEG is decoded at the half, quarter or eighth that still has as many
 PATCH = 32  # pixels: the coarse band includes its three longest waves
 DIRECTIONS = 4  # of 45° each
 COARSE, FINE = (0.05, 0.14), (0.2, 0.42)  # cycles per pixel; JPEG keeps little beyond
@@ -55,7 +55,7 @@ def read_grey(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"]:
         return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
     data = read_checked(photo.path, photo.name, photo.sha256)
     with open_picture(BytesIO(data)) as picture:
-        share = min(1.0, LEAST_SIDE_PX / max(picture.size))
+        share = min(1.0, MIN_SIDE_PX / max(picture.size))
         picture.draft("L", (max(1, int(picture.width * share)), max(1, int(picture.height * share))))
         return np.array(picture.convert("L"))
 

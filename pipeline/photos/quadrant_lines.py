@@ -16,7 +16,7 @@ NEAR_PX = 3.5  # radius of the first fit, around places
 NEAR_ROUNDS = 6
 AT_ONCE = 4096  # places at a time, to save memory
 ROUNDS = 12
-LEAST_PIXELS = 14
+MIN_PIXELS = 14
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def pixels_within(
     column, row = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
     away = np.stack([column.ravel() - cx, row.ravel() - cy], axis=1) @ np.linalg.inv(axes)
     inside = (away**2).sum(axis=1) <= 1.0
-    if inside.sum() < LEAST_PIXELS:
+    if inside.sum() < MIN_PIXELS:
         return None
     x, y = column.ravel()[inside].astype(np.float64), row.ravel()[inside].astype(np.float64)
     return x, y, grey[top:bottom, left:right].ravel()[inside].astype(np.float64)

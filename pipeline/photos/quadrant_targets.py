@@ -30,39 +30,39 @@ from splatpipe.pipeline.photos.quadrant_lines import (
 )
 
 SADDLE_SIGMA_PX = 1.0  # less admits noise, more loses targets of 12 px seen obliquely
-LEAST_CONTRAST = 40.0  # of white over black, of 255
+MIN_CONTRAST = 40.0  # of white over black, of 255
 BLURRED_SIGMA_PX = 1.5  # of a saddle that is still found: lens blur, motion blur and our smoothing together
-LEAST_SADDLE = LEAST_CONTRAST / (np.pi * BLURRED_SIGMA_PX**2)  # a quadrant's is contrast / (π σ²) at its centre
-MOST_SADDLES = 100_000  # per tile, the strongest
+MIN_SADDLE = MIN_CONTRAST / (np.pi * BLURRED_SIGMA_PX**2)  # a quadrant's is contrast / (π σ²) at its centre
+MAX_SADDLES = 100_000  # per tile, the strongest
 RINGS_PX = (2.0, RING_PX)
 LIKE_ITSELF = 0.75  # correlation of a ring with itself, rotated by 180°
 RING_CONTRAST = 0.65  # of the least contrast: blur reduces it near the centre
-RING_DARK = 0.7  # darkest over brightest: looser than MOST_DARK, for the same reason
+RING_DARK = 0.7  # darkest over brightest: looser than MAX_DARK, for the same reason
 ACROSS_PX = 1.5  # from a line to where its sides are sampled
 REACH_PX = 64  # along a line; larger targets are followed only this far
-LEAST_REACH_PX = 2.5
+MIN_REACH_PX = 2.5
 EVEN = 0.55  # smallest ratio of a line's reaches in its two directions
 STEP_PX = 0.5
 TILE_PX, OVERLAP_PX = 2048, 2 * REACH_PX + 16  # large images are searched in tiles, to save memory
 DIFFERENCES = 0.5  # of the contrast, below which a line has ended
 FIT_SHARE = 0.7  # of the reach, within which pixels are fitted: those of four triangles, too
-LEAST_FIT_PX = 2.2
+MIN_FIT_PX = 2.2
 LARGEST_FIT_PX = 14.0  # more pixels add hardly any information
-MOST_MOVED_PX = 2.5  # from where the lines of the first fit meet
+MAX_MOVED_PX = 2.5  # from where the lines of the first fit meet
 APART_PX = 3.0  # one target has one centre
 NEAR_CORRELATION = 0.9  # of the first fit
-LEAST_CORRELATION = 0.975  # of an isolated target: a shadow's edge may cross it
+MIN_CORRELATION = 0.975  # of an isolated target: a shadow's edge may cross it
 CORRELATION_AMONG = 0.986  # of one with similar patterns around it, which gravel, leaves and façades have everywhere
 AROUND_PX = (2.0, 16.0)  # beyond a target's corners
-MOST_AROUND = 0.5  # of a saddle's own strength: the strongest other one around an isolated target
+MAX_AROUND = 0.5  # of a saddle's own strength: the strongest other one around an isolated target
 OWN_PX = 1.6  # from its centre
-LEAST_ANGLE_DEG = 18.0  # between the lines
-MOST_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
-LEAST_NEUTRAL = 0.75  # of white minus black: the smallest colour channel over the largest
-MOST_BLUR_PX = 1.6
+MIN_ANGLE_DEG = 18.0  # between the lines
+MAX_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
+MIN_NEUTRAL = 0.75  # of white minus black: the smallest colour channel over the largest
+MAX_BLUR_PX = 1.6
 # A disc of 12 px has the area of a square of 10.6 px, and blur takes some of it. Smaller ones have so few pixels that
 # gravel correlates with 0.99.
-LEAST_SIZE_PX = 10.0
+MIN_SIZE_PX = 10.0
 UNEVEN = 0.15  # of the contrast, between the two dark sectors, or the two bright ones
 
 
@@ -112,7 +112,7 @@ def _found_in(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
     places = _saddles(grey)
     values, scores = lines_about(grey, places[_ring_like(grey, places)])
     dark = (values[:, 4] - np.abs(values[:, 5])) / np.maximum(values[:, 4] + np.abs(values[:, 5]), 1e-9)
-    worth = (scores > NEAR_CORRELATION) & (dark < RING_DARK) & (2.0 * np.abs(values[:, 5]) > LEAST_CONTRAST)
+    worth = (scores > NEAR_CORRELATION) & (dark < RING_DARK) & (2.0 * np.abs(values[:, 5]) > MIN_CONTRAST)
     found: list[QuadrantTarget] = []
     for k in np.flatnonzero(worth).tolist():
         x, y = (values[k, :2] + 0.5).tolist()
@@ -128,12 +128,12 @@ def _saddles(grey: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "n 2"]:
     smooth = cv2.GaussianBlur(grey, (0, 0), SADDLE_SIGMA_PX)
     saddle = _saddle_strengths(smooth)
     largest = cv2.dilate(saddle, np.ones((3, 3), np.uint8))
-    rows, columns = np.nonzero((saddle >= largest) & (saddle > LEAST_SADDLE**2))
+    rows, columns = np.nonzero((saddle >= largest) & (saddle > MIN_SADDLE**2))
     border = int(np.ceil(RINGS_PX[-1])) + 1
     height, width = grey.shape
     inside = (rows >= border) & (rows < height - border) & (columns >= border) & (columns < width - border)
     rows, columns = rows[inside], columns[inside]
-    order = np.argsort(-saddle[rows, columns], kind="stable")[:MOST_SADDLES]
+    order = np.argsort(-saddle[rows, columns], kind="stable")[:MAX_SADDLES]
     rows, columns = rows[order], columns[order]
     return np.asarray(np.stack([columns, rows], axis=1) + _to_level(smooth, rows, columns))
 
@@ -177,7 +177,7 @@ def _ring_like(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 
         alike = (centred * np.roll(centred, RING_STEPS // 2, axis=1)).sum(axis=1)
         good[chosen] = (
             (crossings == 4)
-            & (high - low > RING_CONTRAST * LEAST_CONTRAST)
+            & (high - low > RING_CONTRAST * MIN_CONTRAST)
             & (low < RING_DARK * high)
             & (alike > LIKE_ITSELF * np.maximum(power, 1e-6))
         )
@@ -190,26 +190,26 @@ def _fitted(
     """Fit the target that starts from these lines; None if there is none."""
     reach = _reach(grey, start)
     lines = None if reach is None else fit_within(grey, start, _fitted_part(reach))
-    if lines is None or np.hypot(*(lines.values[:2] - start.values[:2])) > MOST_MOVED_PX:
+    if lines is None or np.hypot(*(lines.values[:2] - start.values[:2])) > MAX_MOVED_PX:
         return None
     reach = _reach(grey, lines)
     return None if reach is None else _judged(grey, pixels, lines, reach)
 
 
 def _fitted_part(reach: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
-    return np.clip(FIT_SHARE * reach, LEAST_FIT_PX, LARGEST_FIT_PX)
+    return np.clip(FIT_SHARE * reach, MIN_FIT_PX, LARGEST_FIT_PX)
 
 
 def _reach(grey: Float32[np.ndarray, "h w"], lines: LinePair) -> Float64[np.ndarray, " 2"] | None:
     """Extent of the contrast along each line, the mean of both directions; None if it does not fit a target."""
     cx, cy, contrast = lines.values[0], lines.values[1], 2.0 * abs(lines.values[5])
-    if contrast < LEAST_CONTRAST:
+    if contrast < MIN_CONTRAST:
         return None
     steps = np.arange(1.0, REACH_PX, STEP_PX)
     reaches = []
     directions = lines.directions()
     sine = abs(float(np.linalg.det(directions)))
-    if sine < np.sin(np.radians(LEAST_ANGLE_DEG)):
+    if sine < np.sin(np.radians(MIN_ANGLE_DEG)):
         return None
     for k in (0, 1):
         along, aside = directions[k], directions[1 - k] * (ACROSS_PX / sine)
@@ -227,7 +227,7 @@ def _reach(grey: Float32[np.ndarray, "h w"], lines: LinePair) -> Float64[np.ndar
             ended = np.flatnonzero(difference[2:] < DIFFERENCES)
             end = len(steps) if len(ended) == 0 else int(ended[0]) + 2
             ways.append(float(steps[min(end, len(steps) - 1)]))
-        if min(ways) < EVEN * max(ways) or min(ways) < LEAST_REACH_PX:
+        if min(ways) < EVEN * max(ways) or min(ways) < MIN_REACH_PX:
             return None
         reaches.append(sum(ways) / 2.0)
     return np.array(reaches)
@@ -249,7 +249,7 @@ def _judged(
 ) -> QuadrantTarget | None:
     """Return the target if its pixels pass the tests, else None."""
     around = pixels_within(grey, lines, _fitted_part(reach))
-    if around is None or lines.values[6] > MOST_BLUR_PX:
+    if around is None or lines.values[6] > MAX_BLUR_PX:
         return None
     x, y, seen = around
     shown, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
@@ -257,7 +257,7 @@ def _judged(
     middle, half = float(lines.values[4]), abs(float(lines.values[5]))
     if not _even(lines, x, y, seen):
         return None
-    if score < LEAST_CORRELATION or middle - half > MOST_DARK * (middle + half) or not _neutral(pixels, x, y, shown):
+    if score < MIN_CORRELATION or middle - half > MAX_DARK * (middle + half) or not _neutral(pixels, x, y, shown):
         return None
     variance = float(((seen - shown) ** 2).sum()) / max(len(seen) - 7, 1)
     covariance = variance * np.linalg.pinv(derivatives.T @ derivatives)
@@ -266,7 +266,7 @@ def _judged(
     area = 4.0 * reach[0] * reach[1] * abs(float(np.linalg.det(directions)))
     cx, cy = lines.values[:2].tolist()
     size = float(np.sqrt(area))
-    if size < LEAST_SIZE_PX or (score < CORRELATION_AMONG and not _alone(grey, cx, cy, size)):
+    if size < MIN_SIZE_PX or (score < CORRELATION_AMONG and not _alone(grey, cx, cy, size)):
         return None
     return QuadrantTarget(cx + 0.5, cy + 0.5, size, sigma, score)
 
@@ -283,7 +283,7 @@ def _alone(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: floa
     around = (away > corners + AROUND_PX[0]) & (away < corners + AROUND_PX[1])
     if not around.any():
         return False
-    return bool(strengths[around].max() < MOST_AROUND**2 * strengths[away < OWN_PX].max())
+    return bool(strengths[around].max() < MAX_AROUND**2 * strengths[away < OWN_PX].max())
 
 
 def _even(
@@ -313,4 +313,4 @@ def _neutral(
     if not bright.any() or bright.all():
         return False
     difference = colours[bright].mean(axis=0) - colours[~bright].mean(axis=0)
-    return float(difference.min()) > LEAST_NEUTRAL * float(difference.max())
+    return float(difference.min()) > MIN_NEUTRAL * float(difference.max())

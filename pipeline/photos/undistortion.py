@@ -22,7 +22,7 @@ from splatpipe.pipeline.photos.resampling import resample, resampled_strips
 
 SHAPE_TOLERANCE = 0.01  # between the aspect ratios of a photo and of its camera in the model
 WHITE = 254.5  # of 255: a pixel counts only if no part of it is masked, and is sky only if all of it is
-LEAST_VIEWS = 2
+MIN_VIEWS = 2
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def place(
         if key not in targets:
             targets[key] = pinhole_camera(source, max_megapixels, len(targets) + 1)
         placed[photo.name] = RegisteredPhoto(photo, image, source, targets[key])
-    if len(placed) < LEAST_VIEWS:
+    if len(placed) < MIN_VIEWS:
         raise SplatpipeError(
             f"Of the {len(images)} photos in the sparse model, {len(placed)} can be used.",
             hint="images/ must contain them, with the names and aspect ratios of the model.",
@@ -185,8 +185,8 @@ def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[RegisteredPho
     for number in sorted(model.points3D):
         old = model.points3D[number]
         seen = observed.get(number, [])
-        unobserved = old.track.length() < LEAST_VIEWS
-        if (len(seen) < LEAST_VIEWS and not unobserved) or not np.isfinite(old.xyz).all():
+        unobserved = old.track.length() < MIN_VIEWS
+        if (len(seen) < MIN_VIEWS and not unobserved) or not np.isfinite(old.xyz).all():
             continue
         track = pycolmap.Track([pycolmap.TrackElement(*element) for element in seen])
         result.add_point3D(old.xyz, track, old.color)

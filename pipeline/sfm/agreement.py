@@ -16,7 +16,7 @@ from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 EXPLAINED_PX = 4.0  # distance from the epipolar line that verification itself allows; more in large photos
-LEAST_PARALLAX = 2.0  # times EXPLAINED_PX: minimum parallax of a match for the sign of its depth to be meaningful
+MIN_PARALLAX = 2.0  # times EXPLAINED_PX: minimum parallax of a match for the sign of its depth to be meaningful
 
 Rays = Float64[np.ndarray, "n 2"]
 
@@ -114,7 +114,7 @@ def epipolar_errors(
     ahead_one = -np.einsum("ij,ij->i", np.cross(shift, second), normal)
     ahead_two = -np.einsum("ij,ij->i", np.cross(shift, turned), normal)
     angle = np.linalg.norm(normal, axis=1) / (np.linalg.norm(turned, axis=1) * np.linalg.norm(second, axis=1))
-    behind = (np.minimum(ahead_one, ahead_two) < 0.0) & (angle > LEAST_PARALLAX * noise)
+    behind = (np.minimum(ahead_one, ahead_two) < 0.0) & (angle > MIN_PARALLAX * noise)
     # Where a lens's distortion cannot be inverted, there is no ray.
     return np.where(behind | ~np.isfinite(errors), np.inf, errors)
 

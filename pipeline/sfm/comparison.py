@@ -15,7 +15,7 @@ from splatpipe.pipeline.photos.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.pairs import Pair
 from splatpipe.pipeline.sfm.quick_match import InlierMatches, QuickFeatures
 
-LEAST_PLACES = 8  # minimum number of matches for comparing a pair
+MIN_PLACES = 8  # minimum number of matches for comparing a pair
 ALIKE_SIZES = 1.5  # ratio of relative keypoint sizes: beyond it, one photo has more detail because it is closer
 PASSES = 3
 ODD_DETAIL = 0.6  # logarithm of an energy ratio: such dull photos are not a reference for others
@@ -49,8 +49,8 @@ def brighter_ev(glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMa
         here, there = glimpses[i].levels[agreed.first], glimpses[j].levels[agreed.second]
         known = np.isfinite(here) & np.isfinite(there)
         drawn = known & (here < CLIPPED) & (there < CLIPPED)
-        rows = drawn if np.count_nonzero(drawn) >= LEAST_PLACES else known
-        if np.count_nonzero(rows) >= LEAST_PLACES:
+        rows = drawn if np.count_nonzero(drawn) >= MIN_PLACES else known
+        if np.count_nonzero(rows) >= MIN_PLACES:
             value = float(np.median(here[rows] - there[rows]))
             differences[i, j] = np.array([value]), np.array([-value])
     own = _own_share(differences, len(glimpses), 1, ODD_LEVEL_EV)
@@ -65,7 +65,7 @@ def _detail_difference(
     alike = (ratio > 1.0 / ALIKE_SIZES) & (ratio < ALIKE_SIZES)
     here, there = first.detail[agreed.first], second.detail[agreed.second]
     rows = np.flatnonzero(alike & np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1))
-    if len(rows) < LEAST_PLACES:
+    if len(rows) < MIN_PLACES:
         return None
     turn = second.angles_deg[agreed.second[rows]] - first.angles_deg[agreed.first[rows]]
     shift = np.rint(turn / (180.0 / DIRECTIONS)).astype(np.int64)[:, None]

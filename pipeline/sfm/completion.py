@@ -8,10 +8,10 @@ import pycolmap
 
 from splatpipe.pipeline.sfm.coarseness import coarseness
 
-LEAST_MATCHES = 15  # verified matches of a pair; COLMAP's own minimum
+MIN_MATCHES = 15  # verified matches of a pair; COLMAP's own minimum
 STRICT_PX = 2.0  # filtered observations return only within this error, or they would come and go forever
 SETTLED = 2e-3  # share of observations filtered after a robust adjustment: so few had hardly any influence
-MOST_ROUNDS = 4
+MAX_ROUNDS = 4
 ROUGH_TOLERANCE, ROUGH_ITERATIONS = 1e-4, 10  # relative change of the cost: before wrong observations are filtered
 FINE_TOLERANCE, FINE_ITERATIONS = 1e-6, 100
 GRADIENT_TOLERANCE = 1e-6  # COLMAP's 1.0 stops while a focal length is still some pixels off
@@ -40,7 +40,7 @@ def complete(
         place_left: Also place photos that need all matches; the ladder, with its own criteria, passes False.
     """
     cache_options = pycolmap.DatabaseCacheOptions()
-    cache_options.min_num_matches = LEAST_MATCHES
+    cache_options.min_num_matches = MIN_MATCHES
     with pycolmap.Database.open(database) as opened:
         cache = pycolmap.DatabaseCache.create(opened, cache_options)
     mapper = pycolmap.IncrementalMapper(cache)
@@ -54,7 +54,7 @@ def complete(
     _adjust(mapper, options, stop, rough=True)
     mapper.filter_points(mapping)
     triangulation.complete_max_reproj_error = STRICT_PX * coarseness(model.cameras.values())
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         mapper.complete_and_merge_tracks(triangulation)
         _adjust(mapper, options, stop, rough=False)
         if mapper.filter_points(mapping) <= SETTLED * model.compute_num_observations():

@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.sfm.agreement import Agreement
 
-MOST_MATCHES = 200  # cap per pair: thousands of matches prove only that two photos are neighbours
+MAX_MATCHES = 200  # cap per pair: thousands of matches prove only that two photos are neighbours
 SMALLEST_GROUP = 2  # photos; a single one is a wrong photo, not a bend
 SMALLEST_SHARE = 0.02  # of the photos
 DENSE = 600  # photos up to which all eigenvectors are computed
 STEPS = 300  # of the power iteration above
 DIGITS = 8  # decimals of the eigenvector that are kept: the last ones vary with the number of threads
-LEAST_MATCHES_APART = 1.0  # minimum for the consistent matches across a cut, to avoid dividing by zero
+MIN_MATCHES_APART = 1.0  # minimum for the consistent matches across a cut, to avoid dividing by zero
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> Graph
     least = max(SMALLEST_GROUP, int(np.ceil(SMALLEST_SHARE * len(numbers))))
     for order in (np.argsort(_eigenvector(agree, against), kind="stable"), *_detached(agree, against)):
         held, contra = _crossing(agree, order), _crossing(against, order)
-        ratios = contra / np.maximum(held, LEAST_MATCHES_APART)
+        ratios = contra / np.maximum(held, MIN_MATCHES_APART)
         sizes = np.arange(1, len(order))
         ratios[(sizes < least) | (len(order) - sizes < least)] = 0.0
         at = int(np.argmax(ratios))
@@ -65,8 +65,8 @@ def _weights(
     agree = np.zeros((len(numbers), len(numbers)))
     against = np.zeros_like(agree)
     rows = np.searchsorted(numbers, agreement.pairs[agreement.placed])
-    explained = np.minimum(agreement.explained[agreement.placed], MOST_MATCHES)
-    left = np.minimum((agreement.matches - agreement.explained)[agreement.placed], MOST_MATCHES)
+    explained = np.minimum(agreement.explained[agreement.placed], MAX_MATCHES)
+    left = np.minimum((agreement.matches - agreement.explained)[agreement.placed], MAX_MATCHES)
     wrong = contradicts[agreement.placed]
     for matrix, values in ((agree, explained), (against, np.where(wrong, left, 0))):
         np.add.at(matrix, (rows[:, 0], rows[:, 1]), values)

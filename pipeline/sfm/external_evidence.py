@@ -16,7 +16,7 @@ from splatpipe.pipeline.sfm.judging import Reason, is_trusted
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-LEAST_POSITIONS = 8  # photos; a similarity fits fewer too easily
+MIN_POSITIONS = 8  # photos; a similarity fits fewer too easily
 STEPS = 30  # of the reweighted fit
 FAR_SIGMAS, FAR_SHARE = 5.0, 0.04  # of the stated error, and of the flight's size: more than receiver noise
 SMOOTH = 0.5  # difference of neighbouring residuals over their length: about 1.4 for noise, almost 0 for a bend
@@ -73,7 +73,7 @@ def _positions(model: pycolmap.Reconstruction, positions: Sequence[JSON]) -> lis
     known = {entry["name"]: entry for entry in positions if entry["altitude_m"] is not None}
     images = [model.images[number] for number in sorted(model.reg_image_ids())]
     images = [image for image in images if image.name in known]
-    if len(images) < LEAST_POSITIONS:
+    if len(images) < MIN_POSITIONS:
         return []
     entries = [known[image.name] for image in images]
     sigma = float(np.median([max(entry["sigma_horizontal_m"], entry["sigma_vertical_m"]) for entry in entries]))

@@ -20,8 +20,8 @@ from splatpipe.pipeline.sfm.lens_blocks import keep_shape
 
 UNOBSERVED = 0.01  # relative standard deviation above which the photos do not determine a focal length
 PRINCIPAL_POINT_SIGMA = 0.01  # of the width
-MOST_DENSE = 60  # photos up to which the reduced system is solved densely
-MOST_ITERATIONS = 60
+MAX_DENSE = 60  # photos up to which the reduced system is solved densely
+MAX_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6
 EXTRA_SIGMA = 0.2  # of a distortion coefficient: no lens has larger ones
 
@@ -94,9 +94,9 @@ def solver_options(photos: int) -> Any:
     options = pyceres.SolverOptions()
     options.num_threads = 1
     options.linear_solver_type = (
-        pyceres.LinearSolverType.DENSE_SCHUR if photos <= MOST_DENSE else pyceres.LinearSolverType.SPARSE_SCHUR
+        pyceres.LinearSolverType.DENSE_SCHUR if photos <= MAX_DENSE else pyceres.LinearSolverType.SPARSE_SCHUR
     )
-    options.max_num_iterations = MOST_ITERATIONS
+    options.max_num_iterations = MAX_ITERATIONS
     options.function_tolerance = FUNCTION_TOLERANCE
     options.minimizer_progress_to_stdout = False
     options.logging_type = pyceres.LoggingType.SILENT

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float64, Int
 
 GRID = 5  # rays across an image, and as many down
 FURTHEST = 4.0  # times the height above ground or the distance to the crossing: anything beyond is small in the image
-LEAST_HEIGHT_M = 2.0
+MIN_HEIGHT_M = 2.0
 CROSSING_DEG = 15.0  # minimum angle between views to determine where they cross
 CROSSING_MISS = 0.3  # of the distance: axes that miss each other by more do not point at the same thing
-LEAST_CROSSINGS = 3
+MIN_CROSSINGS = 3
 MARGIN = 0.1  # of half an image: angles are off by a few degrees
 ALIKE_DEG, UNLIKE_DEG = 15.0, 90.0  # SIFT matching is unaffected up to the first angle, and fails beyond the second
 
@@ -90,8 +90,8 @@ def crossing_distances(views: StatedPoses) -> Float64[np.ndarray, " n"]:
         other = (cosines * along - back) / sines2
         gap = np.linalg.norm(base + other[:, None] * axes - own[:, None] * axes[i], axis=1)
         crosses = np.abs(cosines) < np.cos(np.radians(CROSSING_DEG))
-        crosses &= (own > LEAST_HEIGHT_M) & (other > LEAST_HEIGHT_M) & (gap < CROSSING_MISS * np.minimum(own, other))
-        if np.count_nonzero(crosses) >= LEAST_CROSSINGS:
+        crosses &= (own > MIN_HEIGHT_M) & (other > MIN_HEIGHT_M) & (gap < CROSSING_MISS * np.minimum(own, other))
+        if np.count_nonzero(crosses) >= MIN_CROSSINGS:
             distances[i] = np.median(own[crosses])
     return distances
 
@@ -101,7 +101,7 @@ def _points(views: StatedPoses, i: int, crossing_m: float) -> Float64[np.ndarray
     steps = (np.arange(GRID) + 0.5) / GRID * 2.0 - 1.0
     across, down = np.meshgrid(steps * views.half_size[i, 0], steps * views.half_size[i, 1])
     rays = np.stack([across.ravel(), down.ravel(), np.ones(GRID * GRID)], axis=1) @ views.enu_from_camera[i].T
-    height = max(float(views.centres_m[i, 2] - views.ground_m[i]), LEAST_HEIGHT_M)
+    height = max(float(views.centres_m[i, 2] - views.ground_m[i]), MIN_HEIGHT_M)
     reach = FURTHEST * (height if np.isnan(crossing_m) else max(height, crossing_m))
     with np.errstate(divide="ignore"):
         to_ground = np.where(rays[:, 2] < 0.0, height / np.maximum(-rays[:, 2], 1e-9), np.inf)

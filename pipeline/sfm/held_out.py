@@ -13,9 +13,9 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
-LEAST_VIEWS = 3  # two that intersect, and one that is predicted
+MIN_VIEWS = 3  # two that intersect, and one that is predicted
 REWEIGHTINGS = 2  # by the distance to the point from the previous round
-LEAST_ANGLE = 0.02  # its square is the minimum eigenvalue ratio: nearly parallel rays do not determine a point
+MIN_ANGLE = 0.02  # its square is the minimum eigenvalue ratio: nearly parallel rays do not determine a point
 CAP = 4.0  # times the median error: a single wrong match must not decide
 BOOTSTRAPS = 500
 DOUBT = 0.01  # share of the bootstrap samples that may show no improvement
@@ -51,7 +51,7 @@ def of_photos(tracks: TrackObservations, images: set[int]) -> TrackObservations:
     """Restrict tracks to some photos, and keep those with three observations or more."""
     inside = np.isin(tracks.image, sorted(images))
     lengths = np.bincount(tracks.track[inside], minlength=int(tracks.track.max(initial=-1)) + 1)
-    inside &= lengths[tracks.track] >= LEAST_VIEWS
+    inside &= lengths[tracks.track] >= MIN_VIEWS
     _, numbers = np.unique(tracks.track[inside], return_inverse=True)
     return TrackObservations(numbers.astype(np.int64), tracks.image[inside], tracks.pixels[inside])
 
@@ -131,7 +131,7 @@ def improves(
 
 def _well_placed(left: Float64[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n"]:
     values = np.linalg.eigvalsh(left)
-    return np.asarray(values[:, 0] > LEAST_ANGLE**2 * values[:, 2])
+    return np.asarray(values[:, 0] > MIN_ANGLE**2 * values[:, 2])
 
 
 def rows_by_camera(

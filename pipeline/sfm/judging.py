@@ -37,7 +37,7 @@ EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed phot
 CONTRADICTED_DOUBT, CONTRADICTED_BAD = 0.04, 0.10  # of the pairs among placed photos; sound models have 0 to 0.03
 STRONG_BAD = 0.02  # the same, for pairs with at least the median number of matches of consistent pairs
 FEW_PAIRS = 3  # fewer contradicting pairs may be chance
-LEAST_MATCHES = 15  # for a pair to count as contradicting; COLMAP's own minimum for a pair
+MIN_MATCHES = 15  # for a pair to count as contradicting; COLMAP's own minimum for a pair
 CUT_DOUBT, CUT_BAD = 0.5, 1.0  # ratio of contradicting to consistent matches between two groups of cameras
 
 
@@ -130,7 +130,7 @@ def _worst_first(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
 
 def contradicting(agreement: Agreement) -> Bool[np.ndarray, " n"]:
     """Return the mask of pairs of placed photos for which the model explains less than half of the matches."""
-    enough = agreement.placed & (agreement.matches >= LEAST_MATCHES)
+    enough = agreement.placed & (agreement.matches >= MIN_MATCHES)
     return np.asarray(enough & (2 * agreement.explained < agreement.matches))
 
 
@@ -215,7 +215,7 @@ def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: V
     count = int(contradicts.sum())
     if count < FEW_PAIRS:
         return []
-    pairs = int((agreement.placed & (agreement.matches >= LEAST_MATCHES)).sum())
+    pairs = int((agreement.placed & (agreement.matches >= MIN_MATCHES)).sum())
     holding = agreement.matches[agreement.placed & ~contradicts]
     usual = float(np.median(holding)) if len(holding) else 0.0
     strong = int((contradicts & (agreement.matches >= usual)).sum())

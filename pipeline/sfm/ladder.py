@@ -19,12 +19,12 @@ from splatpipe.pipeline.sfm.agreement import compare
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.completion import complete
-from splatpipe.pipeline.sfm.ladder_growth import LEAST_OBSERVATIONS, ModelMapper, mean_error_px, observations
+from splatpipe.pipeline.sfm.ladder_growth import MIN_OBSERVATIONS, ModelMapper, mean_error_px, observations
 from splatpipe.pipeline.sfm.ladder_joins import join
 from splatpipe.pipeline.sfm.ladder_keypoints import strengthen
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, tried_pairs
 from splatpipe.pipeline.sfm.ladder_partners import Ranked, choose_pairs, rank_partners
-from splatpipe.pipeline.sfm.ladder_poses import LARGE_SHARE, LEAST_PARTNERS, PoseEstimate, place, sightings
+from splatpipe.pipeline.sfm.ladder_poses import LARGE_SHARE, MIN_PARTNERS, PoseEstimate, place, sightings
 from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.pairs import Pair
@@ -42,10 +42,10 @@ Model: TypeAlias = pycolmap.Reconstruction
 PAIRS_A_PHOTO = 20  # as many as `matches` tries per photo
 ROUNDS = 4  # of registration: newly placed photos add points for the next ones
 PARTNERS = 3  # placed photos that also get stronger keypoints, per leftover photo
-MOST_STRONGER = 12  # photos extracted again, or the share of all below: costs no more than mapping
-MOST_STRONGER_SHARE = 0.125
+MAX_STRONGER = 12  # photos extracted again, or the share of all below: costs no more than mapping
+MAX_STRONGER_SHARE = 0.125
 WEAK_SHARE = 0.5  # of the placed photos' median keypoint count; photos with fewer are worth extracting again
-LEAST_KEYPOINTS = 16  # a photo with fewer is blank, blurred or masked
+MIN_KEYPOINTS = 16  # a photo with fewer is blank, blurred or masked
 KEPT_OBSERVATIONS = 0.98  # share the old photos must keep: a correctly placed photo takes none away
 WORSE_ERROR = 1.05  # the mean reprojection error may grow to this multiple,
 WORSE_ERROR_PX = 0.05  # or by this much if that is more
@@ -134,7 +134,7 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
     left = unplaced(found)
     work.tell(0, len(left), "looking for matches of the remaining photos")
     ranked = rank_partners(work.capture, found, left, work.options.seed)
-    photos = _worth_another_look(found, ranked, max(MOST_STRONGER, int(MOST_STRONGER_SHARE * len(work.capture.photos))))
+    photos = _worth_another_look(found, ranked, max(MAX_STRONGER, int(MAX_STRONGER_SHARE * len(work.capture.photos))))
     pairs = _among(found, ranked, photos)
     if not pairs:
         return found
@@ -157,7 +157,7 @@ def _worth_another_look(found: MappingResult, ranked: Ranked, most: int) -> list
     placed = set(found.model.reg_image_ids())
     counts = {number: len(places) for number, places in found.verified.keypoints.items()}
     weak = WEAK_SHARE * float(np.median([counts[number] for number in sorted(placed)]))
-    matches = {number: 0 for number in ranked if LEAST_KEYPOINTS <= counts[number] < weak}
+    matches = {number: 0 for number in ranked if MIN_KEYPOINTS <= counts[number] < weak}
     for (i, j), rows in found.verified.matches.items():
         for number, other in ((i, j), (j, i)):
             if number in ranked and other in placed:
@@ -314,8 +314,8 @@ def _not_held(verified: ViewGraph, model: Model, photos: Collection[int]) -> set
                 partners[number] += bool(agreement.explained[row] >= LARGE_SHARE * agreement.matches[row])
     bad = set()
     for number in photos:
-        few = number not in placed or model.images[number].num_points3D < LEAST_OBSERVATIONS
-        alone = partners[number] < min(LEAST_PARTNERS, pairs[number])
+        few = number not in placed or model.images[number].num_points3D < MIN_OBSERVATIONS
+        alone = partners[number] < min(MIN_PARTNERS, pairs[number])
         if few or alone or explained[number] < LARGE_SHARE * matches[number]:
             bad.add(number)
     return bad

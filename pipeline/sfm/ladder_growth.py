@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from splatpipe.pipeline.sfm.completion import LEAST_MATCHES
+from splatpipe.pipeline.sfm.completion import MIN_MATCHES
 from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
 
-LEAST_OBSERVATIONS = 15  # of an added photo, after the adjustment
+MIN_OBSERVATIONS = 15  # of an added photo, after the adjustment
 
 
 class ModelMapper:
@@ -23,7 +23,7 @@ class ModelMapper:
         self._triangulation = self._options.get_triangulation()
         self._triangulation.random_seed = options.seed
         cache_options = pycolmap.DatabaseCacheOptions()
-        cache_options.min_num_matches = LEAST_MATCHES
+        cache_options.min_num_matches = MIN_MATCHES
         with pycolmap.Database.open(database) as opened:
             self._cache = pycolmap.DatabaseCache.create(opened, cache_options)
         self._mapper = pycolmap.IncrementalMapper(self._cache)

@@ -19,11 +19,11 @@ from splatpipe.pipeline.sfm.ladder_poses import (
     ERROR,
     HELD_OUT,
     LARGE_SHARE,
-    LEAST_CELLS,
-    LEAST_ERROR_PX,
-    LEAST_INLIERS,
-    LEAST_SHARE,
     MANY_INLIERS,
+    MIN_CELLS,
+    MIN_ERROR_PX,
+    MIN_INLIERS,
+    MIN_SHARE,
 )
 from splatpipe.pipeline.sfm.structure import Structure, Track, cameras_of, make_model, poses_of, read_structure
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
@@ -32,7 +32,7 @@ SLACK = 3.0  # times a pose's tolerance: both models have errors, and neither wa
 TRIALS = 2000  # draws three correct ties with 99.9 % probability if a sixth of all are correct
 SCORED = 1000  # ties that score a trial: enough to find the best, whatever the models' size
 REFITS = 5  # rounds of refitting to the inliers
-LEAST_LINKS = 2  # pairs of photos between the models; a single pair may show a look-alike
+MIN_LINKS = 2  # pairs of photos between the models; a single pair may show a look-alike
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _tied(
             poses[mine] = of.images[number].cam_from_world().matrix()
             places[mine] = camera.cam_from_img(spots)
             pixels[mine] = camera.mean_focal_length()
-            limits[mine] = SLACK * max(LEAST_ERROR_PX, ERROR * max(camera.width, camera.height))
+            limits[mine] = SLACK * max(MIN_ERROR_PX, ERROR * max(camera.width, camera.height))
             part = np.clip((spots / [camera.width, camera.height] * CELLS).astype(int), 0, CELLS - 1)
             cells[mine] = part[:, 0] * CELLS + part[:, 1]
         sides.append((structure.points[rows[:, side]], poses, places, pixels, limits, cells))
@@ -150,7 +150,7 @@ def _tied(
 
 
 def fit_ties(
-    ties: TiePoints, chosen: Bool[np.ndarray, " k"], seed: int, least: int = LEAST_INLIERS
+    ties: TiePoints, chosen: Bool[np.ndarray, " k"], seed: int, least: int = MIN_INLIERS
 ) -> tuple[Similarity, Bool[np.ndarray, " k"]] | None:
     """Fit the similarity from there to here that most of the chosen ties agree with.
 
@@ -213,9 +213,9 @@ def _sure(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
     """Whether the inliers are numerous enough, a large enough share, and spread over the images and photo pairs."""
     held = min(len(np.unique(ties.rows[inliers, side])) for side in (0, 1))
     share = held / max(1, min(len(np.unique(ties.rows[:, side])) for side in (0, 1)))
-    enough = (held >= MANY_INLIERS and share >= LEAST_SHARE) or (held >= LEAST_INLIERS and share >= LARGE_SHARE)
+    enough = (held >= MANY_INLIERS and share >= MIN_SHARE) or (held >= MIN_INLIERS and share >= LARGE_SHARE)
     links = len(np.unique(ties.links[inliers], axis=0))
-    return enough and links >= LEAST_LINKS and len(np.unique(ties.cells[inliers])) >= LEAST_CELLS
+    return enough and links >= MIN_LINKS and len(np.unique(ties.cells[inliers])) >= MIN_CELLS
 
 
 def _foretells(ties: TiePoints, seed: int) -> bool:
@@ -223,7 +223,7 @@ def _foretells(ties: TiePoints, seed: int) -> bool:
     _, order = np.unique(ties.rows[:, 0], return_inverse=True)
     for odd in (0, 1):
         mine = order % 2 == odd
-        fitted = fit_ties(ties, mine, seed, LEAST_INLIERS // 2)
+        fitted = fit_ties(ties, mine, seed, MIN_INLIERS // 2)
         if fitted is None:
             return False
         own, others = fitted[1][mine].mean(), fitted[1][~mine].mean()

@@ -23,10 +23,10 @@ from splatpipe.pipeline.sfm.structure import Structure, poses_of, read_structure
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 SAMPLE = 64  # points of a photo that are projected into the others
-LEAST_POINTS = 8  # of a photo; fewer say nothing about what it shows
+MIN_POINTS = 8  # of a photo; fewer say nothing about what it shows
 ALIKE_COS = float(np.cos(np.radians(40.0)))  # beyond it SIFT matches little, and other sides of objects are visible
-LEAST_SCALE = 0.4  # ratio of the distances to a point: beyond a factor of 2.5 the keypoint scales differ
-LEAST_SHARE = 0.2  # of a photo's points that must lie in the other image
+MIN_SCALE = 0.4  # ratio of the distances to a point: beyond a factor of 2.5 the keypoint scales differ
+MIN_SHARE = 0.2  # of a photo's points that must lie in the other image
 NEAREST = 60  # candidate photos per photo, nearest by the points they observe: the cost grows linearly with the photos
 
 
@@ -56,7 +56,7 @@ def propose_pairs(
         if i in place and j in place:
             joined[place[i], place[j]] = joined[place[j], place[i]] = True
     common = (joined.astype(np.float32) @ joined.astype(np.float32)) > 0.0
-    open_ = (shares >= LEAST_SHARE) & ~joined
+    open_ = (shares >= MIN_SHARE) & ~joined
     for i, j in avoided:
         if i in place and j in place:
             open_[place[i], place[j]] = False
@@ -103,7 +103,7 @@ def shared_views(
         seen = _seen_alike(points, centres[owners], image, model.cameras[image.camera_id], centres[j])
         totals = np.bincount(owners, minlength=len(numbers))
         hits = np.bincount(owners[seen], minlength=len(numbers))
-        shares[:, j] = np.where(totals >= LEAST_POINTS, hits / np.maximum(totals, 1), 0.0)
+        shares[:, j] = np.where(totals >= MIN_POINTS, hits / np.maximum(totals, 1), 0.0)
     return (shares + shares.T) / 2.0
 
 
@@ -142,7 +142,7 @@ def _seen_alike(
     here, there = points - centre, points - owners
     far, near = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
     cosines = (here * there).sum(axis=1) / np.maximum(far * near, 1e-12)
-    alike = (cosines >= ALIKE_COS) & (np.minimum(far, near) >= LEAST_SCALE * np.maximum(far, near))
+    alike = (cosines >= ALIKE_COS) & (np.minimum(far, near) >= MIN_SCALE * np.maximum(far, near))
     return np.asarray(inside & alike)
 
 

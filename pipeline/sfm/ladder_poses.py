@@ -18,15 +18,15 @@ from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 ERROR = 0.003  # reprojection tolerance as a share of the longer side: COLMAP's 12 pixels in a photo of 4,000
-LEAST_ERROR_PX = 4.0  # minimum tolerance for small photos: coarse-scale keypoints are off by pixels
-LEAST_INLIERS = 15  # keypoints; COLMAP's minimum for a pair
+MIN_ERROR_PX = 4.0  # minimum tolerance for small photos: coarse-scale keypoints are off by pixels
+MIN_INLIERS = 15  # keypoints; COLMAP's minimum for a pair
 MANY_INLIERS = 30  # COLMAP's minimum for a pose
-LEAST_SHARE = 0.25  # of the keypoints that lead to a point; COLMAP's minimum for a pose
+MIN_SHARE = 0.25  # of the keypoints that lead to a point; COLMAP's minimum for a pose
 LARGE_SHARE = 0.5  # required where inliers are few: most matches must agree
 CELLS = 4  # grid cells along each side of the image
-LEAST_CELLS = 4  # of the 16: a pose from one corner alone can pivot about it
+MIN_CELLS = 4  # of the 16: a pose from one corner alone can pivot about it
 HELD_OUT = 0.6  # a pose from half of the keypoints must explain this fraction of its own inlier share in the other half
-LEAST_PARTNERS = 2  # placed photos: a single one may show a look-alike of the place
+MIN_PARTNERS = 2  # placed photos: a single one may show a look-alike of the place
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,10 @@ def place(
         seed: For RANSAC.
     """
     total = len(np.unique(seen.keypoints))
-    if total < LEAST_INLIERS:
+    if total < MIN_INLIERS:
         return None
     places, spots = keypoints[seen.keypoints].astype(np.float64), points[seen.rows]
-    limit = max(LEAST_ERROR_PX, ERROR * max(camera.width, camera.height))
+    limit = max(MIN_ERROR_PX, ERROR * max(camera.width, camera.height))
     camera = copy.deepcopy(camera)
     answer = _estimate(places, spots, camera, calibrated, limit, seed)
     if answer is None:
@@ -124,7 +124,7 @@ def place(
     share = held / total
     if not _enough(held, share) or not _spread(places[inliers], camera):
         return None
-    if len(np.unique(seen.partners[inliers])) < LEAST_PARTNERS and not (held >= MANY_INLIERS and share >= LARGE_SHARE):
+    if len(np.unique(seen.partners[inliers])) < MIN_PARTNERS and not (held >= MANY_INLIERS and share >= LARGE_SHARE):
         return None
     if not _foretells(seen.keypoints, places, spots, camera, limit, seed):
         return None
@@ -134,7 +134,7 @@ def place(
 
 
 def _enough(held: int, share: float) -> bool:
-    return (held >= MANY_INLIERS and share >= LEAST_SHARE) or (held >= LEAST_INLIERS and share >= LARGE_SHARE)
+    return (held >= MANY_INLIERS and share >= MIN_SHARE) or (held >= MIN_INLIERS and share >= LARGE_SHARE)
 
 
 def _estimate(
@@ -160,7 +160,7 @@ def _spread(places: Float64[np.ndarray, "k 2"], camera: pycolmap.Camera) -> bool
     """Whether the keypoints lie in enough grid cells of the image."""
     size = np.array([camera.width, camera.height], np.float64)
     cells = np.clip((places / size * CELLS).astype(int), 0, CELLS - 1)
-    return len(np.unique(cells[:, 0] * CELLS + cells[:, 1])) >= LEAST_CELLS
+    return len(np.unique(cells[:, 0] * CELLS + cells[:, 1])) >= MIN_CELLS
 
 
 def _foretells(

@@ -34,9 +34,9 @@ from splatpipe.pipeline.sfm.lens_model import (
     widen,
 )
 
-LEAST_GAIN = 0.002  # relative reduction of the squared held-out errors; noise gives a tenth of it
-LEAST_SIGMAS = 3.0
-LEAST_EFFECT = 0.25  # of the held-out error, at the corner: smaller effects do not change any later measurement
+MIN_GAIN = 0.002  # relative reduction of the squared held-out errors; noise gives a tenth of it
+MIN_SIGMAS = 3.0
+MIN_EFFECT = 0.25  # of the held-out error, at the corner: smaller effects do not change any later measurement
 STEPS = {
     WIDE: (("k2",), ("cx", "cy"), ("p1", "p2"), ("k3",)),
     WIDE_FISHEYE: (("k2",), ("cx", "cy"), ("k3",), ("k4",)),
@@ -113,7 +113,7 @@ class LensTrial:
         for number, state in wanted.items():
             gain, _ = self._gain(number, errors)
             row = {"freed": "stated", "held_out_gain": round(gain, 4)}
-            good = held or gain > -LEAST_GAIN
+            good = held or gain > -MIN_GAIN
             kept[number] = good
             told = state if good else self.states[number]
             wanted[number] = replace(told, tried=(*self.states[number].tried, {**row, "kept": good}))
@@ -170,8 +170,8 @@ class LensTrial:
         for number, names in groups.items():
             gain, sure = self._gain(number, errors)
             effect, sigma, focal = self._doubt(number, names, solved, wanted[number])
-            least = LEAST_EFFECT * self._typical(number)
-            told = effect >= max(least, LEAST_SIGMAS * sigma) and focal <= UNOBSERVED
+            least = MIN_EFFECT * self._typical(number)
+            told = effect >= max(least, MIN_SIGMAS * sigma) and focal <= UNOBSERVED
             kept[number] = sure and told
             row = {
                 "freed": " ".join(names),
@@ -233,7 +233,7 @@ class LensTrial:
 
     def _gain(self, number: int, errors: Float64[np.ndarray, " n"]) -> tuple[float, bool]:
         rows = self._rows.get(number, np.zeros(0, np.int64))
-        return improves(self._errors[rows], errors[rows], self._tracks.image[rows], LEAST_GAIN, self._seed)
+        return improves(self._errors[rows], errors[rows], self._tracks.image[rows], MIN_GAIN, self._seed)
 
     def _typical(self, number: int) -> float:
         """Return the typical held-out error along one axis, pixels."""

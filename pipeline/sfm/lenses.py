@@ -21,16 +21,16 @@ from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
-from splatpipe.pipeline.sfm.held_out import LEAST_VIEWS, of_photos, tracks_of
+from splatpipe.pipeline.sfm.held_out import MIN_VIEWS, of_photos, tracks_of
 from splatpipe.pipeline.sfm.lens_adjustment import BASE, LensFreedom, adjust_lenses, weak_prior
 from splatpipe.pipeline.sfm.lens_model import StatedLens, apart_px, is_known, named_params, narrow, set_lens, widen
 from splatpipe.pipeline.sfm.lens_trial import LensState, LensTrial
-from splatpipe.pipeline.sfm.retriangulation import MOST_ERROR_PX, retriangulate
+from splatpipe.pipeline.sfm.retriangulation import MAX_ERROR_PX, retriangulate
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-LEAST_PHOTOS = 8  # of a camera: fewer cannot separate its lens from their poses
-LEAST_TRACKS = 400  # tracks used for the decision; fewer are inconclusive
-MOST_TRACKS = 6000  # some 30,000 observations for a dozen unknowns per camera
+MIN_PHOTOS = 8  # of a camera: fewer cannot separate its lens from their poses
+MIN_TRACKS = 400  # tracks used for the decision; fewer are inconclusive
+MAX_TRACKS = 6000  # some 30,000 observations for a dozen unknowns per camera
 HELD_OUT = 0.25
 FAR_FROM_STATED = 2e-3  # of the width: twice the usual deviation of a lens from its calibration
 WORDS = {
@@ -42,8 +42,8 @@ WORDS = {
     "fisheye": "a fisheye's projection",
     "stated": "as it is stated",
 }
-WANTED_A_PHOTO = 80  # tracks used for the decision
-LEAST_A_PHOTO = 20  # adjusted tracks: six unknowns need more than three points
+WANTED_PER_PHOTO = 80  # tracks used for the decision
+MIN_PER_PHOTO = 20  # adjusted tracks: six unknowns need more than three points
 
 
 def calibrate(
@@ -63,9 +63,9 @@ def calibrate(
     """
     usable = {number: lens for number, lens in stated.items() if number in model.cameras}
     chosen = _deciding(model, seed)
-    if how == "simple" or (len(chosen) < LEAST_TRACKS and not usable):
+    if how == "simple" or (len(chosen) < MIN_TRACKS and not usable):
         return model, ()
-    if len(chosen) < LEAST_TRACKS:
+    if len(chosen) < MIN_TRACKS:
         return _with_held(model, verified, usable, seed)
     held_out, deciding = np.split(chosen, [round(HELD_OUT * len(chosen))])
     within = _only(model, set(deciding.tolist()))
@@ -103,20 +103,20 @@ def _with_held(
 def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
     """Choose the points used for the decision, in a seeded order.
 
-    Only points seen by three photos or more; up to ``MOST_TRACKS``, and beyond that only those of photos that still
+    Only points seen by three photos or more; up to ``MAX_TRACKS``, and beyond that only those of photos that still
     have too few.
     """
     numbers = np.array(
-        sorted(number for number, point in model.points3D.items() if point.track.length() >= LEAST_VIEWS), np.int64
+        sorted(number for number, point in model.points3D.items() if point.track.length() >= MIN_VIEWS), np.int64
     )
     mixed = np.random.default_rng(seed).permutation(numbers)
-    if len(mixed) <= MOST_TRACKS:
+    if len(mixed) <= MAX_TRACKS:
         return np.asarray(mixed)
     seen: Counter[int] = Counter()
     taken = []
     for place, number in enumerate(mixed.tolist()):
         photos = {element.image_id for element in model.points3D[number].track.elements}
-        if place < MOST_TRACKS or any(seen[photo] < WANTED_A_PHOTO for photo in photos):
+        if place < MAX_TRACKS or any(seen[photo] < WANTED_PER_PHOTO for photo in photos):
             seen.update(photos)
             taken.append(number)
     return np.random.default_rng(seed).permutation(np.array(taken, np.int64))
@@ -135,7 +135,7 @@ def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> 
     states = {}
     for number, camera in sorted(within.cameras.items()):
         told = fewer * sigmas.get(number, math.inf) <= UNOBSERVED
-        free = BASE if told and counts[number] >= LEAST_PHOTOS and is_known(camera.model_name) else ()
+        free = BASE if told and counts[number] >= MIN_PHOTOS and is_known(camera.model_name) else ()
         states[number] = LensState(LensFreedom(free, weak_prior(camera)), told)
     return states
 
@@ -149,7 +149,7 @@ def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstr
     seen = Counter(element.image_id for point in copy.points3D.values() for element in point.track.elements)
     observations = pycolmap.ObservationManager(copy)
     for number in sorted(copy.reg_image_ids()):
-        if seen[number] < LEAST_A_PHOTO:
+        if seen[number] < MIN_PER_PHOTO:
             observations.deregister_frame(copy.images[number].frame_id)
     copy.tear_down()  # COLMAP's covariance needs a pose for every photo in the model
     for number, camera in sorted(model.cameras.items()):
@@ -182,7 +182,7 @@ def _finished(
     adjust_lenses(result, freedoms)
     retriangulate(result, verified, seed)
     adjust_lenses(result, freedoms)
-    pycolmap.ObservationManager(result).filter_all_points3D(MOST_ERROR_PX, 0.0)
+    pycolmap.ObservationManager(result).filter_all_points3D(MAX_ERROR_PX, 0.0)
     for camera in result.cameras.values():
         if is_known(camera.model_name):
             narrow(camera)

@@ -23,9 +23,9 @@ Costs = Callable[[int], Float64[np.ndarray, " n"]]
 LOCATED_SHARE = 0.8  # of the photos must have positions for spatial pairing
 SPREAD_OVER_SIGMA = 2.0  # positions that spread less than this times their sigma say nothing about neighbours
 SAME_PLACE_M = 0.1
-LEAST_FACING = 0.01  # minimum of cos² of half the angle between views, by which distances are divided
+MIN_FACING = 0.01  # minimum of cos² of half the angle between views, by which distances are divided
 SEQUENCE_LENGTH = 8  # photos per folder; shorter folders do not count as sequences
-LEAST_OVERLAP = 0.01  # of two photos' footprints; pairs with less yield one point in several hundred
+MIN_OVERLAP = 0.01  # of two photos' footprints; pairs with less yield one point in several hundred
 FLOOR = 6  # nearest photos that are always partners, since the stated angles may be wrong
 TILTED = -0.87  # up component of the viewing direction: 60° down; views of walls diverge more and need more partners
 WIDER = 1.5  # times the partners of a nadir photo
@@ -165,7 +165,7 @@ def _overlapping(views: StatedPoses, neighbours: int) -> set[Pair]:
     wide = math.ceil(WIDER * neighbours)
     partners: dict[int, list[tuple[float, Pair]]] = {}
     for pair, share in overlaps(views, CANDIDATES_OVER_PARTNERS * wide).items():
-        if share >= LEAST_OVERLAP:
+        if share >= MIN_OVERLAP:
             for photo in pair:
                 partners.setdefault(photo, []).append((-share, pair))
     tilted = views.axes[:, 2] > TILTED
@@ -188,7 +188,7 @@ def spatial_costs(layout: Layout) -> Costs:
         distances = np.sqrt(((layout.positions_m - layout.positions_m[i]) ** 2).sum(axis=1))
         facing = (1.0 + (layout.directions * layout.directions[i]).sum(axis=1)) / 2.0
         facing = np.where(np.isfinite(facing), facing, 1.0)
-        return np.asarray(np.nan_to_num((distances + spacing) / np.maximum(facing, LEAST_FACING), nan=np.inf))
+        return np.asarray(np.nan_to_num((distances + spacing) / np.maximum(facing, MIN_FACING), nan=np.inf))
 
     return costs
 

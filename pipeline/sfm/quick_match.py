@@ -23,12 +23,12 @@ from splatpipe.pipeline.sfm.keypoints import DESCRIPTOR_NORM, reduced
 from splatpipe.pipeline.sfm.pairs import Pair
 
 LONGEST_PX = 640  # longer side of the matched images: a fifth of a second per photo
-MOST_KEYPOINTS = 1000
+MAX_KEYPOINTS = 1000
 FEW_KEYPOINTS = 600  # below this (fields, water, dark or hazy photos) fainter keypoints are used too
 FAINT = 0.008  # OpenCV's contrast threshold for these; its default is 0.04, COLMAP's is about as low as this
 RATIO = 0.85  # of the angles to the best and second-best descriptor, looser than COLMAP's 0.8: RANSAC follows
-LEAST_MATCHES = 12  # inliers of a two-view geometry; chance gives a few more than 8
-LEAST_SHARE = 0.2  # of the candidates: among many, a smaller share agrees by chance
+MIN_MATCHES = 12  # inliers of a two-view geometry; chance gives a few more than 8
+MIN_SHARE = 0.2  # of the candidates: among many, a smaller share agrees by chance
 TOLERANCE_PX = 1.5  # at the low resolution
 ROUNDS = 1000  # of RANSAC
 CONFIDENCE = 0.999
@@ -94,7 +94,7 @@ def glimpse(photo: CheckedPhoto) -> QuickFeatures:
     if len(found) < FEW_KEYPOINTS:
         detector = cv2.SIFT_create(contrastThreshold=FAINT, enable_precise_upscale=True)
         found = detector.detect(small, None)
-    found = sorted(found, key=lambda keypoint: -keypoint.size)[:MOST_KEYPOINTS]
+    found = sorted(found, key=lambda keypoint: -keypoint.size)[:MAX_KEYPOINTS]
     values = np.zeros((0, 128), np.float32)
     if found:
         found, values = detector.compute(small, found)
@@ -126,7 +126,7 @@ def match_glimpses(glimpses: Sequence[QuickFeatures], pairs: Iterable[Pair], thr
 def agreement(first: QuickFeatures, second: QuickFeatures) -> InlierMatches:
     """Return the mutual nearest neighbours of two photos that agree on a fundamental matrix."""
     rows, columns = _mutual(first.descriptors, second.descriptors)
-    if len(rows) < LEAST_MATCHES:
+    if len(rows) < MIN_MATCHES:
         return NOTHING
     scale = LONGEST_PX / max(first.width, first.height), LONGEST_PX / max(second.width, second.height)
     here, there = first.places[rows] * scale[0], second.places[columns] * scale[1]
@@ -135,7 +135,7 @@ def agreement(first: QuickFeatures, second: QuickFeatures) -> InlierMatches:
     if mask is None:
         return NOTHING
     good = np.flatnonzero(mask.ravel())
-    if len(good) < max(LEAST_MATCHES, LEAST_SHARE * len(rows)):
+    if len(good) < max(MIN_MATCHES, MIN_SHARE * len(rows)):
         return NOTHING
     return InlierMatches(rows[good], columns[good])
 

@@ -24,10 +24,10 @@ from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]
 
-LEAST_SHARE = 0.1  # of the photos; a model of fewer is accidental
-LEAST_SEEN = 15  # mean points per photo; COLMAP's minimum for a pair
+MIN_SHARE = 0.1  # of the photos; a model of fewer is accidental
+MIN_SEEN = 15  # mean points per photo; COLMAP's minimum for a pair
 ENOUGH_SHARE = 0.5  # below this share, an attempt with relaxed thresholds is worth its time
-MOST_SHARE = 0.85  # below this share the other mapper may do better; above it the ladder places the rest more cheaply
+MAX_SHARE = 0.85  # below this share the other mapper may do better; above it the ladder places the rest more cheaply
 STRAY_UNOBSERVED = 0.03  # relative deviation allowed for a focal length that the photos do not determine
 CLEARLY = 0.005  # score margin by which a second model must be better to replace the first
 ROUNDS = 2  # of matching additional pairs
@@ -142,7 +142,7 @@ def _doubts(answer: MappingAttempt, total: int, verified: ViewGraph) -> list[str
     if answer.judgement is None:
         return ["no photo was placed"]
     found = []
-    if answer.placed < MOST_SHARE * total:
+    if answer.placed < MAX_SHARE * total:
         found.append(f"{answer.placed} of {total} photos placed")
     told = {"focal": "the focal length ran away", "bent": "pairs of photos contradict it"}
     told["unexplained"] = "many matches are not explained"
@@ -253,11 +253,11 @@ def _row(answer: MappingAttempt) -> dict[str, JSON]:
 
 def _has_points(model: Model) -> bool:
     """Whether a model's photos observe enough points; photos taken from one spot are placed without any."""
-    return bool(model.compute_num_observations() >= LEAST_SEEN * model.num_reg_images())
+    return bool(model.compute_num_observations() >= MIN_SEEN * model.num_reg_images())
 
 
 def _check_enough(count: int, config: SparseConfig, total: int) -> None:
-    if count < max(config.min_model_size, math.ceil(LEAST_SHARE * total)):
+    if count < max(config.min_model_size, math.ceil(MIN_SHARE * total)):
         raise SplatpipeError(
             f"Only {count} of {total} photos could be placed." if count else f"None of {total} photos could be placed.",
             hint="Photos must overlap by two thirds and be taken from different positions."

@@ -6,8 +6,8 @@ import pycolmap
 
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-MOST_ERROR_PX = 4.0  # COLMAP's own limits of mapping
-LEAST_ANGLE_DEG = 1.5
+MAX_ERROR_PX = 4.0  # COLMAP's own limits of mapping
+MIN_ANGLE_DEG = 1.5
 
 
 def retriangulate(model: pycolmap.Reconstruction, verified: ViewGraph, seed: int) -> None:
@@ -31,7 +31,7 @@ def retriangulate(model: pycolmap.Reconstruction, verified: ViewGraph, seed: int
             graph.add_two_view_geometry(first, second, geometry)
     graph.finalize()
     observations = pycolmap.ObservationManager(model, graph)
-    observations.filter_all_points3D(MOST_ERROR_PX, LEAST_ANGLE_DEG)
+    observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
     triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
     options = pycolmap.IncrementalTriangulatorOptions()
     options.random_seed = seed
@@ -40,4 +40,4 @@ def retriangulate(model: pycolmap.Reconstruction, verified: ViewGraph, seed: int
     triangulator.merge_all_tracks(options)
     for number in placed:
         triangulator.triangulate_image(options, number)
-    observations.filter_all_points3D(MOST_ERROR_PX, LEAST_ANGLE_DEG)
+    observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)

@@ -11,13 +11,13 @@ from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.photo_set import PhotoSet, place_of
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, PosedDepthMap
+from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, PosedDepthMap
 
 SIDE = 8  # voxels per side of a block: a surface fills smaller blocks better than open3d's default of 16
 BAND = 3.0  # truncation distance on either side of the surface, in voxels
-LEAST_PHOTOS = 2  # photos that have to see a surface in a block: each of their depths is already confirmed by others
+MIN_PHOTOS = 2  # photos that have to see a surface in a block: each of their depths is already confirmed by others
 EVERY = 3  # one pixel in this many is used per axis: blocks are wider
-LEAST_GROWTH = 1.05  # of voxels that were too small
+MIN_GROWTH = 1.05  # of voxels that were too small
 BITS = 21  # of a block's number along an axis: two million
 
 Keys = Int64[np.ndarray, " n"]
@@ -26,7 +26,7 @@ Box = Float64[np.ndarray, "2 3"]  # least and largest east, north, up, metres: t
 
 def depths_in(box: Box, found: PosedDepthMap) -> Float32[np.ndarray, "h w"]:
     """A photo's confirmed depths inside a box; 0 elsewhere."""
-    sure = (found.confidence >= LEAST_CONFIRMED) & (found.depth > 0.0)
+    sure = (found.confidence >= MIN_CONFIRMED) & (found.depth > 0.0)
     row, column = np.nonzero(sure)
     xyz = _places(found, row, column)
     inside = ((xyz >= box[0][:, None]) & (xyz < box[1][:, None])).all(axis=0)
@@ -76,10 +76,10 @@ def surface_blocks(photos: PhotoSet, box: Box, voxel_m: float, most: int, thread
             count = np.concatenate([seen, np.ones(len(found), np.int64)])
             keys, place = np.unique(every, return_inverse=True)
             seen = np.bincount(place, count, len(keys)).astype(np.int64)
-        kept = keys[seen >= LEAST_PHOTOS]
+        kept = keys[seen >= MIN_PHOTOS]
         if len(kept) <= most:
             return Blocks(box[0], voxel_m, blocks_of(kept))
-        voxel_m *= max(LEAST_GROWTH, float(np.sqrt(len(kept) / most)))  # blocks of a surface go with its area
+        voxel_m *= max(MIN_GROWTH, float(np.sqrt(len(kept) / most)))  # blocks of a surface go with its area
 
 
 def _seen_keys(photos: PhotoSet, box: Box, voxel_m: float, number: int) -> Keys:

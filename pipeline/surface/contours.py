@@ -25,12 +25,12 @@ from splatpipe.pipeline.surface.geotiff import gdal
 
 INDEX_EVERY = 5  # every fifth contour is drawn bold, as on maps
 CELLS_AN_INTERVAL = 6.0  # 95 % of heights are within 3 cells: half an interval, as map standards ask of contours
-LEVELS_AT_MOST = 100  # over the relief, with an interval chosen here
-MOST_LEVELS = 10_000  # with a given interval
-MOST_VERTICES = 3_000_000  # 300 MB until they are written
+MAX_AUTO_LEVELS = 100  # over the relief, with an interval chosen here
+MAX_LEVELS = 10_000  # with a given interval
+MAX_VERTICES = 3_000_000  # 300 MB until they are written
 WINDOW = 1024  # cells
 TOLERANCE_CELLS = 0.3  # of simplified lines: less than half a cell, which is what a height's place means
-LEAST_LOOP_CELLS = 12.0  # around: a loop of less is a single cell's noise
+MIN_LOOP_CELLS = 12.0  # around: a loop of less is a single cell's noise
 SAME_PLACE_CELLS = 1e-6  # two windows round the same crossing differently
 
 Line = Float64[np.ndarray, "n 2"]
@@ -73,7 +73,7 @@ def neat_interval(cell: float, relief: float) -> float:
         cell: Cell size, in the heights' unit.
         relief: Difference between the highest and the lowest height.
     """
-    least = max(CELLS_AN_INTERVAL * cell, relief / LEVELS_AT_MOST)
+    least = max(CELLS_AN_INTERVAL * cell, relief / MAX_AUTO_LEVELS)
     power = 10.0 ** math.floor(math.log10(least))
     return next(float(f"{step * power:.1g}") for step in (1, 2, 5, 10) if step * power >= least * (1.0 - 1e-9))
 
@@ -92,7 +92,7 @@ def trace_contours(dsm: Path, interval: float | None = None) -> Contours:
         low, high = _height_range(raster)
         if interval is None:
             interval = neat_interval(abs(raster.transform.a) * _cell_in_heights(raster), max(high - low, 0.0))
-        if not (math.isfinite(interval) and interval > 0.0) or (high - low) / interval > MOST_LEVELS:
+        if not (math.isfinite(interval) and interval > 0.0) or (high - low) / interval > MAX_LEVELS:
             raise SplatpipeError(
                 f"Contours every {interval:g} over {high - low:g} cannot be drawn.", "Choose another interval."
             )
@@ -181,9 +181,9 @@ class _Joints:
             SplatpipeError: if there are too many.
         """
         self._vertices += len(piece)
-        if self._vertices > MOST_VERTICES:
+        if self._vertices > MAX_VERTICES:
             raise SplatpipeError(
-                f"The contours have more than {MOST_VERTICES:,} points.", "Choose a larger interval, or larger cells."
+                f"The contours have more than {MAX_VERTICES:,} points.", "Choose a larger interval, or larger cells."
             )
         begin, end = _place(level, piece[0]), _place(level, piece[-1])
         if begin == end:
@@ -239,7 +239,7 @@ def _is_closed(line: Line) -> bool:
 
 def _is_noise(line: Line) -> bool:
     around = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-    return _is_closed(line) and around < LEAST_LOOP_CELLS
+    return _is_closed(line) and around < MIN_LOOP_CELLS
 
 
 def _contour(level: int, line: Line, interval: float, transform: Any) -> Contour:

@@ -36,7 +36,7 @@ DXF_VERSION = "R2000"  # the oldest with drawing units and images, so most progr
 METRES = 6  # value of $INSUNITS
 DIGITS = 4  # of coordinates in metres: a tenth of a millimetre
 MARGIN_MM = 10.0  # around an SVG, with room for texts that extend beyond lines
-MOST_EMBEDDED = 4096  # largest side of an image in an SVG, pixels; larger images are reduced
+MAX_EMBEDDED = 4096  # largest side of an image in an SVG, pixels; larger images are reduced
 JPEG_QUALITY = 92
 # AutoCAD's colour, hundredths of a millimetre, and the SVG's colour of each layer.
 LAYERS = {
@@ -172,7 +172,7 @@ def _svg_path(stroke: Stroke, line: np.ndarray) -> str:
 def _embedded(colours: UInt8[np.ndarray, "h w 4"]) -> str:
     """An image as a data URL: JPEG on white, a fifth of a PNG's size."""
     flat = Image.fromarray(np.where(colours[..., 3:] > 0, colours[..., :3], np.uint8(255)))
-    flat.thumbnail((MOST_EMBEDDED, MOST_EMBEDDED))
+    flat.thumbnail((MAX_EMBEDDED, MAX_EMBEDDED))
     kept = io.BytesIO()
     flat.save(kept, "JPEG", quality=JPEG_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(kept.getvalue()).decode("ascii")

@@ -15,7 +15,7 @@ DOTS_AN_INCH = 150  # of paper: a page fills a screen
 MM_AN_INCH, POINTS_A_MM = 25.4, 72.0 / 25.4
 LETTER = 1.4  # a font's size over its capitals' height
 DOT_MM = 0.6  # of a point
-LEAST_MM, MOST_MM = 60.0, 600.0  # of a side, whatever is drawn
+MIN_MM, MAX_MM = 60.0, 600.0  # of a side, whatever is drawn
 TEXT_ROOM_MM = 25.0  # for what is written below and at the left
 
 
@@ -29,7 +29,7 @@ def write_png_drawing(path: Path, drawing: Drawing) -> None:
     low, high = drawing.box()
     low = low - (TEXT_ROOM_MM + MARGIN_MM) * mm
     high = high + MARGIN_MM * mm
-    width, height = ((high - low) / mm).clip(LEAST_MM, MOST_MM) / MM_AN_INCH
+    width, height = ((high - low) / mm).clip(MIN_MM, MAX_MM) / MM_AN_INCH
     figure = Figure(figsize=(width, height), dpi=DOTS_AN_INCH)
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

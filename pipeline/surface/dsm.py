@@ -27,7 +27,7 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 HELD_BYTES = 512 << 20  # limit for depths in memory
 MILLIMETRES = 1000.0
-MOST_MILLIMETRES = np.iinfo(np.uint16).max
+MAX_MILLIMETRES = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
         capture = HeightInput(sources, sheet.sheet.lattice, sheet.sheet.relief, LruCache(HELD_BYTES))
         for part in surface_heights(capture, tiles, task.threads):
             sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))
-            confidence = np.stack([part.photos, np.minimum(sigma, MOST_MILLIMETRES)], axis=-1).astype(np.uint16)
+            confidence = np.stack([part.photos, np.minimum(sigma, MAX_MILLIMETRES)], axis=-1).astype(np.uint16)
             over = sheet.heights(part.tile, part.height).astype(np.float32)
             yield part.tile, {"height": over, "confidence": confidence}
 
@@ -115,7 +115,7 @@ def _write_rasters(making: SheetWork, out: Path, grid: Grid) -> Int64[np.ndarray
     with raster_file(out / "dsm.tif", grid, HEIGHTS) as file:
         for part, arrays in making.finished():
             file.write(part, arrays["height"])
-    sigmas = np.zeros(MOST_MILLIMETRES + 1, np.int64)
+    sigmas = np.zeros(MAX_MILLIMETRES + 1, np.int64)
     with raster_file(out / "dsm_confidence.tif", grid, CONFIDENCE) as file:
         for part, arrays in making.finished():
             file.write(part, np.moveaxis(arrays["confidence"], -1, 0))

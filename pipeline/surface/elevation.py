@@ -27,7 +27,7 @@ from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PosedDepth
 from splatpipe.pipeline.surface.walls import Wall
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sills and cornices; balconies do not
-MOST_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
+MAX_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
 STRIP = 256  # rows that are softened at a time
 SHELF_BYTES = 256 << 20  # of photos, and as many of depths
 
@@ -72,7 +72,7 @@ def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
     """
     width = max(1, math.ceil(wall.length_m / cell_m))
     height = max(1, math.ceil((wall.high_m - wall.low_m) / cell_m))
-    if width * height > MOST_CELLS:
+    if width * height > MAX_CELLS:
         raise SplatpipeError(
             f"The façade {wall.name} of {width:,} × {height:,} pixels of {cell_m:g} m is too large.",
             "Choose larger pixels with --gsd.",

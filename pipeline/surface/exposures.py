@@ -19,8 +19,8 @@ from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, PhotoSource, li
 from splatpipe.pipeline.surface.point_visibility import Points, place_in, sight
 
 COMPARED_AT = 4000  # places that photos' exposures are compared at: their number is no matter of a capture's size
-MOST_GAIN = 2.0  # and one over it: more is not exposure
-MOST_SHADE = 0.5  # of a term's logarithm of light
+MAX_GAIN = 2.0  # and one over it: more is not exposure
+MAX_SHADE = 0.5  # of a term's logarithm of light
 DARKEST, LIGHTEST = 8, 247  # values that are not cut off
 REST = 3.0  # places' worth with which a photo keeps to its own exposure,
 REST_SHADE = 10.0  # and to the shading that all photos have: corners say more of a term than the middle
@@ -60,8 +60,8 @@ def exposure_levels(
     rest = np.array([REST, *([REST_SHADE] * SHADES)])
     numbers = photo.astype(np.int64), place.astype(np.int64)
     factors = np.stack([_levelled(each, terms, rest, numbers, len(sources)) for each in light.T], axis=-1)
-    gain = np.clip(np.exp(factors[:, 0]), 1.0 / MOST_GAIN, MOST_GAIN)
-    shading = np.clip(factors[:, 1:], -MOST_SHADE, MOST_SHADE)
+    gain = np.clip(np.exp(factors[:, 0]), 1.0 / MAX_GAIN, MAX_GAIN)
+    shading = np.clip(factors[:, 1:], -MAX_SHADE, MAX_SHADE)
     return PhotoGains(np.round(gain, DIGITS), np.round(shading, DIGITS))
 
 

@@ -11,16 +11,16 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
+from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, DepthSource, PosedDepthMap
 
 BLOCKS_A_PHOTO = 20_000  # blocks of pixels, each fitted with a plane: 20 cm of a wall in photos with a GSD of 3 cm
-LEAST_BLOCK = 6  # pixels per side: a smaller block's slope is noise
-LEAST_SHARE = 0.6  # of a block's pixels that count
+MIN_BLOCK = 6  # pixels per side: a smaller block's slope is noise
+MIN_SHARE = 0.6  # of a block's pixels that count
 ROUGH_PX = 3.0  # pixel widths by which a block's depths may scatter about its plane: more means two surfaces
 UPRIGHT = 0.35  # largest vertical component of a normal: 20°, three standard deviations for a small block
 COARSEST = 2.0  # times the median pixel: coarser pixels show houses beyond the survey area
 STRIP_PIXELS = 1 << 20  # fitted at a time: about 100 MB
-MOST_FACETS = 1_000_000  # of all photos; more are thinned evenly
+MAX_FACETS = 1_000_000  # of all photos; more are thinned evenly
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
         sources: Depths of photos, always in the same order.
         threads: Photos in parallel.
     """
-    share = max(1, math.ceil(len(sources) * BLOCKS_A_PHOTO / 4 / MOST_FACETS))  # a quarter stands, at most
+    share = max(1, math.ceil(len(sources) * BLOCKS_A_PHOTO / 4 / MAX_FACETS))  # a quarter stands, at most
 
     def thinned(source: DepthSource) -> Facets:
         found = facets_of(source.load())
@@ -70,7 +70,7 @@ def facets_of(found: PosedDepthMap) -> Facets:
     Inverse depth is linear in a plane's pixels: w = n · (x, y, 1) for the plane n · X = 1.
     """
     camera = found.camera
-    side = max(LEAST_BLOCK, round(math.sqrt(camera.width * camera.height / BLOCKS_A_PHOTO)))
+    side = max(MIN_BLOCK, round(math.sqrt(camera.width * camera.height / BLOCKS_A_PHOTO)))
     strip = max(1, STRIP_PIXELS // (side * camera.width)) * side
     parts = [_strip_facets(found, top, strip, side) for top in range(0, camera.height - side + 1, strip)]
     return _joined(parts)
@@ -81,8 +81,8 @@ def _strip_facets(found: PosedDepthMap, top: int, rows: int, side: int) -> Facet
     camera, strip = found.camera, np.s_[top : top + rows]
     depth = found.depth[strip].astype(np.float64)
     inverse = _blocks(np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0.0), side)
-    sure = _blocks(np.where(depth > 0.0, found.confidence[strip], 0), side) >= LEAST_CONFIRMED
-    row, column = np.nonzero(sure.mean(axis=(2, 3)) >= LEAST_SHARE)
+    sure = _blocks(np.where(depth > 0.0, found.confidence[strip], 0), side) >= MIN_CONFIRMED
+    row, column = np.nonzero(sure.mean(axis=(2, 3)) >= MIN_SHARE)
     weight, values = (part[row, column].reshape(len(row), side * side) for part in (sure.astype(float), inverse))
     off = np.arange(side) + 0.5
     x = np.tile(off, side) + (column * side)[:, None]

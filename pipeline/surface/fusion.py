@@ -20,7 +20,7 @@ from splatpipe.pipeline.surface.sources import HeightRange
 from splatpipe.pipeline.surface.tiles import Tile
 
 FINER = 0.9  # of a point's footprint: a photo with a smaller one takes over the point; otherwise both may keep it
-LEAST_PHOTOS = 3  # photos that have to see a point, including its own
+MIN_PHOTOS = 3  # photos that have to see a point, including its own
 REACH = 2.5  # standard deviations from the mean within which a photo counts (Tukey's biweight; Beaton and Tukey 1974)
 SIGMA_PX = 0.7  # standard deviation of a depth, in pixel footprints on the surface
 ROUNDS = 3  # of the robust mean
@@ -142,7 +142,7 @@ def _agreed(points: DepthPoints, parts: Sequence[DepthPart]) -> FusedPoints:
     """Points moved to the average of the photos that see them, without those that few see or many see through."""
     opinion, normal, balance = _heard(points, parts)
     count = 1 + (opinion.weight > 0.0).sum(axis=0)
-    kept = np.flatnonzero((count >= LEAST_PHOTOS) & (balance > 0))
+    kept = np.flatnonzero((count >= MIN_PHOTOS) & (balance > 0))
     normal = normal[:, kept]
     normal = normal / np.maximum(np.sqrt(dot(normal, normal)), 1e-30)
     offset = opinion.offset[:, :, kept]

@@ -25,9 +25,9 @@ from splatpipe.pipeline.survey.world import World
 TILE = 512  # cells: a block of the files
 DIGITS = 3  # significant digits of the cell size: 0.028 rather than 0.027963; at most half a per cent off
 LIKE_GROUND = 0.005  # a grid metre this close to a ground metre counts as one: 2 cm stay 2 cm in UTM
-LEAST_CELL_M, MOST_CELL_M = 1e-4, 1e3
-MOST_CELLS_A_SIDE = 1_000_000
-MOST_CELLS = 20_000_000_000  # 8 km² at 2 cm, a file of 80 GB of heights before compression
+MIN_CELL_M, MAX_CELL_M = 1e-4, 1e3
+MAX_CELLS_A_SIDE = 1_000_000
+MAX_CELLS = 20_000_000_000  # 8 km² at 2 cm, a file of 80 GB of heights before compression
 ROUNDING = 1e-6  # cells: an extent that ends on a grid line gets no cell beyond it
 EDGE_STEPS = 9  # samples along each side of the scene's box
 HEIGHT_MARGIN_M = 10.0  # of the lattice beyond the scene: heights are interpolated linearly in it
@@ -111,7 +111,7 @@ def make_grid(frame: Frame, box: Float64[np.ndarray, "2 3"], gsd_m: float) -> Gr
     Raises:
         SplatpipeError: if the frame is not metric or its CRS cannot be used, or the grid would be absurdly large.
     """
-    if not LEAST_CELL_M <= gsd_m <= MOST_CELL_M:
+    if not MIN_CELL_M <= gsd_m <= MAX_CELL_M:
         raise SplatpipeError(f"Cells of {gsd_m:g} m are not valid for a surface.", "Give a size such as --gsd 2cm.")
     box = np.asarray(box, np.float64)
     if not np.isfinite(box).all() or not (box[0] <= box[1]).all():
@@ -151,7 +151,7 @@ def _ground_scale(world: World) -> float:
 
 
 def _require_reasonable(width: int, height: int, gsd_m: float) -> None:
-    if max(width, height) > MOST_CELLS_A_SIDE or width * height > MOST_CELLS:
+    if max(width, height) > MAX_CELLS_A_SIDE or width * height > MAX_CELLS:
         raise SplatpipeError(
             f"A raster of {width:,} × {height:,} cells of {gsd_m:g} m is too large.",
             "Choose larger cells with --gsd, or a part of the scene with --boundary.",

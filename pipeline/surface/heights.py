@@ -18,15 +18,15 @@ from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import HALF, HeightVotes, Layer, undecided
 
 TILE = 256  # cells per side
-LEAST_PHOTOS = 3  # photos that have to see a cell
+MIN_PHOTOS = 3  # photos that have to see a cell
 NEAR = 4  # cells: holes up to this size are filled from their surroundings,
 FAR = 16  # larger ones up to this if photos may see the filled surface,
 FAR_ON_WALLS = 28  # and still larger ones on walls, which are flat and textureless where depths are missing
 BEHIND = 8  # one photo that sees through a surface outweighs this many that see it: depths widen foreground objects
 FEW = 2  # photos that agree on a height suffice where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
-MOST_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
-LEAST_CELLS = 1 << 12  # smaller tiles are not split: they would be mostly margin
+MAX_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
+MIN_CELLS = 1 << 12  # smaller tiles are not split: they would be mostly margin
 MOST = np.iinfo(np.uint8).max
 
 
@@ -96,7 +96,7 @@ def surface_heights(capture: HeightInput, tiles: Sequence[Tile], threads: int) -
     return ordered_map(partial(tile_heights, capture), tiles, threads)
 
 
-def tile_heights(capture: HeightInput, tile: Tile, most: int = MOST_VOTES) -> Heights:
+def tile_heights(capture: HeightInput, tile: Tile, most: int = MAX_VOTES) -> Heights:
     """Compute the heights of one tile.
 
     Args:
@@ -106,7 +106,7 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MOST_VOTES) -> He
     """
     wide = tile.grown(capture.margin)
     seen = photos_seeing([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
-    if len(seen) * wide.cells > most and tile.cells > LEAST_CELLS:
+    if len(seen) * wide.cells > most and tile.cells > MIN_CELLS:
         return _joined(tile, [tile_heights(capture, half, most) for half in tile.halves()])
     votes = HeightVotes(capture.lattice, wide, capture.relief)
     for number, window in seen:
@@ -116,9 +116,9 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MOST_VOTES) -> He
         return _empty(tile)
     numbers = [number for number, _ in seen]
     fit = votes.fitted(_chosen(capture, wide, found, numbers))
-    agreed = np.where(fit.photos >= LEAST_PHOTOS, fit.height, np.nan)
+    agreed = np.where(fit.photos >= MIN_PHOTOS, fit.height, np.nan)
     few = np.flatnonzero((fit.photos == FEW) & np.isfinite(fit.height))
-    may = _may_see(capture, wide, few, fit.height[few], numbers) >= LEAST_PHOTOS
+    may = _may_see(capture, wide, few, fit.height[few], numbers) >= MIN_PHOTOS
     agreed[few[may]] = fit.height[few[may]]
     height, new = _filled(capture, wide, agreed, numbers)
     shape = (wide.height, wide.width)
@@ -143,7 +143,7 @@ def _filled(
     near, _ = filled(height.reshape(shape), cell_m, NEAR, capture.upright)
     far, new = filled(near, cell_m, capture.far, capture.upright)
     result, asked = far.ravel(), np.flatnonzero(new)
-    seen = _may_see(capture, tile, asked, result[asked], numbers) >= LEAST_PHOTOS
+    seen = _may_see(capture, tile, asked, result[asked], numbers) >= MIN_PHOTOS
     result[asked[~seen]] = np.nan
     return result, np.isfinite(result) & np.isnan(height)
 
@@ -196,7 +196,7 @@ def _chosen(
 
     Surfaces that cover at least half of the cell take precedence.
     """
-    asked = np.flatnonzero(undecided(found, LEAST_PHOTOS))
+    asked = np.flatnonzero(undecided(found, MIN_PHOTOS))
     heights = np.stack([layer.height[asked] for layer in found])
     balance = _balance(capture, tile, asked, heights, numbers)
     good = np.isfinite(heights) & (balance >= 0)

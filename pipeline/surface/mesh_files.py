@@ -27,7 +27,7 @@ from splatpipe.pipeline.survey.sparse_scene import GLTF_FROM_WORLD
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125  # glTF's component types
 ARRAY, ELEMENTS = 34962, 34963  # what its buffers are for
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
-MOST_SHORT = 65535
+MAX_SHORT = 65535
 UNLIT = "KHR_materials_unlit"
 
 
@@ -54,8 +54,8 @@ def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, boundary: Path | 
 
 def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
     positions = (made.mesh.vertices @ GLTF_FROM_WORLD.T).astype("<f4")
-    light = np.round(linear(made.colours / 255.0) * MOST_SHORT).astype("<u2")
-    colours = np.column_stack([light, np.full(len(light), MOST_SHORT, "<u2")])  # 8 bytes a vertex: aligned
+    light = np.round(linear(made.colours / 255.0) * MAX_SHORT).astype("<u2")
+    colours = np.column_stack([light, np.full(len(light), MAX_SHORT, "<u2")])  # 8 bytes a vertex: aligned
     triangles = made.mesh.triangles.astype("<u4")
     arrays = (positions, colours, triangles)
     text = json.dumps(_scene(*arrays), separators=(",", ":")).encode()

@@ -10,7 +10,7 @@ from splatpipe.pipeline.surface.sheet import Sheet
 
 RECESS_M, JUT_M = 0.05, 0.12  # behind the plane: frames of windows; before it: canopies, not shutters and plinths
 STEP_GSD = 2.0  # and at least so many pixels: depths of coarse photos scatter more
-LEAST_M2 = 0.15  # of an opening; smaller ones are vents and noise
+MIN_AREA_M2 = 0.15  # of an opening; smaller ones are vents and noise
 SOFT_M = 0.06  # of a mask: notches and spots that are narrower go
 BRIDGED_M = 1.2  # of the wall's outline: bushes before it that are narrower make no notch
 STRAIGHT_CELLS = 1.5  # that an outline's corners may be off by
@@ -65,7 +65,7 @@ def _rings(there: Bool[np.ndarray, "h w"], sheet: Sheet, face: Bool[np.ndarray, 
     sizes = stats[:, cv2.CC_STAT_AREA]
     rings = []
     for part in sorted(range(1, count), key=lambda part: (-int(sizes[part]), part)):
-        if sizes[part] * cell**2 < LEAST_M2:
+        if sizes[part] * cell**2 < MIN_AREA_M2:
             break
         left, top, width, height = (int(stats[part, k]) for k in range(4))
         own = parts[top : top + height, left : left + width] == part

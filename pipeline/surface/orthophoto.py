@@ -21,8 +21,8 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells per side
 SPREAD = 24  # cells over which colours are extended into areas that no photo sees; farther away there is none
-MOST_RATED = 24_000_000  # cells times photos at once: 70 MB of costs, and colours of a few photos
-LEAST_CELLS = 1 << 14  # smaller tiles are not split: they would be mostly margin
+MAX_RATED = 24_000_000  # cells times photos at once: 70 MB of costs, and colours of a few photos
+MIN_CELLS = 1 << 14  # smaller tiles are not split: they would be mostly margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def orthophotos(album: OrthoInput, tiles: Sequence[Tile], threads: int) -> Itera
     return ordered_map(partial(tile_orthophoto, album), tiles, threads)
 
 
-def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MOST_RATED) -> Orthophoto:
+def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MAX_RATED) -> Orthophoto:
     """Compute one tile of the orthophoto.
 
     Args:
@@ -91,7 +91,7 @@ def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MOST_RATED) -> Or
     """
     wide = tile.grown(MARGIN + SPREAD)
     windows = photos_seeing([source.camera for source in album.sources], album.lattice, wide, album.relief)
-    if len(windows) * wide.cells > most and tile.cells > LEAST_CELLS:
+    if len(windows) * wide.cells > most and tile.cells > MIN_CELLS:
         return _joined(tile, [tile_orthophoto(album, half, most) for half in tile.halves()])
     east, north = np.moveaxis(album.lattice.centres(wide), -1, 0)
     points = contiguous((east, north, album.surface.at(east, north)))

@@ -18,8 +18,8 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 EVERY = 4  # pixels, of which one is looked at where heights are looked for
 LAYER_M = 1.0  # of such heights, and their margin
-LEAST_PHOTOS = 2  # that see something between them
-LEAST_COSINE = 0.1  # of a ray and a surface's normal: flatter rays count as this one
+MIN_PHOTOS = 2  # that see something between them
+MIN_COSINE = 0.1  # of a ray and a surface's normal: flatter rays count as this one
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class PhotoSet:
             east, north, up = _some_places(found, window)
             inside = (lattice.cells(tile, east, north) >= 0) & (up >= relief.low_m) & (up < relief.high_m)
             photos[np.unique(((up[inside] - relief.low_m) / LAYER_M).astype(np.int64))] += 1
-        layers = np.flatnonzero(photos >= LEAST_PHOTOS)
+        layers = np.flatnonzero(photos >= MIN_PHOTOS)
         if not layers.size:
             return None
         low, high = (relief.low_m + LAYER_M * float(edge) for edge in (layers[0] - 1, layers[-1] + 2))
@@ -186,7 +186,7 @@ def look_at(camera: Camera, pieces: SurfacePieces) -> SurfaceView:
     away = np.sqrt(np.square(towards[0]) + np.square(towards[1]) + np.square(towards[2]))
     cosine = dot(towards, pieces.normal) / np.maximum(away, 1e-9)
     seen = place.inside & (cosine > 0.0)
-    pixel = place.depth / max(camera.fx, camera.fy) / np.maximum(cosine, LEAST_COSINE)
+    pixel = place.depth / max(camera.fx, camera.fy) / np.maximum(cosine, MIN_COSINE)
     return SurfaceView(pieces, replace(place, sine=cosine), np.where(seen, pixel, np.inf))
 
 

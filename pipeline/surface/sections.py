@@ -18,13 +18,13 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.ground_scale import ground_metres
 from splatpipe.pipeline.surface.map_crs import MapCrs
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
+from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, DepthSource, PosedDepthMap
 from splatpipe.pipeline.surface.surface_file import SurfaceFile
 
 SAMPLES_A_CELL = 2.0  # along the line, so that no cell that it crosses for some length is left out
-MOST_SAMPLES = 2_000_000  # 20 km at 2 cm: more is a wrong coordinate
+MAX_SAMPLES = 2_000_000  # 20 km at 2 cm: more is a wrong coordinate
 THICKNESS_CELLS = 1.5  # on either side of the plane, from where points are taken
-LEAST_PHOTOS = 2  # that have a point in a cell of the section
+MIN_PHOTOS = 2  # that have a point in a cell of the section
 
 Line = tuple[float, float, float, float]
 
@@ -72,7 +72,7 @@ def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence
     length = float(np.linalg.norm(end - start)) if np.isfinite([start, end]).all() else 0.0
     told = ",".join(f"{number:.10g}" for number in line)
     count = math.ceil(length / surface.cell * SAMPLES_A_CELL) + 1
-    if length == 0.0 or count > MOST_SAMPLES:
+    if length == 0.0 or count > MAX_SAMPLES:
         raise SplatpipeError(f"The section {told} has no length, or is far too long.", "Check its coordinates.")
     share = np.linspace(0.0, 1.0, count)
     place = start + share[:, None] * (end - start)
@@ -102,7 +102,7 @@ def _points(
     numbers = numbers.reshape(-1)
     count = np.bincount(numbers, minlength=len(cells))
     means = [np.bincount(numbers, every[:, axis], len(cells)) / np.maximum(count, 1) for axis in (0, 1)]
-    return np.stack(means, axis=1)[count >= LEAST_PHOTOS]
+    return np.stack(means, axis=1)[count >= MIN_PHOTOS]
 
 
 def _photo_points(ends: Float64[np.ndarray, "2 3"], cell_m: float, source: DepthSource) -> Float64[np.ndarray, "k 2"]:
@@ -117,7 +117,7 @@ def _photo_points(ends: Float64[np.ndarray, "2 3"], cell_m: float, source: Depth
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     off = found.depth * (beside[0] * x + beside[1] * y[:, None] + beside[2]) + ahead
-    near = (np.abs(off) <= THICKNESS_CELLS * cell_m) & (found.depth > 0.0) & (found.confidence >= LEAST_CONFIRMED)
+    near = (np.abs(off) <= THICKNESS_CELLS * cell_m) & (found.depth > 0.0) & (found.confidence >= MIN_CONFIRMED)
     row, column = np.nonzero(near)
     points = camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), found.depth[row, column].astype(np.float64))
     places = np.stack([(points - ends[0]) @ along, points[:, 2]], axis=1)

@@ -20,17 +20,17 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.surface.sources import LEAST_CONFIRMED, DepthSource, PosedDepthMap
+from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, DepthSource, PosedDepthMap
 
 SAMPLES = 3000  # evenly spaced depths per photo
 CELL_GSD = 100.0  # plan cell size in GSDs, such that each cell that a photo sees has several of its samples
-MOST_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
-LEAST_PHOTOS = 3  # photos that have to see a cell
+MAX_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
+MIN_PHOTOS = 3  # photos that have to see a cell
 FARTHEST = 4.0  # pixels larger on the ground than this many times the usual show distant land, not the site
-LEAST_PART = 0.02  # of the area seen: smaller isolated parts are left out
+MIN_PART = 0.02  # of the area seen: smaller isolated parts are left out
 NOISE = 0.001  # share of the lowest and of the highest samples that may be wrong
 MARGIN = 0.1  # of the relief, below and above, for what the samples missed,
-LEAST_MARGIN_M = 3.0  # but at least this: a mast or a well
+MIN_MARGIN_M = 3.0  # but at least this: a mast or a well
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
     row, column = (grid.ravel() for grid in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
-    sure = (found.depth[row, column] > 0.0) & (found.confidence[row, column] >= LEAST_CONFIRMED)
+    sure = (found.depth[row, column] > 0.0) & (found.confidence[row, column] >= MIN_CONFIRMED)
     row, column = row[sure], column[sure]
     depth = found.depth[row, column].astype(np.float64)
     points = camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), depth)
@@ -169,20 +169,20 @@ def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
 def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "rows columns"]:
     """Cells that enough photos see and that are not in small isolated parts."""
     columns, rows = cell.max(axis=0) + 1
-    if rows * columns > MOST_CELLS:
+    if rows * columns > MAX_CELLS:
         raise SplatpipeError("The photos' depths reach too far for a surface.", "Set a --boundary.")
     place = cell[:, 1] * columns + cell[:, 0]
     pairs = np.unique(np.stack([place, number], axis=1), axis=0)
     count = np.bincount(pairs[:, 0], minlength=rows * columns).reshape(rows, columns)
-    covered = (count >= LEAST_PHOTOS).astype(np.uint8)
+    covered = (count >= MIN_PHOTOS).astype(np.uint8)
     _, parts = cv2.connectedComponents(covered, connectivity=8)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    kept = sizes >= min(LEAST_PART * sizes.sum(), sizes.max())  # of a site in many pieces, too, the largest
+    kept = sizes >= min(MIN_PART * sizes.sum(), sizes.max())  # of a site in many pieces, too, the largest
     return np.asarray((covered > 0) & kept[parts])
 
 
 def _relief(up: Float64[np.ndarray, " n"]) -> tuple[float, float]:
     low, high = np.quantile(up, [NOISE, 1.0 - NOISE])
-    margin = max(LEAST_MARGIN_M, MARGIN * (high - low))
+    margin = max(MIN_MARGIN_M, MARGIN * (high - low))
     return float(low - margin), float(high + margin)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 SPACING_M = 50.0  # of nodes: what is between is off by 0.05 mm a direction
-MOST_STEPS = 400  # along a side: beyond 20 km nodes are further apart, and what is between them is off by more
+MAX_STEPS = 400  # along a side: beyond 20 km nodes are further apart, and what is between them is off by more
 CHUNK = 1 << 16  # points at a time: their products stay in the cache
 
 Points = Float64[np.ndarray, "n 3"]
@@ -66,7 +66,7 @@ def sample_map(
         high: Highest corner of the box.
         spacing: Spacing of the nodes, ``SPACING_M`` in the coordinates' unit.
     """
-    counts = np.clip(np.ceil((high - low)[:2] / spacing), 1, MOST_STEPS).astype(np.int64)
+    counts = np.clip(np.ceil((high - low)[:2] / spacing), 1, MAX_STEPS).astype(np.int64)
     xs, ys = (np.linspace(low[axis], high[axis], counts[axis] + 1) for axis in (0, 1))
     nodes = np.stack(np.meshgrid(xs, ys, [low[2], high[2]], indexing="xy"), axis=-1)
     values = exact(nodes.reshape(-1, 3)).reshape(nodes.shape)  # rows, columns, two heights, three coordinates

@@ -17,7 +17,7 @@ from splatpipe.pipeline.surface.tiles import Tile
 
 Loaded = TypeVar("Loaded")
 
-LEAST_CONFIRMED = 2  # other photos that have to confirm a depth used for clouds, meshes, walls and sections
+MIN_CONFIRMED = 2  # other photos that have to confirm a depth used for clouds, meshes, walls and sections
 REACH_PX = 4  # pixels around a tile in a photo: more than slopes and filters need
 
 

@@ -22,7 +22,7 @@ from splatpipe.pipeline.surface.site_extent import SiteExtent
 from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, without_crumbs
 from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
 
-MOST_BLOCKS = 55_000  # of voxels: 0.25 GB, and 2.5 million triangles before decimation; beyond it voxels are larger
+MAX_BLOCKS = 55_000  # of voxels: 0.25 GB, and 2.5 million triangles before decimation; beyond it voxels are larger
 CRUMB_VOXELS = 200.0  # faces of voxels: a piece of a smaller area hangs in the air, or is nobody's interest
 GREY = 128  # of what no photo shows, where nothing near has a colour
 
@@ -97,7 +97,7 @@ def _kept(path: Path) -> tuple[TriangleMesh, float]:
 def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[TriangleMesh, float]:
     """The mesh before decimation, and its voxel size in metres."""
     box = task.site.box
-    blocks = surface_blocks(photos, box, task.voxel_m, MOST_BLOCKS, task.threads)
+    blocks = surface_blocks(photos, box, task.voxel_m, MAX_BLOCKS, task.threads)
     if blocks.voxel_m > task.voxel_m:
         report.note(f"The mesh has voxels of {blocks.voxel_m:.3g} m, not {task.voxel_m:.3g} m: the site is large.")
     mesh = tsdf_mesh(photos, box, blocks, task.threads, report)

@@ -19,7 +19,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface.blocks import BAND, LEAST_PHOTOS, SIDE, Blocks, Box, depths_in
+from splatpipe.pipeline.surface.blocks import BAND, MIN_PHOTOS, SIDE, Blocks, Box, depths_in
 from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.triangles import TriangleMesh, in_order
 
@@ -78,7 +78,7 @@ def tsdf_mesh(photos: PhotoSet, box: Box, blocks: Blocks, threads: int, report: 
             image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
             grid.integrate(core.Tensor(places[near]), image, intrinsic, extrinsic, 1.0, FARTHEST_M, BAND)
         report.progress(done, len(numbers), "joining depths to a surface", "photos")
-    found = grid.extract_triangle_mesh(LEAST_PHOTOS - 0.5)  # open3d leaves out what has that weight or less
+    found = grid.extract_triangle_mesh(MIN_PHOTOS - 0.5)  # open3d leaves out what has that weight or less
     vertices = found.vertex.positions.numpy().astype(np.float64) + blocks.low
     return in_order(TriangleMesh(vertices, found.triangle.indices.numpy().astype(np.int64)))
 

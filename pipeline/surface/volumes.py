@@ -30,9 +30,9 @@ SHARED_CELLS = 1.0  # s of the noise correlation exp(-d² / 4 s²) of two cells 
 SHARED_ALONG = 2.0 * math.sqrt(math.pi) * SHARED_CELLS  # that sum over a line of cells,
 SHARED_AROUND = 4.0 * math.pi * SHARED_CELLS**2  # and over an area
 RIM_CELLS = 1.0  # spacing of samples on the rim, in cells
-MOST_RIM = 1_000_000  # samples: 20 km at 2 cm; a longer rim means a wrong coordinate
-LEAST_RIM = 12  # samples with heights needed to fit a plane
-LEAST_RIM_SHARE = 0.5  # of the rim that needs heights: with less, the base is unreliable
+MAX_RIM = 1_000_000  # samples: 20 km at 2 cm; a longer rim means a wrong coordinate
+MIN_RIM = 12  # samples with heights needed to fit a plane
+MIN_RIM_SHARE = 0.5  # of the rim that needs heights: with less, the base is unreliable
 LOWEST_OF = 5  # neighbouring samples in the median filter: a single cell may be in a hole
 UNTOLD_SIGMA_CELLS = 0.5  # assumed deviation where none is stated, in cells
 ROUNDS, HUBER = 5, 1.5  # of the plane's robust fit, and deviations beyond which a place counts less
@@ -135,7 +135,7 @@ def measure_volume(
     """
     rings = [tuple(_in_crs(ring, crs) for ring in polygon) for polygon in area.polygons]
     ground = _Ground(surface, PlanArea.seen_from_above(rings), ground_metres(crs), crs.height_unit_m)
-    if not sum(_lengths(ring)[-1] for ring in ground.rings()) <= MOST_RIM * RIM_CELLS * surface.cell:
+    if not sum(_lengths(ring)[-1] for ring in ground.rings()) <= MAX_RIM * RIM_CELLS * surface.cell:
         raise SplatpipeError("The polygon's outline is far too long.", "Check its coordinates and its CRS.")
     plane = _base(ground, base, datum_sigma_m)
     sums = _CutFillSums.zero()
@@ -164,7 +164,7 @@ def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
     up = np.concatenate([height for height, _ in heights]) * ground.height_m
     sigma = _told(np.concatenate([sigma for _, sigma in heights]), ground.cell_m)
     known = np.isfinite(up)
-    if known.sum() < LEAST_RIM or known.mean() < LEAST_RIM_SHARE:
+    if known.sum() < MIN_RIM or known.mean() < MIN_RIM_SHARE:
         raise SplatpipeError(
             f"Only {100.0 * known.mean():.0f} % of the polygon's outline has heights, which is too little for a base.",
             "Draw it where the surface has heights, or give the base's height.",
@@ -178,7 +178,7 @@ def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
 def _along(ring: Ring, step: float) -> Float64[np.ndarray, "n 2"]:
     """Evenly spaced points on a closed outline."""
     closed, way = np.concatenate([ring, ring[:1]]), _lengths(ring)
-    count = max(LEAST_RIM, round(way[-1] / step))
+    count = max(MIN_RIM, round(way[-1] / step))
     at = np.arange(count) / count * way[-1]
     return np.stack([np.interp(at, way, closed[:, axis]) for axis in (0, 1)], axis=1)
 

@@ -31,11 +31,11 @@ GAP_M = 3.0  # between pieces of one wall: a tree in front of it, a gate
 CELL_M = 0.25  # of a wall's face, occupied if it has three facets
 CELL_FACETS = 3
 CLOSED_CELLS = 5  # over which openings are bridged
-LEAST_HEIGHT_M, LEAST_LENGTH_M, LEAST_M2 = 2.1, 2.0, 6.0  # of a wall that meets others: garden walls are lower
+MIN_HEIGHT_M, MIN_LENGTH_M, MIN_AREA_M2 = 2.1, 2.0, 6.0  # of a wall that meets others: garden walls are lower
 FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
 LOW_FLAT = 0.22  # of the band, within which half of the facets of a wall lower than that have to lie: on the demo, half
 # lie within 0.04 for low walls, 0.18 for walls with a plinth, and 0.3 to 0.4 for hedges clipped as high as garages
-LEAST_FLAT = 0.6  # share of the facets around a wall's plane that lie within its band: in hedges and trees they scatter
+MIN_FLAT = 0.6  # share of the facets around a wall's plane that lie within its band: in hedges and trees they scatter
 CORNER_M = 0.4  # from where a wall's facets end to the plane of the next one, at most: two facets
 CORNER_COSINE = math.cos(math.radians(30.0))  # planes that meet at less than this angle make no corner
 TOP_M = 0.4  # above the last facets, which end two of them below the eaves
@@ -313,16 +313,16 @@ def _connected(there: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
 def _piece(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> _Piece | None:
     """The part of a plane that is a wall; None if it is too low, too short, too small or too uneven."""
     face = _face(facets, line, ends, band_m)
-    if face is None or face.area_m2 < LEAST_M2:
+    if face is None or face.area_m2 < MIN_AREA_M2:
         return None
-    if face.heights[1] - face.heights[0] < LEAST_HEIGHT_M or face.ends[1] - face.ends[0] < LEAST_LENGTH_M:
+    if face.heights[1] - face.heights[0] < MIN_HEIGHT_M or face.ends[1] - face.ends[0] < MIN_LENGTH_M:
         return None
     around = facets.areas[_around(facets, line, face.ends, CLAIM_BANDS * band_m)].sum()
     flat = facets.select(_around(facets, line, face.ends, band_m))
     is_low = face.heights[1] - face.heights[0] < FREE_HEIGHT_M
     if is_low and np.median(np.abs(line.off(flat))) > LOW_FLAT * band_m:
         return None
-    return _Piece(line, face.ends, face.heights) if flat.areas.sum() >= LEAST_FLAT * around else None
+    return _Piece(line, face.ends, face.heights) if flat.areas.sum() >= MIN_FLAT * around else None
 
 
 def _cornered(pieces: Sequence[_Piece]) -> list[_Piece]:

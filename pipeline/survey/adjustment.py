@@ -26,9 +26,7 @@ from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_
 from splatpipe.pipeline.sfm.lens_blocks import hold, keep_shape
 from splatpipe.pipeline.survey.local_survey import Stations
 
-LEAST_SIGMA_PX = (
-    1.0  # of features: lens and shutter errors are correlated within a photo, and must not outweigh control
-)
+MIN_SIGMA_PX = 1.0  # of features: lens and shutter errors are correlated within a photo, and must not outweigh control
 UNBOUND_M = 1e4  # sigma of a height that was not measured
 FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
 DISTORTION_SIGMA = 0.2  # of a distortion coefficient about its estimate from SfM
@@ -158,7 +156,7 @@ def feature_sigma(model: pycolmap.Reconstruction) -> float:
     squares = squares[np.isfinite(squares)]
     unknowns = 3 * model.num_points3D() + 6 * len(model.reg_image_ids())
     degrees = max(2 * len(squares) - unknowns, 1)
-    return max(math.sqrt(float(squares.sum()) / degrees), LEAST_SIGMA_PX)
+    return max(math.sqrt(float(squares.sum()) / degrees), MIN_SIGMA_PX)
 
 
 class _Blocks:

@@ -34,7 +34,7 @@ DATUM_SIGMAS = 5.0
 DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
 SWAPPED_SHARE = 0.3  # largest share of two points' errors that remains if swapping their names explains them
 WEAK = 4.0  # model uncertainty over the control's own accuracy that is worth a warning
-LEAST_GSD = 3.0  # errors below this many ground pixels are not worth a message
+MIN_GSD = 3.0  # errors below this many ground pixels are not worth a message
 CONTROL_HINT = "--set georef.control=none runs without control."
 
 
@@ -80,7 +80,7 @@ def name_blunders(
     similarity, priors = start
     observed = observed_in(site, survey, model, similarity.scale, config.mark_sigma_px)
     control = [k for k, point in enumerate(survey.points) if point.role == "control" and point.found is not None]
-    least = LEAST_GSD * gsd_m(survey, model, similarity.scale)
+    least = MIN_GSD * gsd_m(survey, model, similarity.scale)
     off = find_blunders(similarity, observed, priors, least)
     kept = np.ones(len(observed), dtype=bool)
     kept[list(off)] = False

@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import Polygon, Ring, signed_area
 
 LARGEST_FILE = 8 << 20  # bytes: a hundred times the size of a detailed outline
-MOST_VERTICES = 20_000  # in all rings: finer than any drawn or measured boundary
+MAX_VERTICES = 20_000  # in all rings: finer than any drawn or measured boundary
 DEEPEST = 8  # nested collections
 LONGEST_NAME = 80  # characters of a feature's name that fit a label
 LARGEST = 1e9  # absolute coordinate; no CRS of the earth has larger ones
@@ -135,7 +135,7 @@ def _name(properties: Any) -> str:
 
 
 def _polygons(geometries: list[tuple[dict[str, Any], str]]) -> Iterator[tuple[Polygon, str]]:
-    left = MOST_VERTICES
+    left = MAX_VERTICES
     for geometry, name in geometries:
         if geometry["type"] not in ("Polygon", "MultiPolygon"):
             continue
@@ -145,7 +145,7 @@ def _polygons(geometries: list[tuple[dict[str, Any], str]]) -> Iterator[tuple[Po
             for ring in _listed(rings):
                 left -= len(_listed(ring))
                 if left < 0:
-                    raise _BrokenError(f"has more than {MOST_VERTICES:,} vertices")
+                    raise _BrokenError(f"has more than {MAX_VERTICES:,} vertices")
                 polygon.append(_ring(ring))
             if polygon:  # an empty polygon is valid
                 yield tuple(polygon), name

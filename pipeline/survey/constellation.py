@@ -13,11 +13,11 @@ from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 
 REACH_M = 25.0  # horizontal offset of a whole capture, with a poor receiver
 TOLERANCE_M = 1.5  # after translation: the positions' frame may be slightly rotated
-LEAST_TOLERANCE_M = 0.15  # after the similarity: the model may be slightly deformed
+MIN_TOLERANCE_M = 0.15  # after the similarity: the model may be slightly deformed
 RESIDUALS = 4.0  # tolerance over the median residual
-LEAST_MATCHES = 3  # fewer places may match points by chance
-MOST_HYPOTHESES = 2000
-MOST_TRIPLES = 500  # of known pairs, as hypotheses
+MIN_MATCHES = 3  # fewer places may match points by chance
+MAX_HYPOTHESES = 2000
+MAX_TRIPLES = 500  # of known pairs, as hypotheses
 ROUNDS = 5
 FLAT = 0.1  # second over longest extent; points nearly on a line do not determine a tilt
 WRONG = 3.0  # times the tolerance: beyond it, a place known by its number belongs to another point
@@ -53,7 +53,7 @@ def overlay(
     Returns:
         The match; None if no match is better than all others.
     """
-    if len(known) >= LEAST_MATCHES:
+    if len(known) >= MIN_MATCHES:
         pairs = np.array(sorted(known.items()), dtype=np.int64).reshape(-1, 2)
         start = _agreed(places, points, pairs)
     else:
@@ -65,13 +65,13 @@ def overlay(
     current, pairs = start, np.zeros((0, 2), dtype=np.int64)
     for _ in range(ROUNDS):
         pairs, residuals = _assigned(current.apply(places), points, tolerance)
-        if len(pairs) < LEAST_MATCHES:
+        if len(pairs) < MIN_MATCHES:
             return None
         current = _fitted(places, points, pairs)
         residuals = _distances(current.apply(places)[pairs[:, 0]], points[pairs[:, 1]])
-        tolerance = min(TOLERANCE_M, max(LEAST_TOLERANCE_M, RESIDUALS * float(np.median(residuals))))
+        tolerance = min(TOLERANCE_M, max(MIN_TOLERANCE_M, RESIDUALS * float(np.median(residuals))))
     pairs, residuals = _assigned(current.apply(places), points, tolerance)
-    return ConstellationMatch(pairs, residuals, tolerance, current) if len(pairs) >= LEAST_MATCHES else None
+    return ConstellationMatch(pairs, residuals, tolerance, current) if len(pairs) >= MIN_MATCHES else None
 
 
 def _agreed(
@@ -83,15 +83,15 @@ def _agreed(
     target = points[known[:, 1]]
     if (_distances(whole.apply(places)[known[:, 0]], target) <= TOLERANCE_M).all():
         return whole
-    triples = list(itertools.combinations(range(len(known)), LEAST_MATCHES))
+    triples = list(itertools.combinations(range(len(known)), MIN_MATCHES))
     best = np.ones(len(known), dtype=bool)
     most = 0
-    for triple in triples[:: max(1, len(triples) // MOST_TRIPLES)]:
+    for triple in triples[:: max(1, len(triples) // MAX_TRIPLES)]:
         moved = _fitted(places, points, known[list(triple)]).apply(places)
         good = _distances(moved[known[:, 0]], target) <= TOLERANCE_M
         if good.sum() > most:
             best, most = good, int(good.sum())
-    return _fitted(places, points, known[best] if most >= LEAST_MATCHES else known)
+    return _fitted(places, points, known[best] if most >= MIN_MATCHES else known)
 
 
 def _moved(
@@ -105,7 +105,7 @@ def _moved(
         chosen[list(known.keys()), list(known.values())] = True
         near &= chosen
     rows, columns = np.nonzero(near)
-    stride = max(1, len(rows) // MOST_HYPOTHESES)
+    stride = max(1, len(rows) // MAX_HYPOTHESES)
     scored = []
     for place, point in zip(rows[::stride].tolist(), columns[::stride].tolist(), strict=True):
         shift = np.where(np.isnan(differences[place, point]), 0.0, differences[place, point])
@@ -116,7 +116,7 @@ def _moved(
     scored.sort(key=lambda each: each[:2], reverse=True)
     most, _, best = scored[0]
     rivals = [each for each in scored if each[0] == most and np.hypot(*(each[2] - best)[:2]) > 2.0 * TOLERANCE_M]
-    return None if most < LEAST_MATCHES or rivals else best
+    return None if most < MIN_MATCHES or rivals else best
 
 
 def _assigned(
@@ -162,7 +162,7 @@ def _fitted(
 
 def _spread(source: Float64[np.ndarray, "k 3"], whole: Bool[np.ndarray, " k"]) -> bool:
     """Return whether the places whose points have heights determine a rotation."""
-    if whole.sum() < LEAST_MATCHES:
+    if whole.sum() < MIN_MATCHES:
         return False
     extents = np.linalg.svd(source[whole] - source[whole].mean(axis=0), compute_uv=False)
     return bool(extents[1] > FLAT * extents[0])

@@ -60,7 +60,7 @@ WGS84_3D = "EPSG:4979"
 MAX_OUTSIDE_KM = 300.0  # distance from a CRS's area of use: surveyors do stay in their zone across a border
 STRETCH = 0.05  # a projected length that differs more from the true one belongs to another part of the earth
 AROUND_DEG = 0.05  # around the points: where operations are compared
-MOST_ROUNDS = 10  # iterations to the exact inverse; each gains four digits
+MAX_ROUNDS = 10  # iterations to the exact inverse; each gains four digits
 TOLERANCE_M = 1e-6  # of the iteration: float64 resolves 1e-9 m at a northing of 5,000 km
 METRES_A_DEGREE = 111_000.0
 EARTH_RADIUS_KM = 6371.0
@@ -161,7 +161,7 @@ def geodetic_by(operation: Operation, crs: Crs, points: Float64[np.ndarray, "n 3
     wanted = np.stack([points[:, 0], points[:, 1], np.where(np.isfinite(stated), stated, 0.0)])
     tolerance = np.array([[1.0 / METRES_A_DEGREE if crs.is_geographic else 1.0]] * 2 + [[1.0]]) * TOLERANCE_M
     sought = wanted
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         lon, lat, height = operation.transformer.transform(*sought)
         if crs.vertical == ELLIPSOIDAL:  # then the CRS's heights are those of its ellipsoid, and move with the datum
             found = np.stack(operation.transformer.transform(lon, lat, height, direction="INVERSE"))

@@ -20,10 +20,10 @@ from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.target_finds import WantedTargets
 
 Window = tuple[int, int, int, int]  # left, top, right, bottom; the latter two exclusive
-LEAST_RADIUS_M = 8.0  # consumer receivers share an error of several metres, whatever they state
+MIN_RADIUS_M = 8.0  # consumer receivers share an error of several metres, whatever they state
 RADIUS_SIGMAS = 4.0
 NEAR_M = 15.0  # radius around a point in which sparse points give the ground's height
-LEAST_NEAR = 5
+MIN_NEAR = 5
 WHOLE = 0.6  # of a photo's area: a larger window becomes the whole photo
 
 
@@ -55,7 +55,7 @@ def expected_windows(
         return whole
     stated = [r.get("sigma_horizontal_m") for r in positions.by_name.values()]
     sigmas = [float(sigma) for sigma in stated if sigma is not None]
-    radius = max(LEAST_RADIUS_M, RADIUS_SIGMAS * float(np.median(sigmas)) if sigmas else 0.0)
+    radius = max(MIN_RADIUS_M, RADIUS_SIGMAS * float(np.median(sigmas)) if sigmas else 0.0)
     radius /= frame.world_from_model.scale
     inside = frame.world_from_model.inverse().apply(places)
     found = {name: _window(inside, radius, model, index, photos[name]) for name, index in posed.items()}
@@ -80,7 +80,7 @@ def expected_enu(
     ground = np.full(len(enu), np.nan)
     for k, place in enumerate(enu):
         near = np.linalg.norm(cloud[:, :2] - place[:2], axis=1) < NEAR_M
-        if near.sum() >= LEAST_NEAR:
+        if near.sum() >= MIN_NEAR:
             ground[k] = np.median(cloud[near, 2])
     known = np.isfinite(stated[:, 2])
     lifts = (ground - enu[:, 2])[known & np.isfinite(ground)]

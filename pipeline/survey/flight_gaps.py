@@ -11,10 +11,10 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.survey.swapped_positions import PositionEvidence
 
-LEAST_PHOTOS = 6
+MIN_PHOTOS = 6
 LONG_STEP, LONG_PAUSE = 2.2, 2.5  # times the usual ones: at least two photos are missing
 BY_NUMBER_PAUSE = 2.2  # suffices where numbers are missing, too
-LEAST_NUMBERS = 2  # missing, to report a gap
+MIN_NUMBERS = 2  # missing, to report a gap
 REGULAR = 0.8  # of the names increase by one: then a skipped number is evidence
 SPEEDS = (0.5, 2.0)  # of the usual speed: slower is a pause or a battery change; faster means the times are wrong
 LONGEST_TURN = 1.3  # times the longest step between two flight lines elsewhere: no turn is as long
@@ -54,7 +54,7 @@ def find_missing(names: Sequence[str], flight: PositionEvidence) -> list[Missing
     """
     order = flight.order()
     numbers = _numbers(names)
-    if len(order) < max(LEAST_PHOTOS, len(names) // 2):
+    if len(order) < max(MIN_PHOTOS, len(names) // 2):
         return _by_numbers(names, numbers, flight)
     way, times = flight.places_m[order], flight.times_s[order]
     steps, pauses = np.linalg.norm(np.diff(way, axis=0), axis=1), np.diff(times)
@@ -67,7 +67,7 @@ def find_missing(names: Sequence[str], flight: PositionEvidence) -> list[Missing
         skipped = 0
         if numbers is not None:
             skipped = numbers[int(order[k + 1])] - numbers[int(order[k])] - 1
-        counted = LEAST_NUMBERS <= skipped <= FURTHEST_MISSING
+        counted = MIN_NUMBERS <= skipped <= FURTHEST_MISSING
         missing = skipped if counted else round(float(pauses[k]) / pause) - 1
         is_gap = counted and pauses[k] > BY_NUMBER_PAUSE * pause
         leads_on = _goes_on(way, k, usual) or steps[k] > max(LONG_STEP * usual, LONGEST_TURN * _other_turns(steps, k))
@@ -101,14 +101,14 @@ def _as_fast(speed: float, usual: float, pauses: float) -> bool:
 
 def _by_numbers(names: Sequence[str], numbers: Sequence[int] | None, flight: PositionEvidence) -> list[MissingStrip]:
     """Gaps without positions: skipped numbers where the photos on both sides have few matches."""
-    if numbers is None or len(names) < LEAST_PHOTOS:
+    if numbers is None or len(names) < MIN_PHOTOS:
         return []
     beside = [flight.matches.get((k, k + 1), 0) for k in range(len(names) - 1)]
     usual = float(np.median(beside))
     found = []
     for k, count in enumerate(beside):
         skipped = numbers[k + 1] - numbers[k] - 1
-        if LEAST_NUMBERS <= skipped <= FURTHEST_MISSING and count < usual / 2.0:
+        if MIN_NUMBERS <= skipped <= FURTHEST_MISSING and count < usual / 2.0:
             found.append(MissingStrip(k, k + 1, skipped, float("nan"), float("nan"), True))
     return found
 

@@ -14,8 +14,8 @@ from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, SharedErrors, SimilarityFit, offset_step_sigmas
 from splatpipe.pipeline.survey.crs_names import UNKNOWN
 
-LEAST_PHOTOS = 3  # of a flight with its own offset; fewer do not determine it
-MOST_FLIGHTS = 100  # with offsets of their own: the largest
+MIN_PHOTOS = 3  # of a flight with its own offset; fewer do not determine it
+MAX_FLIGHTS = 100  # with offsets of their own: the largest
 APART_SIGMAS = 3.0  # a larger difference is not receiver error, but another datum or another base
 UNBOUND_M = 1e4  # a standard deviation that imposes no constraint
 
@@ -31,10 +31,10 @@ def shared_errors(records: Sequence[Mapping[str, Any]], sigmas: Float64[np.ndarr
     numbers, counts = np.unique(flights, return_counts=True)
     if len(numbers) < 2:
         return None
-    large = numbers[counts >= LEAST_PHOTOS]
+    large = numbers[counts >= MIN_PHOTOS]
     if len(large) == 0:
         return None
-    largest = np.argsort(-counts[counts >= LEAST_PHOTOS], kind="stable")[:MOST_FLIGHTS]
+    largest = np.argsort(-counts[counts >= MIN_PHOTOS], kind="stable")[:MAX_FLIGHTS]
     large = large[np.sort(largest)]
     group = np.full(len(records), -1, dtype=np.int64)
     for index, number in enumerate(large):

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-LEAST_GAP_S = 180.0  # a battery change takes at least this long
+MIN_GAP_S = 180.0  # a battery change takes at least this long
 GAP_INTERVALS = 20.0  # times the usual interval: manual capture at a photo a minute has longer pauses within a flight
 TAKEOFF_STEP_M = 1.0  # smaller steps are barometer drift
 TAKEOFF_NOISES = 6.0  # times the spread within a flight: noisy altitudes must not start new flights
-LEAST_PLATEAU = 3  # photos on each side needed to judge a step of the take-off altitude
+MIN_PLATEAU = 3  # photos on each side needed to judge a step of the take-off altitude
 CANDIDATES = 20  # steps between neighbours that are examined, the largest first
-MOST_FLIGHTS = 1000  # of one device without a pause: more are implausible, and cost time
+MAX_FLIGHTS = 1000  # of one device without a pause: more are implausible, and cost time
 MAD_TO_SIGMA = 1.4826  # of Gaussian noise
 
 
@@ -66,7 +66,7 @@ def _split_at_gaps(ordered: list[int], stamps: Sequence[Stamp]) -> list[list[int
     times = np.array([stamps[index].time_s for index in ordered])
     gaps = np.diff(times)
     taken = gaps[gaps > 0.0]
-    longest = max(LEAST_GAP_S, GAP_INTERVALS * float(np.median(taken))) if len(taken) else LEAST_GAP_S
+    longest = max(MIN_GAP_S, GAP_INTERVALS * float(np.median(taken))) if len(taken) else MIN_GAP_S
     cuts = (np.flatnonzero(gaps > longest) + 1).tolist()
     return [ordered[start:end] for start, end in zip([0, *cuts], [*cuts, len(ordered)], strict=True)]
 
@@ -79,7 +79,7 @@ def _split_at_steps(run: list[int], takeoffs: Float64[np.ndarray, " n"]) -> list
     left = [run]
     while left:
         part = left.pop()
-        cut = _best_cut(takeoffs[part]) if len(done) + len(left) < MOST_FLIGHTS else 0
+        cut = _best_cut(takeoffs[part]) if len(done) + len(left) < MAX_FLIGHTS else 0
         if cut:
             left += [part[cut:], part[:cut]]
         else:
@@ -92,7 +92,7 @@ def _best_cut(values: Float64[np.ndarray, " n"]) -> int:
 
     Only the largest steps between neighbours are tried.
     """
-    cuts = np.arange(LEAST_PLATEAU, len(values) - LEAST_PLATEAU + 1)
+    cuts = np.arange(MIN_PLATEAU, len(values) - MIN_PLATEAU + 1)
     largest = cuts[np.argsort(-np.abs(np.diff(values))[cuts - 1], kind="stable")[:CANDIDATES]]
     if len(largest) == 0:
         return 0

@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.world import World
 
 DEGREE = 3
 STEPS = 7  # samples along each side, more than there are powers
-LEAST_REACH_M = 500.0  # of the box that the polynomial is fitted over: people also point at what is around the scene
+MIN_REACH_M = 500.0  # of the box that the polynomial is fitted over: people also point at what is around the scene
 REACH_PER_SCENE = 2.0
 
 
@@ -75,7 +75,7 @@ def local_crs(world: World, box: Float64[np.ndarray, "2 3"]) -> LocalCrs:
         world: The scene's.
         box: Least and largest east, north, up of the scene, metres.
     """
-    reach = max(REACH_PER_SCENE * float(np.abs(box).max()), LEAST_REACH_M)
+    reach = max(REACH_PER_SCENE * float(np.abs(box).max()), MIN_REACH_M)
     side = reach * np.cos(np.pi * (np.arange(STEPS) + 0.5) / STEPS)  # Chebyshev's nodes: the error is even
     samples = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     powers = np.array([p for p in itertools.product(range(DEGREE + 1), repeat=3) if 0 < sum(p) <= DEGREE], np.int64)

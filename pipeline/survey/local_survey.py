@@ -28,7 +28,7 @@ START_SHARE = 0.05  # of the control's extent: the largest miss of an inlier to 
 OFFSET_SIGMA_M = 2.0  # of a flight's positions at least: a base station's coordinates
 OFFSET_SIGMAS = 3.0  # times the positions' sigmas
 DATUM_SIGMA_M = 1000.0  # of heights: those of control and of receivers need not share a datum
-LEAST_EXTENT_M = 0.01  # of control points, to count as several
+MIN_EXTENT_M = 0.01  # of control points, to count as several
 MISFIT_SHARE = 0.25  # of the control's extent: a fit that is off by more is rejected
 
 
@@ -261,7 +261,7 @@ def require_fit(fit: JointFit, observed: JointObservations, survey: Survey) -> N
     known = np.isfinite(observed.sigmas[control])
     error = float(np.sqrt((np.where(known, fit.residuals[control], 0.0) ** 2).sum(axis=1).mean()))
     extent = float(np.linalg.norm(np.ptp(observed.target[control], axis=0)))
-    if extent < LEAST_EXTENT_M:
+    if extent < MIN_EXTENT_M:
         raise SplatpipeError(
             f"All control points of {survey.name} have the same coordinates.",
             "Each name needs its own coordinates: was one line copied to all?",

@@ -31,7 +31,7 @@ FIXED, SINGLE = 50, 16  # drone-dji:RtkFlag (DJI's user manuals); 32 to 49 are k
 FLOAT = range(32, 50)
 # Horizontal (per axis) and vertical standard deviations, metres, where a photo does not state its own.
 DEFAULT_SIGMAS_M = {"fixed": (0.02, 0.03), "float": (0.5, 1.0), "single": (3.0, 5.0), None: (3.0, 5.0)}
-LEAST_SIGMA_M = 0.005  # smaller stated accuracies are the receiver's noise, not the accuracy of the camera's position
+MIN_SIGMA_M = 0.005  # smaller stated accuracies are the receiver's noise, not the accuracy of the camera's position
 VERTICAL_OVER_HORIZONTAL = 1.5  # of GNSS errors, where only the horizontal one is stated
 DATUM_STEP_M = 1.0  # EXIF and XMP altitudes further apart than this are not roundings of one value
 NOWHERE = "states a position that is none on Earth"
@@ -273,7 +273,7 @@ def _sigmas(photo: CheckedPhoto, rtk: str | None, place: FilePlace | None) -> tu
     if place is not None and place.sigma_m[0] is not None:
         source, horizontal = "file", place.sigma_m[0]
         vertical = place.sigma_m[1] or VERTICAL_OVER_HORIZONTAL * horizontal
-    return source, max(horizontal, LEAST_SIGMA_M), max(vertical, LEAST_SIGMA_M)
+    return source, max(horizontal, MIN_SIGMA_M), max(vertical, MIN_SIGMA_M)
 
 
 def _stamp(photo: CheckedPhoto, position: Position) -> Stamp:

@@ -25,7 +25,7 @@ ANOTHER_PLACE_M = 10.0  # in most photos: too large for a correction
 WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
 RTK_SHARE = 0.5  # of the photos with a fix: above, the others have lost it
 ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
-LEAST_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
+MIN_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
 
 
 def position_doubts(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Doubt]:
@@ -126,7 +126,7 @@ def _altitudes(positions: Sequence[Position]) -> list[Doubt]:
         return doubts
     values = np.array(list(stated.values()), dtype=np.float64)
     off = np.abs(values - np.median(values))
-    limit = max(LEAST_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
+    limit = max(MIN_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
     odd = tuple(name for name, metres in zip(stated, off.tolist(), strict=True) if metres > limit)
     if odd:
         text = f"Altitudes far from the others' ({np.median(values):.0f} m): {some(odd)}."

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.alignment import MEDIAN_OF_CHI3
-from splatpipe.pipeline.geometry.correspondences import LEAST_NOISE_FACTOR, REDUNDANT, Correspondences, DirectionPrior
+from splatpipe.pipeline.geometry.correspondences import MIN_NOISE_FACTOR, REDUNDANT, Correspondences, DirectionPrior
 from splatpipe.pipeline.geometry.similarity import (
     SIMILARITY,
     Similarity,
@@ -33,7 +33,7 @@ ROUNDS = 40
 SETTLED = 1e-9  # of a step, in radians and relative to the extent
 SEARCHED_ROUNDS = 3  # in which every correlation is tried; later ones try only the neighbours of the best
 FACTOR_ROUNDS = 2  # each; the rounds of the fit do the rest
-LEAST_FACTOR = 1e-6  # of the stated sigmas: exact positions have no noise to estimate
+MIN_FACTOR = 1e-6  # of the stated sigmas: exact positions have no noise to estimate
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 
 
@@ -156,7 +156,7 @@ def _told(
     prior: DirectionPrior | None,
 ) -> NoisyFit:
     """The fit with its covariance, computed with a lower limit on the noise, since slow errors hide part of it."""
-    least = LEAST_NOISE_FACTOR if len(points) >= REDUNDANT else 1.0
+    least = MIN_NOISE_FACTOR if len(points) >= REDUNDANT else 1.0
     cautious = ReceiverNoise(np.maximum(noise.factors, least), noise.correlations, noise.degrees)
     whitened = _whitened(_rows(points, before, similarity, offsets), cautious)[:, :-1]
     information = whitened.T @ whitened + _held(points, similarity, prior)
@@ -306,7 +306,7 @@ def _profile(
         scaled = design / factors[:, None, None] ** 2
         taken = np.einsum("kpq,kqp->k", _inverse(rest + scaled), scaled)
         free = np.maximum(1.0, group.count - taken)
-        factors = np.maximum(np.sqrt(squares / free), LEAST_FACTOR)
+        factors = np.maximum(np.sqrt(squares / free), MIN_FACTOR)
     information = rest + design / factors[:, None, None] ** 2
     sizes = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 1e-300))
     values = np.linalg.eigvalsh(information / (sizes[:, :, None] * sizes[:, None, :]))

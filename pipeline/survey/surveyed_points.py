@@ -20,11 +20,11 @@ from splatpipe.pipeline.survey.crs import Crs, parse_crs
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
 
-LEAST_FOR_CHECKS = 6  # points: with at least as many, some are kept as check points
+MIN_FOR_CHECKS = 6  # points: with at least as many, some are kept as check points
 EVERY_NTH = 3  # point becomes a check point
 OUTSIDE_SHARE = 0.3  # of the marks outside their photos: above, they were made in photos of another size
 MARK_TOLERANCE = 10.0  # times the marks' sigma
-LEAST_TOLERANCE_PX = 5.0  # of marks: SfM's own errors at the edge of a photo
+MIN_TOLERANCE_PX = 5.0  # of marks: SfM's own errors at the edge of a photo
 FIT_TOLERANCE = 8.0  # times the model's mean reprojection error
 
 
@@ -185,7 +185,7 @@ def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], 
         return point.left_out(_why_unseen(point, len(placed)))
     rays, error_px = _rays([point.sightings[k] for k in placed], model, photos)
     good = np.isfinite(rays.rays).all(axis=1) & np.isfinite(rays.pixels).all(axis=(1, 2))
-    tolerance = max(LEAST_TOLERANCE_PX, MARK_TOLERANCE * mark_sigma_px, FIT_TOLERANCE * error_px)
+    tolerance = max(MIN_TOLERANCE_PX, MARK_TOLERANCE * mark_sigma_px, FIT_TOLERANCE * error_px)
     found = triangulate(rays.only(good), tolerance) if good.sum() >= 2 else None
     if found is None:
         many = "two marks" if len(placed) == 2 else f"{len(placed)} marks"
@@ -345,7 +345,7 @@ def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]
     elif setting == "auto":
         stated = [point for point in points if point.surveyed.role is not None]
         checks = {point.name for point in stated if point.surveyed.role == "check"}
-        if not stated and len(usable) >= LEAST_FOR_CHECKS:
+        if not stated and len(usable) >= MIN_FOR_CHECKS:
             checks = set(usable[EVERY_NTH - 1 :: EVERY_NTH])
     else:
         checks = {name.strip() for name in setting.split(",") if name.strip()}

@@ -15,13 +15,13 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.sfm.pairs import Pair
 
 FURTHEST = 4.0  # times the usual distance of photos that match: a false match must not outweigh all others
-LEAST_PARTNERS = 3  # that each of the two matches
-LEAST_NEARER = 0.02  # of the two photos' distances to their partners; right ones give 0.003 at most
+MIN_PARTNERS = 3  # that each of the two matches
+MIN_NEARER = 0.02  # of the two photos' distances to their partners; right ones give 0.003 at most
 CLEARLY_NEARER = 0.08  # where no times give the path
-LEAST_SHORTER, CLEARLY_SHORTER = 0.3, 1.5  # reduction of the path, in usual steps between two photos
+MIN_SHORTER, CLEARLY_SHORTER = 0.3, 1.5  # reduction of the path, in usual steps between two photos
 HARDLY_NEARER = 0.008  # suffices where the path is clearly shorter
-MOST_SWAPS = 20  # more are not swaps but disorder
-MOST_PHOTOS = 3000  # all pairs of photos are tested
+MAX_SWAPS = 20  # more are not swaps but disorder
+MAX_PHOTOS = 3000  # all pairs of photos are tested
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class PositionEvidence:
 def find_swapped(flight: PositionEvidence) -> list[Pair]:
     """Pairs of photos (i, j), i < j, that very likely have each other's position, the clearest first."""
     located = np.flatnonzero(np.isfinite(flight.places_m).all(axis=1))
-    if not 4 <= len(located) <= MOST_PHOTOS:
+    if not 4 <= len(located) <= MAX_PHOTOS:
         return []
     row = {int(photo): number for number, photo in enumerate(located)}
     places = flight.places_m[located].copy()
@@ -58,7 +58,7 @@ def find_swapped(flight: PositionEvidence) -> list[Pair]:
     order = np.array([row[int(photo)] for photo in flight.order()], np.int64)
     has_order = len(order) >= max(4, len(located) // 2)
     swapped: list[Pair] = []
-    while len(swapped) < MOST_SWAPS:
+    while len(swapped) < MAX_SWAPS:
         best = _best_swap(places, weights, order if has_order else None)
         if best is None:
             break
@@ -75,13 +75,13 @@ def _best_swap(
 ) -> tuple[int, int] | None:
     nearer = _nearer(places, weights)
     partners = (weights > 0.0).sum(axis=1)
-    enough = np.minimum(partners[:, None], partners[None, :]) >= LEAST_PARTNERS
+    enough = np.minimum(partners[:, None], partners[None, :]) >= MIN_PARTNERS
     if order is None:
         good = enough & (nearer > CLEARLY_NEARER)
         score = nearer
     else:
         shorter = _shorter(places, order)
-        good = enough & (nearer > LEAST_NEARER) & (shorter > LEAST_SHORTER)
+        good = enough & (nearer > MIN_NEARER) & (shorter > MIN_SHORTER)
         good |= enough & (nearer > HARDLY_NEARER) & (shorter > CLEARLY_SHORTER)
         score = nearer * np.maximum(shorter, 0.0)
     if not good.any():

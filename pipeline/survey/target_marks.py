@@ -18,7 +18,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.constellation import LEAST_MATCHES, WRONG, overlay
+from splatpipe.pipeline.survey.constellation import MIN_MATCHES, WRONG, overlay
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.target_finds import TargetFind
 from splatpipe.pipeline.survey.target_tracks import Track, coded_tracks, unnamed_tracks
@@ -119,7 +119,7 @@ def _by_place(
     row = {name: k for k, name in enumerate(expected.names)}
     known = {each.name: each.track.place for each in by_number if each.name in row}
     known |= {name: place for name, place in seeds.items() if name in row}
-    if expected.world_from_model is None and len(known) < LEAST_MATCHES:
+    if expected.world_from_model is None and len(known) < MIN_MATCHES:
         return {}, set()
     places = np.array([*known.values(), *(track.place for track in unnamed)], dtype=np.float64).reshape(-1, 3)
     if expected.world_from_model is not None:

@@ -14,12 +14,12 @@ from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.target_finds import TargetFind
 
-LEAST_TOLERANCE_PX = 3.0
+MIN_TOLERANCE_PX = 3.0
 FIT_TOLERANCE = 4.0  # times the model's mean reprojection error
-LEAST_UNNAMED = 3  # photos of a target without a number: two rays can meet by chance
-LEAST_CODED = 2
-MOST_PARTNERS = 40  # of a detection that are tried as hypotheses
-MOST_SEEDS = 4000
+MIN_UNNAMED = 3  # photos of a target without a number: two rays can meet by chance
+MIN_CODED = 2
+MAX_PARTNERS = 40  # of a detection that are tried as hypotheses
+MAX_SEEDS = 4000
 BEYOND = 2.0  # factor by which a target may be farther or nearer than the sparse points in a photo
 
 
@@ -62,7 +62,7 @@ def coded_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mappin
     tracks = []
     for _, group in sorted(groups.items()):
         seen = _seen(group, model, photos)
-        track = None if seen is None else _track(seen, LEAST_CODED)
+        track = None if seen is None else _track(seen, MIN_CODED)
         if track is not None:
             tracks.append(track)
     return tracks
@@ -76,11 +76,11 @@ def unnamed_tracks(finds: Sequence[TargetFind], model: SparseModel, photos: Mapp
         return tracks
     reach = _reach(seen, model)
     free = np.ones(len(seen.finds), dtype=bool)
-    for seed in range(min(len(seen.finds), MOST_SEEDS)):
+    for seed in range(min(len(seen.finds), MAX_SEEDS)):
         if not free[seed]:
             continue
         group = _group(seen, seed, free, reach)
-        track = None if group.sum() < LEAST_UNNAMED else _track(seen.only(group), LEAST_UNNAMED)
+        track = None if group.sum() < MIN_UNNAMED else _track(seen.only(group), MIN_UNNAMED)
         if track is not None:
             used = set(track.finds)
             free &= np.array([find not in used for find in seen.finds])
@@ -101,7 +101,7 @@ def _seen(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, 
     poses = np.stack([views[k].cam_from_model for k in good])
     error = model.reconstruction.compute_mean_reprojection_error() / min(views[k].scale for k in good)
     found = Rays(poses, np.stack([rays[k] for k in good]), np.stack([pixels[k] for k in good]))
-    return _PosedFinds(tuple(posed[k] for k in good), found, max(LEAST_TOLERANCE_PX, FIT_TOLERANCE * float(error)))
+    return _PosedFinds(tuple(posed[k] for k in good), found, max(MIN_TOLERANCE_PX, FIT_TOLERANCE * float(error)))
 
 
 def _track(seen: _PosedFinds, least: int) -> Track | None:
@@ -154,7 +154,7 @@ def _group(
     shown = there[:, :2] / np.where(ahead, there[:, 2], 1.0)[:, None]
     gap = np.where(ahead, np.linalg.norm(np.einsum("nij,nj->ni", pixels, shown - rays), axis=1), np.inf)
     meets = (depth > reach[seed, 0]) & (depth < reach[seed, 1]) & (gap < seen.tolerance_px) & (sine > 3e-4)
-    for point in points[meets][:MOST_PARTNERS]:
+    for point in points[meets][:MAX_PARTNERS]:
         errors = np.linalg.norm(seen.rays.residuals_px(point), axis=1)
         near = (errors < seen.tolerance_px) & free
         score = len({seen.finds[k].photo for k in np.flatnonzero(near).tolist()}), -float(errors[near].mean())

@@ -13,8 +13,8 @@ from splatpipe.pipeline.geometry.similarity import similarity_jacobian
 from splatpipe.pipeline.survey.receiver_noise import NoisyFit, ReceiverNoise
 
 NORMAL_95 = 1.959964
-LEAST_DEGREES = 3.0  # of freedom that intervals count on: of strongly correlated errors, effective ones run out
-MOST_PLACES = 2000  # of the model where the accuracy of its coordinates is evaluated
+MIN_DEGREES = 3.0  # of freedom that intervals count on: of strongly correlated errors, effective ones run out
+MAX_PLACES = 2000  # of the model where the accuracy of its coordinates is evaluated
 DIGITS = 6
 
 
@@ -100,7 +100,7 @@ def uncertainty_of(
     common_3 = common[[0, 0, 1]]
     covariance = fit.covariance
     tilt = covariance[:2, :2]
-    chosen = places[:: max(1, len(places) // MOST_PLACES)] if len(places) else source
+    chosen = places[:: max(1, len(places) // MAX_PLACES)] if len(places) else source
     reach = similarity_jacobian(fit.similarity, chosen, about=source.mean(axis=0))
     variances = np.einsum("nkp,pq,nkq->nk", reach, covariance, reach)
     typical = np.median(variances, axis=0) + common_3**2
@@ -119,7 +119,7 @@ def uncertainty_of(
 
 def student_95(degrees: float) -> float:
     """Two-sided 95 % quantile of Student's t (Abramowitz and Stegun, Handbook, 1964, 26.7.5)."""
-    z, n = NORMAL_95, max(degrees, LEAST_DEGREES)
+    z, n = NORMAL_95, max(degrees, MIN_DEGREES)
     first = (z**3 + z) / 4.0
     second = (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0
     third = (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0

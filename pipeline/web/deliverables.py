@@ -32,7 +32,7 @@ from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer import ViewerScene
 
 DATASET, CENTRES, SPARSE = "dataset", "centres.laz", "sparse.laz"
-MOST_CONFIDENCE = 255  # largest number of photos that fits in a byte
+MAX_CONFIDENCE = 255  # largest number of photos that fits in a byte
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ def _write_clouds(run: RunSplat, folder: Path) -> None:
     write_cloud(folder / CENTRES, _centres(run.scene.gaussians), frame)
     usable = np.isfinite(run.points.xyz).all(axis=1)
     xyz = run.frame.world_from_model.apply(run.points.xyz[usable])
-    seen = np.minimum(run.points.track_lengths[usable], MOST_CONFIDENCE).astype(np.uint8)
+    seen = np.minimum(run.points.track_lengths[usable], MAX_CONFIDENCE).astype(np.uint8)
     chunk = CloudChunk(xyz, run.points.rgb[usable], np.zeros(xyz.shape, np.float32), seen)
     write_cloud(folder / SPARSE, [chunk], frame)
 

@@ -26,7 +26,7 @@ POLICY = (
     " style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:;"
     " base-uri 'none'; form-action 'none'"
 )
-MOST_POINTS = 150_000  # that the page includes, 15 bytes each; more are thinned evenly
+MAX_POINTS = 150_000  # that the page includes, 15 bytes each; more are thinned evenly
 SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis; they bound the scene
 NEARLY_ALL = 0.9  # of the points in focus: a few on the far side are no reason to start from far away
 NEAR_PER_SIZE = 1e-3  # near plane as a share of the scene's size, if the caller gives none
@@ -226,7 +226,7 @@ def _sky(sky: ViewerSky) -> dict[str, Any]:
 def thinned(scene: ViewerScene) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """The sparse points that a page shows, and their colours."""
     usable = np.flatnonzero(np.isfinite(scene.points).all(axis=1))
-    step = max(1, -(-len(usable) // MOST_POINTS))
+    step = max(1, -(-len(usable) // MAX_POINTS))
     return scene.points[usable[::step]], scene.point_colours[usable[::step]]
 
 

@@ -31,7 +31,7 @@ from splatpipe.pipeline.web.viewer import ViewerCamera, ViewerScene, ViewerSky, 
 SPLAT = "splat.spz"
 SH_STEP = 8.0  # finer than in files: the page is for viewing; 41.6 instead of 40.2 dB cost 6 % of its splat's size
 THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows; less if there are many photos
-MOST_LARGE_THUMBS = 300
+MAX_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
 SKY_ROWS = 64  # twice the panorama's, so that the blur of interpolating twice is invisible
 CLEARLY_TILTED = 0.6  # image component of the up direction: in steep views from above, no edge is clearly the top
@@ -82,7 +82,7 @@ def viewer_scene(
     """
     views, points = load_views(dataset), load_points(dataset)
     in_world = frame.world_from_model.apply(points.xyz)
-    height = THUMB_HEIGHT if len(views) <= MOST_LARGE_THUMBS else SMALL_THUMB_HEIGHT
+    height = THUMB_HEIGHT if len(views) <= MAX_LARGE_THUMBS else SMALL_THUMB_HEIGHT
     cameras = tuple(_shown(view, frame, height, view.camera.name in held_out) for view in views)
     crs = None
     if frame.origin is not None:

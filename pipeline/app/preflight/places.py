@@ -13,7 +13,7 @@ from splatpipe.pipeline.app.preflight.findings import ControlPlace, Finding, Pla
 from splatpipe.pipeline.app.preflight.intake import Intake
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.names import NameFinder, some
-from splatpipe.pipeline.sfm.footprints import FURTHEST, LEAST_HEIGHT_M, StatedPoses
+from splatpipe.pipeline.sfm.footprints import FURTHEST, MIN_HEIGHT_M, StatedPoses
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
@@ -40,7 +40,7 @@ def footprint(views: StatedPoses | None, photo: int) -> tuple[Place, ...] | None
         return None
     signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     rays = np.concatenate([signs * views.half_size[photo], np.ones((4, 1))], axis=1) @ views.enu_from_camera[photo].T
-    height = max(float(views.centres_m[photo, 2] - views.ground_m[photo]), LEAST_HEIGHT_M)
+    height = max(float(views.centres_m[photo, 2] - views.ground_m[photo]), MIN_HEIGHT_M)
     reach = FURTHEST * height
     corners = []
     for ray in rays:

@@ -1,6 +1,6 @@
 // A photo on a canvas that can be zoomed to single pixels: sharp, and redrawn only when something has changed.
 
-const MOST_PIXELS = 150e6; // of decoded photos in memory, 4 bytes each
+const MAX_PIXELS = 150e6; // of decoded photos in memory, 4 bytes each
 const LARGEST_ZOOM = 40;
 const SHARP_FROM = 1.5; // device pixels per photo pixel from which pixels are drawn as squares
 const SMALL_WIDTH = 1600; // of the copy drawn when zoomed out: reducing a large photo is slow
@@ -21,7 +21,7 @@ export class Photos {
     let total = 0;
     for (const [other, { bitmap, pixels }] of [...this.kept].reverse()) {
       total += pixels;
-      if (total > MOST_PIXELS && other !== number) {
+      if (total > MAX_PIXELS && other !== number) {
         this.kept.delete(other);
         bitmap.then(({ whole, small }) => [whole, small].forEach((image) => image.close()), () => 0);
       }

@@ -3,8 +3,8 @@
 const SIZE = { width: 340, height: 176 };
 const FRAME = { left: 46, right: 8, top: 8, bottom: 20 };
 const STEPS = [1, 2, 5];
-const MOST_TICKS = { across: 5, up: 4 };
-const LEAST_RANGE_M = 0.1; // of heights, so that the noise of a flat floor is not exaggerated
+const MAX_TICKS = { across: 5, up: 4 };
+const MIN_RANGE_M = 0.1; // of heights, so that the noise of a flat floor is not exaggerated
 
 /** A step of 1, 2 or 5 times a power of ten that divides a range into at most `most` parts. */
 function stepOf(range, most) {
@@ -46,7 +46,7 @@ export class Chart {
     this.trace = trace;
     const known = [...trace.height, ...trace.point_height].filter((height) => height !== null);
     const [low, high] = [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))];
-    const spare = Math.max(0.06 * (high - low), (LEAST_RANGE_M - (high - low)) / 2);
+    const spare = Math.max(0.06 * (high - low), (MIN_RANGE_M - (high - low)) / 2);
     this.across = [0, trace.distance.at(-1)];
     this.up = [low - spare, high + spare];
     this.cursor = svg("path", { class: "cursor" });
@@ -87,11 +87,11 @@ export class Chart {
 
   grid() {
     const [right, bottom] = [SIZE.width - FRAME.right, SIZE.height - FRAME.bottom];
-    const levels = ticks(this.up, MOST_TICKS.up).flatMap(([up, text]) => [
+    const levels = ticks(this.up, MAX_TICKS.up).flatMap(([up, text]) => [
       svg("path", { class: "grid", d: `M${FRAME.left} ${this.y(up)}H${right}` }),
       svg("text", { x: FRAME.left - 5, y: this.y(up) + 3.5, "text-anchor": "end" }, text),
     ]);
-    const marks = ticks(this.across, MOST_TICKS.across).flatMap(([at, text]) => [
+    const marks = ticks(this.across, MAX_TICKS.across).flatMap(([at, text]) => [
       svg("path", { class: "grid", d: `M${this.x(at)} ${FRAME.top}V${bottom}` }),
       svg("text", { x: this.x(at), y: SIZE.height - 6, "text-anchor": "middle" }, text),
     ]);

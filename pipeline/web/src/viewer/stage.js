@@ -13,9 +13,9 @@ const POLL_MS = 4;
 const SLOW_MS = 120; // slower frames are drawn as drafts while the view moves
 const DRAFT_MS = 150; // target duration of a draft
 const DRAFT_SPLATS = 150_000; // a software renderer takes 1 µs each, however small
-const LEAST_RESOLUTION = 0.3; // of a draft
+const MIN_RESOLUTION = 0.3; // of a draft
 const GLIMPSE_RESOLUTION = 0.5; // of the first frame: a quarter of the pixels, the slow part without a GPU
-const MOST_PIXEL_RATIO = 2;
+const MAX_PIXEL_RATIO = 2;
 
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 
@@ -149,7 +149,7 @@ export class Stage {
 
   /** Screen pixels per CSS pixel at rest. */
   get fullRatio() {
-    return Math.min(window.devicePixelRatio, MOST_PIXEL_RATIO);
+    return Math.min(window.devicePixelRatio, MAX_PIXEL_RATIO);
   }
 
   endGlimpse() {
@@ -161,7 +161,7 @@ export class Stage {
 
   setQuality(draft, most) {
     this.setStride(draft ? Math.max(1, Math.ceil(this.spark.activeSplats / DRAFT_SPLATS)) : 1);
-    const share = draft ? Math.max(LEAST_RESOLUTION, Math.sqrt(DRAFT_MS / this.fullMs)) : 1;
+    const share = draft ? Math.max(MIN_RESOLUTION, Math.sqrt(DRAFT_MS / this.fullMs)) : 1;
     const ratio = this.fullRatio * Math.min(most, share);
     const { width, height } = this;
     const drawn = this.drawn;

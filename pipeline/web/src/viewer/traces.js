@@ -8,7 +8,7 @@ import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeome
 const COLOURS = { section: 0x4dd6ff, volume: 0xffd23f };
 const HALO = { colour: 0x0a0e12, more: 3, opacity: 0.6 };
 const WIDTH = { plain: 2, chosen: 4 }; // CSS pixels
-const MOST_NAMES = 12; // with more, only the chosen one is labelled
+const MAX_NAMES = 12; // with more, only the chosen one is labelled
 const NAME_ABOVE_PX = 16;
 
 /** A trace's points as line segments, without those across gaps. */
@@ -95,7 +95,7 @@ export class Traces {
       element.hidden = at.depth <= 0;
       if (at.depth > 0) element.style.transform = `translate(${at.x.toFixed(1)}px, ${(at.y - above).toFixed(1)}px) translate(-50%, -50%)`;
     };
-    const few = this.items.length <= MOST_NAMES;
+    const few = this.items.length <= MAX_NAMES;
     this.items.forEach(({ label, named }, i) => put(label, few || i === this.chosen ? named : null, NAME_ABOVE_PX));
     put(this.dot, this.here, 0);
   }
