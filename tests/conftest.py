@@ -23,7 +23,9 @@ from timeouts import TIMEOUT_S
 
 DEMO = (
     "features.extractor=opencv-sift",
-    "features.max_image_size=1400",
+    "features.max_image_size=1000",
+    "features.max_features=3000",
+    "matches.neighbours=12",
     "undistort.max_megapixels=0.1",
     "train.iterations=600",
     "flythrough.seconds=4.0",
@@ -98,13 +100,18 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo_options() -> list[str]:
+    """The options of ``demo_run``, to continue a copy of it."""
+    return [part for text in DEMO for part in ("--set", text)]
+
+
+@pytest.fixture(scope="session")
+def demo_run(demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the whole demo capture with its control, at 0.1 megapixels: 26 dB. To be read only."""
     from splatpipe.demo import capture_path
 
     out = shared_folder(tmp_path_factory) / "demo_run"
-    sets = [part for text in DEMO for part in ("--set", text)]
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *sets]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *demo_options]
     with (out.parent / "demo_run.lock").open("a+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the first worker makes it, the others wait
         if not os.fstat(lock.fileno()).st_size:

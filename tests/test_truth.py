@@ -28,34 +28,17 @@ from demo_truth import ATTACHED_M, depth_errors
 from opened_run import OpenedRun, open_run
 from path_frames import measure_path, summary
 from rays import first_hits
+from served import linked_copy
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-SETTINGS = (
-    "features.extractor=opencv-sift",
-    "features.max_image_size=1000",
-    "matches.neighbours=12",
-    "undistort.max_megapixels=0.06",
-    "train.iterations=600",
-    "train.max_gaussians=30000",
-)
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The whole demo capture, up to a short training."""
-    folder = tmp_path_factory.mktemp("truth") / "out"
-    chosen = [part for text in SETTINGS for part in ("--set", text)]
-    command = [
-        sys.executable,
-        "-m",
-        "splatpipe.pipeline.app.cli",
-        "run",
-        capture_path(),
-        folder,
-        *chosen,
-        "--until",
-        "train",
-    ]
+def out(demo_run: Path, demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's run, placed by the photos' positions alone, up to its short training."""
+    folder = linked_copy(demo_run, tmp_path_factory.mktemp("truth") / "out")
+    options = [*demo_options, "--set", "georef.control=none", "--until", "train"]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", capture_path(), folder, *options]
     subprocess.run(command, check=True)
     return folder
 
@@ -238,12 +221,12 @@ def test_demo_truth_measures_a_model_beside_the_one_trained_for_the_size(out: Pa
     assert "median depth on the house" in done.stdout and "scales" in done.stdout
     found = json.loads((tmp_path / "demo_truth.json").read_text())
     *views, every = found["depth"]
-    assert [row["view"] for row in views] == [f"DJI_{number:04d}.JPG" for number in range(1, 41, 8)]
+    assert [row["view"] for row in views] == [f"DJI_{number:04d}.JPG" for number in range(1, 41, 4)]
     assert sum(row["pixels"] for row in views) == every["pixels"] > 0
     assert 0.2 < every["within"] < 1.0
-    assert [row["pixels"] for row in found["scales"]] == ["142x105", "284x210", "568x420"]
+    assert [row["pixels"] for row in found["scales"]] == ["183x136", "367x272", "734x544"]
     assert [row.get("below") for row in found["scales"]] == [0.0, None, 0.0]
-    assert len(list(tmp_path.glob("*.depth.png"))) == 5
+    assert len(list(tmp_path.glob("*.depth.png"))) == 10
 
 
 def test_path_frames_finds_what_hangs_before_the_camera(opened: OpenedRun, tmp_path: Path) -> None:
