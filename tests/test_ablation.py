@@ -102,7 +102,7 @@ def test_runs_what_is_new_and_nothing_else(dataset: Path, tmp_path: Path, capfd:
     assert (lost["capture"], lost["variant"]) == ("lost", None) and "a.jpg" in lost["message"]
 
 
-def test_following_a_training_tells_how_far_its_end_is_below_its_best(dataset: Path, tmp_path: Path) -> None:
+def test_following_a_training_reports_how_far_its_end_is_below_its_best(dataset: Path, tmp_path: Path) -> None:
     work = tmp_path / "work"
     code, found = ablate(dataset, work, "--variants", "/dev/null", "--seeds", "1", "--curve", "1e-3")
     (path,) = (work / "runs").glob("*/curve.json")
@@ -126,7 +126,7 @@ def test_following_a_training_tells_how_far_its_end_is_below_its_best(dataset: P
         (["--data", "a/tiny", "b/tiny"], "Write --data NAME=PATH"),
     ],
 )
-def test_a_wrong_call_is_refused_before_anything_runs(
+def test_an_invalid_call_is_refused_before_anything_runs(
     options: list[str], message: str, dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -178,7 +178,7 @@ def test_means_are_over_seeds_with_half_their_range() -> None:
     assert lost == {"variant": "lost", "runs": 0}
 
 
-def test_every_figure_of_a_run_is_kept_whatever_its_measures(tmp_path: Path) -> None:
+def test_every_figure_of_a_run_is_kept_whatever_was_measured(tmp_path: Path) -> None:
     metrics = {"gaussians": 5, "train_megapixels": 0.2, "peak_memory_bytes": 7, "psnr": None, "device": "cpu"}
     metrics |= {"floaters": {"free_space_opacity": 0.25, "views": {"pairs": 3}}, "per_view": [{"psnr": 1.0}]}
     (tmp_path / "metrics.json").write_text(json.dumps(metrics))
@@ -200,7 +200,7 @@ def test_every_figure_of_a_run_is_kept_whatever_its_measures(tmp_path: Path) -> 
     assert shown["free space"] == "0.250000" and "depth off" not in shown and "loss" not in shown
 
 
-def test_results_survive_a_line_cut_off(tmp_path: Path) -> None:
+def test_results_survive_a_truncated_line(tmp_path: Path) -> None:
     ResultLog(tmp_path).add("one", {"psnr": 1.0})
     with (tmp_path / "results.jsonl").open("a") as file:
         file.write('{"key": "two", "ro')
@@ -208,7 +208,7 @@ def test_results_survive_a_line_cut_off(tmp_path: Path) -> None:
     assert ResultLog(tmp_path).rows == {"one": {"psnr": 1.0}, "three": {"psnr": 3.0}}
 
 
-def test_a_work_folder_has_one_owner(tmp_path: Path) -> None:
+def test_a_work_folder_is_used_by_one_process_at_a_time(tmp_path: Path) -> None:
     with work_folder(tmp_path), pytest.raises(UsageError, match="Another run works"), work_folder(tmp_path):
         pass
 

@@ -102,7 +102,7 @@ def test_a_true_splat_has_no_residuals(parts: dict[str, Path]) -> None:
         assert len(told["observations"]) == tiny_scene.CAMERAS and not told["held_out"]
 
 
-def test_what_georef_found_of_each_point_is_kept(parts: dict[str, Path]) -> None:
+def test_georefs_findings_on_each_point_are_kept(parts: dict[str, Path]) -> None:
     told = json.loads(parts["georef.control"].read_text())
     told["points"][1] |= {"why": "", "residual_m": [0.01, 0.02, None], "surveyed_crs": [388_710.5, 5_299_705.2, None]}
     told["points"][1]["observations"][0]["residual_px"] = [0.3, -0.4]
@@ -114,7 +114,7 @@ def test_what_georef_found_of_each_point_is_kept(parts: dict[str, Path]) -> None
     assert point["rms_px"] == pytest.approx(math.sqrt((0.25 + 1.44) / 2), abs=1e-3)
 
 
-def test_a_splat_beside_its_place_is_told_by_how_much(parts: dict[str, Path]) -> None:
+def test_the_offset_of_a_misplaced_splat_is_reported(parts: dict[str, Path]) -> None:
     """Surveyed points beside the wall: the residuals are the negative of it."""
     off = (0.3, -0.2, 0.5)
     rewrite(parts["georef.control"], control(cameras(), points_on_the_wall(), off))
@@ -124,7 +124,7 @@ def test_a_splat_beside_its_place_is_told_by_how_much(parts: dict[str, Path]) ->
     assert table["rmse_3d_m"] == pytest.approx(np.linalg.norm(off), abs=RENDERED)
 
 
-def test_held_out_photos_speak_alone_where_three_of_them_see_the_point(parts: dict[str, Path]) -> None:
+def test_only_held_out_photos_count_if_three_of_them_see_the_point(parts: dict[str, Path]) -> None:
     names = [camera.name for camera in cameras()]
     told = json.loads(parts["georef.control"].read_text())
     told["points"][0]["observations"] = told["points"][0]["observations"][2:]  # in two of the held-out ones
@@ -135,7 +135,7 @@ def test_held_out_photos_speak_alone_where_three_of_them_see_the_point(parts: di
     assert [seen["photo"] for seen in points[0]["observations"]] == names[2:]
 
 
-def test_median_over_photos_forgives_one_floater(parts: dict[str, Path]) -> None:
+def test_median_over_photos_tolerates_one_floater(parts: dict[str, Path]) -> None:
     gaussians = wall()
     camera = cameras()[4]
     floater = wall().select(torch.arange(1))
@@ -147,7 +147,7 @@ def test_median_over_photos_forgives_one_floater(parts: dict[str, Path]) -> None
     assert there[0] > 1.0 and np.abs(point["residual_m"]).max() < 2.0 * RENDERED
 
 
-def test_a_mark_that_georef_left_out_says_nothing_of_the_splat(parts: dict[str, Path]) -> None:
+def test_a_mark_that_georef_rejected_is_not_used(parts: dict[str, Path]) -> None:
     told = json.loads(parts["georef.control"].read_text())
     wrong = told["points"][0]["observations"][0]
     wrong |= {"ray": [0.4, 0.4], "residual_px": [900.0, 0.0], "used": False}
@@ -157,7 +157,7 @@ def test_a_mark_that_georef_left_out_says_nothing_of_the_splat(parts: dict[str, 
     assert (result["points"][0]["photos"], result["points"][0]["rms_px"]) == (tiny_scene.CAMERAS - 1, None)
 
 
-def test_points_without_a_height_photo_or_surface_are_told_as_far_as_they_go(parts: dict[str, Path]) -> None:
+def test_points_without_a_height_photo_or_surface_are_reported_as_far_as_possible(parts: dict[str, Path]) -> None:
     told = json.loads(parts["georef.control"].read_text())
     told["points"][2]["surveyed_m"][2] = None
     for seen in told["points"][3]["observations"]:
@@ -173,7 +173,7 @@ def test_points_without_a_height_photo_or_surface_are_told_as_far_as_they_go(par
     assert splat["tables"]["control"]["count"] == 1 and splat["tables"]["control"]["rmse_up_m"] is None
 
 
-def test_without_points_or_a_place_on_earth_there_are_georefs_tables_alone(parts: dict[str, Path]) -> None:
+def test_without_points_or_georeference_there_are_only_georefs_tables(parts: dict[str, Path]) -> None:
     rewrite(parts["georef.control"], {"points": []})
     assert measured(parts) == {"gsd_m": 0.7, "tables": {"gps": None}, "points": [], "splat": None}
     rewrite(parts["georef.control"], control(cameras(), points_on_the_wall()))
@@ -190,7 +190,7 @@ def test_a_broken_control_json_says_what_to_do(parts: dict[str, Path], text: str
     assert "georef" in raised.value.hint
 
 
-def test_evaluate_leaves_it_in_its_metrics(parts: dict[str, Path], tmp_path: Path) -> None:
+def test_evaluate_writes_it_to_its_metrics(parts: dict[str, Path], tmp_path: Path) -> None:
     from splatpipe.pipeline.photos.dataset import load_views
     from splatpipe.pipeline.splat.panorama import write_panorama
     from splatpipe.pipeline.splat.ply import write_splat
@@ -243,7 +243,7 @@ def test_depth_at_an_edge_is_the_nearest_pixels_and_outside_there_is_none() -> N
     assert depth_at(np.full((1, 1), 3.0), np.array([0.7, 0.2])) == 3.0
 
 
-def test_the_table_is_what_its_names_say() -> None:
+def test_the_tables_figures_match_their_definitions() -> None:
     residuals = np.array([[0.03, -0.04, 0.05], [0.01, 0.0, np.nan], [-0.01, 0.02, -0.01]])
     table = accuracy_table(residuals)
     assert table is not None and table["count"] == 3

@@ -84,7 +84,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     return Inputs(parts, folder)
 
 
-def test_the_start_has_all_of_the_inside_and_an_even_part_of_the_rest() -> None:
+def test_initial_points_include_all_of_the_inside_and_an_even_sample_of_the_rest() -> None:
     inside = np.zeros(1000, np.bool_)
     inside[100:400] = True
     rows = coarse_start(inside)
@@ -102,7 +102,9 @@ def test_a_backdrop_leaves_the_inside_two_thirds_of_the_cap() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_initialize_spends_points_inside_and_tells_the_sparse_ones(inputs: Inputs, tmp_path: Path, sign: float) -> None:
+def test_initialize_prefers_points_inside_and_counts_the_sparse_ones(
+    inputs: Inputs, tmp_path: Path, sign: float
+) -> None:
     boundary = json.loads(inputs["georef.boundary"].read_text())
     boundary["model"]["polygons"][0][0] = (HALF * [sign, 1.0]).tolist()
     (tmp_path / "boundary.json").write_text(json.dumps(boundary))
@@ -118,7 +120,7 @@ def test_initialize_spends_points_inside_and_tells_the_sparse_ones(inputs: Input
     assert (sign * means[:, 0] > 0.0).sum() == min(inside.sum() // 2, (~inside).sum())
 
 
-def test_outside_density_control_keeps_to_the_backdrops_share(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_density_control_outside_keeps_to_the_backdrops_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """If all Gaussians qualify for cloning, the outside grows to its share and the inside to the rest of the cap."""
     monkeypatch.setattr(scheduled, "GRADIENT", 1e-12)
     config = tiny_scene.plain(iterations=40, max_gaussians=400)
@@ -141,7 +143,7 @@ def test_outside_density_control_keeps_to_the_backdrops_share(monkeypatch: pytes
     assert int(inside.sum()) > 2.5 * before and len(state.gaussians) <= 400
 
 
-def test_without_a_boundary_nothing_ranks_or_removes() -> None:
+def test_without_a_boundary_nothing_is_ranked_or_removed() -> None:
     config = tiny_scene.plain(iterations=40)
     views = tiny_scene.cameras()
     schedule = scheduled.resolve_schedule(config)
@@ -151,7 +153,7 @@ def test_without_a_boundary_nothing_ranks_or_removes() -> None:
     assert techniques.ranked(score, tiny_scene.true_model(), schedule.density) is score
 
 
-def test_pixels_count_by_where_their_surface_is() -> None:
+def test_pixels_are_inside_or_outside_by_their_surface() -> None:
     camera = tiny_scene.cameras()[4]
     depth = np.full((camera.height, camera.width), 4.0, np.float32)
     depth[:5] = 0.0
@@ -162,7 +164,7 @@ def test_pixels_count_by_where_their_surface_is() -> None:
     assert not shown[:5].any() and 0.3 < shown.mean() < 0.6
 
 
-def test_figures_are_of_the_inside_and_the_whole_picture_is_told_beside(inputs: Inputs, tmp_path: Path) -> None:
+def test_figures_are_of_the_inside_and_those_of_the_whole_image_are_given_too(inputs: Inputs, tmp_path: Path) -> None:
     evaluate.run(EvaluateConfig(), inputs, tmp_path, tiny_scene.Recorder())
     result = json.loads((tmp_path / "metrics.json").read_text())
     without = {part: path for part, path in inputs.parts.items() if part != "georef.boundary"}
@@ -181,7 +183,7 @@ def test_figures_are_of_the_inside_and_the_whole_picture_is_told_beside(inputs: 
         assert view["counted"] == pytest.approx((mask > 0).mean(), abs=1e-6) and 0.1 < view["counted"] < 0.9
 
 
-def test_a_photo_that_hardly_shows_the_inside_is_no_witness(inputs: Inputs, tmp_path: Path) -> None:
+def test_a_photo_that_hardly_shows_the_inside_is_not_counted(inputs: Inputs, tmp_path: Path) -> None:
     boundary = json.loads(inputs["georef.boundary"].read_text())
     boundary["model"]["polygons"][0][0] = (HALF - [1.9, 0.0]).tolist()  # a strip of the wall that two photos show
     (tmp_path / "boundary.json").write_text(json.dumps(boundary))

@@ -67,7 +67,7 @@ def events(out: Path) -> dict[str, bytes]:
     return {path.parent.name: path.read_bytes() for path in out.glob("*/events.jsonl")}
 
 
-def test_what_fails_stops_no_other_and_what_is_finished_is_not_touched(tmp_path: Path) -> None:
+def test_a_failed_capture_stops_no_other_and_finished_ones_are_not_touched(tmp_path: Path) -> None:
     """One broken capture, one with wrong options, one without a folder; a rerun; then one added, changed, removed."""
     captures, out = tmp_path / "captures", tmp_path / "out"
     link(captures / "house", demo()[:2])
@@ -149,7 +149,7 @@ def worker_of(running: subprocess.Popen[str], out: Path, but: int = 0) -> int:
     return wait_until(found, "the stage features")
 
 
-def test_a_killed_stage_is_begun_again_and_ctrl_c_ends_all_in_order(tmp_path: Path) -> None:
+def test_a_killed_stage_is_restarted_and_ctrl_c_ends_everything_cleanly(tmp_path: Path) -> None:
     link(tmp_path / "captures" / "house", demo()[:3])
     out = tmp_path / "out"
     with subprocess.Popen(command(tmp_path / "captures", out, *SLOW), stdout=subprocess.PIPE, text=True) as running:
@@ -167,7 +167,7 @@ def test_a_killed_stage_is_begun_again_and_ctrl_c_ends_all_in_order(tmp_path: Pa
     assert "features: The stage features was ended by SIGKILL" in house["earlier"][0]
 
 
-def test_a_batch_that_is_killed_leaves_nothing_at_work_and_no_lie(tmp_path: Path) -> None:
+def test_a_killed_batch_leaves_no_process_and_no_false_report(tmp_path: Path) -> None:
     link(tmp_path / "captures" / "house", demo()[:3])
     out = tmp_path / "out"
     with subprocess.Popen(command(tmp_path / "captures", out, *SLOW), stdout=subprocess.PIPE, text=True) as running:
@@ -219,7 +219,7 @@ FULL = TryResult(EXIT_MACHINE, "The disk is full.", "Make room.")
         ([("ingest", TryResult(0)), ("train", BAD), ("train", TryResult(0))], True, ("done", "", 1.0, 2, "")),
     ],
 )
-def test_a_captures_state_follows_from_its_tries_alone(
+def test_a_captures_state_follows_from_its_attempts_alone(
     tmp_path: Path, tries: Sequence[tuple[str, TryResult | None]], ended: bool, expected: tuple[object, ...]
 ) -> None:
     call = call_of(tmp_path, planned("house", "ingest", "train"))
@@ -254,7 +254,7 @@ def run_job(call: Call, stage: str) -> int:
     return subprocess.run([*words, str(call.folder / "marker")], check=False).returncode
 
 
-def test_a_job_without_room_does_not_begin_and_a_hopeless_one_is_not_begun_again(tmp_path: Path) -> None:
+def test_a_job_without_disk_space_is_not_started_and_a_hopeless_one_is_not_repeated(tmp_path: Path) -> None:
     large = replace(planned("house"), jobs=(replace(job("ingest"), disk_bytes=10**18),))
     call = call_of(tmp_path, large, retries=5)
     assert run_job(call, "ingest") == run_job(call, "ingest") == EXIT_MACHINE
@@ -272,7 +272,7 @@ def call_warnings(call: Call, capture: PlannedCapture) -> tuple[str, ...]:
     return BatchMonitor(call).state().warnings
 
 
-def test_the_workflow_has_a_rule_for_each_stage_that_runs_and_asks_for_what_it_needs(tmp_path: Path) -> None:
+def test_the_workflow_has_a_rule_for_each_stage_that_runs_with_its_resources(tmp_path: Path) -> None:
     call = call_of(tmp_path / "a b{c}", planned("house", "georef", "train"), replace(planned("barn"), key="0002-barn"))
     text = workflow_text(call, replace(call.plan(), gpu=True), LINE)
     assert [line for line in text.splitlines() if line.startswith("rule ")] == [
@@ -302,7 +302,7 @@ class Plain(str):
         return str(self)
 
 
-def test_a_control_file_that_cannot_be_read_is_told_without_a_job_until_it_is_mended(tmp_path: Path) -> None:
+def test_an_unreadable_control_file_is_reported_without_a_job_until_it_is_corrected(tmp_path: Path) -> None:
     house = link(tmp_path / "captures" / "house", demo()[:2])
     (house / "gcp_list.txt").write_text("EPSG:4326\n1 2 three 4 5 a.jpg\n")
     call = fresh_call(tmp_path / "out")
@@ -325,7 +325,7 @@ def test_a_profile_decides_where_jobs_run_and_without_one_memory_does(tmp_path: 
         assert elsewhere[elsewhere.index("--cores") + 1] == "2"  # no job gets more
 
 
-def test_a_stopped_batch_tells_of_itself_alone_and_waits_for_no_notice(
+def test_a_stopped_batch_notifies_only_of_itself_and_waits_for_no_notice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Docker kills ten seconds after SIGTERM, and the jobs may have taken eight of them."""
@@ -353,7 +353,7 @@ def test_a_cell_of_the_table_is_never_a_formula() -> None:
     assert tuple(row) == COLUMNS and row["capture"] == "'=1+1" and row["reason"] == "'@SUM(A1)"
 
 
-def test_a_time_budget_counts_what_the_captures_earlier_stages_took(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_time_budget_includes_the_captures_earlier_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     for told, expected in (("90.5", 90.5), ("-3", 0.0), ("soon", 0.0)):
         monkeypatch.setenv(SPENT_VARIABLE, told)
         assert spent_s() == expected

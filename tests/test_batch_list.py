@@ -14,14 +14,14 @@ def folders(root: Path, *names: str) -> Path:
     return root
 
 
-def test_each_folder_is_a_capture_but_hidden_ones_files_and_the_results(tmp_path: Path) -> None:
+def test_each_folder_is_a_capture_except_hidden_ones_files_and_the_results(tmp_path: Path) -> None:
     folders(tmp_path, "b", "a", ".git", "out")
     (tmp_path / "notes.txt").write_text("")
     (tmp_path / "linked").symlink_to(tmp_path / "a")
     assert [capture.name for capture in read_captures(tmp_path, tmp_path / "out")] == ["a", "b", "linked"]
 
 
-def test_a_capture_is_told_from_a_folder_of_captures(tmp_path: Path) -> None:
+def test_a_capture_is_distinguished_from_a_folder_of_captures(tmp_path: Path) -> None:
     (tmp_path / "DJI_0001.JPG").write_bytes(b"")
     with pytest.raises(UsageError, match="photos of one capture") as caught:
         read_captures(tmp_path, tmp_path.parent / "out")
@@ -29,7 +29,7 @@ def test_a_capture_is_told_from_a_folder_of_captures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("out", ["captures/north/out", "captures/north"])
-def test_results_never_lie_among_a_captures_photos(tmp_path: Path, out: str) -> None:
+def test_results_are_never_placed_among_a_captures_photos(tmp_path: Path, out: str) -> None:
     folders(tmp_path / "captures", "north/out", "south")
     (tmp_path / "linked").symlink_to(tmp_path / "captures" / "north")
     (tmp_path / "a.toml").write_text("[[capture]]\nphotos = 'captures/south'\n[[capture]]\nphotos = 'linked'\n")
@@ -132,16 +132,14 @@ def test_a_list_gives_each_capture_its_options_and_paths_from_its_own_folder(
         ("a.txt", "x\n", "neither a folder nor a list"),
     ],
 )
-def test_a_list_that_makes_no_sense_is_refused_in_one_sentence(
-    tmp_path: Path, name: str, text: str, message: str
-) -> None:
+def test_an_invalid_list_is_refused_in_one_sentence(tmp_path: Path, name: str, text: str, message: str) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(UsageError, match=message) as caught:
         read_captures(tmp_path / name, tmp_path / "out")
     assert caught.value.hint and len(caught.value.message) < 400
 
 
-def test_no_list_and_no_text_are_refused(tmp_path: Path) -> None:
+def test_a_missing_list_and_a_binary_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="There is no"):
         read_captures(tmp_path / "none", tmp_path / "out")
     for name in ("a.toml", "a.csv"):
@@ -152,7 +150,7 @@ def test_no_list_and_no_text_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("column", ["config", "georef.control"])
 @pytest.mark.parametrize("path", ["~nobody-here/x", "a\\u0000b"])
-def test_a_path_that_can_be_none_is_its_captures_own_trouble(tmp_path: Path, column: str, path: str) -> None:
+def test_an_impossible_path_fails_only_its_own_capture(tmp_path: Path, column: str, path: str) -> None:
     told = f'config = "{path}"' if column == "config" else f'set = ["{column}={path}"]'
     (tmp_path / "a.toml").write_text(f'[[capture]]\nphotos = "x"\n{told}\n[[capture]]\nphotos = "y"\n')
     wrong, right = read_captures(tmp_path / "a.toml", tmp_path / "out")

@@ -52,7 +52,7 @@ def full_batch(folder: Path) -> BatchState:
 
 
 @pytest.mark.parametrize(("width", "height"), WIDTHS)
-def test_a_card_a_capture_fits_the_screen_and_asks_for_nothing(
+def test_one_card_per_capture_fits_the_screen_and_requests_nothing(
     tmp_path: Path, open_page: Callable, width: int, height: int
 ) -> None:
     write_page(full_batch(tmp_path), tmp_path / "batch.html")
@@ -106,7 +106,7 @@ def test_hostile_names_and_messages_stay_text(tmp_path: Path, open_page: Callabl
     assert links == [(odd / "report.html").as_uri()]
 
 
-def test_at_work_it_loads_itself_again_and_nothing_else(tmp_path: Path, open_page: Callable) -> None:
+def test_during_the_batch_it_reloads_itself_and_nothing_else(tmp_path: Path, open_page: Callable) -> None:
     path = tmp_path / "batch.html"
     state = batch(CaptureState("one", "running", "train", progress=0.25))
     write_page(state, path)
@@ -134,7 +134,7 @@ def test_pause_stops_the_refresh(tmp_path: Path, open_page: Callable) -> None:
     watched.page.wait_for_event("load")
 
 
-def test_without_scripts_the_browser_itself_refreshes_it(tmp_path: Path, browser: Browser) -> None:
+def test_without_scripts_the_browser_refreshes_it(tmp_path: Path, browser: Browser) -> None:
     path = tmp_path / "batch.html"
     write_page(batch(CaptureState("one", "running", "train")), path)
     path.write_text(path.read_text().replace(f'refresh" content="{REFRESH_S}"', 'refresh" content="1"'))
@@ -145,7 +145,7 @@ def test_without_scripts_the_browser_itself_refreshes_it(tmp_path: Path, browser
         expect(page.locator("h2").first).to_have_text("1 of 1 capture failed; 0 finished")
 
 
-def test_a_page_that_nobody_renews_says_so_itself(tmp_path: Path, open_page: Callable) -> None:
+def test_a_page_that_is_no_longer_updated_says_so(tmp_path: Path, open_page: Callable) -> None:
     """After a power cut the end of the batch is not recorded: the reader's clock reveals it."""
     path = tmp_path / "batch.html"
     write_page(batch(CaptureState("one", "running"), as_of_s=time.time() - STALE_S - 30.0), path)
@@ -165,7 +165,7 @@ def test_a_page_that_nobody_renews_says_so_itself(tmp_path: Path, open_page: Cal
         ((), {"exit_code": 0}, "doubt", "There were no captures to process"),
     ],
 )  # fmt: skip
-def test_the_headline_tells_how_it_ended(
+def test_the_headline_states_how_it_ended(
     tmp_path: Path, captures: tuple[str, ...], facts: dict[str, object], level: str, headline: str
 ) -> None:
     states = [CaptureState(f"c{i}", standing) for i, standing in enumerate(captures)]  # type: ignore[arg-type]
@@ -174,14 +174,14 @@ def test_the_headline_tells_how_it_ended(
     assert "refresh" not in page and "<script>" not in page
 
 
-def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
+def test_no_folder_of_this_machine_is_named(tmp_path: Path) -> None:
     reason = f"{tmp_path}/one/stages/x is gone, and so is /home/somebody/photos/a.jpg."
     page = batch_page(batch(CaptureState("one", "failed", reason=reason), warnings=(f"{tmp_path} is full.",)), tmp_path)
     assert "OUT/one/stages/x is gone, and so is a.jpg." in page and "OUT is full." in page
     assert str(tmp_path.parent) not in page and "somebody" not in page
 
 
-def test_a_reason_of_many_lines_is_told_in_its_first(tmp_path: Path) -> None:
+def test_a_reason_of_many_lines_is_shortened_to_its_first(tmp_path: Path) -> None:
     reason = "None of the 70 pictures can be used. Left out:\n" + "\n".join(f"  {i}.jpg is cut off" for i in range(70))
     capture = CaptureState("a", "failed", "ingest", verdict="Failed in ingest", level="bad", reason=reason)
     page = batch_page(batch(capture), tmp_path)
@@ -189,7 +189,7 @@ def test_a_reason_of_many_lines_is_told_in_its_first(tmp_path: Path) -> None:
     assert "and 20 more" in page and page.count("Failed in ingest") == 1
 
 
-def test_finished_with_doubts_is_told_in_the_headline(tmp_path: Path) -> None:
+def test_finished_with_doubts_is_stated_in_the_headline(tmp_path: Path) -> None:
     captures = (CaptureState("a", "done", level="good"), CaptureState("b", "done", level="doubt"))
     page = batch_page(batch(*captures, ended_s=time.time(), exit_code=0), tmp_path)
     assert "<h2>All 2 captures succeeded; 1 to look at</h2>" in page
@@ -211,7 +211,7 @@ def test_two_hundred_captures_stay_a_small_page(tmp_path: Path, open_page: Calla
     assert watched.page.locator(".capture img").count() == 200
 
 
-def test_a_card_shows_a_render_and_before_there_is_one_a_photo(demo_run: Path, tmp_path: Path) -> None:
+def test_a_card_shows_a_photo_until_there_is_a_render(demo_run: Path, tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     photo = capture_picture(tmp_path / "none", capture_path(), kept)
     assert photo is not None and photo.parent == kept
@@ -243,7 +243,7 @@ def difference(small: Image.Image, path: Path) -> float:
     return sum(abs(a - b) for a, b in pairs) / len(small.tobytes())
 
 
-def test_pictures_that_cannot_be_read_cost_nothing_but_themselves(tmp_path: Path) -> None:
+def test_unreadable_images_affect_nothing_else(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     (photos / "a.jpg").write_bytes(b"no picture")
@@ -259,7 +259,7 @@ def test_pictures_that_cannot_be_read_cost_nothing_but_themselves(tmp_path: Path
         assert picture.convert("L").crop((0, 0, 480, 100)).getextrema()[1] > 60
 
 
-def test_a_pipe_among_the_photos_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_pipe_among_the_photos_does_not_block(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     os.mkfifo(photos / "pipe.jpg")

@@ -46,7 +46,7 @@ def batch(listed: Path, out: Path, *more: str, **variables: str) -> subprocess.C
     )
 
 
-def test_captures_run_in_shards_and_one_that_is_killed_costs_its_own_job_alone(tmp_path: Path) -> None:
+def test_captures_run_in_shards_and_a_killed_shard_costs_only_its_own_job(tmp_path: Path) -> None:
     """Their number is known once the stage that counts them has run; in later runs, before anything runs."""
     listed, out = captures(tmp_path), tmp_path / "night"
     told = batch(listed, out, "--dry-run")
@@ -86,7 +86,7 @@ def call_of(out: Path) -> Call:
     return call
 
 
-def test_the_workflow_has_a_job_a_shard_and_a_checkpoint_that_counts_them(tmp_path: Path) -> None:
+def test_the_workflow_has_a_job_per_shard_and_a_checkpoint_that_counts_them(tmp_path: Path) -> None:
     call = call_of(tmp_path)
     text = workflow_text(call, call.plan(), sharded.LINE)
     kinds = [line for line in text.splitlines() if line.startswith(("rule ", "checkpoint "))]
@@ -98,7 +98,7 @@ def test_the_workflow_has_a_job_a_shard_and_a_checkpoint_that_counts_them(tmp_pa
     ]  # fmt: skip
 
 
-def test_shards_have_their_own_part_of_what_a_stage_takes(tmp_path: Path) -> None:
+def test_shards_have_their_own_share_of_a_stages_resources(tmp_path: Path) -> None:
     call = call_of(tmp_path)
     (house,) = call.plan().captures
     assert [each.stage for each in call.jobs(house)] == ["divide", "sum", "show"]
@@ -123,7 +123,7 @@ def test_shards_have_their_own_part_of_what_a_stage_takes(tmp_path: Path) -> Non
         ((("sum.1", TryResult(0)), ("sum.2", TryResult(0))), False, ("waiting", "sum", 0.625)),
     ],
 )
-def test_of_shards_side_by_side_the_liveliest_is_told_of(
+def test_the_state_of_concurrent_shards_is_that_of_the_most_active(
     tmp_path: Path, tries: Sequence[tuple[str, TryResult | None]], ended: bool, expected: tuple[object, ...]
 ) -> None:
     call = call_of(tmp_path)
@@ -141,6 +141,6 @@ def test_of_shards_side_by_side_the_liveliest_is_told_of(
     assert house.reason == (BAD.message if failed else house.reason) and house.tries == (2 if failed else house.tries)
 
 
-def test_time_of_shards_side_by_side_counts_once() -> None:
+def test_time_of_concurrent_shards_counts_once() -> None:
     spans = ((0.0, 10.0), (12.0, 20.0), (13.0, 15.0), (14.0, 26.0), (30.0, None))
     assert spent_s([Try("sum.1", began, "here", 1, ended) for began, ended in reversed(spans)]) == 24.0

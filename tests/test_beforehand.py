@@ -25,7 +25,7 @@ def request(tmp_path: Path, preset: str, **train: object) -> Request:
     return request_of(capture_path(), tmp_path / "out", config, "cpu", 2)
 
 
-def test_a_limit_that_no_training_keeps_to_is_refused_before_anything_is_done(tmp_path: Path) -> None:
+def test_a_limit_that_no_training_can_keep_is_refused_before_anything_is_done(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(tmp_path / "out")]
     command += ["--device", "cpu", "--max-memory", "500M"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -37,11 +37,11 @@ def test_a_limit_that_no_training_keeps_to_is_refused_before_anything_is_done(tm
     ("said", "size"),
     [([], 0.3), (["train.time_budget_s=60"], 0.0), (["train.time_budget_s=60", "train.max_megapixels=0.4"], 0.4)],
 )
-def test_a_time_budget_may_take_all_of_the_photos_unless_somebody_says_less(said: list[str], size: float) -> None:
+def test_a_time_budget_may_use_photos_at_full_size_unless_a_smaller_one_is_set(said: list[str], size: float) -> None:
     assert overrides(None, said, None).resolve(load_preset("preview")).train.max_megapixels == size
 
 
-def test_the_least_limit_that_is_told_is_taken(tmp_path: Path) -> None:
+def test_the_smallest_limit_that_the_message_names_is_accepted(tmp_path: Path) -> None:
     least = least_memory_bytes(LineConfig())
     require_memory(request(tmp_path, "standard"))
     require_memory(request(tmp_path, "standard", max_memory_bytes=least))
@@ -50,7 +50,7 @@ def test_the_least_limit_that_is_told_is_taken(tmp_path: Path) -> None:
     assert f"{-(-least // 1_000_000)}M" in raised.value.hint
 
 
-def test_a_run_says_what_it_takes_and_what_memory_leaves_out(tmp_path: Path) -> None:
+def test_a_run_states_its_cost_and_what_the_memory_limit_leaves_out(tmp_path: Path) -> None:
     told = forecast_text(request(tmp_path, "preview"))
     assert told.startswith("40 photos of 1.1 megapixels take about ") and "1,500 iterations" in told
     assert "GB of memory" in told and "GB of disk" in told and "memory holds" not in told

@@ -89,7 +89,7 @@ def test_contributing_pairs_are_those_of_the_definition(dataset: Path, opacity_l
         assert expected > 5000 and abs(counted - expected) <= 2e-3 * expected
 
 
-def test_train_speed_times_every_point_set_in_every_size(dataset: Path, tmp_path: Path) -> None:
+def test_train_speed_times_every_point_set_at_every_size(dataset: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     data.mkdir()
     for link, target in (("images", "images"), ("sparse", "sparse"), ("sparse_again", "sparse")):
@@ -120,7 +120,7 @@ def test_window_speed_compares_windows_with_whole_photos_of_their_size(dataset: 
     assert math.isclose(parts["mean_ratio"], parts["cpu_mean_s"] / whole["cpu_mean_s"])
 
 
-def test_scaling_keeps_the_pairs_of_a_pixel_while_gaussians_grow(dataset: Path, tmp_path: Path) -> None:
+def test_scaling_keeps_the_pairs_per_pixel_while_the_number_of_gaussians_grows(dataset: Path, tmp_path: Path) -> None:
     options = ("--threads", "1", "--gaussians", "400", "1600", "--at-gaussians", "1600", "--photos", "5", "--memory")
     size, pairs = str(MEGAPIXELS), 12.0
     sizes = ("--megapixels", size, "--at-megapixels", size, "--pairs", str(pairs), "--repeats", "2")
@@ -136,7 +136,7 @@ def test_scaling_keeps_the_pairs_of_a_pixel_while_gaussians_grow(dataset: Path, 
     assert math.isclose(rows[1]["ratio_to_linear"], growth / 4.0)
 
 
-def test_time_to_quality_trains_and_measures_what_the_line_does(dataset: Path, tmp_path: Path) -> None:
+def test_time_to_quality_trains_and_measures_as_the_pipeline_does(dataset: Path, tmp_path: Path) -> None:
     iterations, held_out = 60, "flight 1/photo_4.png"
     options = ("--threads", "1", "--held-out", held_out, "--iterations", str(iterations), "--every", "1e9")
     found = run("time_to_quality", dataset, tmp_path / "f.json", *options, "--marks", "1", "99")

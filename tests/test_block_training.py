@@ -121,7 +121,7 @@ def test_coarse_pass_trains_whole_photos_at_the_first_size(site: SiteParts) -> N
     }
 
 
-def test_outcome_is_of_cell_and_margin_alone_and_keeps_to_its_shares(site: SiteParts, undisturbed: Path) -> None:
+def test_result_is_of_cell_and_margin_only_and_keeps_to_its_shares(site: SiteParts, undisturbed: Path) -> None:
     model = read_splat(undisturbed / "model.ply")
     points = model.means.double().numpy()
     assert PARTITION.trained_by(0, points).all()
@@ -132,7 +132,7 @@ def test_outcome_is_of_cell_and_margin_alone_and_keeps_to_its_shares(site: SiteP
     assert len(model) > inside.sum()  # it has grown
 
 
-def test_outside_of_a_boundary_a_block_stays_coarse(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
+def test_outside_a_boundary_a_block_stays_coarse(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
     plan = PARTITION.plan
     inside = np.array([[-4.0, -2.0], [-1.0, -2.0], [-1.0, 4.0], [-4.0, 4.0]])
     area = PlanArea(plan.axes, ((inside,),))
@@ -159,7 +159,7 @@ def step_with(patch: pytest.MonkeyPatch, look: Callable[[TrainState, TrainingPho
     patch.setattr(loop, "iterate", looking)
 
 
-def test_frozen_gaussians_stay_to_the_bit_and_have_no_moments(
+def test_frozen_gaussians_stay_bit_identical_and_have_no_moments(
     site: SiteParts, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     around, held = [], []
@@ -185,7 +185,7 @@ def test_frozen_gaussians_stay_to_the_bit_and_have_no_moments(
     assert digest(tmp_path) == digest(undisturbed)
 
 
-def test_windows_are_those_that_show_the_cell_each_as_often_as_without_blocks(site: SiteParts, tmp_path: Path) -> None:
+def test_windows_that_show_the_cell_are_each_used_as_often_as_without_blocks(site: SiteParts, tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"iterations": "auto", "least_iterations": 1})
     other = surveyed(replace(site, prospects=tmp_path / "prospects"), config, 400)
     looked = []
@@ -208,7 +208,7 @@ def test_windows_are_those_that_show_the_cell_each_as_often_as_without_blocks(si
     assert len({part for part in first | second if part[1] == 0}) > 0.9 * whole * len(every)
 
 
-def test_killed_block_goes_on_with_other_threads_and_ends_with_the_same_bits(
+def test_killed_block_resumes_with_other_threads_and_ends_with_the_same_bits(
     site: SiteParts, undisturbed: Path, tmp_path: Path
 ) -> None:
     def look(state: TrainState, photo: TrainingPhoto) -> None:
@@ -235,7 +235,7 @@ def test_memory_of_the_process_does_not_end_a_blocks_growth(
     assert digest(tmp_path) == digest(undisturbed) and not recorder.warnings
 
 
-def test_what_a_block_looks_at_reads_back_and_a_missing_file_is_told(site: SiteParts, tmp_path: Path) -> None:
+def test_a_blocks_views_read_back_and_a_missing_file_is_reported(site: SiteParts, tmp_path: Path) -> None:
     views = [view for view in load_views(site.dataset) if view.camera.name in set(load_split(site.split).train)]
     points, tracks = load_points_and_tracks(site.dataset)
     cameras = [view.camera for view in views]
@@ -275,7 +275,7 @@ def sights_of(site: SiteParts) -> list[PhotoCoverage]:
     return coarse_sights(site.coarse, views, [tracks[view.camera.name] for view in views], Machine("cpu", 1))
 
 
-def test_what_counts_lies_near_the_cell_or_has_no_depth(site: SiteParts) -> None:
+def test_pixels_that_count_are_near_the_cell_or_have_no_depth(site: SiteParts) -> None:
     points, _ = load_points_and_tracks(site.dataset)
     beside = np.ones((3, 3), np.uint8)
     (x0, y0), (x1, y1) = CELLS[0].low, CELLS[0].high
@@ -305,7 +305,7 @@ def test_what_counts_lies_near_the_cell_or_has_no_depth(site: SiteParts) -> None
         assert len(down) and lost[down, across].all() and lost.sum() <= 9 * len(observed.pixels)
 
 
-def test_photos_come_with_what_counts_and_their_part_of_the_whole(
+def test_photos_come_with_their_counting_pixels_and_share_of_the_whole(
     site: SiteParts, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photos: list[TrainingPhoto] = []
@@ -331,7 +331,7 @@ def test_photos_come_with_what_counts_and_their_part_of_the_whole(
     assert 0.2 * len(photos) < len(cut) < len(photos)
 
 
-def test_outlook_tells_what_a_block_does(site: SiteParts, undisturbed: Path) -> None:
+def test_outlook_matches_a_blocks_training(site: SiteParts, undisturbed: Path) -> None:
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     points, _ = load_points_and_tracks(site.dataset)
@@ -344,7 +344,7 @@ def test_outlook_tells_what_a_block_does(site: SiteParts, undisturbed: Path) -> 
     assert outlook.pixels[0] <= WINDOW * outlook.parts[0]
 
 
-def test_positions_move_as_fast_as_where_the_whole_has_as_many_gaussians() -> None:
+def test_positions_move_as_fast_as_in_the_whole_with_as_many_gaussians() -> None:
     config = TrainConfig(iterations=1600, max_gaussians=60_000)
     footage = PhotoSizes(((640, 420, 40),))
     whole = resolve_schedule(config, footage)
@@ -360,7 +360,7 @@ def test_positions_move_as_fast_as_where_the_whole_has_as_many_gaussians() -> No
         assert math.isclose(begun.at(800).means_rate, whole.at(1600).means_rate, rel_tol=1e-12)
 
 
-def test_a_cell_that_nobody_sees_keeps_what_the_coarse_pass_has(site: SiteParts, tmp_path: Path) -> None:
+def test_a_cell_that_no_photo_sees_keeps_the_coarse_passs_gaussians(site: SiteParts, tmp_path: Path) -> None:
     far = Partition(PARTITION.plan, (*CELLS, Cell((90.0, 90.0), (99.0, 99.0))), PARTITION.margin)
     summary = train_block(
         CONFIG,

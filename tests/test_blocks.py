@@ -70,7 +70,7 @@ def divided(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"], cells
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -2, 0), (0.3, -0.5, 0.8), (-1, 0, 0)])
-def test_plan_of_any_up_is_a_rotation(up: tuple[float, float, float]) -> None:
+def test_plan_for_any_up_direction_is_a_rotation(up: tuple[float, float, float]) -> None:
     plan = GroundPlan.across(np.array(up, np.float64))
     turn = np.vstack([plan.axes, plan.up])
     assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-15) and np.linalg.det(turn) > 0.0
@@ -116,7 +116,7 @@ def test_every_place_of_the_site_has_one_owner(seen: list[PhotoCoverage], sparse
     assert np.array_equal(within, ((places[:, :2] >= low) & (places[:, :2] < high)).all(axis=1))
 
 
-def test_what_lies_beyond_the_site_belongs_to_the_nearest_cell(
+def test_places_beyond_the_site_belong_to_the_nearest_cell(
     seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     partition = divided(seen, sparse, 7)
@@ -187,7 +187,7 @@ def test_background_and_wrong_depths_do_not_widen_the_site(
     assert drawn.low[0] >= 10.0 and drawn.high[0] <= 20.0
 
 
-def test_a_flat_cloud_of_points_alone_is_cut(seen: list[PhotoCoverage]) -> None:
+def test_a_flat_cloud_of_points_without_a_model_is_divided(seen: list[PhotoCoverage]) -> None:
     line = np.column_stack([np.linspace(0.0, 10.0, 400), np.full(400, 3.0), np.zeros(400)])
     rows = np.arange(400)
     flat = [PhotoCoverage(sight.camera, sight.grid, None, None, rows) for sight in seen]
@@ -199,7 +199,7 @@ def test_a_flat_cloud_of_points_alone_is_cut(seen: list[PhotoCoverage]) -> None:
         cut(work_map(PLAN, site(PLAN, flat, line), flat, line), 2 * BINS)
 
 
-def test_block_sees_its_cell_whole_and_by_sight(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]) -> None:
+def test_a_blocks_photos_show_all_of_its_cell(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]) -> None:
     partition = divided(seen, sparse, 4)
     views = block_views(partition, seen, sparse, building_site.quarters)
     whole = sum(sight.camera.width * sight.camera.height for sight in seen)
@@ -216,7 +216,7 @@ def test_block_sees_its_cell_whole_and_by_sight(seen: list[PhotoCoverage], spars
             assert shown <= 0.08 * seen[number].pixels
 
 
-def test_work_of_a_block_is_told_before_anything_is_cut(
+def test_work_of_a_block_is_forecast_before_anything_is_divided(
     seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     pixels = sum(sight.pixels for sight in seen)
@@ -255,7 +255,7 @@ def test_a_building_hides_the_ground_behind_it(coarse: Gaussians, sparse: Float6
     assert len(pixels) == 1  # though it lies in its picture
 
 
-def test_without_a_coarse_model_points_say_what_is_seen(
+def test_without_a_coarse_model_points_determine_visibility(
     coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     by_points = building_site.site_sights(coarse, sparse, by_depth=False)
@@ -267,7 +267,7 @@ def test_without_a_coarse_model_points_say_what_is_seen(
         assert len(a & b) >= 0.9 * len(a | b)
 
 
-def test_masked_pixels_are_no_work(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> None:
+def test_masked_pixels_do_not_count_as_work(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> None:
     view = building_site.flight()[0]
     rows = building_site.observed(sparse, [view], coarse)
     half = np.zeros((86, 115), np.bool_)
@@ -284,7 +284,7 @@ def test_masked_pixels_are_no_work(coarse: Gaussians, sparse: Float64[np.ndarray
     )
 
 
-def test_surroundings_leave_the_blocks_photos_as_they_are(
+def test_surroundings_leave_a_blocks_photos_unchanged(
     coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
     """A block's Gaussians, trained and frozen, look like the whole in its photos; thinned, nearly so."""
@@ -315,7 +315,7 @@ def _likeness(whole: Gaussians, drawn: Gaussians, sight: PhotoCoverage, parts: n
     return -10.0 * math.log10(max(float(np.concatenate(shown).mean()), 1e-12))
 
 
-def test_thinning_keeps_moments_and_lone_ones() -> None:
+def test_thinning_keeps_moments_and_isolated_gaussians() -> None:
     generator = torch.Generator().manual_seed(3)
     pair = Gaussians.empty(3, 1)
     pair.means = torch.tensor([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [9.0, 9.0, 9.0]])
@@ -396,7 +396,7 @@ def test_merge_takes_each_gaussian_once_in_any_order(
         merged(partition, {0: coarse})
 
 
-def test_blocks_are_merged_one_at_a_time_to_the_bytes_of_all_at_once(
+def test_blocks_merged_one_at_a_time_give_the_same_bytes_as_all_at_once(
     coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"], tmp_path: Path
 ) -> None:
     partition = divided(seen, sparse, 4)
@@ -415,7 +415,7 @@ def test_blocks_are_merged_one_at_a_time_to_the_bytes_of_all_at_once(
         counted(partition, {**trained, 3: Gaussians.empty(3, 0 if degree else 1)}.__getitem__)
 
 
-def test_what_wanders_into_a_neighbours_cell_is_left_to_it(coarse: Gaussians) -> None:
+def test_gaussians_that_move_into_a_neighbours_cell_are_dropped(coarse: Gaussians) -> None:
     partition = Partition(PLAN, (Cell((0.0, 0.0), (10.0, 24.0)), Cell((10.0, 0.0), (20.0, 24.0))), 1.0)
     wandered = coarse.clone()
     wandered.means[0] = torch.tensor([15.0, 3.0, 0.0])
@@ -455,7 +455,7 @@ def test_blocks_are_as_few_as_memory_allows() -> None:
     assert block_need(10, 6, 1, 3).memory_bytes > block_need(10, 5, 1, 3).memory_bytes
 
 
-def test_demo_is_cut_seen_and_put_together(demo_run: Path) -> None:
+def test_demo_is_divided_assigned_to_photos_and_merged(demo_run: Path) -> None:
     """The demo's own sparse model and coarse depths: four blocks of alike work that see their cells."""
     dataset = next((demo_run / "stages").glob("undistort-*")) / "dataset"
     (ply,) = (demo_run / "stages").glob("train-*/*.ply")

@@ -102,7 +102,7 @@ def alone(scene: Path, out: Path, shard: str, threads: int) -> subprocess.Popen[
 
 
 @pytest.mark.parametrize("limit", [1_000_000_000, 1_500_000_000, 2_000_000_000])
-def test_a_cap_that_does_not_fit_stays_and_the_scene_is_cut(limit: int) -> None:
+def test_a_cap_that_does_not_fit_is_kept_and_the_scene_is_divided(limit: int) -> None:
     found = divided(SITE, limit)
     assert found.blocks > 1 and found.cap == SITE.cap and found.memory_bytes <= limit
     assert found.need.trained < found.cap
@@ -111,7 +111,7 @@ def test_a_cap_that_does_not_fit_stays_and_the_scene_is_cut(limit: int) -> None:
 
 
 @pytest.mark.parametrize("limit", [1_000_000_000, 1_500_000_000, 2_000_000_000])
-def test_the_coarse_pass_has_the_whole_scene_or_what_the_limit_holds(limit: int) -> None:
+def test_the_coarse_pass_has_the_cap_of_the_whole_or_what_the_limit_holds(limit: int) -> None:
     found = divided(SITE, limit)
     room = limit - (found.memory_bytes - found.need.memory_bytes)  # the libraries are in no need
     assert found.need.trained < found.coarse_cap < found.cap  # more than a block trains: nothing lies frozen around it
@@ -120,20 +120,20 @@ def test_the_coarse_pass_has_the_whole_scene_or_what_the_limit_holds(limit: int)
     assert divided(SITE, 0, least=4).coarse_cap == divided(SITE, 8_000_000_000, least=4).coarse_cap == SITE.cap
 
 
-def test_what_fits_or_will_not_come_near_the_cap_is_one_whole() -> None:
+def test_a_scene_that_fits_or_stays_far_below_the_cap_is_not_divided() -> None:
     assert divided(SITE, 0).is_whole and divided(SITE, 8_000_000_000).is_whole
     assert divided(replace(SITE, expected=90_000.0), 1_500_000_000).is_whole
     assert divided(SITE, 0, least=4).blocks == divided(SITE, 8_000_000_000, least=4).blocks == 4
 
 
-def test_few_photos_have_few_blocks_and_then_the_cap_is_what_these_hold() -> None:
+def test_few_photos_have_few_blocks_and_a_cap_that_these_hold() -> None:
     few = divided(replace(SITE, photos=5 * PHOTOS_A_BLOCK), 1_000_000_000)
     assert few.blocks == 5 and 0 < few.cap < SITE.cap and few.memory_bytes <= 1_000_000_000
     assert divided(replace(SITE, photos=PHOTOS_A_BLOCK), 1_000_000_000).is_whole
     assert divided(SITE, 500_000_000).is_whole  # which says itself that it is too little
 
 
-def test_a_limit_that_was_asked_for_counts_before_the_machines() -> None:
+def test_a_requested_limit_takes_precedence_over_the_machines() -> None:
     assert memory_limit(3, 100) == 3 and 0 < memory_limit(0, 100) < 100 and memory_limit(0, 0) == 0
 
 
@@ -149,7 +149,7 @@ def test_shares_add_up_to_the_cap_and_no_block_has_more_than_fits() -> None:
         assert 0 < each.share <= each.trained <= division.need.trained and each.frozen > 0
 
 
-def test_without_blocks_nothing_is_trained_before_and_training_is_as_it_was(scene: Path, tmp_path: Path) -> None:
+def test_without_blocks_there_is_no_coarse_pass_and_training_is_unchanged(scene: Path, tmp_path: Path) -> None:
     config = tiny_scene.plain(iterations=12, sh_degree=0)
     folders = [tmp_path / name for name in ("blocks", "whole", "line")]
     for folder in folders:
@@ -164,7 +164,7 @@ def test_without_blocks_nothing_is_trained_before_and_training_is_as_it_was(scen
         assert (folders[1] / name).read_bytes() == (folders[2] / name).read_bytes()
 
 
-def test_a_machine_with_other_memory_goes_on_with_the_division_that_was_made(
+def test_a_machine_with_other_memory_continues_with_the_existing_division(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = tiny_scene.plain(iterations=12, sh_degree=0, max_gaussians=2_000_000)
@@ -178,7 +178,7 @@ def test_a_machine_with_other_memory_goes_on_with_the_division_that_was_made(
     assert Division.of_facts(json.loads(json.dumps(asdict(division)))) == division
 
 
-def test_blocks_are_joined_to_what_a_training_leaves(undisturbed: Path) -> None:
+def test_merged_blocks_have_the_outputs_of_a_training(undisturbed: Path) -> None:
     site = load_site_plan(part(undisturbed, "blocks/blocks.json"))
     model = read_splat(part(undisturbed, "train/model.ply"))
     assert len(site.blocks) == 3 and sum(each.share for each in site.blocks) == 6000 >= len(model)
@@ -196,7 +196,7 @@ def test_blocks_are_joined_to_what_a_training_leaves(undisturbed: Path) -> None:
     assert manifest["summary"]["loss"] < history["curve"][0]["loss"]
 
 
-def test_blocks_know_the_sky_and_leave_out_what_moves(tmp_path: Path) -> None:
+def test_blocks_model_the_sky_and_exclude_moving_objects(tmp_path: Path) -> None:
     folder = prepared(skies.write_dataset(tmp_path / "dataset"), 3)
     config = tiny_scene.plain(iterations=40, max_gaussians=3000, sh_degree=0, sky="model", robust=0.05)
     block_line.make(folder, tmp_path, {"train": config.model_dump(), "blocks": {"least": 2}})
@@ -237,7 +237,7 @@ class Kill(BaseException):
     """Stands for a kill."""
 
 
-def test_a_coarse_pass_that_is_done_is_not_made_again(
+def test_a_finished_coarse_pass_is_not_repeated(
     scene: Path, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = TrainConfig(**QUICK)
@@ -256,7 +256,7 @@ def test_a_coarse_pass_that_is_done_is_not_made_again(
         assert (tmp_path / path).read_bytes() == part(undisturbed, f"blocks/{path}").read_bytes()
 
 
-def test_a_coarse_pass_is_told_to_be_done_once_its_files_are_on_the_disk(
+def test_a_coarse_pass_is_reported_as_done_once_its_files_are_on_disk(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flushed: list[Path] = []
@@ -287,9 +287,7 @@ def test_a_coarse_pass_is_told_to_be_done_once_its_files_are_on_the_disk(
     assert json.loads((tmp_path / "coarse.json").read_text()) == {"iterations": 1}
 
 
-def test_blocks_that_are_missing_are_named_before_anything_is_merged(
-    scene: Path, undisturbed: Path, tmp_path: Path
-) -> None:
+def test_missing_blocks_are_named_before_anything_is_merged(scene: Path, undisturbed: Path, tmp_path: Path) -> None:
     plan, coarse = (part(undisturbed, f"blocks/{name}") for name in ("blocks.json", "coarse"))
     given = inputs(scene, TrainConfig(**QUICK), blocks_plan=plan, blocks_coarse=coarse)
     shards = [part(undisturbed, f"{name}/model.ply").parent for name in SHARDS]
@@ -324,7 +322,7 @@ def test_too_few_photos_for_blocks_are_trained_within_the_machines_memory(
     assert [each.max_memory_bytes for each in seen] == [near.limit_bytes, 900_000_000]
 
 
-def test_two_makers_of_one_block_are_refused_and_of_two_are_not(
+def test_two_processes_may_train_two_blocks_but_not_the_same_one(
     scene: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
@@ -350,14 +348,14 @@ def test_the_history_of_blocks_is_one_curve_after_the_coarse_pass() -> None:
     assert joint["skipped_gradients"] == 3 and len(joint["blocks"]) == 2
 
 
-def test_the_size_that_is_told_is_the_blocks_own_not_the_coarse_passes(tmp_path: Path) -> None:
+def test_the_reported_size_is_the_blocks_not_the_coarse_passs(tmp_path: Path) -> None:
     summaries = {"blocks": {"coarse": {"train_megapixels": 0.49}}, "train.1": {"train_megapixels": 1.9466}}
     summaries |= {"train.2": {"train_megapixels": 0.0}}  # one that had nothing to train
     given = replace(Inputs({}, tmp_path), summaries=summaries, shards=(tmp_path,) * 2)
     assert assembly._told(given, {"curve": []}, 100)["train_megapixels"] == 1.9466
 
 
-def test_why_blocks_trained_fewer_iterations_is_told(tmp_path: Path) -> None:
+def test_the_reason_for_fewer_iterations_of_blocks_is_reported(tmp_path: Path) -> None:
     parts = [{"iterations": 90, "planned_iterations": 100, "flat_at": 80}, {"iterations": 70, "planned_iterations": 70}]
     parts.append({"iterations": 60, "planned_iterations": 80, "sizes_ended": [30], "flat_at": 50})
     summaries = {"blocks": {"coarse": {"iterations": 20, "planned_iterations": 30, "sizes_ended": [10]}}}

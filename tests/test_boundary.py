@@ -93,7 +93,7 @@ def winding(points: np.ndarray, ring: np.ndarray) -> np.ndarray:
     return np.abs(((turns + np.pi) % (2 * np.pi) - np.pi).sum(axis=1)) > np.pi
 
 
-def test_what_is_inside_is_what_the_outline_winds_around_and_no_hole_does() -> None:
+def test_inside_is_where_the_outline_winds_around_and_no_hole_does() -> None:
     turns = np.linspace(0.0, 2.0 * np.pi, 300, endpoint=False)
     star = (12.0 + 8.0 * np.cos(7.0 * turns))[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     island = np.array([[20.0, 20.0], [28.0, 21.0], [24.0, 27.0]])
@@ -105,7 +105,7 @@ def test_what_is_inside_is_what_the_outline_winds_around_and_no_hole_does() -> N
     assert PlanArea.seen_from_above([(OUTLINE, HOLE)]).size() == pytest.approx(21.0 * 16.0 - 16.0)
 
 
-def test_neighbouring_polygons_share_no_point_and_leave_none_out() -> None:
+def test_neighbouring_polygons_share_no_point_and_omit_none() -> None:
     left = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 2.0], [4.0, 8.0], [0.0, 8.0]])
     right = np.array([[4.0, 0.0], [8.0, 0.0], [8.0, 8.0], [4.0, 8.0], [4.0, 2.0]])
     x, y = np.meshgrid(np.arange(0.0, 8.0, 0.5), np.arange(0.0, 8.0, 0.5))
@@ -141,14 +141,14 @@ CASES: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_all_forms_and_systems_are_one_area(tmp_path: Path, case: str) -> None:
+def test_all_forms_and_reference_systems_give_the_same_area(tmp_path: Path, case: str) -> None:
     area, notes = laid(tmp_path, CASES[case])
     for ring, wanted in zip(area.polygons[0], (OUTLINE, HOLE), strict=True):
         np.testing.assert_allclose(ring, wanted, atol=0.002)  # the demo's own geodesy, another way of PROJ's
     assert not notes.warnings and "320 m²" in notes.notes[0]
 
 
-def test_without_a_file_the_part_says_nothing_of_the_frame(tmp_path: Path) -> None:
+def test_without_a_file_the_part_does_not_depend_on_the_frame(tmp_path: Path) -> None:
     texts = []
     for frame in (FRAME, Frame("arbitrary", Similarity.identity())):
         assert lay_boundary(tmp_path / "none", frame, POINTS, tmp_path / "out.json", Notes()) == {}
@@ -197,7 +197,7 @@ HOSTILE: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_what_is_no_boundary_is_refused_by_name_and_with_what_to_do(tmp_path: Path, case: str) -> None:
+def test_an_invalid_boundary_is_refused_by_name_and_with_what_to_do(tmp_path: Path, case: str) -> None:
     value, reason = HOSTILE[case]
     path = tmp_path / "boundary.geojson"
     path.write_bytes((value if isinstance(value, str) else json.dumps(value)).encode("utf-8", "surrogateescape"))
@@ -215,7 +215,7 @@ def test_a_large_file_is_not_read(tmp_path: Path) -> None:
         read_boundary(path)
 
 
-def test_the_finest_allowed_is_read_and_holds_what_it_should(tmp_path: Path) -> None:
+def test_the_finest_allowed_boundary_is_read_correctly(tmp_path: Path) -> None:
     value = {"type": "Polygon", "coordinates": [ring_of(boundary_file.MAX_VERTICES)]}
     drawing = read_boundary(written(tmp_path, value))
     assert len(drawing.polygons[0][0]) == boundary_file.MAX_VERTICES - 1 and drawing.crossing == ()
@@ -242,7 +242,7 @@ def test_polygons_have_their_features_names(tmp_path: Path) -> None:
     assert names == ("Heap A", "a b", "a b", "", "", "in", "?", "x" * boundary_file.LONGEST_NAME)
 
 
-def test_an_outline_that_crosses_itself_is_told_where(tmp_path: Path) -> None:
+def test_the_place_where_an_outline_crosses_itself_is_reported(tmp_path: Path) -> None:
     bow = np.array([[-9.0, -8.0], [9.0, 8.0], [9.0, -8.0], [-9.0, 8.0]])
     np.testing.assert_allclose(crossing_of(bow), [0.0, 0.0], atol=1e-12)
     assert crossing_of(OUTLINE) == crossing_of(HOLE) == ()
@@ -250,13 +250,13 @@ def test_an_outline_that_crosses_itself_is_told_where(tmp_path: Path) -> None:
     assert f"crosses itself near {DEMO.longitude:.4f}" in notes.warnings[0] and "outside" in notes.warnings[0]
 
 
-def test_points_and_lines_beside_the_polygon_are_told(tmp_path: Path) -> None:
+def test_points_and_lines_beside_the_polygon_are_reported(tmp_path: Path) -> None:
     line = {"type": "LineString", "coordinates": degrees(OUTLINE)}
     _, notes = laid(tmp_path, {"type": "GeometryCollection", "geometries": [line, polygon(degrees, OUTLINE)]})
     assert "are ignored" in notes.warnings[0]
 
 
-def test_a_few_points_inside_are_told(tmp_path: Path) -> None:
+def test_few_points_inside_are_reported(tmp_path: Path) -> None:
     _, notes = laid(tmp_path, polygon(degrees, OUTLINE), points=POINTS[:200])
     assert "sparse model lie inside" in notes.warnings[0]
 
@@ -264,7 +264,7 @@ def test_a_few_points_inside_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("offset", "told"), [((0.0, 9_000.0), "9.0 km north of"), ((-400.0, 0.0), "m west of"), ((5e4, -5e4), "south-east")]
 )
-def test_a_boundary_elsewhere_is_refused_with_the_way_to_it(
+def test_a_boundary_elsewhere_is_refused_with_distance_and_direction(
     tmp_path: Path, offset: tuple[float, float], told: str
 ) -> None:
     with pytest.raises(SplatpipeError, match="No part of the capture lies inside") as caught:
@@ -280,7 +280,7 @@ def test_swapped_coordinates_are_recognised(tmp_path: Path) -> None:
     assert "swapped" in caught.value.hint
 
 
-def test_a_model_without_coordinates_takes_no_boundary(tmp_path: Path) -> None:
+def test_a_model_without_coordinates_accepts_no_boundary(tmp_path: Path) -> None:
     frame = Frame("arbitrary", WORLD_FROM_MODEL, note="no photo states a position")
     with pytest.raises(SplatpipeError, match="not georeferenced: no photo states a position") as caught:
         laid(tmp_path, polygon(degrees, OUTLINE), frame)
@@ -298,7 +298,7 @@ def test_degrees_of_a_projected_system_are_refused(tmp_path: Path) -> None:
         laid(tmp_path, polygon(degrees, OUTLINE) | named("EPSG:32633"))
 
 
-def test_the_command_lines_file_is_the_option_and_set_has_the_last_word() -> None:
+def test_boundary_sets_the_option_and_set_takes_precedence() -> None:
     def resolved(assignments: list[str], boundary: str | None) -> str:
         return overrides(None, with_boundary(assignments, boundary), None).resolve().georef.boundary
 
@@ -315,7 +315,7 @@ def stated() -> tuple[Position, ...]:
     return read_positions([photo for photo in checked if isinstance(photo, CheckedPhoto)]).positions
 
 
-def test_the_preflight_tells_what_a_run_would_stumble_over(tmp_path: Path, stated: tuple[Position, ...]) -> None:
+def test_the_preflight_reports_problems_of_the_boundary(tmp_path: Path, stated: tuple[Position, ...]) -> None:
     def told(value: Any, positions: tuple[Position, ...] = stated, controlled: bool = False) -> list[tuple[str, str]]:
         found = boundary_findings(written(tmp_path, value), GeorefConfig(), positions, controlled)
         assert all(finding.hint for finding in found)
@@ -331,7 +331,7 @@ def test_the_preflight_tells_what_a_run_would_stumble_over(tmp_path: Path, state
     assert told(polygon(degrees, OUTLINE), (), controlled=True) == []
 
 
-def test_any_datum_finds_the_same_ground(tmp_path: Path) -> None:
+def test_any_datum_gives_the_same_area_on_the_ground(tmp_path: Path) -> None:
     """The same outline in Web Mercator and in the Austrian Lambert of EPSG, made by PROJ alone."""
     from pyproj import Transformer
 

@@ -49,7 +49,7 @@ def test_a_cut_or_damaged_stream_is_an_error_wherever_it_is() -> None:
             InflatedFile(PATH, io.BytesIO(broken)).at_most(len(CONTENT) + 1)
 
 
-def test_files_that_are_none_end_in_our_error(tmp_path: Path) -> None:
+def test_invalid_files_end_in_our_error(tmp_path: Path) -> None:
     for path in (tmp_path / "none", tmp_path, tmp_path / "a\0b"):
         with pytest.raises(SplatpipeError, match="Cannot read"):
             read_whole(path)
@@ -61,7 +61,7 @@ def test_files_that_are_none_end_in_our_error(tmp_path: Path) -> None:
             read_exactly(tmp_path / "file", file, 4)
 
 
-def test_a_promise_beyond_what_splats_grow_is_refused() -> None:
+def test_an_implausible_declared_size_is_refused() -> None:
     check_expansion(PATH, FREE_BYTES, 10)
     check_expansion(PATH, 300_000_000, 30_000_000)
     with pytest.raises(SplatpipeError, match="promised"):
@@ -77,7 +77,7 @@ def test_a_promise_beyond_what_splats_grow_is_refused() -> None:
         ("means", -1e30, "coordinates"),
     ],
 )
-def test_values_that_nothing_can_be_computed_with_are_refused(name: str, value: float, said: str) -> None:
+def test_values_that_cannot_be_computed_with_are_refused(name: str, value: float, said: str) -> None:
     made = Gaussians.empty(5, 1)
     check_values(PATH, made)
     check_values(PATH, Gaussians.empty(0, 1))

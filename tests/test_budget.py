@@ -97,7 +97,7 @@ def test_durations_are_read(text: str, seconds: float) -> None:
         "1_0s",
     ],
 )
-def test_what_is_no_duration_is_refused_with_an_example(text: str) -> None:
+def test_an_invalid_duration_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(UsageError, match="--time-budget") as raised:
         parse_duration(text, "--time-budget")
     assert "10m" in raised.value.hint and len(str(raised.value)) < 80
@@ -114,25 +114,25 @@ def test_sizes_are_read(text: str, number: int) -> None:
     "text",
     ["", "8", "G", "-8G", "0G", "0.0000000000001M", "8g", "8 G", "8Gi", "8K", "nanG", "1e3G", "８G", "9" * 99 + "G"],
 )
-def test_what_is_no_size_is_refused_with_an_example(text: str) -> None:
+def test_an_invalid_size_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(UsageError, match="--max-memory") as raised:
         parse_bytes(text, "--max-memory")
     assert "8G" in raised.value.hint
 
 
-def test_durations_are_told_as_people_say_them() -> None:
+def test_durations_are_formatted_for_people() -> None:
     said = {4.4: "4 s", 60.0: "1 min", 400.0: "6 min 40 s", 7500.0: "2 h 05 min", 7200.0: "2 h"}
     assert {seconds: duration(seconds) for seconds in said} == said
 
 
-def test_a_speed_is_found_again_from_its_timings() -> None:
+def test_a_speed_is_recovered_from_its_timings() -> None:
     sizes = [(n, p) for n in (5_000, 60_000) for p in (100_000, 400_000, 1_600_000)]
     fitted = fit_speed([Timing(n, p, SPEED.seconds(n, p)) for n, p in sizes])
     for n, p in ((7_000, 2e5), (200_000, 1e6)):
         assert fitted.seconds(n, p) == pytest.approx(SPEED.seconds(n, p), rel=1e-6)
 
 
-def test_a_speed_tells_apart_what_windows_leave_out() -> None:
+def test_a_speed_separates_costs_that_windows_avoid() -> None:
     true = replace(SPEED, seen_s=5e-7)
     cases = [(n, p, share) for n in (5_000, 60_000) for p, share in ((1e5, 1.0), (4e5, 1.0), (1e5, 0.25), (5e4, 0.05))]
     fitted = fit_speed([Timing(n, int(p), true.seconds(n, p, share), share) for n, p, share in cases])
@@ -161,7 +161,7 @@ def test_the_window_that_is_timed_is_the_middle_of_its_photo() -> None:
     assert torch.equal(window.colour, colour[top : top + window.camera.height, left : left + window.camera.width])
 
 
-def test_a_size_whose_parts_would_be_seen_too_seldom_loses_to_the_one_before() -> None:
+def test_a_size_whose_windows_would_be_visited_too_rarely_is_not_chosen() -> None:
     sizes = ((2304, 1728, 50),)
     tasks = [
         BudgetTask(tiny_scene.plain(), 8_000, 0, sizes, 500_000, SPEED, 0.0, s) for s in (15.0, 60.0, 240.0, 3600.0)
@@ -217,13 +217,13 @@ def test_more_time_never_plans_less() -> None:
     assert plans[-1].options.iterations > plans[0].options.iterations
 
 
-def test_no_limit_is_passed_however_much_time_there_is() -> None:
+def test_no_limit_is_exceeded_however_much_time_there_is() -> None:
     choice = plan_for(1e6, cap=20_000)
     assert choice.options.max_gaussians == 20_000 and choice.iterations == choice.last_iteration == LONGEST
     assert choice.options.max_megapixels == 0.0
 
 
-def test_too_little_time_plans_the_smallest_training_and_not_none() -> None:
+def test_too_little_time_still_plans_the_smallest_training() -> None:
     choice = choose(replace(task_of(0.01, size=2.0), sparse=500_000))
     assert choice.options.iterations == FEWEST and choice.options.max_gaussians == FEWEST_GAUSSIANS
     assert choice.options.max_megapixels == SMALLEST_MEGAPIXELS
@@ -236,7 +236,7 @@ def test_every_photo_is_seen_often_enough_before_photos_grow() -> None:
 
 
 @pytest.mark.parametrize("seconds", [5.0, 15.0, 60.0])
-def test_dense_points_take_nothing_from_photos_and_iterations(seconds: float) -> None:
+def test_dense_points_reduce_neither_photo_size_nor_iterations(seconds: float) -> None:
     """They are what a plan drops first, so it need not have room for them: only the forecast counts those that stay."""
     bare, dense = choose(task_of(seconds)), choose(replace(task_of(seconds), dense=50_000))
     assert dense.options.max_megapixels == bare.options.max_megapixels
@@ -269,7 +269,7 @@ def digest(out: Path) -> str:
     return hashlib.sha256((out / "model.ply").read_bytes() + (out / "history.json").read_bytes()).hexdigest()
 
 
-def test_a_budget_is_planned_told_and_ends_the_training(scene: Path, tmp_path: Path) -> None:
+def test_a_budget_is_planned_reported_and_ends_the_training(scene: Path, tmp_path: Path) -> None:
     recorder = tiny_scene.Recorder()
     summary = train.run(tiny_scene.plain(time_budget_s=5.0), make_inputs(scene), tmp_path, recorder)
     plan = read_plan(tmp_path)
@@ -281,7 +281,7 @@ def test_a_budget_is_planned_told_and_ends_the_training(scene: Path, tmp_path: P
     assert len(read_splat(tmp_path / "model.ply")) == summary["gaussians"] > 0
 
 
-def test_time_that_is_gone_before_training_leaves_a_look_and_one_warning(scene: Path, tmp_path: Path) -> None:
+def test_a_budget_spent_before_training_gives_a_minimal_training_and_one_warning(scene: Path, tmp_path: Path) -> None:
     recorder = tiny_scene.Recorder()
     summary = train.run(
         TrainConfig(time_budget_s=6.0), make_inputs(scene, time.monotonic() - 100.0), tmp_path, recorder
@@ -339,7 +339,7 @@ def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
     assert digest(tmp_path / "killed") == digest(tmp_path / "whole")
 
 
-def test_the_deadline_ends_after_a_whole_iteration_that_is_as_without_it(
+def test_the_deadline_ends_after_a_whole_iteration_and_changes_none(
     scene: Path, tmp_path: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained(scene, tmp_path / "whole", plan, monkeypatch)
@@ -471,7 +471,7 @@ def test_a_memory_limit_binds_and_the_resident_memory_stays_below_it(scene: Path
     assert told["peak"] <= told["limit"]  # type: ignore[operator]
 
 
-def test_growth_ends_where_memory_runs_out_all_the_same_and_pruning_goes_on(
+def test_growth_ends_when_memory_runs_out_and_pruning_continues(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(iteration, "over_memory", lambda options: True)
@@ -490,7 +490,7 @@ def test_growth_ends_where_memory_runs_out_all_the_same_and_pruning_goes_on(
     assert rest[-1]["gaussians"] == left == len(read_splat(tmp_path / "model.ply"))
 
 
-def test_a_budget_long_enough_for_a_film_keeps_time_for_it() -> None:
+def test_a_budget_long_enough_for_a_film_reserves_time_for_it() -> None:
     """Ten seconds of film take as long as measuring forty photos; shorter budgets have no film."""
     views = [View(camera, Path("photo.jpg"), None) for camera in tiny_scene.cameras()]
     measured = MachineSpeed(SPEED, 0.0, 2.0)

@@ -27,7 +27,7 @@ def test_unprojected_pixels_project_back_and_lie_at_their_depths(camera: Camera)
     np.testing.assert_allclose(camera.depths(places), depths, atol=1e-12)
 
 
-def test_only_what_is_in_front_and_in_the_picture_is_in_view(camera: Camera) -> None:
+def test_only_points_in_front_and_inside_the_image_are_in_view(camera: Camera) -> None:
     corners = np.array([[0.001, 0.001], [89.999, 59.999], [-0.001, 5.0], [90.001, 5.0], [5.0, 60.001], [45.0, 30.0]])
     places = camera.unproject(corners, np.full(6, 3.0))
     behind = camera.unproject(corners[5:], np.array([-3.0]))
@@ -37,7 +37,7 @@ def test_only_what_is_in_front_and_in_the_picture_is_in_view(camera: Camera) -> 
     np.testing.assert_allclose(depths, 3.0)
 
 
-def test_a_part_sees_what_the_whole_sees_there_and_knows_the_whole(camera: Camera) -> None:
+def test_a_window_sees_what_the_whole_sees_there_and_refers_to_the_whole(camera: Camera) -> None:
     part = camera.cut(31, 7, 40, 29)
     assert (part.width, part.height, part.window) == (40, 29, Window(31, 7, 90, 60))
     places = camera.unproject(pixels_everywhere(), np.linspace(0.5, 30.0, 40))
@@ -50,7 +50,7 @@ def test_a_part_sees_what_the_whole_sees_there_and_knows_the_whole(camera: Camer
     np.testing.assert_allclose(np.add(inner.project(places), [36.0, 13.0]), camera.project(places), atol=1e-10)
 
 
-def test_all_of_a_picture_is_no_part_and_what_is_outside_is_refused(camera: Camera) -> None:
+def test_a_window_of_the_whole_image_is_none_and_one_outside_is_refused(camera: Camera) -> None:
     assert camera.cut(0, 0, 90, 60) is camera
     for part in [(-1, 0, 5, 5), (0, -1, 5, 5), (0, 0, 0, 5), (0, 0, 5, 0), (86, 0, 5, 5), (0, 56, 5, 5)]:
         with pytest.raises(ValueError, match="no part"):

@@ -123,13 +123,13 @@ def test_cameras_of_a_film_are_level_whatever_the_photos_roll() -> None:
         assert (camera.width, camera.height, camera.cx, camera.cy) == (640, 360, 320.0, 180.0)
 
 
-def test_a_film_looks_where_the_photos_looked() -> None:
+def test_a_film_looks_in_the_photos_directions() -> None:
     route = film(ring(24))
     to_middle = towards(route.places, np.tile([0.0, 0.0, 3.0], (FRAMES, 1))).directions()
     assert np.degrees(angles_between(route.directions(), to_middle)).max() < 5.0
 
 
-def test_strays_are_left_out() -> None:
+def test_outlying_photos_are_left_out() -> None:
     cameras = ring(20)
     far = photo((300.0, 40.0, 8.0), (0, 0, 3))
     away = photo((20.0, 0.0, 8.0), (90.0, 0.0, 30.0))  # sees nothing of the house
@@ -154,7 +154,7 @@ def test_a_film_goes_round_the_house_and_not_through_it() -> None:
         film([one[4], other[4]])
 
 
-def test_the_ground_keeps_its_distance() -> None:
+def test_the_path_keeps_its_distance_from_the_ground() -> None:
     """Two photos on either side of a hill: what is between them is solid."""
     hill = np.random.default_rng(1).uniform([-3, -40, 0], [3, 40, 20], (40000, 3))
     left, right = photo((-15.0, 0.0, 5.0), (0, 0, 3)), photo((15.0, 0.0, 5.0), (0, 0, 3))
@@ -162,7 +162,7 @@ def test_the_ground_keeps_its_distance() -> None:
         film([left, right], hill)
 
 
-def test_without_telling_names_the_nearest_photo_comes_next() -> None:
+def test_if_names_give_no_order_the_nearest_photo_comes_next() -> None:
     cameras = ring(24)
     shuffled = [cameras[index] for index in np.random.default_rng(5).permutation(24)]
     route = film(shuffled)
@@ -171,7 +171,7 @@ def test_without_telling_names_the_nearest_photo_comes_next() -> None:
     assert (steps > -1e-9).all() or (steps < 1e-9).all()  # around in one direction
 
 
-def test_photos_straight_down_make_a_map_that_slides_by() -> None:
+def test_photos_straight_down_make_a_film_like_a_moving_map() -> None:
     """A survey in strips, the drone turning at the end of each: the film does not turn with it."""
     cameras = []
     for strip, y in enumerate((-8.0, 0.0, 8.0)):
@@ -183,7 +183,7 @@ def test_photos_straight_down_make_a_map_that_slides_by() -> None:
     assert_smooth(route)
 
 
-def test_a_swaying_kite_is_followed_where_it_looked() -> None:
+def test_photos_from_a_swaying_kite_are_followed_in_direction() -> None:
     """Nearly down, leaning to the side of the picture, one photo far enough to have a heading of its own."""
     cameras = []
     for k, y in enumerate(np.linspace(-8, 8, 14)):
@@ -268,7 +268,7 @@ def test_an_orbit_is_a_level_circle_around_the_house_that_closes() -> None:
     assert np.degrees(angles_between(route.directions(), to_middle)).max() < 8.0
 
 
-def test_an_orbit_rises_over_what_is_in_its_way() -> None:
+def test_an_orbit_rises_over_obstacles() -> None:
     """A façade seen from one side; behind the house is another of the same height."""
     front = [photo((x, -14.0, 3.0), (x, 0, 3)) for x in np.linspace(-6, 6, 9)]
     other = np.random.default_rng(2).uniform([-8, 9, 0], [8, 20, 7], (8000, 3))
@@ -278,7 +278,7 @@ def test_an_orbit_rises_over_what_is_in_its_way() -> None:
     assert route.places[:, 2].min() > 8.0
 
 
-def test_photos_straight_down_are_orbited_at_a_slant() -> None:
+def test_a_nadir_survey_is_orbited_obliquely() -> None:
     cameras = [photo((x, y, 30.0), (x, y, 0.0)) for x in (-6.0, 0.0, 6.0) for y in (-6.0, 0.0, 6.0)]
     route = orbit(capture(cameras), 12)
     assert -60.0 < np.degrees(route.pitches[0]) < -40.0
@@ -384,7 +384,7 @@ def test_a_single_keyframe_is_no_film(tmp_path: Path) -> None:
         twice.film(10.0, 25, 5.0)
 
 
-def test_clearance_is_the_distance_to_what_is_solid_and_heeds_no_lone_floater() -> None:
+def test_clearance_is_the_distance_to_solid_objects_and_ignores_a_lone_floater() -> None:
     wall = np.column_stack((np.full(900, 5.0), *(grid.ravel() for grid in np.mgrid[-3:3:30j, -3:3:30j])))
     clearance = Clearance(np.vstack((wall, [[1.0, 0.0, 0.0]] * 3, [[np.nan] * 3])))
     assert clearance.at(np.zeros((1, 3)))[0] == pytest.approx(5.0, abs=0.1)

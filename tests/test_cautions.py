@@ -29,19 +29,19 @@ def told(root: Path, place: str, *, mounted: str = "", kernel: str = "6.8.0-45-g
     return [f"{caution.message} {caution.hint}" for caution in cautions(Path(place), root)]
 
 
-def test_a_local_disk_is_nothing_to_think_of(tmp_path: Path) -> None:
+def test_a_local_disk_needs_no_caution(tmp_path: Path) -> None:
     assert told(tmp_path, "/home/jane/out") == []
     assert told(tmp_path, "/home/jane/out", kernel=WSL2) == []
     assert told(tmp_path, "/", mounted=WINDOWS_DRIVE, kernel=WSL2) == []
 
 
 @pytest.mark.parametrize("place", ["/mnt/c", "/mnt/c/Users/jane/out"])
-def test_a_windows_drive_is_told(tmp_path: Path, place: str) -> None:
+def test_a_windows_drive_is_reported(tmp_path: Path, place: str) -> None:
     (said,) = told(tmp_path, place, mounted=WINDOWS_DRIVE, kernel=WSL2)
     assert f"{place} is on 9p (mounted at /mnt/c)" in said and "~/out" in said
 
 
-def test_half_of_windows_memory_is_told(tmp_path: Path) -> None:
+def test_half_of_windows_memory_is_reported(tmp_path: Path) -> None:
     (said,) = told(tmp_path, "/home/jane/out", kernel=WSL2, gb=8)
     assert "8.2 GB" in said and ".wslconfig" in said
     assert "WSL 1" in told(tmp_path, "/home/jane/out", kernel="4.4.0-19041-Microsoft\n")[0]
@@ -65,7 +65,7 @@ def test_half_of_windows_memory_is_told(tmp_path: Path) -> None:
         ("xfs", "rw", True),
     ],
 )
-def test_locks_that_hold_on_one_machine_only_are_told(
+def test_locks_that_hold_on_one_machine_only_are_reported(
     tmp_path: Path, kind: str, options: str, locks_hold: bool
 ) -> None:
     mounted = f"81 24 0:46 / /data rw,relatime shared:7 - {kind} server:/share {options}\n"
@@ -74,7 +74,7 @@ def test_locks_that_hold_on_one_machine_only_are_told(
     assert locks_hold or (f"on {kind} (mounted at /data)" in said[0] and "this machine only" in said[0])
 
 
-def test_read_only_and_memory_are_told(tmp_path: Path) -> None:
+def test_read_only_and_in_memory_file_systems_are_reported(tmp_path: Path) -> None:
     mounted = "82 24 0:47 / /media/stick ro - vfat /dev/sdb rw\n83 24 0:48 / /run/x rw - tmpfs tmpfs rw\n"
     assert "read-only" in told(tmp_path, "/media/stick/out", mounted=mounted)[0]
     assert "up memory" in told(tmp_path, "/run/x/out", mounted=mounted)[0]
@@ -85,5 +85,5 @@ def test_the_mount_that_hides_another_counts(tmp_path: Path) -> None:
     assert told(tmp_path, "/data/out", mounted=hidden) == []
 
 
-def test_a_system_without_these_texts_is_no_fault(tmp_path: Path) -> None:
+def test_a_system_without_these_files_is_no_fault(tmp_path: Path) -> None:
     assert cautions(Path("/anything"), tmp_path) == []

@@ -86,7 +86,7 @@ def with_exif(path: Path, gps: dict[int, object] | None = None, model: str = "")
     pixels.save(path, quality=92, exif=exif.tobytes())
 
 
-def test_of_good_photos_without_a_strip_of_three_only_the_gap_is_told(tmp_path: Path) -> None:
+def test_of_good_photos_without_a_strip_of_three_only_the_gap_is_reported(tmp_path: Path) -> None:
     preflight = examined(ring(tmp_path / "photos", leave_out=(6, 7, 8)))
     told = [finding for finding in preflight.findings if finding.severity != "note"]
     assert [finding.code for finding in told] == ["gap"] and told[0].photos == ()
@@ -147,7 +147,7 @@ def seen_together(places: np.ndarray) -> dict[tuple[int, int], int]:
     return {(i, j): int(max(0.0, 300.0 - 5.0 * apart[i, j])) for i in range(count) for j in range(i + 1, count)}
 
 
-def test_swapped_positions_are_told_by_matches_and_the_way_and_right_ones_are_not() -> None:
+def test_swapped_positions_are_found_by_matches_and_flight_path_and_correct_ones_are_not_reported() -> None:
     places, times = lines(4, 10)
     matches = seen_together(places)
     noisy = places + np.random.default_rng(0).normal(0.0, 1.0, places.shape)
@@ -186,7 +186,7 @@ def test_detail_falls_with_blur_in_its_direction_and_not_with_contrast() -> None
     assert np.isnan(detail_at(sharp.astype(np.uint8), np.array([[3.0, 60.0]]))).all()
 
 
-def test_levels_are_of_linear_light() -> None:
+def test_brightness_levels_are_of_linear_light() -> None:
     places = np.array([[10.0, 10.0]])
     step = levels_at(np.full((20, 20), 188, np.uint8), places) - levels_at(np.full((20, 20), 137, np.uint8), places)
     assert step[0] == pytest.approx(1.0, abs=0.02)  # 188 and 137 are 50 % and 25 % of light in sRGB
@@ -201,7 +201,7 @@ def little(folder: Path) -> Path:
     return folder
 
 
-def test_what_cannot_be_reconstructed_ends_with_1_and_says_why(tmp_path: Path) -> None:
+def test_a_capture_that_cannot_be_reconstructed_exits_with_1_and_says_why(tmp_path: Path) -> None:
     photos = little(tmp_path / "photos")
     (photos / "gcp_list.txt").write_text("EPSG:32633\n388710 5299705 512 112 514\n")
     (photos / "scale_bars.csv").write_text("name_a,name_b,metres\nA,A,1.0\n")
@@ -214,7 +214,7 @@ def test_what_cannot_be_reconstructed_ends_with_1_and_says_why(tmp_path: Path) -
     assert "Line 2 of gcp_list.txt" in done.stderr
 
 
-def test_what_was_found_is_told_also_where_the_page_cannot_be_written(tmp_path: Path) -> None:
+def test_findings_are_printed_even_if_the_page_cannot_be_written(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     (photos / "[red]broken[bold].jpg").write_bytes(b"none")
@@ -230,7 +230,7 @@ def test_what_was_found_is_told_also_where_the_page_cannot_be_written(tmp_path: 
     ("north_m", "severities"),
     [((0.0, 5.0, -5.0), []), ((0.0, 5.0, 900.0), ["warning"]), ((20e3, 20.1e3, 20.2e3), ["error"])],
 )
-def test_points_that_no_photo_can_show_are_told(
+def test_points_that_no_photo_can_show_are_reported(
     tmp_path: Path, north_m: tuple[float, ...], severities: list[str]
 ) -> None:
     photos = ring(tmp_path / "photos", leave_out=tuple(number for number in RING if number not in (1, 6, 11)))
@@ -246,7 +246,7 @@ def test_points_that_no_photo_can_show_are_told(
     assert len(places) == 3 and ("P2" in findings[0].message if severities == ["warning"] else True)
 
 
-def test_a_run_tells_a_broken_control_file_before_its_first_stage(tmp_path: Path) -> None:
+def test_a_run_reports_a_broken_control_file_before_its_first_stage(tmp_path: Path) -> None:
     photos = little(tmp_path / "photos")
     (photos / "gcp_list.txt").write_text("EPSG:32633\n388710 5299705 512 112 514\n")
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(photos), str(tmp_path / "out")]
@@ -255,7 +255,7 @@ def test_a_run_tells_a_broken_control_file_before_its_first_stage(tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_of_rubbish_is_told_file_by_file(tmp_path: Path) -> None:
+def test_a_folder_of_rubbish_is_reported_file_by_file(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     rng = np.random.default_rng(0)

@@ -103,7 +103,7 @@ def full(names: list[str]) -> Preflight:
 
 
 @pytest.mark.parametrize(("width", "height"), WIDTHS)
-def test_it_fits_the_screen_and_asks_for_nothing(
+def test_it_fits_the_screen_and_requests_nothing(
     tmp_path: Path, open_page: Callable, demo_names: list[str], width: int, height: int
 ) -> None:
     path = tmp_path / "check.html"
@@ -157,7 +157,7 @@ def test_the_map_marks_gaps_orphans_doubts_and_control_where_they_are(
     assert watched.errors == []
 
 
-def test_overlap_counts_the_footprints_that_hold_a_place(demo_names: list[str]) -> None:
+def test_overlap_counts_the_footprints_that_contain_a_place(demo_names: list[str]) -> None:
     preflight = grid(capture_path(), demo_names)
     frame = frame_of(preflight)
     assert frame is not None
@@ -180,7 +180,7 @@ def test_overlap_counts_the_footprints_that_hold_a_place(demo_names: list[str]) 
     assert cells == [int(((counts >= a) & (counts < b)).sum()) for a, b in pairwise(bounds)]
 
 
-def test_without_positions_the_photos_stand_in_a_ring(
+def test_without_positions_the_photos_are_drawn_in_a_ring(
     tmp_path: Path, open_page: Callable, demo_names: list[str]
 ) -> None:
     placed = grid(capture_path(), demo_names, findings=(Finding("no_positions", "note", "No photo has a position."),))
@@ -221,7 +221,7 @@ def test_hostile_names_stay_text_and_open_nothing(
     assert "\u202e" not in text and "\u2066" not in text
 
 
-def test_pictures_are_few_and_a_cut_off_photo_shows_what_there_is(
+def test_images_are_few_and_a_truncated_photo_shows_what_there_is(
     tmp_path: Path, open_page: Callable, demo_names: list[str]
 ) -> None:
     for name in demo_names[:12]:
@@ -268,7 +268,7 @@ def test_two_thousand_photos_stay_a_page_that_opens(tmp_path: Path, open_page: C
     assert len(ends) == 2000  # no photo loses all its lines
 
 
-def test_a_finding_of_the_whole_capture_is_shown_by_photos_too(demo_names: list[str]) -> None:
+def test_a_finding_on_the_whole_capture_shows_example_photos(demo_names: list[str]) -> None:
     findings = (
         Finding("orphan", "warning", "1 of 40 photos matches no other one."),
         Finding("gap", "warning", f"Photos are missing between {demo_names[4]} and {demo_names[5]}: 80 m apart."),
@@ -308,7 +308,7 @@ def test_the_verdict_is_that_of_the_worst_finding(severities: tuple[str, ...], l
     assert f'<section class="verdict {level}"' in page and f"<h2>{headline}</h2>" in page
 
 
-def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
+def test_no_folder_of_this_machine_is_named(tmp_path: Path) -> None:
     finding = Finding("control", "error", f"{tmp_path}/gcp_list.txt: line 4 is broken.", "See /home/somebody/a.txt.")
     page = check_page(grid(tmp_path, ["a.jpg", "b.jpg"], findings=(finding,)))
     assert "PHOTOS/gcp_list.txt: line 4 is broken." in page and "See a.txt." in page

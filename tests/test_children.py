@@ -35,13 +35,13 @@ def is_alive(pid: int) -> bool:
     return bool(shown.strip()) and not shown.strip().startswith("Z")
 
 
-def test_they_run_to_their_ends_and_their_memory_is_told() -> None:
+def test_they_run_to_completion_and_their_memory_is_reported() -> None:
     looks = []
     peak = run_children([(CODE, "pass"), (CODE, "pass")], lambda: looks.append(1), "idling")
     assert looks and peak > 2 * 4 << 20  # two interpreters
 
 
-def test_one_that_dies_ends_the_others_and_is_told() -> None:
+def test_one_that_dies_ends_the_others_and_is_reported() -> None:
     with pytest.raises(StageError, match=r"that was idling ended by signal 9\.") as caught:
         run_children([sleeping(), (CODE, "import os; os.kill(os.getpid(), 9)")], lambda: None, "idling")
     assert "--threads 1" in caught.value.hint

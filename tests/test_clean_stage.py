@@ -63,7 +63,7 @@ def inputs_of(folder: Path, dataset: Path, model: Gaussians, threads: int = 1) -
     return Inputs(parts, folder, machine=Machine("cpu", threads))
 
 
-def test_floaters_go_and_the_rest_keeps_its_bits(dataset: Path, tmp_path: Path) -> None:
+def test_floaters_are_removed_and_the_rest_keeps_its_bits(dataset: Path, tmp_path: Path) -> None:
     """One and two threads give the same, and the held-out photos are not used."""
     truth = tiny_scene.true_model()
     both, recorder = Gaussians.concat([truth, floaters()]), tiny_scene.Recorder()
@@ -97,26 +97,26 @@ def test_where_nothing_is_removed_the_bytes_are_those_of_training(enabled: bool,
     assert (out / "model.ply").read_bytes() == inputs["train.model"].read_bytes()
 
 
-def test_turned_off_it_reads_the_trained_model_all_the_same() -> None:
+def test_disabled_it_still_reads_the_trained_model() -> None:
     """A line of its own is run so by `test_ablation.py`."""
     assert not CleanConfig(enabled=False).is_off
 
 
-def test_a_damaged_model_is_told(dataset: Path, tmp_path: Path) -> None:
+def test_a_damaged_model_is_reported(dataset: Path, tmp_path: Path) -> None:
     inputs = inputs_of(tmp_path, dataset, tiny_scene.true_model())
     inputs["train.model"].write_bytes(inputs["train.model"].read_bytes()[:5000])
     with pytest.raises(SplatpipeError, match="cut off"):
         clean.run(CleanConfig(), inputs, tmp_path, tiny_scene.Recorder())
 
 
-def test_all_that_is_made_of_the_splat_is_made_of_the_cleaned_one() -> None:
+def test_everything_derived_from_the_splat_uses_the_cleaned_one() -> None:
     after = [stage for stage in LINE[LINE.index(CLEAN) + 1 :] if any(part.endswith(".model") for part in stage.reads)]
     assert not [stage.name for stage in after if "train.model" in stage.reads]
     readers = {stage.name for stage in after if "clean.model" in stage.reads}
     assert {"evaluate", "export", "flythrough", "splat_depths"} <= readers
 
 
-def test_the_report_tells_what_was_removed() -> None:
+def test_the_report_states_what_was_removed() -> None:
     assert removed_in_words({"reasons": {"floating": 12, "transparent": 2000, "oversized": 0}}) == (
         "2,012 removed: 12 floating, 2,000 transparent"
     )

@@ -126,12 +126,12 @@ def test_thin_things_are_kept(known: str) -> None:
     assert clean_scene(scene(), seen).keep[-thin:].all()
 
 
-def test_large_haze_before_everything_is_found() -> None:
+def test_large_haze_in_front_of_everything_is_found() -> None:
     cleaned = clean_scene(Gaussians.concat([scene(), planted("oversized")]), photos(pictures=True))
     assert not cleaned.keep[-1] and cleaned.keep[:-1].float().mean() >= 0.995
 
 
-def test_what_no_photo_sees_goes_unless_the_scene_holds_it() -> None:
+def test_gaussians_that_no_photo_sees_are_removed_unless_attached_to_the_scene() -> None:
     inside = made_of(np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9]]), 0.02, 0.5)  # far below
     behind = made_of(np.array([[0.0, 0.0, -0.03]]), 0.05, 0.5)  # under the box, on its floor's ground
     cleaned = clean_scene(Gaussians.concat([scene(), inside, behind]), photos(pictures=False))
@@ -139,7 +139,7 @@ def test_what_no_photo_sees_goes_unless_the_scene_holds_it() -> None:
     assert cleaned.removed["seen by none"] == 2
 
 
-def test_pictures_keep_what_floats_and_is_real() -> None:
+def test_real_floating_objects_are_kept_because_of_the_photos() -> None:
     balloon = made_of(np.array([[1.8, -1.5, 1.9], [-1.9, 1.6, 1.5]]), 0.08, 0.9)
     real = Gaussians.concat([scene(), balloon])
 
@@ -152,7 +152,7 @@ def test_pictures_keep_what_floats_and_is_real() -> None:
     assert not clean_scene(real, photos(pictures=True)).keep[-2:].any()  # on photos without them
 
 
-def test_cleaning_twice_is_cleaning_once_and_gives_the_same_bits() -> None:
+def test_cleaning_twice_equals_cleaning_once_bit_for_bit() -> None:
     both = Gaussians.concat([scene(), planted("single"), planted("clusters")])
     first = clean_scene(both, photos(pictures=True))
     assert torch.equal(first.keep, clean_scene(both, photos(pictures=True)).keep)
@@ -160,7 +160,7 @@ def test_cleaning_twice_is_cleaning_once_and_gives_the_same_bits() -> None:
     assert again.keep.all() and not any(again.removed.values())
 
 
-def test_nothing_is_taken_from_a_few_gaussians_and_none() -> None:
+def test_nothing_is_removed_from_few_or_no_gaussians() -> None:
     for few in (scene().first(0), scene().first(1), scene().first(9)):
         assert clean_scene(few).keep.all()
 
@@ -187,7 +187,7 @@ def test_weights_are_those_of_the_definition() -> None:
     assert found.angle_deg == pytest.approx([0.0, 0.0], abs=0.1)  # float32 of a cosine near 1
 
 
-def test_the_angle_between_photos_is_told() -> None:
+def test_the_angle_between_photos_is_correct() -> None:
     one = made_of(np.array([[0.0, 0.0, 0.7]]), 0.2, 0.5)
     pair = [camera((5.0 * np.sin(a), 0.0, 0.7 + 5.0 * np.cos(a)), str(a)) for a in (-0.2, 0.2)]
     found = look_through(one, TrainingPhotos(pair, OPTIONS), lambda _done: None)
@@ -195,7 +195,7 @@ def test_the_angle_between_photos_is_told() -> None:
     assert found.angle_deg[0] == pytest.approx(np.rad2deg(0.2), rel=0.02)
 
 
-def test_islands_are_filled_and_long_things_are_not() -> None:
+def test_islands_are_filled_and_long_objects_are_not() -> None:
     depth: Float32[np.ndarray, "h w"] = np.full((120, 160), 10.0, np.float32)
     depth[50:56, 40:46] = 5.0  # an island
     depth[:90, 100:102] = 6.0  # a pole

@@ -56,7 +56,7 @@ def space(dataset: Path) -> FreeSpace:
     return free_space_of(load_views(dataset), dataset)
 
 
-def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: FreeSpace) -> None:
+def test_gaussians_in_front_of_the_wall_are_marked_at_the_scheduled_steps(space: FreeSpace) -> None:
     gaussians, clearing = haze_and_wall(), FloaterPruning(space, SCHEDULE)
     found = clearing.unwanted(gaussians, LOOKS)
     assert found is not None and found.tolist() == [True] * 4 + [False] * 4
@@ -65,7 +65,7 @@ def test_what_hangs_before_the_wall_is_unwanted_where_training_looks(space: Free
 
 
 @pytest.mark.parametrize("density", ["published", "absolute"])
-def test_density_control_takes_it_away(dataset: Path, space: FreeSpace, density: str) -> None:
+def test_density_control_removes_them(dataset: Path, space: FreeSpace, density: str) -> None:
     config = TrainConfig.model_validate({"prune_free_space": 2, "density": density})
     plan = make_plan(config, load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     state = TrainState.begin(haze_and_wall(), plan, Techniques((FloaterPruning(space, plan.schedule),)))
@@ -74,7 +74,7 @@ def test_density_control_takes_it_away(dataset: Path, space: FreeSpace, density:
     assert not near_or_free(state.gaussians.detach(), space, 2).any()
 
 
-def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: Path, space: FreeSpace) -> None:
+def test_checks_continue_after_density_control_and_end_before_the_run(dataset: Path, space: FreeSpace) -> None:
     plan = make_plan(TrainConfig(prune_free_space=2), load_views(dataset), tiny_scene.split_of(load_views(dataset)), 8)
     step = STEPS_BETWEEN * plan.schedule.density.every
     after = (plan.schedule.density.last // step + 1) * step
@@ -91,7 +91,7 @@ def test_looking_goes_on_after_density_control_and_ends_before_the_run(dataset: 
     ]
 
 
-def test_nobody_asks_nothing_is_looked_at(dataset: Path) -> None:
+def test_if_disabled_nothing_is_checked(dataset: Path) -> None:
     views = load_views(dataset)
     for times, found in ((0, False), (1, True)):
         plan = make_plan(TrainConfig(prune_free_space=times), views, tiny_scene.split_of(views), 8)

@@ -72,7 +72,7 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
         (["fly"], 2, "No such command"),
     ],
 )
-def test_a_wrong_call_gets_one_message_and_its_exit_code(
+def test_an_invalid_call_gets_one_message_and_its_exit_code(
     tmp_path: Path, photos: Path, arguments: list[str], code: int, message: str
 ) -> None:
     (tmp_path / "file").write_text("")
@@ -84,7 +84,7 @@ def test_a_wrong_call_gets_one_message_and_its_exit_code(
     assert not (tmp_path / "out" / "splat.ply").exists()
 
 
-def test_json_is_one_object_on_stdout_also_when_it_fails(tmp_path: Path, photos: Path) -> None:
+def test_json_is_one_object_on_stdout_even_on_failure(tmp_path: Path, photos: Path) -> None:
     done = splatpipe("run", photos, tmp_path / "out", "--json")
     assert done.returncode == 1
     told = json.loads(done.stdout)
@@ -93,7 +93,7 @@ def test_json_is_one_object_on_stdout_also_when_it_fails(tmp_path: Path, photos:
     assert told["error"]["hint"]
 
 
-def test_doctor_names_the_instruction_set_in_use_and_those_there_are() -> None:
+def test_doctor_names_the_instruction_set_in_use_and_those_available() -> None:
     done = splatpipe("doctor", "--json", env={**os.environ, "SPLATPIPE_ISA": ""})
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["rasterizer"] == f"native, {isa_names()[0]} (of {', '.join(isa_names())})"
@@ -106,7 +106,7 @@ def unwrapped(panel: str) -> str:
     return " ".join(panel.replace("│", " ").split())
 
 
-def test_cuda_is_refused_at_once_with_the_reason_and_doctor_tells_the_same(tmp_path: Path, photos: Path) -> None:
+def test_cuda_is_refused_at_once_with_the_same_reason_as_in_doctor(tmp_path: Path, photos: Path) -> None:
     hidden = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}  # with a GPU or without
     told = json.loads(splatpipe("doctor", "--json", env=hidden).stdout)["CUDA"]
     assert told.startswith("not used. ")
@@ -118,7 +118,7 @@ def test_cuda_is_refused_at_once_with_the_reason_and_doctor_tells_the_same(tmp_p
 
 
 @pytest.mark.parametrize("arguments", [("doctor",), ("run", "{photos}", "{out}")])
-def test_an_unknown_instruction_set_is_told_before_anything_runs(
+def test_an_unknown_instruction_set_is_reported_before_anything_runs(
     tmp_path: Path, photos: Path, arguments: tuple[str, ...]
 ) -> None:
     arguments = tuple(text.format(photos=photos, out=tmp_path / "out") for text in arguments)
@@ -129,7 +129,7 @@ def test_an_unknown_instruction_set_is_told_before_anything_runs(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_instruction_set_that_the_machine_lacks_is_the_machines_fault() -> None:
+def test_an_instruction_set_that_the_machine_lacks_is_a_machine_error() -> None:
     assert choose_isa("", ["avx2", "baseline"]) == choose_isa("auto", ["avx2", "baseline"]) == "avx2"
     assert choose_isa("baseline", ["avx2", "baseline"]) == "baseline"
     with pytest.raises(MachineError, match="avx512, which this CPU does not have") as caught:

@@ -33,7 +33,7 @@ def test_map_and_gradients_are_those_of_the_definition(size: tuple[int, int], st
         assert torch.linalg.vector_norm(ours - exact) < 1e-6 * torch.linalg.vector_norm(exact)
 
 
-def test_any_number_of_threads_leaves_the_same_bits() -> None:
+def test_any_number_of_threads_gives_the_same_bits() -> None:
     found = []
     for threads in (1, 2, 5):
         set_threads(threads)

@@ -91,7 +91,7 @@ def test_every_parameter_reads_back_within_half_a_step_of_its_code(tmp_path: Pat
     assert np.degrees(2.0 * np.arccos(np.minimum(cosine, 1.0))).max() < 0.2  # each within half of √2 / 1023
 
 
-def test_the_reader_says_what_the_letter_says(tmp_path: Path) -> None:
+def test_the_reader_agrees_with_a_literal_decoder(tmp_path: Path) -> None:
     for degree in (0, 1, 2, 3):
         compressed_ply.write(tmp_path / "a.ply", Scene(some_gaussians(300, degree), FACTS))
         found, read = by_the_letter(tmp_path / "a.ply"), compressed_ply.read(tmp_path / "a.ply")
@@ -107,7 +107,7 @@ def test_the_reader_says_what_the_letter_says(tmp_path: Path) -> None:
             np.testing.assert_allclose(made.sh[:, 1:], found["sh"], atol=1e-6)
 
 
-def test_it_is_written_y_down_wherever_up_was_and_the_same_each_time(tmp_path: Path) -> None:
+def test_it_is_written_y_down_whatever_the_up_axis_and_reproducibly(tmp_path: Path) -> None:
     scene = Scene(some_gaussians(1000), replace(FACTS, axes="z up"))
     compressed_ply.write(tmp_path / "a.ply", scene)
     read = compressed_ply.read(tmp_path / "a.ply")
@@ -132,7 +132,7 @@ def test_it_looks_the_same(tmp_path: Path) -> None:
     assert -10.0 * math.log10(float(((pictures[0] - pictures[1]) ** 2).mean())) > 42.0
 
 
-def test_an_outlier_costs_its_own_chunk_alone(tmp_path: Path) -> None:
+def test_an_outlier_affects_only_its_own_chunk(tmp_path: Path) -> None:
     scene = Scene(some_gaussians(5000), FACTS)
     scene.gaussians.means[7] = torch.tensor([1e6, 0.0, 0.0])
     compressed_ply.write(tmp_path / "a.ply", scene)
@@ -141,7 +141,7 @@ def test_an_outlier_costs_its_own_chunk_alone(tmp_path: Path) -> None:
     assert int((nearest > 0.1).sum()) < 256
 
 
-def test_none_and_equal_gaussians_are_written(tmp_path: Path) -> None:
+def test_zero_and_identical_gaussians_are_written(tmp_path: Path) -> None:
     for made in (Gaussians.empty(0, 3), Gaussians.empty(1, 0), Gaussians.empty(257, 1)):
         compressed_ply.write(tmp_path / "a.ply", Scene(made, FACTS))
         read = compressed_ply.read(tmp_path / "a.ply").gaussians
@@ -171,7 +171,9 @@ def written_by_others(path: Path, colours: bool, byte_order: str = "<", swap: bo
 
 
 @pytest.mark.parametrize(("byte_order", "swap"), [("<", False), (">", False), ("<", True)])
-def test_older_files_colours_lie_between_0_and_1_and_foreign_ones_are_y_down_and_nowhere(tmp_path, byte_order, swap):
+def test_older_files_have_colours_from_0_to_1_and_foreign_ones_are_y_down_without_georeference(
+    tmp_path, byte_order, swap
+):
     for colours, expected in ((True, [[-1.0] * 3, [3.0] * 3]), (False, [[0.0] * 3, [1.0] * 3])):
         written_by_others(tmp_path / "a.ply", colours, byte_order, swap)
         read = compressed_ply.read(tmp_path / "a.ply")
@@ -201,7 +203,7 @@ HEADER_LIES = [
 
 
 @pytest.mark.parametrize(("true", "lie"), HEADER_LIES, ids=lambda part: part.decode()[:40])
-def test_a_header_that_lies_is_an_error(tmp_path: Path, true: bytes, lie: bytes) -> None:
+def test_a_false_header_is_an_error(tmp_path: Path, true: bytes, lie: bytes) -> None:
     compressed_ply.write(tmp_path / "a.ply", Scene(some_gaussians(300), FACTS))
     data = (tmp_path / "a.ply").read_bytes()
     assert true in data
@@ -214,7 +216,7 @@ def test_a_header_that_lies_is_an_error(tmp_path: Path, true: bytes, lie: bytes)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38, 1e20, 0.0])
-def test_ranges_that_are_none_are_an_error(tmp_path: Path, value: float) -> None:
+def test_invalid_ranges_are_an_error(tmp_path: Path, value: float) -> None:
     compressed_ply.write(tmp_path / "a.ply", Scene(some_gaussians(300), FACTS))
     data = bytearray((tmp_path / "a.ply").read_bytes())
     number = struct.pack("<f", value) if value else b"\x01\x00\x80\x7f"  # a signalling NaN: casting it warns
@@ -226,7 +228,7 @@ def test_ranges_that_are_none_are_an_error(tmp_path: Path, value: float) -> None
             compressed_ply.read(tmp_path / "b.ply")
 
 
-def test_a_plain_reader_names_the_command_that_helps_and_a_plain_file_is_none(tmp_path: Path) -> None:
+def test_the_plain_ply_reader_names_the_command_to_use_and_a_plain_file_is_not_compressed(tmp_path: Path) -> None:
     compressed_ply.write(tmp_path / "a.ply", Scene(some_gaussians(3), FACTS))
     with pytest.raises(SplatpipeError) as raised:
         read_splat(tmp_path / "a.ply")

@@ -27,7 +27,7 @@ from splatpipe.stages.options import LineConfig
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_every_preset_resolves_and_says_only_what_differs(name: str) -> None:
+def test_every_preset_resolves_and_states_only_what_differs(name: str) -> None:
     preset = load_preset(name)
     resolved = resolve(LineConfig, [preset]).model_dump()
     defaults = LineConfig().model_dump()
@@ -51,7 +51,7 @@ def test_a_resolved_configuration_survives_its_file() -> None:
 
 
 @pytest.mark.parametrize("own", [[], ["train.max_megapixels=1.5"]], ids=("of the preset", "one's own"))
-def test_the_file_of_a_run_with_budgets_asks_for_the_same_again(tmp_path: Path, own: list[str]) -> None:
+def test_the_stored_configuration_of_a_run_with_budgets_has_the_same_budgets(tmp_path: Path, own: list[str]) -> None:
     first = overrides(None, with_budgets(own, "10m", "4GB"), 3).resolve(load_preset("standard"))
     assert first.train.max_megapixels == (1.5 if own else 0.0) and first.train.time_budget_s == 600.0
     kept = tmp_path / "config.toml"
@@ -64,7 +64,7 @@ def test_every_option_has_a_help_text() -> None:
         assert len(text) > 10, name
 
 
-def test_the_line_is_whole() -> None:
+def test_the_pipeline_is_complete() -> None:
     """Every part read is written by an earlier stage or named by an option; every stage has its section."""
     known = {"source.photos"} | {file.part for stage in LINE for file in stage.files.values()}
     sections = set(option_names(LineConfig))
@@ -94,7 +94,7 @@ def test_a_wrong_option_is_named(table: dict[str, object], message: str) -> None
     assert message in caught.value.message
 
 
-def test_a_configuration_of_another_version_is_told_each_reason_once() -> None:
+def test_a_configuration_of_another_version_is_refused_with_each_reason_once() -> None:
     old = {"train": {"lr_means": 1e-4, "iterations": 7, "sh_limit": False, "lr_sh": 2e-3, "spread_weight": 0.1}}
     with pytest.raises(UsageError) as caught:
         resolve(LineConfig, [old])
@@ -116,7 +116,7 @@ def test_a_broken_assignment_is_refused(text: str) -> None:
 
 
 @given(st.text())
-def test_any_assignment_is_a_table_or_a_usage_error(text: str) -> None:
+def test_any_assignment_is_parsed_or_a_usage_error(text: str) -> None:
     try:
         table = parse_set(text, LineConfig)
     except UsageError:
@@ -139,7 +139,7 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         load_file(tmp_path / "none.toml")
 
 
-def test_an_older_outs_options_are_taken_by_their_new_names_and_values() -> None:
+def test_an_older_outs_options_are_translated_to_new_names_and_values() -> None:
     table = {
         "evaluate": {"every": 5, "views": "a.jpg"},
         "train": {"lr_sh": 0.1, "density": "mcmc", "exposure": "bilateral", "iterations": 900, "spread_weight": 0.05},
@@ -155,7 +155,7 @@ def test_an_older_outs_options_are_taken_by_their_new_names_and_values() -> None
     assert table == before
 
 
-def test_a_value_that_is_gone_is_refused_with_the_one_to_write() -> None:
+def test_a_removed_value_is_refused_with_its_replacement() -> None:
     with pytest.raises(UsageError, match=r"initialize\.dense = 'sweep' no longer exists; write true"):
         resolve(LineConfig, [{"initialize": {"dense": "sweep"}}])
 
@@ -178,12 +178,12 @@ def test_text_options_are_taken_as_they_are_written() -> None:
 @pytest.mark.parametrize(
     "text", ["train.lr_means=inf", "train.lr_means=nan", "train.iterations=true", "train.iterations=1.5"]
 )
-def test_what_is_no_number_for_it_is_refused(text: str) -> None:
+def test_an_invalid_number_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="train"):
         resolve(LineConfig, [parse_set(text, LineConfig)])
 
 
-def test_a_whole_number_does_for_a_length() -> None:
+def test_an_integer_is_accepted_as_a_length() -> None:
     assert (
         resolve(LineConfig, [parse_set("georef.max_position_error_m=3", LineConfig)]).georef.max_position_error_m == 3.0
     )

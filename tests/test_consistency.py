@@ -44,7 +44,7 @@ def true_depth(view: Camera, box: bool = False) -> np.ndarray:
 LEFT, RIGHT = camera(-0.5), camera(0.5)
 
 
-def test_true_depths_agree_wherever_both_see() -> None:
+def test_true_depths_agree_wherever_both_views_see() -> None:
     found = depth_differences(LEFT, true_depth(LEFT), RIGHT, true_depth(RIGHT))
     # A pixel is 10 / 80 wide there, and what the left sees up to 8 of them from its border the right does not.
     assert found.size == (HEIGHT // SAMPLE_EVERY) * ((WIDTH - 8) // SAMPLE_EVERY)
@@ -61,7 +61,7 @@ def test_turned_and_smaller_neighbour_agrees_within_half_a_pixel() -> None:
         assert figures.median is not None and figures.median < 0.003
 
 
-def test_what_one_view_alone_calls_a_surface_is_a_contradiction() -> None:
+def test_a_surface_in_one_view_only_is_a_contradiction() -> None:
     floating = true_depth(LEFT)
     floating[PATCH] = 6.0
     found = depth_differences(LEFT, floating, RIGHT, true_depth(RIGHT))
@@ -72,7 +72,7 @@ def test_what_one_view_alone_calls_a_surface_is_a_contradiction() -> None:
     assert figures.share == pytest.approx(20 / found.size) and figures.pixels == found.size
 
 
-def test_what_hides_a_place_says_nothing_of_it() -> None:
+def test_occlusion_is_no_contradiction() -> None:
     hidden = true_depth(RIGHT)
     hidden[PATCH] = 6.0
     found = depth_differences(LEFT, true_depth(LEFT), RIGHT, hidden)
@@ -81,7 +81,7 @@ def test_what_hides_a_place_says_nothing_of_it() -> None:
     assert np.abs(found).max() < 1e-6
 
 
-def test_real_board_before_the_wall_contradicts_nothing() -> None:
+def test_real_board_in_front_of_the_wall_contradicts_nothing() -> None:
     both = (LEFT, RIGHT), (RIGHT, LEFT)
     found = [depth_differences(a, true_depth(a, box=True), b, true_depth(b, box=True)) for a, b in both]
     without = [depth_differences(a, true_depth(a), b, true_depth(b)) for a, b in both]
@@ -99,7 +99,7 @@ def test_looking_through_everything_is_the_largest_contradiction() -> None:
         assert depth_differences(RIGHT, holes, LEFT, true_depth(LEFT)).size == 0
 
 
-def test_views_that_do_not_meet_have_no_figures() -> None:
+def test_views_without_overlap_have_no_figures() -> None:
     away = camera(0.0, turned=np.pi)
     found = depth_differences(LEFT, true_depth(LEFT), away, np.ones((HEIGHT, WIDTH), np.float32))
     assert found.size == 0

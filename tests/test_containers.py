@@ -35,7 +35,7 @@ def commands() -> list[list[str]]:
 
 
 @pytest.mark.parametrize("command", commands(), ids=" ".join)
-def test_the_examples_call_splatpipe_as_it_is(tmp_path: Path, command: list[str]) -> None:
+def test_the_examples_call_splatpipe_with_valid_options(tmp_path: Path, command: list[str]) -> None:
     """Not one is refused for how it is called, though the container's folders are not here."""
     here = [word.replace("/", f"{tmp_path}/", 1) if word.startswith("/") else word for word in command]
     started = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *here]
@@ -66,7 +66,7 @@ def test_the_slurm_job_ends_with_the_exit_code_of_its_command(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("number", "queued"), [(signal.SIGUSR1, "requeue 7\n"), (signal.SIGTERM, "")])
-def test_the_slurm_job_hands_the_warning_on_waits_for_the_end_and_is_queued_again_unless_cancelled(
+def test_the_slurm_job_forwards_the_signal_waits_for_the_end_and_is_requeued_unless_cancelled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, queued: str
 ) -> None:
     out, told_slurm = tmp_path / "out", tmp_path / "told_slurm"
@@ -80,7 +80,7 @@ def test_the_slurm_job_hands_the_warning_on_waits_for_the_end_and_is_queued_agai
     assert (told_slurm.read_text() if told_slurm.exists() else "") == queued
 
 
-def test_a_batch_of_a_user_without_home_and_name_has_both_below_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_of_a_user_without_home_or_name_gets_both_below_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     """Snakemake requires both at its start; existing ones are kept."""
     for name in ("HOME", "LOGNAME"):
         monkeypatch.delenv(name, raising=False)

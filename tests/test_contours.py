@@ -99,7 +99,7 @@ def test_lines_are_simple_and_noise_is_left_out(tmp_path: Path) -> None:
     "cell, relief, interval",
     [(0.03, 8.0, 0.2), (0.02, 4.0, 0.2), (0.1, 30.0, 1.0), (0.03, 400.0, 5.0), (0.0166, 1.0, 0.1), (1.0, 0.0, 10.0)],
 )
-def test_interval_is_neat_and_what_heights_are_good_for(cell: float, relief: float, interval: float) -> None:
+def test_interval_is_round_and_fits_the_heights_accuracy(cell: float, relief: float, interval: float) -> None:
     assert neat_interval(cell, relief) == interval
 
 
@@ -108,7 +108,7 @@ def test_interval_of_a_surface_follows_its_cells(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("interval", [0.0, -1.0, float("nan"), 1e-9])
-def test_interval_that_is_none_is_refused(tmp_path: Path, interval: float) -> None:
+def test_invalid_interval_is_refused(tmp_path: Path, interval: float) -> None:
     with pytest.raises(SplatpipeError, match="cannot be drawn"):
         traced(tmp_path / "dsm.tif", hill_grid(gsd_m=0.5), interval)
 

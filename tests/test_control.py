@@ -149,7 +149,7 @@ def independent_rmse(result: Result, names: tuple[str, ...]) -> tuple[float, flo
 
 
 @pytest.mark.parametrize("lift", [0.0, -47.0])
-def test_five_control_points_make_the_others_right_whatever_the_datum_of_gps(
+def test_five_control_points_make_the_check_points_right_whatever_the_datum_of_gps(
     tmp_path: Path, whole: pycolmap.Reconstruction, lift: float
 ) -> None:
     """The lift: control heights 47 m above GPS heights. Not more than the receivers' mean error of 3 m / sqrt(40)."""
@@ -190,7 +190,7 @@ def test_residuals_to_consumer_gps_are_what_was_injected(tmp_path: Path, whole: 
         assert table[f"rmse_{axis}_m"] == pytest.approx(sigma, rel=0.2)
 
 
-def test_check_points_in_another_datum_than_the_positions_are_told(
+def test_check_points_in_another_datum_than_the_positions_are_reported(
     tmp_path: Path, whole: pycolmap.Reconstruction
 ) -> None:
     result = georef(tmp_path, whole, gcp_list(rows(FIVE)), RTK, lift=47.0, check_points=checks(*FIVE))
@@ -263,14 +263,14 @@ def flat_nadir() -> pycolmap.Reconstruction:
     return adjusted(true_model(NADIR, flat=True))
 
 
-def test_posterior_tells_which_photos_know_their_focal_length(whole: pycolmap.Reconstruction) -> None:
+def test_posterior_shows_which_photos_determine_their_focal_length(whole: pycolmap.Reconstruction) -> None:
     before = np.array(whole.cameras[1].params)
     assert focal_sigmas(whole)[1] < 0.1 * UNOBSERVED
     assert focal_sigmas(flat_nadir())[1] > UNOBSERVED
     np.testing.assert_array_equal(whole.cameras[1].params, before)
 
 
-def test_focal_length_that_nothing_tells_is_held_near_the_metadata(tmp_path: Path) -> None:
+def test_undetermined_focal_length_is_held_near_the_metadata(tmp_path: Path) -> None:
     """Control on the flat ground does not tell it either; the metadata say 853 pixels, the model 10 % more."""
     flat = adjusted(true_model(NADIR, flat=True), LENS[0] * 1.1, LENS[3])
     ground = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08")
@@ -319,7 +319,7 @@ def test_check_point_that_is_off_is_named_and_stays_in_the_table(
 
 
 @pytest.mark.parametrize("pair", [("P03", "P07"), ("P03", "P08"), ("P15", "P08")])
-def test_swapped_names_are_told(tmp_path: Path, whole: pycolmap.Reconstruction, pair: tuple[str, str]) -> None:
+def test_swapped_names_are_reported(tmp_path: Path, whole: pycolmap.Reconstruction, pair: tuple[str, str]) -> None:
     """Two control points; one of each kind; two check points."""
     places = {row.name: row.place for row in rows(tuple(POINTS))}
     other = dict(zip(pair, reversed(pair), strict=True))
@@ -375,7 +375,9 @@ def test_file_without_a_crs_or_with_one_place_for_all_is_refused_by_name(
         georef(tmp_path / "b", whole, gcp_list([replace(row, place=lines[0].place) for row in lines]))
 
 
-def test_control_on_a_line_is_told_and_control_all_over_is_not(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+def test_control_on_a_line_is_reported_and_well_distributed_control_is_not(
+    tmp_path: Path, whole: pycolmap.Reconstruction
+) -> None:
     control = gcp_list(rows(tuple(POINTS)))
     for name, kept, weak in (("line", ("P06", "P12", "P14"), True), ("site", FIVE, False)):
         others = checks(*(point for point in POINTS if point not in kept))
@@ -390,7 +392,7 @@ def test_coordinates_beyond_their_crs_are_of_a_named_file(tmp_path: Path, whole:
     assert "east" in caught.value.hint
 
 
-def test_heights_in_feet_are_told(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+def test_heights_in_feet_are_reported(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     feet = [replace(row, place=(*row.place[:2], row.place[2] / 0.3048)) for row in rows(FIVE)]
     result = georef(tmp_path, whole, gcp_list(feet), check_points="none", adjust="off")
     assert [w for w in result.told.warnings if "more than vertical datums can differ" in w and "feet" in w]
@@ -440,7 +442,7 @@ def test_control_without_heights_controls_horizontally(tmp_path: Path, whole: py
     assert np.median(heights) == pytest.approx(float(np.median(true)), abs=3.0)
 
 
-def test_hand_held_control_is_believed_as_far_as_it_agrees(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+def test_hand_held_control_is_weighted_by_its_agreement(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     """Errors of 0.8 m: no blunder, no bending, and a sigma of that order."""
     rng = np.random.default_rng(5)
     errors = {name: rng.normal(size=3) * 0.8 for name in POINTS}
@@ -454,7 +456,7 @@ def test_hand_held_control_is_believed_as_far_as_it_agrees(tmp_path: Path, whole
     assert 0.4 < result.table("check")["rmse_horizontal_m"] < 2.5
 
 
-def test_sixth_control_point_leaves_the_model_as_it_is(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+def test_sixth_control_point_leaves_the_model_unchanged(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     five = georef(tmp_path / "five", whole, gcp_list(rows(FIVE)))
     six = georef(tmp_path / "six", whole, gcp_list(rows((*FIVE, "P12"))), check_points="none")
     assert five.is_model_untouched()
@@ -463,9 +465,7 @@ def test_sixth_control_point_leaves_the_model_as_it_is(tmp_path: Path, whole: py
     assert (five.out / "frame.json").read_bytes() != (six.out / "frame.json").read_bytes()
 
 
-def test_every_third_of_six_points_is_a_check_point_unless_said_otherwise(
-    tmp_path: Path, whole: pycolmap.Reconstruction
-) -> None:
+def test_every_third_of_six_points_is_a_check_point_by_default(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     names = ("P01", "P02", "P03", "P04", "P05", "P06")
     auto = georef(tmp_path / "auto", whole, gcp_list(rows(names)))
     assert [name for name, role in auto.roles().items() if role == "check"] == ["P03", "P06"]
@@ -475,7 +475,9 @@ def test_every_third_of_six_points_is_a_check_point_unless_said_otherwise(
         georef(tmp_path / "wrong", whole, gcp_list(rows(names)), check_points="P99")
 
 
-def test_option_goes_before_roles_of_the_file_and_says_so(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
+def test_option_takes_precedence_over_roles_in_the_file_and_says_so(
+    tmp_path: Path, whole: pycolmap.Reconstruction
+) -> None:
     names = ("P01", "P02", "P03", "P04", "P05", "P06")
     lines = ["EPSG:32633", "name,x,y,z,photo,pixel_x,pixel_y,role"]
     for row in rows(names):

@@ -26,7 +26,7 @@ def written(path: Path, text: str) -> ControlText:
 
 
 @pytest.mark.parametrize("as_csv", [False, True])
-def test_what_is_marked_is_read_back(tmp_path: Path, as_csv: bool) -> None:
+def test_marks_read_back(tmp_path: Path, as_csv: bool) -> None:
     path = tmp_path / "marks"
     named = [point("P1"), point('a point, named "so"', 1e-7, None), point("Ö 3", -12345678.123456789, 0.5)]
     text = ControlText.begin(path, "EPSG:32633", as_csv, find)
@@ -67,7 +67,7 @@ def test_only_the_marked_line_changes(tmp_path: Path) -> None:
     assert after[3].split() == before[3].replace("112.14", "1.00").replace("514.11", "2.00").split()
 
 
-def test_a_new_mark_stands_with_its_point_and_repeats_its_coordinates_as_written(tmp_path: Path) -> None:
+def test_a_new_mark_is_written_with_its_point_and_repeats_its_coordinates_as_written(tmp_path: Path) -> None:
     text = written(tmp_path / "gcp_list.txt", ODM).with_mark(point("P1"), "Ö.jpg", (1.0, 2.0))
     text = text.with_mark(point("point 2", 1.0, 3.0), "A.JPG", (5.0, 6.0))
     text.save()
@@ -99,7 +99,7 @@ UNNAMED = ("1 2 3 10 11 A.JPG", "4 5 6 20 21 A.JPG", "1 2 3 12 13 Ö.jpg", "7 8 
 
 @pytest.mark.parametrize("as_csv", [False, True])
 @pytest.mark.parametrize(("name", "photo"), [("point 1", "A.JPG"), ("point 2", "A.JPG"), ("P", "A.JPG")])
-def test_points_without_names_stay_themselves_when_a_mark_goes(
+def test_points_without_names_keep_their_identity_when_a_mark_is_removed(
     tmp_path: Path, as_csv: bool, name: str, photo: str
 ) -> None:
     lines = ["EPSG:32633", *(["x,y,z,pixel_x,pixel_y,photo,name"] if as_csv else []), *UNNAMED]
@@ -119,7 +119,7 @@ def test_points_without_names_stay_themselves_when_a_mark_goes(
     assert again.marks["point 3"] == {"A.JPG": (30.0, 31.0), "Ö.jpg": (5.0, 6.0)}
 
 
-def test_what_a_photo_does_not_show_is_a_comment(tmp_path: Path) -> None:
+def test_hidden_points_are_written_as_comments(tmp_path: Path) -> None:
     path = tmp_path / "gcp_list.txt"
     text = ControlText.begin(path, "EPSG:32633", False, find).with_mark(point("P1"), "A.JPG", (1.0, 2.0))
     text = text.with_hidden("P1", PHOTOS[1], hidden=True).with_hidden("P1", PHOTOS[1], hidden=True)
@@ -130,7 +130,7 @@ def test_what_a_photo_does_not_show_is_a_comment(tmp_path: Path) -> None:
     assert text.with_mark(point("P1"), PHOTOS[1], (3.0, 4.0)).hidden == set()
 
 
-def test_tables_of_others_keep_their_columns(tmp_path: Path) -> None:
+def test_third_party_tables_keep_their_columns(tmp_path: Path) -> None:
     path = tmp_path / "control.csv"
     first = "Label;Easting;Northing;Height;remark;Image;px;py"
     text = written(path, f'# CRS: EPSG:25832\n{first}\nP1;1,5;2,5;3,5;"a;b";A.JPG;10;20\nP2;4,5;2,5;3,5;c;;;\n')
@@ -146,7 +146,7 @@ def test_tables_of_others_keep_their_columns(tmp_path: Path) -> None:
     assert [p.marks[0].x for p in read_control_file(path).points] == [11.0, 12.0, 13.0]
 
 
-def test_links_and_permissions_stay_and_a_file_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_links_and_permissions_are_kept_and_a_read_only_file_is_reported(tmp_path: Path) -> None:
     real = tmp_path / "real.txt"
     link = tmp_path / "gcp_list.txt"
     real.write_text("EPSG:32633\n1 2 3 4 5 A.JPG P1\n")
@@ -169,7 +169,7 @@ change = st.tuples(
 
 @settings(max_examples=60, deadline=None)
 @given(st.booleans(), st.lists(change, max_size=12))
-def test_any_changes_leave_a_file_that_says_what_they_said(as_csv: bool, changes: list) -> None:
+def test_any_changes_leave_a_file_that_reads_back_accordingly(as_csv: bool, changes: list) -> None:
     """Against the plainest model of it: a dictionary."""
     text = ControlText.begin(Path("marks"), "EPSG:32633", as_csv, find)
     wanted: dict[tuple[str, str], object] = {}

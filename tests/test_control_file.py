@@ -29,7 +29,7 @@ def test_odm_list_gives_points_with_their_marks(tmp_path: Path, crs: str) -> Non
     assert found.points[0].role is None
 
 
-def test_lines_without_names_are_told_apart_by_their_coordinates(tmp_path: Path) -> None:
+def test_lines_without_names_are_distinguished_by_their_coordinates(tmp_path: Path) -> None:
     found = read(tmp_path, "EPSG:32633\n1 2 3 10 20 A.JPG\n4 5 6 10 20 A.JPG\n1 2 3 11 21 B.JPG\n")
     assert [(point.name, len(point.marks)) for point in found.points] == [("point 1", 2), ("point 2", 1)]
 
@@ -64,7 +64,7 @@ def test_table_of_longitudes_and_latitudes_needs_no_crs(tmp_path: Path) -> None:
     assert (found.crs, found.points[0].x, found.points[0].y, found.points[0].z) == ("EPSG:4326", 13.5, 47.8, None)
 
 
-def test_height_of_exactly_zero_is_unknown_unless_the_sea_is_near(tmp_path: Path) -> None:
+def test_height_of_exactly_zero_is_unknown_unless_others_are_near_sea_level(tmp_path: Path) -> None:
     inland = read(tmp_path, "EPSG:32633\n1 2 0.0 1 1 A.JPG P1\n3 4 512 1 1 A.JPG P2\n5 6 NaN 1 1 A.JPG P3\n")
     assert [point.z for point in inland.points] == [None, 512.0, None]
     assert inland.zero_heights == ("P1",)
@@ -99,7 +99,7 @@ def test_height_of_exactly_zero_is_unknown_unless_the_sea_is_near(tmp_path: Path
         ("name,x,y,photo,px,py,crs\nP1,1,2,A.JPG,3,4,1\nP2,1,2,A.JPG,3,4,2\n", "Line 3.*another CRS"),
     ],
 )
-def test_file_that_is_wrong_is_refused_with_its_line(tmp_path: Path, text: str | bytes, message: str) -> None:
+def test_invalid_file_is_refused_with_its_line(tmp_path: Path, text: str | bytes, message: str) -> None:
     with pytest.raises(SplatpipeError, match=message) as caught:
         read(tmp_path, text)
     assert caught.value.hint
@@ -109,7 +109,7 @@ def test_point_may_be_listed_without_being_marked(tmp_path: Path) -> None:
     assert read(tmp_path, "EPSG:32633\nname,x,y,photo,px,py\nP1,1,2\n").points[0].marks == ()
 
 
-def test_too_much_is_refused(tmp_path: Path) -> None:
+def test_too_large_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SplatpipeError, match="more than 200,000 lines"):
         read(tmp_path, "EPSG:32633\n" + "\n" * 200_001)
     many = "EPSG:32633\n" + "".join(f"{i} 0 1 2 3 A.JPG P{i}\n" for i in range(10_001))

@@ -60,7 +60,7 @@ def far_points(count: int = 40) -> np.ndarray:
         ("+proj=utm +zone=33 +datum=WGS84 +units=m", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs", "unknown"),
     ],
 )
-def test_a_crs_is_read_in_every_form_and_reads_itself(text: str, stated: str, vertical: str) -> None:
+def test_a_crs_is_read_in_every_form_including_its_own_output(text: str, stated: str, vertical: str) -> None:
     crs = parse_crs(text)
     assert (crs.text, crs.vertical) == (stated, vertical)
     assert parse_crs(crs.text) == crs
@@ -92,19 +92,19 @@ def test_a_crs_is_read_in_every_form_and_reads_itself(text: str, stated: str, ve
         "/etc/passwd",
     ],
 )
-def test_what_is_no_crs_is_refused_with_a_hint(text: str) -> None:
+def test_an_invalid_crs_is_refused_with_a_hint(text: str) -> None:
     with pytest.raises(SplatpipeError) as raised:
         parse_crs(text)
     assert raised.value.hint and len(str(raised.value)) < 400
 
 
 @pytest.mark.parametrize("text", ["EPSG:32633", "sea level", "EPSG:5783+5783", "EPSG:5336", "", "EPSG:" + "1" * 900])
-def test_what_is_no_vertical_datum_is_refused(text: str) -> None:
+def test_an_invalid_vertical_datum_is_refused(text: str) -> None:
     with pytest.raises(SplatpipeError):
         parse_vertical(text)
 
 
-def test_vertical_datums_in_metres_and_feet_are_one() -> None:
+def test_vertical_datums_in_metres_and_feet_are_the_same() -> None:
     assert parse_vertical("epsg:5703") == "EPSG:5703" and parse_vertical("Ellipsoidal") == "ellipsoidal"
     assert same_datum("EPSG:5703", "EPSG:6360") and not same_datum("EPSG:5703", "EPSG:5773")
     assert not same_datum("ellipsoidal", "EPSG:5703")
@@ -123,7 +123,7 @@ def test_vertical_datums_in_metres_and_feet_are_one() -> None:
         ("EPSG:2193", (1_600_000.0, 10_000_000.0, 0.0), 0.0, 173.0, None),
     ],
 )
-def test_published_points_are_where_they_are(
+def test_published_points_have_their_published_coordinates(
     text: str, point: tuple[float, float, float], latitude: float, longitude: float, off_m: float | None
 ) -> None:
     crs = parse_crs(text)
@@ -135,7 +135,7 @@ def test_published_points_are_where_they_are(
     assert math.hypot(lat - latitude, (lon - longitude) * math.cos(math.radians(lat))) * 111_200.0 < off_m
 
 
-def test_the_surveyors_file_of_the_demo_is_where_its_truth_says() -> None:
+def test_the_demos_control_file_agrees_with_its_truth() -> None:
     truth = json.loads((capture_path().parent / "truth.json").read_text())
     origin = Origin(**truth["frame"]["origin"])
     utm = np.array([point["utm_m"] for point in truth["points"]])
@@ -156,7 +156,7 @@ def test_local_to_crs_and_back_at_a_kilometre(text: str, vertical: str) -> None:
 
 
 @pytest.mark.parametrize("text", CRSS)
-def test_georef_json_alone_leads_to_where_proj_leads_directly(text: str) -> None:
+def test_georef_json_alone_agrees_with_proj(text: str) -> None:
     """Transform by the file and PROJ, compare with PROJ's direct geocentric transform, and invert by our World."""
     told = json.loads(json.dumps(georeference(frame(text), BOX)))
     local = far_points()
@@ -193,7 +193,7 @@ def test_the_demos_truth_comes_back_through_georef_json_in_three_crss() -> None:
         np.testing.assert_allclose(world.crs_from_local(splat), surveyed, atol=MILLIMETRE)
 
 
-def test_tangent_is_as_far_off_as_it_says() -> None:
+def test_tangent_approximation_has_its_stated_error() -> None:
     told = georeference(frame("EPSG:32633"), BOX)["crs_from_local_tangent"]
     matrix = np.array(told["matrix"])
     world = open_world(frame("EPSG:32633"))
@@ -253,7 +253,7 @@ def test_a_distant_crs_and_a_missing_grid_are_refused_with_the_reason(
     assert reason in raised.value.message and raised.value.hint
 
 
-def test_a_missing_grid_is_taken_as_it_is_where_the_user_accepts_that_and_told() -> None:
+def test_a_missing_grid_is_replaced_with_a_note_if_the_user_accepts_that() -> None:
     greenwich = frame(origin=Origin(51.48, -0.01, 60.0))
     placed = in_crs(greenwich, "EPSG:27700", approximate=True)
     operation = georeference(placed, BOX)["crs"]["operation"]
@@ -262,7 +262,7 @@ def test_a_missing_grid_is_taken_as_it_is_where_the_user_accepts_that_and_told()
     assert np.hypot(*(there[:2] - [538_250.0, 177_600.0])) < 1000.0  # Greenwich, roughly, in the national grid
 
 
-def test_a_modern_datum_without_an_operation_is_wgs84_only_where_the_user_accepts_that() -> None:
+def test_a_modern_datum_without_an_operation_is_wgs84_only_if_the_user_accepts_that() -> None:
     """CGCS2000 has none in EPSG; MGI's, beside its area of use, is hundreds of metres off and stays refused."""
     wuhan = frame("EPSG:4547", origin=Origin(30.5, 114.3, 30.0))
     with pytest.raises(SplatpipeError, match="has no transformation") as raised:
@@ -278,7 +278,7 @@ def test_a_modern_datum_without_an_operation_is_wgs84_only_where_the_user_accept
     assert "not stated" in unstated.note
 
 
-def test_heights_go_through_the_geoids_grid_where_it_is_there(tmp_path: Path) -> None:
+def test_heights_use_the_geoid_grid_if_it_is_present(tmp_path: Path) -> None:
     """A made-up EGM96: 40 m at 47° N, falling by 2 m to the degree northwards."""
     rows, columns = 721, 1440
     latitudes = -90.0 + 0.25 * np.arange(rows)
@@ -312,7 +312,7 @@ def test_feet_are_feet() -> None:
     assert (mixed.unit_m, mixed.height_unit_m) == (1.0, 0.3048)
 
 
-def test_points_without_a_height_keep_none_and_lie_where_they_lie() -> None:
+def test_points_without_a_height_keep_none_and_their_horizontal_position() -> None:
     points = np.array([[388_710.5, 5_299_705.2, np.nan], [388_710.5, 5_299_705.2, 0.0]])
     located = to_geodetic(points, parse_crs("EPSG:32633")).geodetic
     assert np.isnan(located[0, 2])
@@ -355,7 +355,7 @@ def test_axis_order_is_east_first_whatever_the_crs_says() -> None:
         assert east[0] > 10 * abs(east[1]) and north[1] > 10 * abs(north[0])
 
 
-def test_the_crs_is_the_control_files_else_the_utm_zone() -> None:
+def test_the_crs_is_the_control_files_or_else_the_utm_zone() -> None:
     assert in_crs(frame(), "auto").crs == "EPSG:32633"
     assert in_crs(frame(), "auto", "EPSG:31255").crs == "EPSG:31255"
     assert in_crs(frame(), "EPSG:3034", "EPSG:31255").crs == "EPSG:3034"

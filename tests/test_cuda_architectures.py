@@ -31,7 +31,7 @@ def told(built_for: str) -> tuple[int, SplatDevice]:
         ("500,{newer}", False),
     ],
 )
-def test_kernels_are_there_for_the_family_and_by_ptx_for_what_is_newer(built_for, has_kernels):
+def test_kernels_exist_for_the_family_and_as_ptx_for_newer_devices(built_for, has_kernels):
     _, device = told("500")
     architecture = 10 * device.architecture
     assert architecture > 500

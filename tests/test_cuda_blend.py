@@ -365,7 +365,7 @@ def assert_same_bits(ours: Answer, expected: Answer) -> None:
 @pytest.mark.parametrize(
     ("seed", "count", "log10_sigmas"), [(5, 1500, (-1.0, 1.0)), (6, 700, (-1.0, 3.5)), (7, 300, (3.0, 5.0))]
 )
-def test_no_pixel_in_reach_lies_in_a_sub_block_that_is_left_out(kernels, seed, count, log10_sigmas):
+def test_no_pixel_in_reach_is_in_a_skipped_sub_block(kernels, seed, count, log10_sigmas):
     scene = random_scene(count, 48, 48, seed, (0.004, 1.0), log10_sigmas)
     counts = _Counts()
     lists = list_pairs(scene, 1000)

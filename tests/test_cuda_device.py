@@ -152,7 +152,7 @@ def test_chunks_do_not_change_a_bit(device: torch.device, most_pairs: int) -> No
         torch.cuda.synchronize(device)
 
 
-def test_short_memory_is_met_by_smaller_chunks_with_the_same_bits(device: torch.device) -> None:
+def test_short_memory_leads_to_smaller_chunks_with_the_same_bits(device: torch.device) -> None:
     model, view, options = scene().to(device), camera(1600, 1200), RenderOptions(3, depth=False)
     model.log_scales += 3.0  # hundreds of tiles each: nearly all of a frame's memory is for pairs
     with torch.no_grad():
@@ -171,7 +171,7 @@ def test_short_memory_is_met_by_smaller_chunks_with_the_same_bits(device: torch.
         assert kernels.forecast.most_pairs < most
 
 
-def test_memory_that_is_never_enough_is_told(device: torch.device) -> None:
+def test_insufficient_memory_is_reported(device: torch.device) -> None:
     model, options = scene().to(device), RenderOptions(3, depth=False)
     torch.cuda.empty_cache()
     full = torch.cuda.get_device_properties(device).total_memory

@@ -77,7 +77,7 @@ def test_blocks_that_wait_for_each_other_give_other_results_in_other_orders(exam
     assert distinct(in_every_order(examples, "example_read_neighbour", 40, count=40)) > 1
 
 
-def test_order_of_threads_is_as_asked(examples):
+def test_order_of_threads_is_as_requested(examples):
     taken = []
     for order, seed in ORDERS:
         examples.harness_order(order, seed)

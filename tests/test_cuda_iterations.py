@@ -128,7 +128,7 @@ def train(place: DeviceSetup | None, given: DeviceSetup) -> list[Tensor]:
     return [tensor.detach().cpu() for tensor in (*scene.tensors().values(), affine, probe.grad.to_dense())]
 
 
-def test_iterations_never_wait_and_lead_where_the_cpus_do(place):
+def test_iterations_never_wait_and_give_the_cpus_results(place):
     start = [*place.scene.tensors().values(), torch.eye(3, 4), torch.zeros(len(place.scene), 2)]
     for ours, expected, before in zip(train(place, place), train(None, place), start, strict=True):
         moved = (expected - before).norm()
@@ -141,7 +141,7 @@ def test_iterations_have_the_same_bits_twice(place):
     assert all(torch.equal(ours, again) for ours, again in zip(first, second, strict=True))
 
 
-def test_the_place_is_named(place):
+def test_the_device_is_named(place):
     with use_kernels(place.kernels):
         kernels = kernels_of(place.device)
         assert kernels is not None

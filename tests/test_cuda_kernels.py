@@ -225,7 +225,7 @@ def pixel_centres(case: RenderCase, tile: int) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(left, min(width, left + TILE)) + 0.5, np.arange(top, min(height, top + TILE)) + 0.5
 
 
-def test_nothing_to_see_is_the_background(library: CudaLibrary) -> None:
+def test_an_empty_view_is_the_background(library: CudaLibrary) -> None:
     behind = random_scene(1, 20)
     behind.means[:, 2] = -5.0
     for scene in (behind, Gaussians.empty(0, 3)):
@@ -239,7 +239,7 @@ def test_nothing_to_see_is_the_background(library: CudaLibrary) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38, -3e38])
-def test_hostile_numbers_are_skipped_and_spare_the_others(library: CudaLibrary, value: float) -> None:
+def test_hostile_numbers_are_skipped_and_do_not_affect_the_others(library: CudaLibrary, value: float) -> None:
     scene = random_scene(2, 60, 1)
     hostile = torch.zeros(len(scene), dtype=torch.bool)
     for row, tensor in enumerate(scene.tensors().values()):
@@ -269,7 +269,7 @@ def test_more_tiles_than_a_chunk_may_have_are_two_chunks(library: CudaLibrary) -
     assert all((ours.pictures["alpha"][part] > 0).any() for part in (slice(1000, 2000), slice(-1, None)))
 
 
-def test_what_makes_no_sense_is_refused(library: CudaLibrary) -> None:
+def test_invalid_arguments_are_refused(library: CudaLibrary) -> None:
     case = case_of(random_scene(1, 20), random_camera(1))
     for change in ({"size": (0, 5)}, {"sh_degree": 4}, {"sh_degree": -1}):
         with pytest.raises(ValueError, match="splat_"):
@@ -287,7 +287,7 @@ def test_what_makes_no_sense_is_refused(library: CudaLibrary) -> None:
 
 
 @pytest.mark.parametrize("name", ["colour", "alpha", "depth_sum", "depth_square_sum"])
-def test_picture_without_a_gradient_is_one_of_zeros(library: CudaLibrary, name: str) -> None:
+def test_image_without_a_gradient_has_a_zero_gradient(library: CudaLibrary, name: str) -> None:
     case = case_of(random_scene(9, 40, 1), random_camera(9, 33, 20), background=(0.3, 0.2, 0.1))
     without = {other: weights for other, weights in case.upstream.items() if other != name}
     zeros = without | {name: np.zeros_like(case.upstream[name])}

@@ -70,12 +70,12 @@ def test_functions_and_constants_are_those_of_the_header():
     assert int(re.search(r"SPLAT_NO_KERNEL = (-?\d+)", API)[1]) == cuda_api.NO_KERNEL
 
 
-def test_a_library_that_is_not_there_is_told(tmp_path):
+def test_a_missing_library_is_reported(tmp_path):
     with pytest.raises(MachineError, match="no CUDA kernels at"):
         CudaLibrary(tmp_path / "libsplat_cuda.so")
 
 
-def test_a_library_of_another_interface_is_refused(tmp_path):
+def test_a_library_with_another_interface_is_refused(tmp_path):
     build('extern "C" int splat_abi() { return 99; }', tmp_path / "other.so", "-shared", "-fPIC")
     with pytest.raises(MachineError, match="version 99, not"):
         CudaLibrary(tmp_path / "other.so")
@@ -87,7 +87,7 @@ def test_a_library_of_another_interface_is_refused(tmp_path):
         CudaLibrary(tmp_path / "half.so")
 
 
-def test_nothing_is_in_the_way_of_a_good_installation():
+def test_a_good_installation_has_no_obstacle():
     assert reason_of(GOOD) is None
     newer = replace(GOOD, library=(0, replace(H200, driver=13000, runtime=13020)))
     assert reason_of(newer) is None  # minor versions of CUDA 13 run on its first driver
@@ -128,14 +128,14 @@ def test_nothing_is_in_the_way_of_a_good_installation():
         (replace(GOOD, torch_works=False), "torch does not find", "torch.cuda.init"),
     ],
 )
-def test_each_reason_is_told_with_what_to_do(installed, reason, hint):
+def test_each_reason_is_reported_with_what_to_do(installed, reason, hint):
     found = reason_of(installed)
     assert found is not None
     assert re.search(reason, found.reason), found.reason
     assert re.search(hint, found.hint), found.hint
 
 
-def test_asking_for_the_reason_imports_no_torch_where_there_is_no_device():
+def test_finding_the_reason_imports_no_torch_without_a_device():
     code = """
 import sys
 from splatpipe.pipeline.raster import cuda_library
@@ -180,7 +180,7 @@ extern "C" int nvmlShutdown() { return 0; }
         (13000, 0, True, "torch does not find" if torch.version.cuda else "torch is a CPU-only build"),
     ],
 )
-def test_what_the_system_says_leads_to_the_reason(fake_driver, version, init, has_kernels, reason):
+def test_the_systems_state_leads_to_the_reason(fake_driver, version, init, has_kernels, reason):
     library = build_on_cpu() if has_kernels else fake_driver / "libsplat_cuda.so"
     code = f"""
 from pathlib import Path
@@ -196,7 +196,7 @@ print(why_not(Path({str(library)!r})).reason)
     assert reason in done.stdout
 
 
-def test_a_device_is_described_with_what_may_change_its_bits():
+def test_a_devices_description_includes_what_may_change_its_bits():
     assert H200.described() == "cuda sm_90 NVIDIA H200, driver CUDA 13.0, kernels CUDA 13.0"
     known = replace(H200, release="580.65.06").described()
     assert known == "cuda sm_90 NVIDIA H200, driver 580.65.06 (CUDA 13.0), kernels CUDA 13.0"
@@ -227,7 +227,7 @@ def test_the_drivers_own_version_is_the_kernels(tmp_path, monkeypatch, content, 
 
 
 @pytest.mark.parametrize(("text", "release"), [("577.00", "577.00"), ("580.65.06", "580.65.06"), ("\\xff?", "")])
-def test_without_the_kernels_word_nvml_tells_the_version(fake_driver, tmp_path, text, release):
+def test_if_the_kernel_does_not_report_the_version_nvml_does(fake_driver, tmp_path, text, release):
     code = f"""
 from pathlib import Path
 from splatpipe.pipeline.raster.cuda_driver import driver_release

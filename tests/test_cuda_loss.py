@@ -142,7 +142,9 @@ def test_loss_and_gradient_are_the_references_and_the_cpus(
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("inner", [(0, 0, 1, 1), (5, 3, 40, 30), (33, 0, 70, 17), (0, 5, 70, 37), (69, 36, 70, 37)])
-def test_of_a_part_that_counts_they_are_too(kernels: Kernels, inner: Rectangle, masked: bool) -> None:
+def test_loss_and_gradient_of_a_counting_part_are_the_references_too(
+    kernels: Kernels, inner: Rectangle, masked: bool
+) -> None:
     render, photo = pair("random", 37, 70)
     mask = some_mask(37, 70) if masked else None
     loss, gradient = device_loss(kernels, render, photo, 0.2, mask, inner)
@@ -155,7 +157,7 @@ def test_of_a_part_that_counts_they_are_too(kernels: Kernels, inner: Rectangle, 
     assert torch.equal(through[1], gradient)
 
 
-def test_all_that_counts_is_no_part_of_it(kernels: Kernels) -> None:
+def test_a_counting_part_of_the_whole_image_is_none(kernels: Kernels) -> None:
     render, photo = pair("random", 20, 40)
     without, whole = (device_loss(kernels, render, photo, inner=inner) for inner in (None, (0, 0, 40, 20)))
     assert without[0] == whole[0]
@@ -163,7 +165,7 @@ def test_all_that_counts_is_no_part_of_it(kernels: Kernels) -> None:
 
 
 @pytest.mark.parametrize("inner", [(0, 0, 41, 20), (5, 5, 5, 20), (-1, 0, 20, 20), (0, 8, 20, 7)])
-def test_a_part_that_lies_outside_is_refused(kernels: Kernels, inner: Rectangle) -> None:
+def test_a_counting_part_outside_is_refused(kernels: Kernels, inner: Rectangle) -> None:
     with pytest.raises(AssertionError):
         device_loss(kernels, *pair("random", 20, 40), inner=inner)
 
@@ -188,7 +190,7 @@ def test_loss_has_the_same_bits_in_every_order_of_threads(kernels: Kernels) -> N
         assert torch.equal(gradient, found[0][1])
 
 
-def test_what_is_masked_neither_counts_nor_has_a_gradient(kernels: Kernels) -> None:
+def test_masked_pixels_neither_count_nor_have_a_gradient(kernels: Kernels) -> None:
     render, photo = pair("random", 40, 50)
     mask = torch.ones(40, 50, dtype=torch.bool)
     mask[10:30, 5:20] = False

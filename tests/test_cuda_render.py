@@ -160,7 +160,7 @@ def test_another_gradient_besides_the_renders_is_stepped_with_it(kernels, dropou
     assert not torch.allclose(without[0].means, expected[0].means, atol=1e-5)
 
 
-def test_rows_that_the_photo_did_not_choose_can_sit_out(kernels):
+def test_rows_that_were_not_chosen_can_be_skipped(kernels):
     scene, buffers = random_scene(0).requires_grad_(), GradientBuffers()
     optimizer, before, chosen = Adam(scene.tensors()), scene.detach().clone(), torch.arange(60) < 30
     with use_kernels(kernels):
@@ -238,7 +238,7 @@ def test_draws_and_places_are_the_cpus(kernels):
     assert kernels.morton(means, (0.0, 0.0, 0.0), (2.0, 2.0, 2.0)).argsort().tolist() == [1, 3, 2, 0]
 
 
-def test_a_view_in_many_chunks_has_the_same_bits_and_is_foreseen(kernels):
+def test_a_view_in_many_chunks_has_the_same_bits_and_is_forecast(kernels):
     whole, gradients = backward_of(RenderOptions(3), kernels)
     assert kernels.forecast.room(FrameSize(60, 20)).passes == 1
     few = kernels_on_cpu()
@@ -252,7 +252,7 @@ def test_a_view_in_many_chunks_has_the_same_bits_and_is_foreseen(kernels):
     assert 3 < room.passes < FIRST_PASSES
 
 
-def test_what_was_not_foreseen_is_rendered_all_the_same(kernels):
+def test_what_was_not_forecast_is_still_rendered(kernels):
     whole, gradients = backward_of(RenderOptions(3), kernels)
     blind = kernels_on_cpu()
     blind.forecast.most_pairs = 1
@@ -268,7 +268,7 @@ def facts(pairs: int) -> FrameFacts:
     return FrameFacts(FrameSize(1000, 400), 100_000, pairs, chunks=1)
 
 
-def test_forecast_keeps_the_most_of_late_and_forgets_it():
+def test_forecast_keeps_the_recent_maximum_and_forgets_it():
     forecast, size = Forecast(), FrameSize(1000, 400)
     assert forecast.room(size).passes == FIRST_PASSES
     for pairs in (5000, 9000, 4000):
@@ -285,7 +285,7 @@ def test_a_larger_device_holds_more_pairs_at_a_time_within_limits() -> None:
     assert sizes == [1 << 22, 1 << 22, 1 << 23, 3 << 23, 141 << 20, 1 << 28]
 
 
-def test_a_memory_limit_is_shared_as_a_smaller_device_is_as_long_as_it_lasts(kernels):
+def test_a_memory_limit_acts_like_a_smaller_device_while_it_lasts(kernels):
     kernels.forecast.most_pairs = most_pairs_of(24 << 30)
     with use_kernels(kernels):
         for limit_bytes, least in ((0, 24 << 30), (8 << 30, 8 << 30), (141 << 30, 24 << 30)):  # what is less stays
@@ -326,7 +326,7 @@ class ShortOfMemory(CudaKernels):
         return super().empty(size_bytes)
 
 
-def test_short_memory_makes_chunks_smaller_then_is_told():
+def test_short_memory_makes_chunks_smaller_and_then_is_reported():
     kernels, scene = ShortOfMemory(library_on_cpu(), torch.device("cpu")), random_scene(0)
     with use_kernels(kernels):
         expected = render(scene, CAMERA, OPTIONS).colour
@@ -359,7 +359,7 @@ class ShortOnce(CudaKernels):
         return super().empty(size_bytes)
 
 
-def test_an_iteration_begun_again_with_smaller_chunks_is_the_same_one(kernels):
+def test_an_iteration_repeated_with_smaller_chunks_has_the_same_result(kernels):
     expected = trained(kernels, sparse=True, dropout=False, steps=1)
     short = ShortOnce(library_on_cpu(), torch.device("cpu"))
     with pytest.raises(torch.OutOfMemoryError):
@@ -383,7 +383,7 @@ def test_an_empty_model_is_the_background(kernels):
         Adam(nothing.tensors()).step(nothing.tensors(), RATES, rendered.visible, buffers, LIMITS)
 
 
-def test_only_what_kernels_take_goes_to_them(kernels):
+def test_kernels_get_only_supported_inputs(kernels):
     with use_kernels(kernels):
         assert kernels_name(torch.device("cpu")) == kernels.facts.described()
         doubles = random_scene(0).to(dtype=torch.float64)

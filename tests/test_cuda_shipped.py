@@ -90,22 +90,22 @@ def strangers(library: Path) -> list[str]:
     return sorted([*(exports(library) - interface), *missing, *(n for n in needed(library) if not SYSTEM.fullmatch(n))])
 
 
-def test_what_a_build_tells_is_read() -> None:
+def test_a_builds_record_is_read() -> None:
     assert devices_told("with CUDA for 86 90 (nvcc 13.0.88)\n") == {86, 90}
     assert devices_told("without CUDA: this machine has no NVIDIA GPU (nvidia-smi finds none)\n") == set()
     with pytest.raises(AssertionError):
         devices_told("with CUDA\n")
 
 
-def test_the_library_is_there_where_it_was_asked_for() -> None:
+def test_the_library_exists_if_it_was_requested() -> None:
     assert LIBRARY.exists() == bool(devices_asked_for()), os.environ.get("SPLATPIPE_CUDA")
 
 
-def test_the_library_exports_the_interface_alone_and_needs_nothing_of_cuda_or_torch() -> None:
+def test_the_library_exports_only_the_interface_and_needs_no_library_of_cuda_or_torch() -> None:
     assert [strangers(library) for library in LIBRARY.parent.glob(LIBRARY.name)] == [[]] * bool(devices_asked_for())
 
 
-def test_each_source_is_there_for_every_device() -> None:
+def test_each_source_is_compiled_for_every_device() -> None:
     asked = devices_asked_for()
     for library in LIBRARY.parent.glob(LIBRARY.name):
         binaries = fat_binaries(section(library, ".nv_fatbin"))
@@ -131,7 +131,7 @@ def build(library: Path, source: str, *flags: str) -> Path:
         ('extern "C" int other(); int (*use)() = other;', "libother.so"),
     ],
 )
-def test_strangers_are_found(tmp_path: Path, source: str, stranger: str) -> None:
+def test_foreign_exports_and_dependencies_are_found(tmp_path: Path, source: str, stranger: str) -> None:
     build(tmp_path / "libother.so", 'extern "C" int other() { return 1; }')
     assert stranger in strangers(build(tmp_path / "library.so", source, f"-L{tmp_path}", "-Wl,--as-needed", "-lother"))
 

@@ -133,7 +133,7 @@ def test_nodes_that_do_not_reach_the_last_pixel_are_refused(kernels: CudaKernels
             laid_over_nodes(colour, alpha, torch.zeros(rows, 4, 3), SkyLayer(BACKGROUND, step=step))
 
 
-def test_nothing_beyond_the_nodes_is_looked_at(kernels: CudaKernels) -> None:
+def test_nothing_beyond_the_nodes_is_read(kernels: CudaKernels) -> None:
     colour, alpha = torch.zeros(17, 9, 3), torch.zeros(17, 9)  # the last nodes lie at the last pixels
     guarded = torch.full((4, 2, 3), torch.nan)
     guarded[:3] = torch.rand(3, 2, 3, generator=torch.Generator().manual_seed(2))

@@ -147,7 +147,7 @@ def test_plan_puts_whole_tiles_into_chunks(library, any_order, tiles, most, capa
     assert plan.facts[0] == counts.sum()
 
 
-def test_plan_of_more_pairs_than_32_bits_count(library):
+def test_plan_of_more_pairs_than_32_bits_can_count(library):
     counts = np.full(32_400, 2_600_000)  # a picture of 3840 x 2160 that 2.6 million Gaussians cover, each all of it
     plan = planned(library, counts, 1 << 28)
     assert plan.facts[0] == 32_400 * 2_600_000 > 1 << 36
@@ -310,7 +310,7 @@ def test_chunks_and_passes_change_no_bit(library, name):
 
 
 @pytest.mark.parametrize("passes", [1, 3])
-def test_nothing_to_see_is_the_background(library, passes):
+def test_an_empty_view_is_the_background(library, passes):
     case = scene(20, (40, 30), (0.1, 0.2))
     behind = {**case.rows, "means": case.rows["means"] * np.float32([1, 1, 0]) - np.float32([0, 0, 1])}
     none = {name: rows[:0] for name, rows in case.rows.items()}
@@ -323,7 +323,7 @@ def test_nothing_to_see_is_the_background(library, passes):
         assert all((gradient == 0).all() for gradient in outcome.gradients.values())
 
 
-def test_what_makes_no_sense_is_refused(library):
+def test_invalid_arguments_are_refused(library):
     case = SCENES["one"]
 
     def code(**changes: int) -> int:

@@ -178,7 +178,7 @@ def test_tiles_are_those_of_the_cpu_for_splats_of_all_sizes(library: CudaLibrary
     assert made.facts[0] > 20 * made.facts[1]
 
 
-def test_gaussians_that_are_not_finite_are_neither_seen_nor_moved(library: CudaLibrary) -> None:
+def test_gaussians_that_are_not_finite_are_neither_visible_nor_moved(library: CudaLibrary) -> None:
     case = small_case()
     for row, name in enumerate(PARAMETERS):
         case.rows[name].reshape(case.count, -1)[row, -1] = (np.nan, np.inf, -np.inf)[row % 3]
@@ -209,7 +209,7 @@ def test_fused_step_is_that_of_the_gradients(library: CudaLibrary, sh_degree: in
     assert log_scales.max() == np.float32(high)
 
 
-def test_fused_step_with_bands_that_do_not_count_yet(library: CudaLibrary) -> None:
+def test_fused_step_with_inactive_bands(library: CudaLibrary) -> None:
     case = small_case(9).changed(sh_degree=1)
     assert_same(fused_step(library, case, StepSettings()), separate_step(library, case, StepSettings()))
 
@@ -221,7 +221,7 @@ def test_fused_step_of_unaligned_rows(library: CudaLibrary) -> None:
         assert array.tobytes() == unaligned.arrays[name].tobytes(), name
 
 
-def test_fused_step_through_other_logits_than_the_trained(library: CudaLibrary) -> None:
+def test_fused_step_with_logits_other_than_the_trained(library: CudaLibrary) -> None:
     case = small_case(11)
     gain = np.random.default_rng(2).random(case.count).astype(np.float32)
     gain[::3] = 0.0
@@ -339,7 +339,7 @@ def test_adam_gives_the_same_bits_in_every_order_of_threads(library: CudaLibrary
 
 
 @pytest.mark.parametrize("wrong", [{"step": 0}, {"beta2": 1.0}, {"epsilon": 0.0}, {"tensors": 9}, {"skipped": None}])
-def test_adam_refuses_what_makes_no_sense(library: CudaLibrary, wrong: dict[str, object]) -> None:
+def test_adam_refuses_invalid_arguments(library: CudaLibrary, wrong: dict[str, object]) -> None:
     tensors = Tensors.random(4, (3,))
     adam = tensors.arguments([tensors.values, tensors.means, tensors.squares], np.zeros(1, np.int64))
     for name, value in wrong.items():

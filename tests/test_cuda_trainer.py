@@ -83,7 +83,7 @@ def photos(device: Device, count: int) -> list[TrainingPhoto]:
     return found
 
 
-def test_photos_arrive_as_the_cpus_to_the_bit(device: Device) -> None:
+def test_photos_on_the_device_are_bit_identical_to_the_cpus(device: Device) -> None:
     for ours, expected in zip(photos(device, 16), photos(cpu(), 16), strict=True):
         assert ours.colour.is_cuda and torch.equal(ours.colour.cpu(), expected.colour)
         assert (ours.mask is None) == (expected.mask is None)
@@ -124,7 +124,7 @@ def test_an_iteration_waits_for_nothing(device: Device) -> None:
     assert training.iteration == 4
 
 
-def test_a_limit_of_memory_holds_and_is_answered_by_less_at_a_time(device: Device) -> None:
+def test_a_memory_limit_holds(device: Device) -> None:
     training, plan = make_training(FEW, device, 200_000)
     given = photos(device, 3)
     torch.cuda.synchronize()

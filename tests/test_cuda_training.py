@@ -169,7 +169,7 @@ def test_a_checkpoint_moves_between_devices_and_loses_no_bit(scene: Path, whole:
     assert parts_of(tmp_path) == parts_of(whole)
 
 
-def test_going_on_with_another_device_is_told(scene: Path, tmp_path: Path) -> None:
+def test_resuming_on_another_device_is_reported(scene: Path, tmp_path: Path) -> None:
     for begun, other in ((ON_CUDA, cpu()), (cpu(), ON_CUDA)):
         with killed_at(EARLY if begun is ON_CUDA else LATE):
             trained(scene, tmp_path / begun.name, ALL, begun)
@@ -185,7 +185,7 @@ ASKED_OF_THE_CPU = {  # numbers that are the host's: learning rates, and what ar
 }
 
 
-def test_an_iteration_asks_the_device_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_iteration_reads_nothing_from_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[str] = []
 
     def note(what: str) -> None:
@@ -233,7 +233,7 @@ def make_small_plan(config: TrainConfig) -> TrainingPlan:
     return make_plan(config, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
 
 
-def test_short_memory_makes_chunks_smaller_then_the_model_and_then_is_told(
+def test_short_memory_makes_chunks_then_the_model_smaller_and_then_is_reported(
     scene: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shortage, "FEWEST_GAUSSIANS", 120)
@@ -268,7 +268,7 @@ def test_short_memory_makes_chunks_smaller_then_the_model_and_then_is_told(
     assert "max_megapixels" in failure.value.hint
 
 
-def test_a_trial_for_a_budget_has_smaller_chunks_where_memory_is_short_too(
+def test_a_budgets_trial_also_uses_smaller_chunks_if_memory_is_short(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, shot = tiny_scene.true_model(), shot_of(tiny_scene.cameras()[0], RenderOptions(3, depth=False), 16)
@@ -319,7 +319,9 @@ def test_memory_that_ends_while_the_model_changes_ends_the_training_at_the_check
     assert parts_of(tmp_path) == parts_of(whole)
 
 
-def test_a_memory_limit_is_the_trainings_alone(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_memory_limit_applies_to_the_training_only(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     kernels, seen = kernels_on_cpu(), []
     kernels.forecast.most_pairs = most_pairs_of(24 << 30)
 
@@ -339,7 +341,7 @@ def test_a_memory_limit_is_the_trainings_alone(scene: Path, tmp_path: Path, monk
     assert seen == [most_pairs_of(8 << 30)] * 3
 
 
-def test_held_out_photos_are_measured_the_same(scene: Path, whole: Path, tmp_path: Path) -> None:
+def test_held_out_photos_have_the_same_figures(scene: Path, whole: Path, tmp_path: Path) -> None:
     parts = dict(make_inputs(scene).parts)
     parts |= {"clean.model": whole / "model.ply", "train.rendering": whole / "rendering.json"}
     parts |= {"train.sky": whole / "sky.npz"}
@@ -360,7 +362,7 @@ def test_held_out_photos_are_measured_the_same(scene: Path, whole: Path, tmp_pat
     assert ours["free_space_rendered"] == pytest.approx(theirs["free_space_rendered"], abs=1e-4)
 
 
-def test_a_checkpoint_that_the_device_has_no_room_for_is_not_called_broken(
+def test_a_checkpoint_too_large_for_the_device_is_not_called_broken(
     scene: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def no_room(*_: object) -> None:
@@ -373,7 +375,7 @@ def test_a_checkpoint_that_the_device_has_no_room_for_is_not_called_broken(
         TrainState.restore(begun.checkpoint("any"), plan, Techniques())
 
 
-def test_density_control_finds_nothing_left_of_the_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_density_control_starts_with_the_iterations_memory_freed(monkeypatch: pytest.MonkeyPatch) -> None:
     left: list[object] = []
     select = state.Adam.select
 

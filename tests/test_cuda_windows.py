@@ -54,7 +54,7 @@ def trained(views: list[View], cache: Path, kernels: CudaKernels | None) -> tupl
     return model | beside, observed
 
 
-def test_windows_on_cuda_lead_where_the_cpus_do(views: list[View], tmp_path: Path) -> None:
+def test_windows_on_cuda_give_the_cpus_results(views: list[View], tmp_path: Path) -> None:
     ours, theirs = (trained(views, tmp_path, kernels) for kernels in (kernels_on_cpu(), None))
     start = tiny_scene.true_model().tensors()
     for name, expected in theirs[0].items():

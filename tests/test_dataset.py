@@ -104,7 +104,7 @@ def test_tracks_are_rows_of_the_points_each_once(tmp_path: Path) -> None:
     assert found == {"a.jpg": [0, 1], "b.jpg": [0, 1], "c.jpg": []}
 
 
-def test_a_missing_broken_or_distorted_model_is_a_failed_stage(tmp_path: Path) -> None:
+def test_a_missing_broken_or_distorted_model_fails_the_stage(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="sparse/0"):
         load_views(tmp_path)
     write_model(tmp_path / "radial", "SIMPLE_RADIAL")
@@ -189,7 +189,7 @@ def test_views_may_be_named_without_suffix_case_and_folder() -> None:
     assert split_views(["x", "x.jpg", "X.jpg"], 8, "x,x.jpg").held_out == ("x", "x.jpg")
 
 
-def test_something_must_be_left_to_train_on() -> None:
+def test_at_least_one_photo_must_remain_for_training() -> None:
     with pytest.raises(SplatpipeError, match="none is left"):
         split_views(["a", "b"], 1, "")
 

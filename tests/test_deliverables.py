@@ -76,7 +76,7 @@ def test_colmap_reads_cameras_and_points_in_the_world_frame(run: RunSplat, deliv
     assert abs(model.compute_mean_reprojection_error() - before.compute_mean_reprojection_error()) < 1e-6
 
 
-def test_transforms_say_where_a_point_is_in_each_picture(run: RunSplat, delivered: Path) -> None:
+def test_transforms_project_points_to_their_pixels(run: RunSplat, delivered: Path) -> None:
     table = json.loads((delivered / "dataset/transforms.json").read_text())
     assert table["test_filenames"] == [f"images/{run.cameras[0].name}"]
     assert len(table["train_filenames"]) == len(run.cameras) - 1
@@ -120,7 +120,7 @@ def test_clouds_lie_in_the_crs_of_the_run(run: RunSplat, delivered: Path) -> Non
     assert np.abs(centres.xyz - expected).max() < 6e-4
 
 
-def test_tiles_stand_on_the_globe_and_the_site_is_whole(delivered: Path) -> None:
+def test_tiles_are_placed_on_the_globe_and_the_site_is_complete(delivered: Path) -> None:
     tileset = json.loads((delivered / "tiles/tileset.json").read_text())
     matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
     np.testing.assert_allclose(matrix, FRAME.origin.ecef_from_enu(), atol=1e-6)
@@ -130,7 +130,7 @@ def test_tiles_stand_on_the_globe_and_the_site_is_whole(delivered: Path) -> None
     assert (delivered.parent / "web/index.html").is_file() and (delivered.parent / "web/levels.json").is_file()
 
 
-def test_what_a_run_without_scale_cannot_have_is_left_out_and_told(run: RunSplat, tmp_path: Path) -> None:
+def test_formats_that_need_a_scale_are_left_out_with_a_note(run: RunSplat, tmp_path: Path) -> None:
     told = tiny_scene.Recorder()
     nowhere = replace(run, frame=Frame("arbitrary", Similarity.identity()))
     assert list(write_deliverables(("laz", "model"), nowhere, tmp_path, told)) == ["model"]

@@ -211,7 +211,7 @@ def test_the_brown_lens_is_as_far_from_simple_as_the_p1s() -> None:
     assert 3.0 < np.sqrt(np.mean(apart_px(near, true, turn=True) ** 2)) < 4.5
 
 
-def test_points_are_on_ground_walls_and_roof_and_each_seen_four_times() -> None:
+def test_points_are_on_ground_walls_and_roof_and_each_is_seen_four_times() -> None:
     points = {point["name"]: point for point in truth()["points"]}
     assert len(points) >= 12
     assert {point["where"] for point in points.values()} == {"ground", "wall", "roof"}
@@ -245,7 +245,7 @@ def test_marks_are_the_projections_with_a_third_of_a_pixel() -> None:
     assert np.abs(residuals).max() < 5 * 0.3
 
 
-def test_targets_are_in_the_photos_where_the_cameras_say() -> None:
+def test_targets_in_the_photos_are_at_their_projections() -> None:
     """The corner that OpenCV finds in the pixels is the projection: lens, poses and pixel convention are right."""
     gaps = []
     for point in truth()["points"]:
@@ -276,7 +276,7 @@ def test_marked_points_are_not_hidden() -> None:
         assert np.allclose(first_hits(origin, ahead / distance[:, None], corners), distance, atol=0.03)
 
 
-def test_surface_is_the_house_and_its_land() -> None:
+def test_surface_is_the_house_and_its_plot() -> None:
     mesh = surface()
     assert len(mesh.faces) > 10_000
     low, high = mesh.bounds

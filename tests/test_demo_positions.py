@@ -110,7 +110,9 @@ def test_corrected_positions_in_geo_txt_place_the_cameras_as_rtk_does(
     assert (np.sqrt((camera_errors(frame, found) ** 2).mean(axis=0)) <= [0.011, 0.011, 0.016]).all()
 
 
-def test_photos_with_wrong_gps_are_named_and_the_others_placed(photos: list[CheckedPhoto], tmp_path: Path) -> None:
+def test_photos_with_wrong_gps_are_reported_and_the_others_are_placed(
+    photos: list[CheckedPhoto], tmp_path: Path
+) -> None:
     def at(photo: CheckedPhoto, gps: Gps) -> CheckedPhoto:
         return replace(photo, exif=replace(photo.exif, gps=gps), xmp={})
 

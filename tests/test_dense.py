@@ -140,7 +140,7 @@ def test_depths_are_within_a_hundredth_and_nothing_is_found_without_texture() ->
     assert not seen[inner].any()
 
 
-def test_added_points_lie_on_the_walls_where_there_were_none(room: Path, points: DensePoints) -> None:
+def test_points_are_added_on_the_walls_where_there_were_none(room: Path, points: DensePoints) -> None:
     off_wall = np.abs(points.xyz).min(axis=1)
     assert len(points) > 500
     assert np.median(off_wall) < 0.01  # of 3 to 4 m to the cameras
@@ -166,7 +166,7 @@ def test_threads_do_not_change_a_bit(room: Path, started: tuple[dict, bytes], tm
     assert initialized(room, tmp_path / "two", threads=2) == started
 
 
-def test_sparse_gaussians_stay_and_the_summary_counts_both(
+def test_sparse_gaussians_are_kept_and_the_summary_counts_both(
     room: Path, started: tuple[dict, bytes], tmp_path: Path
 ) -> None:
     off, _ = initialized(room, tmp_path / "off", dense=False)
@@ -204,7 +204,7 @@ def test_masked_surfaces_get_no_points(tmp_path: Path) -> None:
     assert not on_masked_wall.any()
 
 
-def test_held_out_photos_have_no_say(tmp_path: Path) -> None:
+def test_held_out_photos_have_no_influence(tmp_path: Path) -> None:
     dataset = write_room(tmp_path / "dataset", room_cameras(4))
     counts, before = initialized(dataset, tmp_path / "before", held_out="3.png")
     assert counts["dense_points"] > 0
@@ -249,14 +249,14 @@ def test_neighbours_prefer_ten_degrees_and_skip_views_that_share_nothing() -> No
     assert inverse_depths(tracks, 4, cameras[4], WIDER) is None
 
 
-def test_the_surest_point_of_a_voxel_without_a_sparse_one_stays() -> None:
+def test_a_voxel_without_a_sparse_point_keeps_its_most_certain_point() -> None:
     xyz = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [5.1, 0.0, 0.0], [9.0, 9.0, 9.0]])
     points = DensePoints(xyz, np.zeros((4, 3), np.uint8), np.array([1.0, 2.0, 1.0, 3.0]), np.full(4, 1.0))
     kept = thinned(points, np.array([[5.2, 0.1, 0.1]]), 10)
     np.testing.assert_array_equal(kept.xyz, xyz[[1, 3]])
 
 
-def test_voxels_are_as_large_as_photos_see_there() -> None:
+def test_voxels_have_the_photos_resolution() -> None:
     xyz = np.array(
         [[0.1, 0.1, 0.1], [1.1, 0.1, 0.1], [60.1, 0.1, 0.1], [61.1, 0.1, 0.1], [8.2, 0.1, 0.1], [8.9, 0.1, 0.1]]
     )

@@ -46,13 +46,13 @@ def on_roof(points: FusedPoints) -> np.ndarray:
     return (np.abs(east) < 3.8) & (np.abs(north) < 3.2) & (up > 3.1)
 
 
-def test_points_lie_on_the_surfaces_though_depths_err() -> None:
+def test_points_lie_on_the_surfaces_despite_noisy_depths() -> None:
     off = surface_distances(noisy_cloud().pieces.xyz.T)
     assert np.quantile(off, 0.5) < 0.25 * GSD_M and np.quantile(off, 0.95) < GSD_M
     assert (off < 2.0 * GSD_M).mean() > 0.995
 
 
-def test_every_place_is_there_and_few_are_twice() -> None:
+def test_every_place_is_covered_and_few_twice() -> None:
     east, north, _ = noisy_cloud().pieces.xyz[:, on_roof(noisy_cloud())]
     cells = np.unique(np.floor(np.stack([east, north]) / GSD_M), axis=1).shape[1]
     assert cells > 0.97 * 76 * 64
@@ -62,7 +62,7 @@ def test_every_place_is_there_and_few_are_twice() -> None:
     assert walls.sum() > 0.7 * 28.0 * 2.2 / GSD_M**2
 
 
-def test_normals_look_out_of_the_surface() -> None:
+def test_normals_point_out_of_the_surface() -> None:
     points = noisy_cloud()
     north, roof = points.pieces.xyz[1], on_roof(points)
     true = np.stack([np.zeros_like(north), np.sign(north) * 2.0 / 3.5, np.ones_like(north)])
@@ -107,7 +107,7 @@ def test_tiles_and_threads_change_no_point(tmp_path: Path, monkeypatch: pytest.M
     assert (tmp_path / "one/cloud.laz").read_bytes() == made[0] and left[1].stat().st_mtime_ns == kept
 
 
-def test_nothing_lies_outside_of_the_boundary(tmp_path: Path) -> None:
+def test_nothing_lies_outside_the_boundary(tmp_path: Path) -> None:
     ring = np.array([[-2.0, -2.0], [2.0, -2.0], [0.0, 2.0]])
     area = PlanArea.seen_from_above([(ring,)])
     task = CloudTask(run_surface(FRAME, photos()[::3], area), house_site(), 2.0 * GSD_M, 1)

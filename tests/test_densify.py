@@ -68,7 +68,7 @@ def test_the_largest_scores_come_first_and_the_rest_is_counted() -> None:
     assert counts == {"cloned": 0, "split": 0, "held_back": 9}
 
 
-def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
+def test_both_halves_together_transmit_as_much_light_as_their_parent() -> None:
     gaussians = model([0.05, 0.5, 0.5])
     gaussians.opacity_logits[:] = torch.tensor([2.0, -4.0, 1.0])
     growth, _ = grow(gaussians, torch.tensor([1.0, 1.0, 0.0]), 9, SCHEDULE, EXTENT, 1)
@@ -79,7 +79,7 @@ def test_two_let_as_much_light_through_as_the_one_they_come_from() -> None:
     assert growth.opacity_logits[1] == gaussians.opacity_logits[2]
 
 
-def test_what_would_be_pruned_when_halved_is_not_densified() -> None:
+def test_gaussians_that_would_be_pruned_once_halved_are_not_densified() -> None:
     gaussians = model([0.05, 0.5, 0.05, 0.5])
     gaussians.opacity_logits[:] = torch.logit(torch.tensor([0.0099, 0.0099, 0.0101, 0.0101]))
     growth, counts = grow(gaussians, torch.ones(4), 9, SCHEDULE, EXTENT, 1)
@@ -103,7 +103,7 @@ def test_halved_opacity_is_exact_for_any_logit(logit: float) -> None:
     assert halved == pytest.approx(math.log(alpha) - math.log1p(through) - math.log(through), rel=1e-9)
 
 
-def test_gaussians_rise_to_the_cap_fast_at_first() -> None:
+def test_the_number_of_gaussians_rises_to_the_cap_fast_at_first() -> None:
     schedule = resolve_schedule(
         TrainConfig(iterations=4000, max_gaussians=1000)
     ).density  # steps at 500, 600, ..., 2000

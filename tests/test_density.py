@@ -52,7 +52,7 @@ def observed(magnitudes: bool, gaussians: Gaussians, weights: Tensor) -> Tensor:
     return density.statistics.score()
 
 
-def test_published_score_is_the_norm_of_the_loss_by_the_place_on_screen() -> None:
+def test_published_score_is_the_norm_of_the_gradient_by_screen_position() -> None:
     gaussians, weights = scene(1, dtype=torch.float64), picture(2)
 
     def loss(right: float, down: float) -> float:

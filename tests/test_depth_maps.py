@@ -25,7 +25,7 @@ def one_array() -> bytes:
     return file.getvalue()
 
 
-def test_a_map_is_read_as_it_was_kept(tmp_path: Path) -> None:
+def test_a_map_reads_back_as_written(tmp_path: Path) -> None:
     kept = DepthMap(np.full((3, 4), 2.5, np.float32), np.full((3, 4), 3, np.uint8))
     told = keep_depth_maps(tmp_path / "maps", [(CAMERA, kept)])
     assert told == {"maps": 1, "megapixels": 12e-6, "found": 1.0}
@@ -46,7 +46,7 @@ def test_a_map_is_read_as_it_was_kept(tmp_path: Path) -> None:
         one_array(),
     ],
 )
-def test_what_is_no_map_is_refused_by_its_name(tmp_path: Path, content: bytes) -> None:
+def test_an_invalid_map_is_refused_by_its_name(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "00000.npz").write_bytes(content)
     with pytest.raises(StageError, match=r"00000\.npz"):
         DepthMapFile(CAMERA, tmp_path / "00000.npz").load()

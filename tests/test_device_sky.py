@@ -79,7 +79,7 @@ def test_masks_are_those_of_the_cpu_at_every_size(size: tuple[int, int]) -> None
     assert bool((device.around | ~device.mask).all())
 
 
-def test_photos_without_sky_have_none_and_moving_keeps_what_there_is() -> None:
+def test_photos_without_sky_have_none_and_moving_to_a_device_keeps_it() -> None:
     camera = skies.look()
     mask = np.ones((60, 80), bool)
     masks = PhotoSkies({camera.name: SkyMask.packed(mask), "other": SkyMask.packed(~mask)})

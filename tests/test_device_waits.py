@@ -70,7 +70,7 @@ def distortion() -> Technique:
 
 
 @pytest.mark.parametrize("make", [sky, robust, distortion, lambda: Exposure(NAMES)], ids=lambda make: make.__name__)
-def test_iteration_of_a_technique_asks_the_device_for_nothing(make: Callable[[], Technique]) -> None:
+def test_iteration_of_a_technique_reads_nothing_from_the_device(make: Callable[[], Technique]) -> None:
     technique, shot = make(), a_shot()
     technique.move_to(META)
     model = Gaussians.empty(7, 0)
@@ -87,7 +87,7 @@ def test_iteration_of_a_technique_asks_the_device_for_nothing(make: Callable[[],
 KEPT_HERE = ("centre", "adam.step")
 
 
-def test_dropout_asks_the_device_for_nothing() -> None:
+def test_dropout_reads_nothing_from_the_device() -> None:
     model = Gaussians.empty(50, 0)
     model.opacity_logits = torch.empty(50, device=META, requires_grad=True)
     found = Dropout(resolve_schedule(TrainConfig(iterations=100, dropout=0.3))).before_render(model, a_moment())
@@ -95,7 +95,7 @@ def test_dropout_asks_the_device_for_nothing() -> None:
     assert found.opacity_logits.device == META
 
 
-def test_meta_tensors_fail_where_somebody_waits_or_mixes() -> None:
+def test_meta_tensors_fail_on_waiting_or_mixing() -> None:
     """The assumption of the tests above."""
     tensor = torch.empty(3, device=META)
     for waits in (lambda: float(tensor[0]), lambda: bool((tensor > 0).any()), lambda: tensor[tensor > 0]):
@@ -105,7 +105,7 @@ def test_meta_tensors_fail_where_somebody_waits_or_mixes() -> None:
         tensor + torch.zeros(3)
 
 
-def test_the_sky_of_the_shot_has_a_part_in_it() -> None:
+def test_the_iteration_includes_the_sky() -> None:
     made = sky()
     assert isinstance(made, SkyModel) and made.seen(CAMERAS[1]) is not None
     assert a_moment().colour(ELSEWHERE) != a_moment(3).colour(ELSEWHERE)

@@ -51,7 +51,7 @@ def spread(gaussians: Gaussians, origin: float = 0.0, backend: str = "native") -
     return spread_loss(rendered, origin, FRONT)
 
 
-def test_one_surface_has_none_and_two_that_shine_through_have_that_of_their_variance() -> None:
+def test_one_surface_has_no_distortion_and_two_translucent_ones_have_their_variance() -> None:
     assert float(spread(layers((9.0,), 0.9), 9.0)) == pytest.approx(0.0, abs=1e-4)
     two = layers((8.0, 12.0), 0.6)
     first, second = 0.6, 0.4 * 0.6
@@ -61,13 +61,13 @@ def test_one_surface_has_none_and_two_that_shine_through_have_that_of_their_vari
     assert float(spread(two, 10.0)) == pytest.approx(excess / (excess + HALF_PX**2), rel=1e-3)
 
 
-def test_little_is_free_and_much_counts_no_more_than_one() -> None:
+def test_small_distortion_is_free_and_large_distortion_is_capped() -> None:
     pixel = 100.0 / FRONT.fx
     assert float(spread(layers((100.0, 100.0 + pixel), 0.6), 100.0)) == 0.0
     assert 0.95 < float(spread(layers((2.0, 900.0), 0.6), 100.0)) <= 1.0
 
 
-def test_far_away_float32_still_tells_it_with_an_origin() -> None:
+def test_an_origin_keeps_precision_far_away() -> None:
     far = layers((3000.0, 3000.0 + 1000.0), 0.6)  # ten pixels apart
     origin = depth_origin(far.means, FRONT)
     assert origin == pytest.approx(3500.0)
@@ -93,7 +93,7 @@ def test_gradient_agrees_with_finite_differences() -> None:
     assert torch.autograd.gradcheck(value, leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
 
 
-def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> None:
+def test_it_counts_only_in_the_later_part_of_a_run_and_if_enabled() -> None:
     distortion = DistortionLoss(0.1, after=20)
     assert not distortion.is_counted(20) and distortion.is_counted(21)
     views = [View(camera, Path(), None) for camera in tiny_scene.cameras()]
@@ -102,7 +102,7 @@ def test_it_counts_after_the_first_of_the_run_only_and_where_it_is_wanted() -> N
         assert (make_techniques(plan).find(DistortionLoss) is not None) == (weight > 0.0)
 
 
-def test_on_a_device_the_centre_is_looked_for_seldom_and_goes_on_through_a_checkpoint() -> None:
+def test_on_a_device_the_centre_is_updated_rarely_and_kept_in_checkpoints() -> None:
     model, camera, options = layers((4.0, 6.0), 0.6), FRONT, rasterizer.RenderOptions(0)
     for device, moves in (("cpu", True), ("meta", False)):
         distortion = DistortionLoss(0.1, after=0)
@@ -122,7 +122,7 @@ def make_schedule() -> Schedule:
     return resolve_schedule(TrainConfig(iterations=2 * CENTRE_EVERY))
 
 
-def test_training_with_it_leaves_depths_closer_together(tmp_path: Path) -> None:
+def test_training_with_it_reduces_the_spread_of_depths(tmp_path: Path) -> None:
     tiny_scene.write_dataset(tmp_path / "dataset")
     parts = {"undistort.dataset": tmp_path / "dataset"}
     initialize.run(InitializeConfig(dense=False), Inputs(parts, tmp_path), tmp_path, tiny_scene.Recorder())

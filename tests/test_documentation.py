@@ -95,14 +95,14 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", DOCS, ids=name_of)
-def test_a_page_begins_with_what_somebody_in_a_hurry_needs(page: Path) -> None:
+def test_a_page_begins_with_the_essentials(page: Path) -> None:
     first = page.read_text(encoding="utf-8").splitlines()[:FIRST_SCREEN]
     assert first[0].startswith("# ")
     assert any(line.startswith(("```", "|---")) for line in first)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_every_command_is_one_that_splatpipe_takes(page: Path) -> None:
+def test_every_command_is_valid(page: Path) -> None:
     for name, *arguments in command_lines(page, "splatpipe"):
         told = COMMANDS[name].make_context(name, list(arguments)).params
         assignments = told.get("assignments") or []
@@ -113,7 +113,7 @@ def test_every_command_is_one_that_splatpipe_takes(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_every_command_in_a_sentence_has_the_options_it_is_said_to_have(page: Path) -> None:
+def test_every_command_in_running_text_has_the_stated_options(page: Path) -> None:
     for text in re.findall(r"`splatpipe ([^`]+)`", prose(page)):
         words = text.split()
         if not re.match(r"[a-z]", words[0]):  # an option of all commands, or no command
@@ -124,7 +124,7 @@ def test_every_command_in_a_sentence_has_the_options_it_is_said_to_have(page: Pa
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_every_make_target_and_program_is_there(page: Path) -> None:
+def test_every_make_target_and_program_exists(page: Path) -> None:
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     inline = [text.split() for text in re.findall(r"`make ([^`]+)`", prose(page))]
     for words in [*command_lines(page, "make"), *inline]:
@@ -149,7 +149,7 @@ def test_every_option_and_source_file_that_is_named_exists(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_every_configuration_is_read(page: Path, tmp_path: Path) -> None:
+def test_every_configuration_is_valid(page: Path, tmp_path: Path) -> None:
     for text in fences(page, "toml"):
         file = tmp_path / "example.toml"
         file.write_text(text, encoding="utf-8")
@@ -168,7 +168,7 @@ def test_every_example_in_python_compiles(page: Path) -> None:
         compile(text, page.name, "exec")
 
 
-def test_the_page_of_options_is_what_the_code_says() -> None:
+def test_the_page_of_options_matches_the_code() -> None:
     assert options_page.PAGE.read_text(encoding="utf-8") == options_page.written(), "run: make options-page"
 
 

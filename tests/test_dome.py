@@ -37,7 +37,7 @@ def scene_around(centre: np.ndarray, reach: float) -> Gaussians:
     return scene
 
 
-def test_lattice_is_even_and_ends_where_the_panorama_does() -> None:
+def test_lattice_is_even_and_ends_with_the_panorama() -> None:
     rays = dome_directions(TILTED)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
     assert -2.0 < np.degrees(np.arcsin((rays @ TILTED).min())) < -1.9
@@ -60,7 +60,7 @@ def test_dome_shows_the_panorama_without_holes(up: np.ndarray, x: float) -> None
         assert float(error.mean()) < (0.01 if x == 4.0 else 0.03)
 
 
-def test_dome_is_around_the_scene_whatever_lies_far_off() -> None:
+def test_dome_surrounds_the_scene_despite_distant_outliers() -> None:
     centre = CAMERAS.mean(axis=0)
     assert dome_radius(scene_around(centre, 50.0), CAMERAS, centre) == pytest.approx(100.0, rel=0.02)
     small = scene_around(centre, 0.1)
@@ -69,7 +69,7 @@ def test_dome_is_around_the_scene_whatever_lies_far_off() -> None:
     assert dome_radius(Gaussians.empty(0, sh_degree=0), CAMERAS[:1], CAMERAS[0]) == 1.0
 
 
-def test_gaussians_of_the_scene_stay_in_sight() -> None:
+def test_gaussians_of_the_scene_stay_visible() -> None:
     camera = skies.look(0.0, 30.0, x=4.0)
     ray = directions(camera)[skies.HEIGHT // 2, skies.WIDTH // 2]
     scene = scene_around(CAMERAS.mean(axis=0), 50.0)

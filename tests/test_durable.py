@@ -34,7 +34,7 @@ def test_written_file_has_the_new_content_and_the_old_permissions(tmp_path: Path
     assert path.read_bytes() == b"\0\1" and list(tmp_path.iterdir()) == [path]
 
 
-def test_file_that_cannot_be_written_to_its_end_stays_as_it_was(tmp_path: Path) -> None:
+def test_file_that_cannot_be_written_completely_is_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.npz"
     path.write_text("old")
 
@@ -47,7 +47,7 @@ def test_file_that_cannot_be_written_to_its_end_stays_as_it_was(tmp_path: Path) 
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_process_was_writing_can_be_told_from_all_else_and_removed(tmp_path: Path) -> None:
+def test_partial_files_of_a_killed_process_are_recognised_and_removed(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     write_durably(path, "old")
     subprocess.run([sys.executable, "-c", KILLED.format(path=str(path))], check=False)
@@ -58,7 +58,7 @@ def test_what_a_killed_process_was_writing_can_be_told_from_all_else_and_removed
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
+def test_partial_files_of_another_running_process_are_kept(tmp_path: Path) -> None:
     killed, other = (tmp_path / f".report.html.{process}.new" for process in (12, 123))
     for aside in (killed, other):
         aside.write_text("half")

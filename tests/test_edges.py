@@ -20,7 +20,7 @@ def roof_over_lawn(
     return depth, np.clip(colour, 0, 255).astype(np.uint8)
 
 
-def test_what_looks_like_what_is_behind_lies_there() -> None:
+def test_pixels_that_look_like_the_background_get_its_depth() -> None:
     depth, colour = roof_over_lawn(wider=3)
     rows, columns, behind = pixels_behind(depth, colour)
     strip = (columns >= EDGE) & (columns < EDGE + 3)
@@ -30,11 +30,11 @@ def test_what_looks_like_what_is_behind_lies_there() -> None:
     assert len(rows) == len({*zip(rows.tolist(), columns.tolist(), strict=True)})
 
 
-def test_an_edge_that_is_right_stays() -> None:
+def test_a_correct_edge_is_unchanged() -> None:
     assert len(pixels_behind(*roof_over_lawn(wider=0))[0]) <= 3
 
 
-def test_where_both_sides_look_alike_nothing_is_said() -> None:
+def test_edges_between_similar_sides_are_unchanged() -> None:
     assert not len(pixels_behind(*roof_over_lawn(wider=3, lawn=RED))[0])
 
 

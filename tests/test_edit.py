@@ -83,7 +83,7 @@ def same(first: Gaussians, second: Gaussians) -> bool:
 
 
 @pytest.mark.parametrize("axes", ["z up", "y down"])
-def test_turned_by_37_degrees_it_looks_the_same_from_cameras_that_are_turned_with_it(axes):
+def test_rotated_by_37_degrees_it_looks_the_same_from_cameras_rotated_with_it(axes):
     scene = Scene(true_model(), SceneFacts(axes))
     up = turn_of(axes, "z up").numpy() @ [0.0, 0.0, 1.0]
     turned = edited(scene, ("about", "0.2,0.1,-0.3"), ("rotate", "37"))
@@ -105,7 +105,7 @@ def test_any_axis_any_scale_and_a_move_look_the_same_from_cameras_that_follow():
         assert decibels(view(scene, camera), view(changed, moved(camera, similarity))) >= SAME_DB
 
 
-def test_steps_are_taken_in_their_order():
+def test_steps_are_applied_in_order():
     scene = Scene(true_model(), SceneFacts())
     box = ("crop_box", "0,-9,-9,9,9,9")
     first, last = edited(scene, box, ("move", "-1,0,0")), edited(scene, ("move", "-1,0,0"), box)
@@ -113,13 +113,13 @@ def test_steps_are_taken_in_their_order():
     assert len(first.gaussians) > len(last.gaussians) > 0
 
 
-def test_what_is_moved_away_and_back_is_rounded_once():
+def test_moving_away_and_back_rounds_only_once():
     scene = Scene(true_model(), SceneFacts())
     back = edited(scene, ("move", "1e7,0,0"), ("rotate", "180,z"), ("rotate", "-180,z"), ("move", "-1e7,0,0"))
     assert float((back.gaussians.means - scene.gaussians.means).abs().max()) < 1e-6
 
 
-def test_two_measured_points_make_metres_and_the_first_stays():
+def test_two_measured_points_set_the_scale_and_the_first_stays_fixed():
     scene = Scene(true_model(), SceneFacts(metres=False))
     scene.gaussians.means[0] = torch.tensor([1.0, 0.0, 0.0])
     scene.gaussians.means[1] = torch.tensor([1.0, 0.5, 0.0])
@@ -129,14 +129,14 @@ def test_two_measured_points_make_metres_and_the_first_stays():
     assert edited(scaled, ("scale", "2")).facts == SceneFacts(metres=False)
 
 
-def test_a_georeferenced_splat_keeps_its_place_but_for_a_bare_factor():
+def test_a_georeferenced_splat_keeps_its_georeference_except_under_a_plain_scale():
     scene = Scene(true_model(), PLACED)
     for steps in ((("rotate", "12"),), (("move", "1,2,3"),), (("scale_from", ("0,0,0", "1,0,0", "1.003m")),)):
         assert edited(scene, *steps, local=True).facts == PLACED
     assert edited(scene, ("scale", "1.003")).facts == replace(PLACED, place=None, metres=False)
 
 
-def test_a_splat_comes_to_the_coordinates_it_is_moved_to():
+def test_a_splat_is_moved_to_the_given_coordinates():
     scene = Scene(true_model(), PLACED)
     world = open_world(frame_of(PLACE))
     start = world.crs_from_local(np.array([[0.5, 0.25, -0.125]]))[0]
@@ -152,7 +152,7 @@ def test_a_splat_comes_to_the_coordinates_it_is_moved_to():
     np.testing.assert_allclose(level.gaussians.means.median(0)[0][2], scene.gaussians.means.median(0)[0][2], atol=0.01)
 
 
-def test_far_away_on_the_earth_it_stands_upright_on_a_zero_of_its_own():
+def test_moved_far_away_it_is_upright_in_a_new_local_frame():
     scene = Scene(true_model(), PLACED)
     far = Transformer.from_crs("EPSG:4326", "EPSG:32634", always_xy=True).transform(21.9, 53.1)
     piece = Workpiece(Scene(scene.gaussians.clone(), scene.facts))
@@ -170,7 +170,7 @@ def test_far_away_on_the_earth_it_stands_upright_on_a_zero_of_its_own():
         edited(scene, ("move", "60000,0,0"))
 
 
-def test_without_a_place_it_is_not_moved_to_where_float32_has_no_digits():
+def test_without_georeference_it_is_not_moved_beyond_float32_precision():
     with pytest.raises(SplatpipeError, match="32-bit"):
         edited(Scene(true_model(), SceneFacts()), ("move", "500000,5800000,0"))
 
@@ -178,7 +178,7 @@ def test_without_a_place_it_is_not_moved_to_where_float32_has_no_digits():
 # --------------------------------------------------------------------------------------------------------------- crops
 
 
-def test_a_box_keeps_what_lies_in_it_to_the_bit_and_a_cut_the_rest():
+def test_a_box_crop_keeps_its_contents_bit_identical_and_a_cut_keeps_the_rest():
     scene = Scene(true_model(), SceneFacts("y down"))
     inside = ((scene.gaussians.means[:, :2] >= 0.0) & (scene.gaussians.means[:, :2] <= 2.0)).all(1)
     kept, rest = edited(scene, ("crop_box", "2,2,0,0")), edited(scene, ("cut_box", "0,0,2,2"))
@@ -186,7 +186,7 @@ def test_a_box_keeps_what_lies_in_it_to_the_bit_and_a_cut_the_rest():
     assert same(rest.gaussians, scene.gaussians.select(~inside))
 
 
-def test_heights_are_along_up_whichever_axis_that_is():
+def test_heights_are_along_the_up_axis_whichever_it_is():
     scene = Scene(true_model(), SceneFacts("y down"))
     heights = -scene.gaussians.means[:, 1]
     assert same(edited(scene, ("crop_heights", "0.25,")).gaussians, scene.gaussians.select(heights >= 0.25))
@@ -222,7 +222,7 @@ def geojson(path: Path, ring: Sequence[Sequence[float]], crs: str = "") -> Path:
 
 @pytest.mark.parametrize("crs", ["", "2180", "25834", "3857"])
 @pytest.mark.parametrize("axes", ["z up", "y down"])
-def test_a_polygon_of_any_crs_cuts_where_it_lies_on_the_earth(tmp_path: Path, crs, axes):
+def test_a_polygon_in_any_crs_crops_at_its_place_on_earth(tmp_path: Path, crs, axes):
     scene = Scene(true_model(), PLACED)
     corners = np.array([[-1.0, -0.5, 0.0], [1.2, -0.75, 0.0], [0.3, 1.5, 0.0]])
     geodetic = Origin(PLACE.latitude, PLACE.longitude, PLACE.height_m).geodetic_from_enu(corners)
@@ -244,7 +244,7 @@ def test_a_polygon_of_any_crs_cuts_where_it_lies_on_the_earth(tmp_path: Path, cr
     assert len(rest.gaussians) + len(kept.gaussians) == len(scene.gaussians)
 
 
-def test_a_polygon_that_crosses_itself_is_told_and_what_is_twice_inside_is_out(tmp_path: Path):
+def test_a_self_intersecting_polygon_is_reported_and_filled_by_the_even_odd_rule(tmp_path: Path):
     path = geojson(tmp_path / "bow.geojson", [[-3, -3], [3, 3], [3, -3], [-3, 2]])
     piece = Workpiece(Scene(true_model(), SceneFacts("z up")))
     parse_steps([("crop_polygon", path)], OUTPUT, True)[0].apply(piece)
@@ -254,7 +254,7 @@ def test_a_polygon_that_crosses_itself_is_told_and_what_is_twice_inside_is_out(t
     assert bool(((y - x) * (y + 3.0 - (3.0 - x) * 5.0 / 6.0) < 1e-5).all())  # between the two lines that cross
 
 
-def test_crops_that_leave_nothing_say_where_the_splat_is(tmp_path: Path):
+def test_crops_that_leave_nothing_state_where_the_splat_is(tmp_path: Path):
     scene = Scene(true_model(), PLACED)
     with pytest.raises(SplatpipeError, match="would remove the whole splat") as told:
         edited(scene, ("crop_box", "0,0,1,1"))
@@ -288,7 +288,7 @@ def test_a_polygon_of_many_vertices_cuts_like_the_circle_it_is(tmp_path: Path):
 # --------------------------------------------------------------------------------------------------------------- merges
 
 
-def test_two_halves_merged_are_the_whole(tmp_path: Path):
+def test_two_halves_merge_to_the_whole(tmp_path: Path):
     scene = Scene(true_model(), PLACED)
     right = edited(scene, ("crop_box", "0,-9,9,9"), local=True)
     plain_ply.write(tmp_path / "left.ply", edited(scene, ("cut_box", "0,-9,9,9"), local=True))
@@ -301,7 +301,7 @@ def test_two_halves_merged_are_the_whole(tmp_path: Path):
 
 
 @pytest.mark.parametrize("axes", ["z up", "y up"])
-def test_a_splat_of_another_run_comes_to_where_it_lies_on_the_earth(tmp_path: Path, axes):
+def test_a_splat_of_another_run_is_merged_at_its_place_on_earth(tmp_path: Path, axes):
     scene = Scene(true_model(), PLACED)
     other = replace(PLACE, latitude=52.21, longitude=21.02, height_m=90.0, crs="EPSG:2180")
     here, there = (Origin(place.latitude, place.longitude, place.height_m) for place in (PLACE, other))
@@ -338,13 +338,13 @@ def test_degrees_of_harmonics_may_differ(tmp_path: Path):
         (SceneFacts("z up", metres=True), "not georeferenced"),
     ],
 )
-def test_what_lies_nobody_knows_where_is_not_merged(tmp_path: Path, facts, told):
+def test_splats_of_unknown_place_are_not_merged(tmp_path: Path, facts, told):
     plain_ply.write(tmp_path / "other.ply", Scene(true_model(), facts))
     with pytest.raises(SplatpipeError, match=told):
         edited(Scene(true_model(), PLACED), ("merge", tmp_path / "other.ply"))
 
 
-def test_without_places_only_one_frame_is_merged(tmp_path: Path):
+def test_without_georeference_only_splats_in_one_frame_are_merged(tmp_path: Path):
     plain_ply.write(tmp_path / "other.ply", Scene(true_model(), SceneFacts("z up")))
     with pytest.raises(SplatpipeError, match="axis"):
         edited(Scene(true_model(), SceneFacts("y down")), ("merge", tmp_path / "other.ply"))
@@ -357,7 +357,7 @@ def test_without_places_only_one_frame_is_merged(tmp_path: Path):
 # ------------------------------------------------------------------------------------------------------------- cleaning
 
 
-def test_cleaning_sees_by_cameras_that_went_with_the_splat():
+def test_cleaning_uses_cameras_moved_with_the_splat():
     scene = Scene(true_model(), SceneFacts("y down"))
     scene.gaussians.opacity_logits[::10] = -8.0  # what nobody sees
     to_up = Similarity(1.0, turn_of("z up", "y down").numpy(), np.zeros(3))
@@ -372,7 +372,7 @@ def test_cleaning_sees_by_cameras_that_went_with_the_splat():
     assert kept[0][0] == kept[1][0] and torch.equal(kept[0][1], kept[1][1])
 
 
-def test_photos_of_one_run_do_not_judge_what_was_merged_into_it(tmp_path: Path):
+def test_photos_of_one_run_do_not_judge_merged_splats(tmp_path: Path):
     plain_ply.write(tmp_path / "other.ply", Scene(true_model(), SceneFacts()))
     piece = Workpiece(Scene(true_model(), SceneFacts()))
     told = [
@@ -382,7 +382,7 @@ def test_photos_of_one_run_do_not_judge_what_was_merged_into_it(tmp_path: Path):
     assert told[-1]["photos"] == 0 and "before --merge" in piece.notes[0]
 
 
-def test_photos_that_a_run_judges_itself_by_are_no_witnesses(run_folder: Path):
+def test_held_out_photos_are_not_used_for_cleaning(run_folder: Path):
     assert len(open_source(run_folder).trained_on()) == 9
     (run_folder / "metrics.json").write_text(json.dumps({"per_view": [{"name": "flight 1/photo_0.png"}]}))
     assert next(camera.name for camera in open_source(run_folder).trained_on()) == "flight 1/photo_1.png"
@@ -393,7 +393,7 @@ def test_photos_that_a_run_judges_itself_by_are_no_witnesses(run_folder: Path):
 # ------------------------------------------------------------------------------------------------------ sizes, records
 
 
-def test_it_is_reduced_to_so_many_or_to_so_many_bytes(tmp_path: Path):
+def test_it_is_reduced_to_a_count_or_a_size_in_bytes(tmp_path: Path):
     scene = Scene(true_model(600), SceneFacts())
     assert len(edited(scene, ("reduce", "200")).gaussians) == 200
     assert same(edited(scene, ("reduce", "900")).gaussians, scene.gaussians)
@@ -460,20 +460,20 @@ def test_a_record_keeps_the_newest_edits_and_counts_the_others():
         ("reduce", "١٢"),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_anything_is_read(name, value):
+def test_invalid_steps_are_refused_before_anything_is_read(name, value):
     with pytest.raises(UsageError) as told:
         parse_steps([(name, value)], OUTPUT, False)
     assert told.value.hint and len(told.value.message) < 200
 
 
-def test_points_that_are_one_and_absurd_factors_are_refused():
+def test_coinciding_points_and_absurd_factors_are_refused():
     scene = Scene(true_model(), SceneFacts())
     for points in (("1,1,1", "1,1,1"), ("0,0,0", "0,0,1e-9")):
         with pytest.raises(SplatpipeError, match="apart in the splat"):
             edited(scene, ("scale_from", (*points, "12.40m")))
 
 
-def test_options_are_read_in_their_order_each_as_often_as_given():
+def test_options_are_read_in_order_and_may_be_repeated():
     options = {"rotate": ["10", "20"], "move": ["1,0,0"], "scale_from": ("a", "b", "c"), "about": None}
     order = ["source", "rotate", "move", "local", "scale_from", "rotate"]
     expected = [("rotate", "10"), ("move", "1,0,0"), ("scale_from", ("a", "b", "c")), ("rotate", "20")]
@@ -518,7 +518,7 @@ def run_folder(tmp_path: Path) -> Path:
     return out
 
 
-def test_a_run_is_edited_from_the_command_line_and_stays_as_it_is(run_folder: Path, tmp_path: Path):
+def test_a_run_is_edited_from_the_command_line_and_stays_unchanged(run_folder: Path, tmp_path: Path):
     before = (run_folder / "splat.ply").read_bytes()
     out = tmp_path / "site.ply"
     steps = "--rotate", "30", "--crop-box", "-1.5,-9,1.5,9", "--about", "0,0,0", "--rotate", "7", "--local"
@@ -557,7 +557,7 @@ def test_errors_leave_nothing_behind_and_say_what_to_do(run_folder: Path, tmp_pa
 
 
 @pytest.mark.parametrize("name", ["splat.ply", "stages/train/model.ply", ".partial/a.ply", "cameras.json"])
-def test_what_belongs_to_a_run_is_not_written_over(run_folder: Path, name):
+def test_files_of_a_run_are_not_overwritten(run_folder: Path, name):
     steps = parse_steps([("rotate", "1")], OUTPUT, False)
     task = EditTask(open_source(run_folder), OutputFile(run_folder / name, format_named("ply")), steps)
     with pytest.raises(UsageError) as told:
@@ -565,7 +565,7 @@ def test_what_belongs_to_a_run_is_not_written_over(run_folder: Path, name):
     assert "edited.ply" in told.value.hint or "IN must not be overwritten" in told.value.hint
 
 
-def test_into_a_run_new_files_are_written_and_their_like_again(run_folder: Path):
+def test_new_files_in_a_run_may_be_written_and_overwritten(run_folder: Path):
     for degrees in ("1", "2"):
         output = OutputFile(run_folder / "edited.ply", format_named("ply"))
         report = Recorder()
@@ -574,7 +574,7 @@ def test_into_a_run_new_files_are_written_and_their_like_again(run_folder: Path)
     assert plain_ply.read(run_folder / "edited.ply").facts.edits[0]["degrees"] == 2.0
 
 
-def test_what_is_read_is_not_written_over(tmp_path: Path):
+def test_input_files_are_not_overwritten(tmp_path: Path):
     plain_ply.write(tmp_path / "a.ply", Scene(true_model(), SceneFacts()))
     plain_ply.write(tmp_path / "b.ply", Scene(true_model(), SceneFacts()))
     steps = parse_steps([("merge", tmp_path / "b.ply")], OUTPUT, False)
@@ -586,7 +586,7 @@ def test_what_is_read_is_not_written_over(tmp_path: Path):
             )
 
 
-def test_a_model_folder_is_written_whole_and_no_folder_with_something_in_it(tmp_path: Path):
+def test_a_model_folder_is_written_completely_and_never_into_a_nonempty_folder(tmp_path: Path):
     plain_ply.write(tmp_path / "a.ply", Scene(true_model(), SceneFacts()))
     output = OutputFile(tmp_path / "model", format_named("model"))
     task = EditTask(open_source(tmp_path / "a.ply"), output, parse_steps([("rotate", "1")], output, False), False)
@@ -601,7 +601,7 @@ def test_a_model_folder_is_written_whole_and_no_folder_with_something_in_it(tmp_
 # ------------------------------------------------------------------------------------------------------------ pictures
 
 
-def test_a_photo_that_shows_it_is_taken_and_an_oblique_view_where_none_does(run_folder: Path):
+def test_a_photo_that_shows_it_is_used_or_else_an_oblique_view(run_folder: Path):
     points = true_model().means.double().numpy()
     found = read_cameras(run_folder / "cameras.json")
     assert [camera.name for camera in found] == [camera.name for camera in cameras()]
@@ -623,6 +623,6 @@ def test_an_oblique_view_shows_all_of_a_box_from_above():
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"rotation": 5}]', "[" * 10_000, "[null]"])
-def test_damaged_cameras_are_none(tmp_path: Path, text):
+def test_damaged_cameras_are_ignored(tmp_path: Path, text):
     (tmp_path / "cameras.json").write_text(text)
     assert read_cameras(tmp_path / "cameras.json") == []

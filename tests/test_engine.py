@@ -57,7 +57,7 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def test_a_run_leaves_its_deliverable_and_a_second_one_runs_nothing(numbers: Path, out: Path) -> None:
+def test_a_run_writes_its_deliverable_and_a_second_one_runs_nothing(numbers: Path, out: Path) -> None:
     first, _ = walk(request_of(numbers, out))
     assert first.ran == ["read", "add", "count", "tell"]
     assert (out / "telling.txt").read_text() == "3 1 False 21"
@@ -66,7 +66,7 @@ def test_a_run_leaves_its_deliverable_and_a_second_one_runs_nothing(numbers: Pat
     assert [event.kind for event in events] == ["run_started", *["stage_reused"] * 4, "run_finished"]
 
 
-def test_what_a_killed_run_was_delivering_is_cleared_away(numbers: Path, out: Path) -> None:
+def test_partial_deliverables_of_a_killed_run_are_removed(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     (out / "telling.txt").unlink()
     (out / ".telling.txt.99.new").write_text("3 1")
@@ -76,7 +76,7 @@ def test_what_a_killed_run_was_delivering_is_cleared_away(numbers: Path, out: Pa
     assert [path.name for path in out.glob(".*.new")] == [".report.html.99.new"]
 
 
-def test_what_begins_is_told_however_soon_it_follows() -> None:
+def test_starts_are_reported_however_soon_they_follow() -> None:
     told: list[str] = []
     reporter = EventReporter("count", lambda event: told.append(f"{event.data['what']} {event.data['done']}"))
     for what in ("placing", "joining"):
@@ -86,7 +86,7 @@ def test_what_begins_is_told_however_soon_it_follows() -> None:
     assert "joining 0" in told
 
 
-def test_a_changed_option_is_felt_exactly_as_far_as_it_changes_bytes(numbers: Path, out: Path) -> None:
+def test_a_changed_option_reruns_exactly_as_far_as_it_changes_bytes(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     outcome, _ = walk(request_of(numbers, out, add={"offset": 2}))
     assert outcome.ran == ["add", "tell"]  # the parity stayed, so the count did
@@ -107,7 +107,7 @@ def test_a_borrowed_setting_reruns_the_stage_that_borrows_it(numbers: Path, out:
     assert outcome.ran == ["count", "tell"]
 
 
-def test_what_is_delivered_only_with_an_option_is_taken_back_without_it(numbers: Path, out: Path) -> None:
+def test_files_delivered_only_with_an_option_are_removed_without_it(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out, tell={"loud": True}))
     assert (out / "echo.txt").read_text() == "3 1 TRUE 21"
     walk(request_of(numbers, out))
@@ -118,7 +118,7 @@ def test_what_is_delivered_only_with_an_option_is_taken_back_without_it(numbers:
     assert (out / "echo.txt").read_text() == "somebody's own"
 
 
-def test_what_was_put_into_a_delivered_file_stays_and_is_taken_back_with_it(numbers: Path, out: Path) -> None:
+def test_content_added_to_a_delivered_file_is_kept_and_removed_with_it(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out, tell={"loud": True}))
     echo = out / "echo.txt"
     before = echo.stat()
@@ -140,7 +140,7 @@ def test_a_changed_photo_reruns_but_a_touched_or_copied_one_does_not(numbers: Pa
     assert walk(request_of(numbers, out))[0].ran == ["read", "add", "count", "tell"]
 
 
-def test_strays_are_dropped_and_the_manifest_describes_every_file(numbers: Path, out: Path) -> None:
+def test_undeclared_files_are_dropped_and_the_manifest_describes_every_file(numbers: Path, out: Path) -> None:
     outcome, _ = walk(request_of(numbers, out))
     folder = outcome.artifacts["read"].folder
     assert sorted(path.name for path in folder.iterdir()) == ["left_out.json", "manifest.json", "numbers.json"]
@@ -155,7 +155,7 @@ def test_a_damaged_artifact_is_made_again(numbers: Path, out: Path) -> None:
     assert again.ran == ["add"]
 
 
-def test_rerun_runs_again_and_what_follows_is_reused_when_the_bytes_are_the_same(numbers: Path, out: Path) -> None:
+def test_rerun_runs_again_and_later_stages_are_reused_if_the_bytes_are_the_same(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     outcome, _ = walk(request_of(numbers, out), rerun=frozenset({"add"}))
     assert outcome.ran == ["add"]
@@ -191,7 +191,7 @@ def test_one_stage_alone_needs_what_it_reads(numbers: Path, out: Path) -> None:
         ("forget", StageError, "did not write count.txt"),
     ],
 )
-def test_a_failed_stage_has_a_reason_and_what_came_before_it_stays(
+def test_a_failed_stage_has_a_reason_and_earlier_stages_are_kept(
     numbers: Path, out: Path, fail: str, error: type[SplatpipeError], message: str
 ) -> None:
     with pytest.raises(error, match=message):
@@ -227,7 +227,7 @@ def run_in_background(numbers: Path, out: Path, **count: object) -> subprocess.P
 
 
 @pytest.mark.parametrize("whole_group", [False, True])
-def test_a_killed_run_goes_on_from_its_checkpoint(numbers: Path, out: Path, whole_group: bool) -> None:
+def test_a_killed_run_resumes_from_its_checkpoint(numbers: Path, out: Path, whole_group: bool) -> None:
     slow = {"steps": 200, "step_s": 0.15}
     with run_in_background(numbers, out, **slow) as process:
         assert process.stdout is not None
@@ -270,7 +270,7 @@ def test_a_worker_that_is_asked_to_end_is_not_waited_for(numbers: Path, tmp_path
         assert json.loads(worker.stdout.readlines()[-1]) == {"failed": {"type": "KeyboardInterrupt"}}
 
 
-def test_a_second_process_is_refused_and_told_who_works_there(
+def test_a_second_process_is_refused_and_the_message_names_the_first(
     numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
@@ -282,7 +282,7 @@ def test_a_second_process_is_refused_and_told_who_works_there(
         process.kill()
 
 
-def test_a_commit_cut_between_its_renames_is_finished(numbers: Path, out: Path) -> None:
+def test_a_commit_interrupted_between_its_renames_is_finished(numbers: Path, out: Path) -> None:
     outcome, _ = walk(request_of(numbers, out))
     folder = outcome.artifacts["add"].folder
     partial = out / "stages" / ".partial" / folder.name
@@ -292,7 +292,7 @@ def test_a_commit_cut_between_its_renames_is_finished(numbers: Path, out: Path) 
     assert not partial.exists()
 
 
-def test_what_changed_while_a_stage_read_it_becomes_no_artifact(numbers: Path, out: Path) -> None:
+def test_inputs_changed_while_a_stage_reads_them_give_no_artifact(numbers: Path, out: Path) -> None:
     """Its key would claim that it was made from the earlier contents."""
     changed = (numbers / "b.txt").read_text()
 
@@ -318,7 +318,7 @@ def test_survey_says_why(numbers: Path, out: Path) -> None:
     assert statuses[1].reason == "add.offset changed from 0 to 5"
 
 
-def test_clean_removes_only_what_nothing_asks_for(numbers: Path, out: Path) -> None:
+def test_clean_removes_only_unused_artifacts(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     walk(request_of(numbers, out, add={"offset": 1}))
     request = request_of(numbers, out, add={"offset": 1})
@@ -329,13 +329,13 @@ def test_clean_removes_only_what_nothing_asks_for(numbers: Path, out: Path) -> N
     assert walk(request)[0].ran == []
 
 
-def test_the_run_can_be_taken_up_from_its_out_alone(numbers: Path, out: Path) -> None:
+def test_the_run_can_be_continued_from_its_out_alone(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out, add={"offset": 3}))
     photos, config = open_run_folder(out, arithmetic.LINE).config(arithmetic.LineConfig)
     assert photos == numbers and config.add.offset == 3
 
 
-def test_out_that_cannot_be_used(numbers: Path, tmp_path: Path) -> None:
+def test_unusable_out_is_refused(numbers: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="is a file"):
         walk(request_of(numbers, tmp_path / "file"))
@@ -389,7 +389,7 @@ def test_how_a_run_and_its_stages_ended_is_in_the_events(numbers: Path, out: Pat
 
 
 @pytest.mark.parametrize(("meddled", "lasting"), [("", True), ("gone", False), ("another", False)])
-def test_a_failure_for_the_photos_lasts_as_long_as_they_do(
+def test_a_failure_due_to_the_photos_is_remembered_until_they_change(
     numbers: Path, out: Path, meddled: str, lasting: bool
 ) -> None:
     """If a folder was temporarily missing or still being written, the next run may succeed."""
@@ -409,7 +409,7 @@ def test_a_failure_for_the_photos_lasts_as_long_as_they_do(
     assert (failed["exit_code"], failed["lasting"]) == (1, lasting)
 
 
-def test_hostile_names_do_not_disturb(numbers: Path, out: Path) -> None:
+def test_hostile_names_do_no_harm(numbers: Path, out: Path) -> None:
     for name in ("näme mit leer", "写真", "new\nline", "quote'\"`$(x)"):
         (numbers / f"{name}.txt").write_text("1")
     Path(os.fsdecode(os.fsencode(numbers) + b"/\xff\xfe.txt")).write_text("1")
@@ -426,7 +426,7 @@ def test_a_refused_stage_leaves_the_configuration_as_it_was(numbers: Path, out: 
     assert open_run_folder(out, arithmetic.LINE).config(arithmetic.LineConfig)[1].add.offset == 0
 
 
-def test_looking_writes_nothing(numbers: Path, out: Path) -> None:
+def test_status_writes_nothing(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     (numbers / "d.txt").write_text("4")
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
@@ -434,13 +434,13 @@ def test_looking_writes_nothing(numbers: Path, out: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
 
 
-def test_a_photo_that_cannot_be_read_is_for_ingest_to_name(numbers: Path, out: Path) -> None:
+def test_an_unreadable_photo_is_left_to_ingest_to_report(numbers: Path, out: Path) -> None:
     (numbers / "dangling.md").symlink_to(numbers / "nothing")
     (numbers / "pipe.md").symlink_to("/proc/self/mem")
     assert walk(request_of(numbers, out))[0].ran == ["read", "add", "count", "tell"]
 
 
-def test_a_run_walks_to_every_deliverable_and_no_further_than_asked(numbers: Path, out: Path) -> None:
+def test_a_run_makes_every_deliverable_and_nothing_beyond_the_request(numbers: Path, out: Path) -> None:
     """Two stages whose outputs no stage reads: both run, since their outputs are for users."""
     side = replace(arithmetic.ADD, deliverables=("total",))
     stages = (arithmetic.READ, arithmetic.COUNT, arithmetic.TELL, side)
@@ -451,7 +451,7 @@ def test_a_run_walks_to_every_deliverable_and_no_further_than_asked(numbers: Pat
     assert [stage.name for stage in line.needed()] == ["read", "count", "tell", "add"]
 
 
-def test_a_stage_that_is_turned_off_reads_nothing_and_waits_for_nobody(numbers: Path, out: Path) -> None:
+def test_a_disabled_stage_reads_nothing_and_waits_for_nothing(numbers: Path, out: Path) -> None:
     off = request_of(numbers, out, count={"enabled": False})
     assert walk(off, until="count")[0].ran == ["count"]
     assert [status.state for status in line_status(*status_of(off))] == ["missing", "waiting", "valid", "waiting"]
@@ -461,7 +461,7 @@ def test_a_stage_that_is_turned_off_reads_nothing_and_waits_for_nobody(numbers: 
     assert walk(changed)[0].ran == ["add", "tell"]  # another parity, which nobody counts
 
 
-def test_what_belongs_together_is_found_without_configuration_and_source(numbers: Path, out: Path) -> None:
+def test_matching_artifacts_are_found_without_configuration_and_source(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     walk(request_of(numbers, out, add={"offset": 2}))
     walk(request_of(numbers, out))  # reused: what OUT shows is not the newest
@@ -475,7 +475,7 @@ def test_what_belongs_together_is_found_without_configuration_and_source(numbers
     assert folder.lineage(none, arithmetic.TELL)["add.total"].path.read_text() == "23" and folder.lineage(none) == {}
 
 
-def test_contents_are_what_the_last_run_made_and_nothing_that_contradicts_it(numbers: Path, out: Path) -> None:
+def test_contents_are_those_of_the_last_run_and_consistent_with_it(numbers: Path, out: Path) -> None:
     first = walk(request_of(numbers, out))[0].artifacts
     second = walk(request_of(numbers, out, add={"offset": 2}))[0].artifacts
     folder, keys = open_run_folder(out, arithmetic.LINE), {name: artifact.key for name, artifact in first.items()}
@@ -493,14 +493,14 @@ def test_contents_are_what_the_last_run_made_and_nothing_that_contradicts_it(num
     assert folder.contents(None, keys).artifacts == {}
 
 
-def test_what_no_stage_ever_left_came_from_the_users_folder(numbers: Path, out: Path) -> None:
+def test_parts_that_no_stage_made_come_from_the_users_folder(numbers: Path, out: Path) -> None:
     """An external part, like a reconstruction, replaces the stage that would have produced it."""
     made = dict(walk(request_of(numbers, out))[0].artifacts)
     shutil.rmtree(made.pop("read").folder)
     assert open_run_folder(out, arithmetic.LINE).contents(None, {}).artifacts == made
 
 
-def test_unfinished_work_is_found_where_it_lies(numbers: Path, out: Path) -> None:
+def test_unfinished_work_is_found(numbers: Path, out: Path) -> None:
     events: list[Event] = []
     request = request_of(numbers, out, count={"fail": "raise"})
     with pytest.raises(StageError), open_session(request, events.append) as runner:
@@ -510,7 +510,7 @@ def test_unfinished_work_is_found_where_it_lies(numbers: Path, out: Path) -> Non
     assert (contents.working["count"] / "checkpoint").read_text() == "3"
 
 
-def test_deliverables_are_files_that_are_there_and_that_a_stage_left(numbers: Path, out: Path) -> None:
+def test_deliverables_are_existing_files_made_by_a_stage(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     folder = open_run_folder(out, arithmetic.LINE)
     (out / "notes.txt").write_text("mine")
@@ -519,13 +519,13 @@ def test_deliverables_are_files_that_are_there_and_that_a_stage_left(numbers: Pa
     assert folder.deliverables() == []
 
 
-def test_folder_is_at_work_as_long_as_a_session_is_open(numbers: Path, out: Path) -> None:
+def test_folder_is_in_use_while_a_session_is_open(numbers: Path, out: Path) -> None:
     with open_session(request_of(numbers, out), lambda event: None):
         assert open_run_folder(out, arithmetic.LINE).is_running
     assert not open_run_folder(out, arithmetic.LINE).is_running
 
 
-def test_the_log_thins_the_progress_of_a_thing_and_keeps_what_begins(tmp_path: Path) -> None:
+def test_the_log_thins_progress_and_keeps_starts(tmp_path: Path) -> None:
     log = EventLog(tmp_path / "events.jsonl")
     for time_s, what, done in (
         (9.0, "decoding", 1),

@@ -85,7 +85,7 @@ def test_floaters_are_measured_with_or_without_held_out_views(left: Path, inputs
     assert figures == without
 
 
-def test_figures_come_out_of_the_pngs_again(left: Path) -> None:
+def test_figures_can_be_recomputed_from_the_pngs(left: Path) -> None:
     for view in json.loads((left / "metrics.json").read_text())["per_view"]:
         photo, render = (read(left / "views" / f"{view['file']}.{kind}.png") for kind in ("photo", "render"))
         counted = np.ones(photo.shape[:2], bool)
@@ -107,7 +107,9 @@ def test_photos_are_kept_as_they_are(left: Path, inputs: Inputs) -> None:
     np.testing.assert_array_equal(read(left / "views/flight 1_photo_0.photo.png"), original)
 
 
-def test_photos_are_judged_at_their_own_size_whatever_was_trained(inputs: Inputs, left: Path, tmp_path: Path) -> None:
+def test_photos_are_evaluated_at_their_own_size_whatever_was_trained(
+    inputs: Inputs, left: Path, tmp_path: Path
+) -> None:
     rendering = json.loads(inputs["train.rendering"].read_text()) | {"megapixels": 0.001}
     (tmp_path / "rendering.json").write_text(json.dumps(rendering))
     smaller = replace(inputs, parts={**inputs.parts, "train.rendering": tmp_path / "rendering.json"})
@@ -118,7 +120,9 @@ def test_photos_are_judged_at_their_own_size_whatever_was_trained(inputs: Inputs
     assert summary["judged_megapixels"] == pytest.approx(size, abs=5e-4)
 
 
-def test_larger_photos_are_judged_at_one_size(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_larger_photos_are_evaluated_at_one_size(
+    inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(evaluate, "JUDGED_MEGAPIXELS", 0.002)
     assert evaluate.run(EvaluateConfig(), inputs, tmp_path, tiny_scene.Recorder())["judged_megapixels"] == 0.002
     for view in json.loads((tmp_path / "metrics.json").read_text())["per_view"]:
@@ -157,7 +161,7 @@ def test_without_held_out_views_it_says_so_and_leaves_valid_figures(inputs: Inpu
     assert list((tmp_path / "views").iterdir()) == []
 
 
-def test_named_views_are_taken(inputs: Inputs, tmp_path: Path) -> None:
+def test_named_views_are_evaluated(inputs: Inputs, tmp_path: Path) -> None:
     named = held_out(inputs, 8, "flight 1/photo_2.png, flight 1/photo_7.png")
     assert evaluate.run(EvaluateConfig(), named, tmp_path, tiny_scene.Recorder())["test_views"] == 2
 

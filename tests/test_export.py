@@ -179,7 +179,7 @@ def test_georef_json_places_the_exported_cameras(exported: Path) -> None:
     assert (positions >= low - 1e-3).all() and (positions <= high + 1e-3).all()
 
 
-def test_the_crs_and_its_operation_are_told(inputs: Inputs, tmp_path: Path) -> None:
+def test_the_crs_and_its_operation_are_reported(inputs: Inputs, tmp_path: Path) -> None:
     recorder = tiny_scene.Recorder()
     export.run(ExportConfig(), inputs, tmp_path, recorder)
     note = recorder.notes[0]
@@ -201,7 +201,7 @@ def test_an_accuracy_is_never_rounded_to_nothing(accuracy_m: float | None, words
     assert accuracy_in_words(accuracy_m) == words
 
 
-def test_broken_gaussians_stay_out_of_the_file(inputs: Inputs, tmp_path: Path) -> None:
+def test_broken_gaussians_are_left_out_of_the_file(inputs: Inputs, tmp_path: Path) -> None:
     model = read_splat(inputs["clean.model"])
     model.quats[0] = 0.0
     model.log_scales[1, 0] = float("nan")
@@ -230,7 +230,7 @@ def test_photos_left_out_are_counted_too(inputs: Inputs, tmp_path: Path) -> None
     assert export.count_photos(Inputs({}, tmp_path), 8) == 8
 
 
-def test_sparse_scene_has_the_points_and_a_frustum_a_camera_y_up(inputs: Inputs, exported: Path) -> None:
+def test_sparse_scene_has_the_points_and_a_frustum_per_camera_y_up(inputs: Inputs, exported: Path) -> None:
     scene = trimesh.load(io.BytesIO((exported / "sparse.glb").read_bytes()), file_type="glb")
     parts = {type(geometry).__name__: geometry for geometry in scene.geometry.values()}
     points = load_points(inputs["undistort.dataset"])
@@ -271,7 +271,7 @@ def test_sky_is_a_file_of_its_own_in_the_same_frame(inputs: Inputs, exported: Pa
     assert not (exported / "sky/sky.ply").exists()
 
 
-def test_sky_that_was_not_trained_is_told(inputs: Inputs, tmp_path: Path) -> None:
+def test_requesting_a_sky_that_was_not_trained_is_reported(inputs: Inputs, tmp_path: Path) -> None:
     recorder = tiny_scene.Recorder()
     summary = export.run(ExportConfig(sky=True), inputs, tmp_path, recorder)
     assert len(recorder.warnings) == 1 and "no sky" in recorder.warnings[0]

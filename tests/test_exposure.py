@@ -43,7 +43,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_gains_are_those_that_the_photos_were_given_whatever_the_surface_and_a_few_highlights() -> None:
+def test_gains_are_the_photos_true_ones_despite_texture_and_a_few_highlights() -> None:
     random = np.random.default_rng(3)
     true = random.normal(scale=0.1, size=(7, 3))
     photo, point = (grid.ravel() for grid in np.meshgrid(np.arange(7), np.arange(80), indexing="ij"))
@@ -55,12 +55,12 @@ def test_gains_are_those_that_the_photos_were_given_whatever_the_surface_and_a_f
     np.testing.assert_allclose(found, true - true.mean(axis=0), atol=0.025)
 
 
-def test_photos_without_points_in_common_tell_no_gains() -> None:
+def test_photos_without_common_points_give_no_gains() -> None:
     photo, point = np.repeat([0, 1], 30), np.arange(60)
     assert log_gains(photo, point, np.random.default_rng(4).normal(size=(60, 3)), 3).shape == (0, 3)
 
 
-def test_exposures_are_modelled_where_they_differ_unless_told_otherwise(scene: Path, tmp_path: Path) -> None:
+def test_exposures_are_modelled_if_they_differ_unless_set_otherwise(scene: Path, tmp_path: Path) -> None:
     differing, alike = scene / "dataset", tiny_scene.write_dataset(tmp_path / "dataset")
     for asked, dataset, told in (("auto", differing, "affine"), ("auto", alike, "off"), ("off", differing, "off")):
         recorder = tiny_scene.Recorder()
@@ -69,7 +69,7 @@ def test_exposures_are_modelled_where_they_differ_unless_told_otherwise(scene: P
         assert [note[:9] for note in recorder.notes] == (["exposures"] if told == "affine" else [])
 
 
-def test_a_written_plan_has_decided_and_no_photo_is_asked_again(
+def test_a_written_plan_is_final_and_no_photo_is_measured_again(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
@@ -139,7 +139,7 @@ def test_a_step_changes_one_photo_and_keeps_the_mean() -> None:
     assert bool((maps["b"] < maps["a"]).all())
 
 
-def test_maps_are_drawn_to_the_identity() -> None:
+def test_maps_are_pulled_towards_the_identity() -> None:
     exposure = Exposure(["a", "b"], first_rate=0.01, decay=1.0)
     with torch.no_grad():
         exposure.tensors["deviations"][0] += 0.2

@@ -20,7 +20,7 @@ def both(off: float, size: tuple[int, int] = (60, 80)) -> tuple[DepthMap, DepthM
     return found, DepthMap(splat, confidence)
 
 
-def test_holes_are_filled_with_what_is_sure_where_the_surface_is() -> None:
+def test_holes_are_filled_with_confirmed_depths_at_the_surface() -> None:
     found, rendered = both(0.001)
     assert behind(found, rendered) == pytest.approx(0.001, rel=1e-2)
     result = filled(found, rendered)
@@ -33,7 +33,7 @@ def test_holes_are_filled_with_what_is_sure_where_the_surface_is() -> None:
     assert not result.depth[10:20, 25:30].any() and not result.confidence[10:20, 25:30].any()
 
 
-def test_where_few_have_both_or_another_surface_nothing_is_moved() -> None:
+def test_with_little_overlap_or_another_surface_nothing_is_shifted() -> None:
     assert behind(*both(0.001, (30, 30))) == 0.0
     assert behind(*both(0.1)) == 0.0
 

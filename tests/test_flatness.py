@@ -44,7 +44,7 @@ def power_law(exponent: float, noise: float = 0.0, until: int = 5000) -> list[tu
 
 
 @pytest.mark.parametrize("exponent", [-0.5, -0.1, 0.0, 0.2])
-def test_expected_gain_of_a_power_law_is_what_the_law_says(exponent: float) -> None:
+def test_expected_gain_of_a_power_law_is_exact(exponent: float) -> None:
     gain = flatness.expected_gain(power_law(exponent), 7000)
     assert gain == pytest.approx(1.0 - (7000 / 4950) ** exponent, abs=1e-9)
 
@@ -56,7 +56,7 @@ def test_noise_raises_the_expected_gain_and_does_not_end_a_training() -> None:
     assert not flatness.is_flat(power_law(-0.001, noise=0.05), plan, 5000)
 
 
-def test_a_curve_that_still_falls_a_few_epochs_or_the_schedules_end_are_not_flat() -> None:
+def test_a_falling_curve_few_epochs_and_the_schedules_end_are_not_flat() -> None:
     plan = make_plan(7000, 0.05)
     assert not flatness.is_flat(power_law(-0.5), plan, 5000)
     assert not flatness.is_flat(power_law(0.0)[: flatness.FEWEST_EPOCHS - 1], plan, 4200)
@@ -92,7 +92,7 @@ def test_a_size_is_flat_where_all_iterations_that_are_left_would_gain_too_little
     assert not flatness.is_flat(power_law(0.0, until=6050), plan, 6000)  # it ends here anyway
 
 
-def test_what_a_size_spares_goes_to_the_finest_by_its_pixels() -> None:
+def test_iterations_saved_at_a_size_go_to_the_finest_by_its_pixels() -> None:
     plan = make_plan(10_000, 0.1, last=15_000)
     sizes = (Stretch(2, 0, 4000), Stretch(1, 0, 6000), Stretch(0, 0, 10_000))
     schedule = replace(plan.schedule, stretches=sizes, density=replace(plan.schedule.density, reset_until=4000))
@@ -159,7 +159,7 @@ def test_a_flat_training_ends_early_and_says_so(scene: Path, tmp_path: Path) -> 
     assert history["flat_at"] == flat_at and history["curve"][-1]["iteration"] == end
 
 
-def test_a_training_that_gains_goes_on_to_its_end_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
+def test_a_training_that_still_improves_runs_to_its_end_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
     off, _ = trained(scene, tmp_path / "off", FEW)
     on, recorder = trained(scene, tmp_path / "on", FEW.model_copy(update={"stop_when_flat": 1e-3}))
     assert on["iterations"] == off["iterations"] == 200 and "flat_at" not in on and not recorder.notes
@@ -167,7 +167,7 @@ def test_a_training_that_gains_goes_on_to_its_end_with_the_same_bits(scene: Path
         assert (tmp_path / "on" / part).read_bytes() == (tmp_path / "off" / part).read_bytes()
 
 
-def test_a_size_whose_loss_is_flat_gives_way_to_larger_photos_at_once(scene: Path, tmp_path: Path) -> None:
+def test_a_size_whose_loss_is_flat_is_followed_by_larger_photos_at_once(scene: Path, tmp_path: Path) -> None:
     summary, recorder = trained(scene, tmp_path, SIZES)
     assert summary["sizes_ended"] == [6 * flatness.FEWEST_EPOCHS]
     assert any("flat after 48 iterations: continuing with larger photos, to 161" in note for note in recorder.notes)
@@ -177,7 +177,7 @@ def test_a_size_whose_loss_is_flat_gives_way_to_larger_photos_at_once(scene: Pat
     assert summary["iterations"] == 106 and recorder.steps[-1] == (106, 106)
 
 
-def test_a_training_that_may_not_end_early_ends_its_smaller_sizes_all_the_same(scene: Path, tmp_path: Path) -> None:
+def test_a_training_that_may_not_end_early_still_ends_its_smaller_sizes(scene: Path, tmp_path: Path) -> None:
     trained(scene, tmp_path / "any", SIZES)
     (tmp_path / "planned").mkdir()
     plan = replace(TrainingPlan.from_json((tmp_path / "any/plan.json").read_text()), ends_when_flat=False)

@@ -51,7 +51,7 @@ def plane(across: float, down: float) -> torch.Tensor:
     return (1.0 / (0.1 + across * x + down * y)).double()
 
 
-def test_planes_are_even_whatever_their_slant_and_what_is_off_them_costs_its_share() -> None:
+def test_planes_are_even_whatever_their_slant_and_deviations_cost_their_share() -> None:
     for slant in ((0.0, 0.0), (2e-3, 0.0), (-1e-3, 3e-3)):
         assert float(unevenness(picture(plane(*slant)), FRONT)) == pytest.approx(0.0, abs=1e-9)
     bent, off = 1.0 / plane(0.0, 0.0), 0.5 * 0.1 / FRONT.fx  # half a pixel on the ground
@@ -65,7 +65,7 @@ def test_planes_are_even_whatever_their_slant_and_what_is_off_them_costs_its_sha
     assert float(unevenness(picture(step), FRONT, reaches=(1,))) <= 2.0 / 22.0
 
 
-def test_no_surface_no_neighbours_and_what_does_not_count_are_nothing() -> None:
+def test_missing_surfaces_neighbours_and_masked_pixels_cost_nothing() -> None:
     rough = plane(0.0, 0.0) * (1.0 + 0.1 * torch.rand(16, 24, generator=torch.Generator().manual_seed(1)))
     assert float(unevenness(picture(rough), FRONT)) > 0.1
     assert float(unevenness(picture(rough, alpha=0.4), FRONT)) == 0.0
@@ -92,7 +92,7 @@ def test_gradient_of_unevenness_agrees_with_finite_differences() -> None:
     assert all(torch.allclose(own, by_hand, rtol=1e-6, atol=1e-12) for own, by_hand in pairs)
 
 
-def test_spread_about_the_median_leaves_the_front_where_it_is() -> None:
+def test_spread_about_the_median_does_not_move_the_front_surface() -> None:
     gaussians = Gaussians.empty(2, 0)
     gaussians.means = torch.tensor([[0.0, 0.0, 8.0], [0.0, 0.0, 12.0]])
     gaussians.log_scales = torch.log(torch.tensor([[240.0, 240.0, 1e-6], [360.0, 360.0, 1e-6]]))
@@ -189,7 +189,7 @@ def inputs_of(parts: dict[str, Path], folder: Path, threads: int = 1) -> Inputs:
 
 
 @pytest.mark.usefixtures("few")
-def test_stage_leaves_a_map_for_every_photo_and_goes_on_where_it_was_killed(
+def test_stage_writes_a_map_for_every_photo_and_resumes_after_a_kill(
     parts: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     once, twice = tmp_path / "once", tmp_path / "twice"
@@ -220,7 +220,7 @@ def test_stage_leaves_a_map_for_every_photo_and_goes_on_where_it_was_killed(
         assert ((found.depth > 0.0) == (found.confidence > 0)).all()
 
 
-def test_without_it_there_are_no_maps_and_of_blocks_the_splat_is_taken_as_it_is(
+def test_disabled_it_writes_no_maps_and_with_blocks_the_splat_is_used_unchanged(
     parts: dict[str, Path], tmp_path: Path
 ) -> None:
     off = SplatDepthsConfig(enabled=False)
@@ -248,7 +248,7 @@ def test_broken_exposures_are_refused(tmp_path: Path) -> None:
     assert read_exposures(path, "train") == {"a": [[1.0, 0.0, 0.0, 0.0]] * 3}
 
 
-def test_photos_are_seen_whole_and_often_enough(parts: dict[str, Path]) -> None:
+def test_whole_photos_are_used_and_often_enough(parts: dict[str, Path]) -> None:
     views, split = load_views(parts["undistort.dataset"]), tiny_scene.split_of(load_views(parts["undistort.dataset"]))
     options = options_of(Gaussians.empty(5, 2), Rendering(True, (0.0, 0.0, 0.0), 0.1, None), has_exposures=False)
     assert options.sh_degree == 2 and options.antialias and options.exposure == "off" and not options.densify

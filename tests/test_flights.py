@@ -43,7 +43,7 @@ def test_a_step_of_the_takeoff_altitude_is_another_flight() -> None:
     assert tell_flights(flight(0.0, 509.0, noise_m=3.0) + flight(62.0, 511.0, noise_m=3.0)) == [0] * 40
 
 
-def test_flights_are_told_whatever_the_order_of_names() -> None:
+def test_flights_are_distinguished_whatever_the_order_of_names() -> None:
     stamps = flight(0.0, 509.0) + flight(600.0, 509.0)
     order = np.random.default_rng(0).permutation(len(stamps))
     told = tell_flights([stamps[index] for index in order])
@@ -71,7 +71,7 @@ def test_shared_errors_are_estimated_and_the_shape_is_exact(step_m: float) -> No
     assert centre[0] == pytest.approx(0.15 * step_m, abs=1e-3 + 0.01 * step_m)
 
 
-def test_accuracy_with_shared_errors_is_what_repetition_shows() -> None:
+def test_accuracy_with_shared_errors_agrees_with_repeated_fits() -> None:
     """The stated sigma of the scale against the scatter of 25 fits, shared errors drawn anew in each."""
     rng = np.random.default_rng(8)
     source = rng.uniform(-3, 3, (30, 3))
@@ -101,7 +101,7 @@ def two_flights(step: tuple[float, float, float], sigma: tuple[float, float] = (
     return scene
 
 
-def test_flights_in_two_vertical_datums_are_told_and_brought_together(tmp_path: Path) -> None:
+def test_flights_in_two_vertical_datums_are_reported_and_aligned(tmp_path: Path) -> None:
     scene = two_flights((0.0, 0.0, 47.0))
     frame, summary, warnings = georef(scene, tmp_path)
     assert summary["positions_left_out"] == 0
@@ -127,14 +127,14 @@ def test_one_flight_has_no_offset(tmp_path: Path) -> None:
     assert georef(survey(grid()), tmp_path)[0].residuals["flights"] == []
 
 
-def test_a_position_of_a_flight_that_is_off_is_still_named(tmp_path: Path) -> None:
+def test_a_wrong_position_in_a_displaced_flight_is_still_reported(tmp_path: Path) -> None:
     scene = two_flights((0.9, -0.6, 47.0))
     scene.positions[30]["altitude_m"] = float(scene.positions[30]["altitude_m"]) - 47.0  # type: ignore[arg-type]
     frame, _, _ = georef(scene, tmp_path)
     assert frame.left_out == (scene.names[30],)
 
 
-def test_swapped_latitude_and_longitude_of_all_photos_is_told(tmp_path: Path) -> None:
+def test_swapped_latitude_and_longitude_of_all_photos_is_reported(tmp_path: Path) -> None:
     scene = survey(grid(), (0.5, 1.0))
     for record in scene.positions:
         record["latitude"], record["longitude"] = float(str(record["longitude"])) + 100.0, record["latitude"]
@@ -156,7 +156,7 @@ def test_the_frame_has_the_datum_that_its_leading_positions_declare(tmp_path: Pa
     np.testing.assert_allclose(lifted, 47.0, atol=1.0)
 
 
-def test_a_declared_datum_comes_before_what_photos_declare(tmp_path: Path) -> None:
+def test_a_declared_datum_takes_precedence_over_the_photos(tmp_path: Path) -> None:
     scene = survey(grid())
     for record in scene.positions:
         record["vertical"] = "ellipsoidal"

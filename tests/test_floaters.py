@@ -76,7 +76,7 @@ def test_true_model_has_no_floaters_and_its_views_agree(dataset: Path) -> None:
     json.dumps(figures, allow_nan=False)
 
 
-def test_planted_floater_is_found_with_the_light_that_it_stops(dataset: Path) -> None:
+def test_planted_floater_is_found_with_the_light_that_it_absorbs(dataset: Path) -> None:
     floater = blob(np.array([[0.0, 0.0, 2.0]]), 0.08, 0.98)
     model = Gaussians.concat([wall(), floater])
     figures = measure_floaters(model, cameras(), HELD_OUT, dataset, OPTIONS)
@@ -135,7 +135,7 @@ def test_figures_do_not_depend_on_the_size_beyond_half_a_megapixel(dataset: Path
     assert next(figures) == next(figures)
 
 
-def test_floater_that_passes_trainings_own_rule_is_still_called_out(dataset: Path) -> None:
+def test_floater_that_passes_trainings_own_rule_is_still_reported(dataset: Path) -> None:
     """Right before a held-out camera, where no other one looks: training's photos have no say there."""
     centre = cameras()[3].centre()
     floater = blob(centre[None] + (0.0, 0.0, 0.5), 0.1, 0.9)
@@ -151,7 +151,7 @@ def test_floater_that_passes_trainings_own_rule_is_still_called_out(dataset: Pat
     assert seen["mean"] == 0.0  # it hangs before nothing that this one sees
 
 
-def test_light_that_a_veil_stops_is_what_its_gaussian_says(dataset: Path) -> None:
+def test_light_absorbed_by_a_veil_is_that_of_its_gaussian(dataset: Path) -> None:
     """Haze that more than half of the light passes in every pixel, so no depth map shows it."""
     camera, sigma_px = cameras()[1], 0.6 * 130.0 / 2.0
     veil = blob(camera.centre()[None] + (0.0, 0.0, 2.0), 0.6, 0.3)
@@ -164,7 +164,7 @@ def test_light_that_a_veil_stops_is_what_its_gaussian_says(dataset: Path) -> Non
     assert not light_stopped(Gaussians.concat([wall(), beside]), camera, xyz, OPTIONS).any()  # is the surface itself
 
 
-def test_veil_is_of_what_the_near_plane_lets_into_pictures(dataset: Path) -> None:
+def test_veil_excludes_what_is_nearer_than_the_near_plane(dataset: Path) -> None:
     """Half a unit before a held-out camera: a plane beyond hides it from every picture, and from training."""
     floater = blob(cameras()[3].centre()[None] + (0.0, 0.0, 0.5), 0.1, 0.98)
     model = Gaussians.concat([wall(), floater])
@@ -176,7 +176,7 @@ def test_veil_is_of_what_the_near_plane_lets_into_pictures(dataset: Path) -> Non
     assert far["worst"] == 0.0 and far["points"] == near["points"]
 
 
-def test_where_no_photo_is_held_out_training_photos_are_asked(dataset: Path) -> None:
+def test_if_no_photo_is_held_out_training_photos_are_used(dataset: Path) -> None:
     floater = blob(cameras()[3].centre()[None] + (0.0, 0.0, 0.5), 0.1, 0.98)
     model = Gaussians.concat([wall(), floater])
     of_one, of_all = (measure_floaters(model, cameras(), names, dataset, OPTIONS)["veil"] for names in (HELD_OUT, ()))

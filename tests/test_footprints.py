@@ -80,7 +80,7 @@ def test_neighbours_on_an_orbit_overlap_most_and_opposite_photos_not() -> None:
     assert by_step[11] == 0.0
 
 
-def test_photos_of_which_nothing_is_known_overlap_with_none() -> None:
+def test_photos_without_metadata_overlap_with_none() -> None:
     these = orbit(12, 30.0, 14.0)
     these.centres_m[3] = np.nan
     these.enu_from_camera[3] = np.nan

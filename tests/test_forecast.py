@@ -53,7 +53,7 @@ def test_every_stage_has_a_forecast_that_grows_with_the_preset() -> None:
         assert all(less[name].cpu_seconds <= more[name].cpu_seconds for name in less)
 
 
-def test_what_is_turned_off_costs_nothing() -> None:
+def test_disabled_stages_cost_nothing() -> None:
     off, on = (
         forecast(SIZE, resolve(LineConfig, [{"mesh": {"enabled": enabled}}]))["mesh"] for enabled in (False, True)
     )
@@ -77,7 +77,7 @@ def test_each_further_format_takes_its_time_and_disk_of_the_export_alone() -> No
     assert needs("colmap,transforms") == each["colmap"]  # one folder of photos
 
 
-def test_more_photos_and_larger_ones_take_more() -> None:
+def test_more_and_larger_photos_cost_more() -> None:
     config = configured("standard")
     base = whole(forecast(SIZE, config))
     for larger in (replace(SIZE, photos=160), replace(SIZE, megapixels=24.0)):
@@ -107,19 +107,19 @@ def test_limits_of_memory_and_of_gaussians_bound_the_training() -> None:
 
 
 @pytest.mark.parametrize("budget", [120.0, 1800.0, 36_000.0])
-def test_a_time_budget_is_the_time(budget: float) -> None:
+def test_a_time_budget_is_the_forecast_time(budget: float) -> None:
     needs = forecast(CaptureSize(20, 2.0, True), configured("preview", time_budget_s=budget), threads=4)
     assert sum(seconds(need, 4) for need in needs.values()) == pytest.approx(budget, rel=0.15)
 
 
-def test_it_is_light_and_runs_anywhere() -> None:
+def test_it_is_cheap_and_runs_anywhere() -> None:
     code = "import sys, splatpipe.stages.forecast; print({'numpy', 'torch', 'cv2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
     assert 0.25 <= machine_speed() <= 4.0
 
 
-def test_a_run_forecasts_from_what_ingest_counted() -> None:
+def test_a_run_forecasts_from_ingests_counts() -> None:
     forecaster = Forecaster(configured("preview"), 2)
     assert forecaster({}) == {}
     assert forecaster({"ingest": {"photos": 0, "positions": 0, "camera_groups": []}}) == {}
@@ -132,7 +132,7 @@ LARGE = CaptureSize(photos=1000, megapixels=1.1, positions=True)
 LIMITED = {"max_gaussians": 4_000_000, "max_memory_bytes": 1_500_000_000}
 
 
-def test_blocks_are_forecast_by_what_each_begins_with_and_sees_around_itself() -> None:
+def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> None:
     work = CaptureWork.of(LARGE, configured("standard", **LIMITED), REFERENCE, 1)
     assert work.blocks is not None
     most, limit = work.blocks.division.need.trained, LIMITED["max_memory_bytes"]
@@ -155,7 +155,7 @@ def test_blocks_are_forecast_by_what_each_begins_with_and_sees_around_itself() -
     assert needs_of_blocks(work, {}, 1.0) == {}
 
 
-def test_a_run_goes_by_what_blocks_decided_and_decides_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_follows_the_decision_of_blocks_which_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     divide = work_module.divided
 
@@ -183,7 +183,7 @@ def test_a_run_goes_by_what_blocks_decided_and_decides_once(monkeypatch: pytest.
     )
 
 
-def test_the_costs_are_what_the_runs_say_and_hold_for_captures_left_out() -> None:
+def test_the_costs_fit_the_runs_and_hold_for_captures_left_out() -> None:
     rows = json.loads(benchmark.TABLE.read_text(encoding="utf-8"))
     runs, _others = benchmark.runs_of(rows)
     assert len(runs) >= 6

@@ -52,7 +52,7 @@ def test_whole_files_are_read_by_their_reader_and_by_content(samples, process, t
             assert (answer["outcome"], answer["detail"]) == ("read", "")
 
 
-def test_a_seed_makes_the_same_file_again(samples):
+def test_a_seed_reproduces_its_file(samples):
     for seed in range(30):
         first, again = damaged(samples, seed), damaged(samples, seed)
         assert first[0] == again[0] and first[1].files == again[1].files
@@ -88,7 +88,7 @@ def test_damage_gets_past_check_sums(kind):
     assert changed > 25
 
 
-def test_bombs_unpack_to_what_they_promise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bombs_unpack_to_their_declared_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1 << 26)  # photos take the limit away for the whole process
     packed, crc = container_layers.deflated_zeros()
     unpack, total, found = zlib.decompressobj(-15), 0, 0
@@ -117,7 +117,7 @@ for line in sys.stdin:
 """
 
 
-def test_a_reader_that_dies_or_hangs_is_seen_and_another_goes_on(tmp_path):
+def test_a_reader_that_dies_or_hangs_is_noticed_and_replaced(tmp_path):
     worker = tmp_path / "worker.py"
     worker.write_text(WORKER)
     process = ReadProcess(worker, patience_s=5.0)

@@ -22,7 +22,7 @@ def splatpipe(*arguments: str) -> tuple[int, dict[str, Any]]:
     return done.returncode, json.loads(done.stdout)
 
 
-def test_a_finished_run_is_handed_over_in_more_formats_and_keeps_those_it_has(demo_run: Path, tmp_path: Path) -> None:
+def test_a_finished_run_is_exported_in_more_formats_and_keeps_earlier_ones(demo_run: Path, tmp_path: Path) -> None:
     out = shutil.copytree(demo_run, tmp_path / "out")
     before = (out / "splat.ply").read_bytes()
     code, told = splatpipe("export", str(out), "--format", "laz,model")
@@ -40,7 +40,7 @@ def test_a_finished_run_is_handed_over_in_more_formats_and_keeps_those_it_has(de
     assert (out / "export/dataset/sparse/0/images.bin").is_file() and (out / "export/model").is_dir()
 
 
-def test_formats_that_are_none_or_impossible_are_told_at_once(demo_run: Path, tmp_path: Path) -> None:
+def test_unknown_or_impossible_formats_are_reported_at_once(demo_run: Path, tmp_path: Path) -> None:
     out = shutil.copytree(demo_run, tmp_path / "out")
     with pytest.raises(UsageError, match="no format 'obj'"):
         with_formats(out, "obj")
@@ -49,7 +49,7 @@ def test_formats_that_are_none_or_impossible_are_told_at_once(demo_run: Path, tm
     check_possible(out, "laz,tiles")
 
 
-def test_a_file_is_converted_and_says_what_it_became(demo_run: Path, tmp_path: Path) -> None:
+def test_a_file_is_converted_and_the_result_is_reported(demo_run: Path, tmp_path: Path) -> None:
     code, told = splatpipe("convert", str(demo_run / "splat.ply"), str(tmp_path / "made.viewer.ply"))
     assert code == 0
     read = read_scene(tmp_path / "made.viewer.ply")
@@ -61,7 +61,7 @@ def test_a_file_is_converted_and_says_what_it_became(demo_run: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("source", "target", "code"), [("no.ply", "a.ply", 1), ("bad.ply", "a.ply", 1), ("bad.ply", "a.xyz", 2)]
 )
-def test_what_cannot_be_converted_is_told(tmp_path: Path, source: str, target: str, code: int) -> None:
+def test_files_that_cannot_be_converted_are_reported(tmp_path: Path, source: str, target: str, code: int) -> None:
     (tmp_path / "bad.ply").write_bytes(b"ply\nnonsense\n")
     found, told = splatpipe("convert", str(tmp_path / source), str(tmp_path / target))
     assert found == code

@@ -34,7 +34,7 @@ def scene() -> Scene:
     return Scene(tiny_scene.true_model(), UP_FROM_DOWN)
 
 
-def test_positions_are_judged_by_the_step_that_the_file_has(scene, tmp_path):
+def test_positions_are_judged_by_the_files_quantization_step(scene, tmp_path):
     path = tmp_path / "splat.spz"
     path.write_bytes(spz_bytes(scene.gaussians, antialias=False))
     step = 2.0 ** -gzip.decompress(path.read_bytes())[13]
@@ -54,7 +54,7 @@ def test_a_site_is_three_kilometres_across(scene):
     assert span[0].item() == pytest.approx(SITE_M, rel=0.05)
 
 
-def test_a_frame_that_nobody_names_is_found(scene):
+def test_an_unnamed_frame_is_found(scene):
     cameras = tiny_scene.cameras(3)
     turned = scene.turned("z up")
     back = np.eye(4)
@@ -70,7 +70,7 @@ def test_a_frame_that_nobody_names_is_found(scene):
     assert decibels(originals, originals) == math.inf
 
 
-def test_floaters_are_planted_before_surfaces_and_seen(scene):
+def test_floaters_are_planted_in_front_of_surfaces_and_visible(scene):
     model = scene.gaussians
     wall = Gaussians.empty(1200, 3)  # behind all: every ray ends
     wall.means = torch.rand(1200, 3, generator=torch.Generator().manual_seed(2)) * torch.tensor([8.0, 6.0, 0.05])

@@ -58,7 +58,7 @@ def test_camera_pose_sees_the_same_pixel_in_either_frame() -> None:
 @pytest.mark.parametrize(
     "matrix", [np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.0, 2.0, 1.0, 1.0]), np.zeros((4, 4)), np.full((4, 4), np.nan)]
 )
-def test_mirrored_sheared_and_empty_matrices_are_no_similarities(matrix: np.ndarray) -> None:
+def test_mirrored_sheared_and_zero_matrices_are_no_similarities(matrix: np.ndarray) -> None:
     with pytest.raises(ValueError, match="not a similarity"):
         Similarity.from_matrix(matrix)
 
@@ -173,7 +173,7 @@ def test_line_of_cameras_takes_its_free_rotation_from_the_prior() -> None:
     assert held.similarity.scale == pytest.approx(4.0, rel=0.03)
 
 
-def test_well_placed_cameras_do_not_heed_a_wrong_prior() -> None:
+def test_well_distributed_cameras_ignore_a_wrong_prior() -> None:
     _, points = noisy(40, 0, (0.5, 1.0), 7)
     wrong = DirectionPrior(np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), 0.05)
     with_prior, without = robust_similarity(points, 10.0, wrong), robust_similarity(points, 10.0)
@@ -246,7 +246,7 @@ def test_up_of_an_orbit_whatever_its_pitch_and_however_stored(pitch_deg: float, 
     assert estimate(cameras, outwards * 20.0, orientation=orientation) < 1.0
 
 
-def test_up_of_nadir_strips_flown_back_and_forth_and_turned_alike() -> None:
+def test_up_of_nadir_strips_flown_back_and_forth_or_with_constant_heading() -> None:
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.arange(6) * 10.0, np.arange(4) * 12.0), axis=-1).reshape(-1, 2)
     centres = np.concatenate([grid, np.full((len(grid), 1), 40.0)], axis=1)
@@ -256,21 +256,21 @@ def test_up_of_nadir_strips_flown_back_and_forth_and_turned_alike() -> None:
     assert estimate([look(d, north * sign) for d, sign in zip(down, flown, strict=True)], centres) < 1.5
 
 
-def test_up_of_a_walk_along_a_street_is_where_the_pictures_have_their_top() -> None:
+def test_up_of_a_walk_along_a_street_is_that_of_the_photos() -> None:
     rng = np.random.default_rng(5)
     centres = np.stack([np.linspace(0.0, 40.0, 30), rng.normal(scale=0.3, size=30), rng.normal(1.6, 0.3, 30)], axis=1)
     ahead = np.array([1.0, 0.0, 0.0]) + rng.normal(size=(30, 3)) * 0.05
     assert estimate([look(forward, np.array([0.0, 0.0, 1.0])) for forward in ahead], centres) < 3.0
 
 
-def test_up_below_a_swaying_kite_is_across_the_ground() -> None:
+def test_up_below_a_swaying_kite_is_normal_to_the_ground() -> None:
     rng = np.random.default_rng(1)
     centres = np.stack([rng.uniform(-20, 20, 30), rng.uniform(-20, 20, 30), rng.uniform(45, 55, 30)], axis=1)
     tilt = np.array([0.3, 0.0, -1.0]) + rng.normal(size=(30, 3)) * 0.15
     assert estimate([look(d, np.array([0.0, 1.0, 0.0])) for d in tilt], centres) < 1.0
 
 
-def test_up_along_a_facade_is_not_taken_for_a_survey() -> None:
+def test_photos_along_a_facade_are_not_taken_for_a_survey() -> None:
     centres = np.stack([np.linspace(-15, 15, 12), np.full(12, -20.0), np.full(12, 1.7)], axis=1)
     cameras = [look(np.array([0.01 * i, 1.0, 0.1]), np.array([0.0, 0.0, 1.0])) for i in range(12)]
     assert estimate(cameras, centres) < 8.0  # all tilted up by 6°, and nothing shows it

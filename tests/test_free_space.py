@@ -64,7 +64,7 @@ def with_opacity(gaussians: Gaussians, opacity: float) -> Gaussians:
     return replace(gaussians, opacity_logits=torch.full((len(gaussians),), float(np.log(opacity / (1.0 - opacity)))))
 
 
-def test_share_of_opacity_is_that_of_the_gaussians_before_the_wall(space: FreeSpace) -> None:
+def test_share_of_opacity_is_that_of_the_gaussians_in_front_of_the_wall(space: FreeSpace) -> None:
     rows = [(0.1 * n, 0.05 * n) for n in range(-5, 5)]
     parts = [with_opacity(gaussians_at([(x, y, z) for x, y in rows]), o) for z, o in ((5, 0.8), (WALL, 0.4), (15, 0.2))]
     model = Gaussians.concat(parts)
@@ -81,7 +81,7 @@ def test_every_photo_that_sees_through_a_gaussian_counts_once(space: FreeSpace) 
     assert near_or_free(gaussians_at(places), space, views=1).tolist() == [True, True, True, False]
 
 
-def test_a_tenth_of_the_depth_before_the_surface_is_left_alone(space: FreeSpace) -> None:
+def test_gaussians_within_a_tenth_of_the_depth_of_the_surface_are_kept(space: FreeSpace) -> None:
     assert free_space_views(gaussians_at([(0, 0, 8.95), (0, 0, 9.05)]), space).tolist() == [3, 0]
 
 
@@ -92,7 +92,7 @@ def test_only_the_extent_along_the_view_may_reach_the_surface(space: FreeSpace) 
     assert free_space_views(model, space).tolist() == [3, 3, 0, 0]
 
 
-def test_right_before_a_camera_one_photo_is_enough() -> None:
+def test_directly_in_front_of_a_camera_one_photo_is_enough() -> None:
     # Two units are a fifth of the wall's depth; so near, the others' pictures do not reach.
     space = space_of(CAMERAS, wall())
     places = [(-1.0, 0.0, 1.0), (-1.0, 0.0, -1.0), (-1.5, 0.0, 0.5)]
@@ -109,7 +109,7 @@ def test_a_photo_with_something_close_does_not_call_that_a_floater() -> None:
 
 
 @pytest.mark.parametrize(("observers", "through"), [(3, 0), (2, 3)])
-def test_well_observed_point_beside_a_gaussian_refutes(observers: int, through: int) -> None:
+def test_well_observed_point_beside_a_gaussian_contradicts_free_space(observers: int, through: int) -> None:
     """A post that is thinner than a cell: three photos see the wall around it, others see it."""
     xyz = np.concatenate((wall(), [(0.0, 0.0, 6.0)]))
     others = [camera(0.0, f"other {n}") for n in range(observers)]
@@ -120,7 +120,7 @@ def test_well_observed_point_beside_a_gaussian_refutes(observers: int, through: 
     assert views.tolist() == [through, 3]  # 4 % of the distance of 6 are 0.24
 
 
-def test_ground_before_the_foot_of_a_wall_is_not_judged() -> None:
+def test_ground_at_the_foot_of_a_wall_is_not_judged() -> None:
     """The wall's points end within a cell (pixels 220 to 240); below them, something may be nearer."""
     space = space_of(CAMERAS, wall(lowest=1.3))
     foot = float(wall(lowest=1.3)[:, 1].max()) * FOCAL / WALL + HEIGHT / 2
@@ -148,7 +148,7 @@ def test_nothing_is_called_free_without_points_or_photos() -> None:
     assert space_of(CAMERAS, wall()).known
 
 
-def test_broken_gaussians_and_points_are_in_no_space(space: FreeSpace) -> None:
+def test_broken_gaussians_and_points_are_ignored(space: FreeSpace) -> None:
     model = gaussians_at([(0.0, 0.0, 5.0)] * 6 + [(0.0, 0.0, 0.0)])
     model.means[0, 2] = float("nan")
     model.means[1, 0] = float("inf")
@@ -171,7 +171,7 @@ def test_model_without_gaussians_or_opacity_has_no_share(space: FreeSpace) -> No
     assert share_of_opacity(empty, near_or_free(empty, space)) == 0.0
 
 
-def test_answer_is_the_same_in_another_frame_and_by_parts(space: FreeSpace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_is_the_same_in_another_frame_and_by_parts(space: FreeSpace, monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(3)
     model = gaussians_at([(0.0, 0.0, 0.0)] * 2000)
     model.means = torch.rand(2000, 3, generator=generator) * torch.tensor([10.0, 6.0, 14.0]) - torch.tensor([5.0, 3, 0])

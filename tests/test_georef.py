@@ -253,7 +253,7 @@ def test_line_of_cameras_is_levelled_by_the_gimbal(tmp_path: Path) -> None:
         (np.stack([np.zeros(9), np.zeros(9), np.arange(9) * 9.0], axis=1), (0.5, 1.0), 9, "along a line"),
     ],
 )
-def test_positions_that_tell_nothing_leave_an_arbitrary_frame(
+def test_uninformative_positions_leave_an_arbitrary_frame(
     tmp_path: Path, centres: np.ndarray, sigma: tuple[float, float], keep: int, reason: str
 ) -> None:
     """The last case: a vertical line of cameras looking down, whose heading is undetermined."""
@@ -268,7 +268,7 @@ def test_positions_that_tell_nothing_leave_an_arbitrary_frame(
     assert frame.world_from_model.scale == 1.0
 
 
-def test_positions_that_contradict_each_other_are_not_believed(tmp_path: Path) -> None:
+def test_contradictory_positions_are_rejected(tmp_path: Path) -> None:
     scene = survey(grid())
     rng = np.random.default_rng(3)
     for record in scene.positions:
@@ -279,7 +279,7 @@ def test_positions_that_contradict_each_other_are_not_believed(tmp_path: Path) -
     assert "agree with the model" in frame.note
 
 
-def test_height_that_the_drone_contradicts_is_told(tmp_path: Path) -> None:
+def test_height_contradicted_by_the_drone_is_reported(tmp_path: Path) -> None:
     scene = survey(grid(), (0.02, 0.03), gimbal=True)
     for record in scene.positions:
         record["relative_altitude_m"] = 34.0
@@ -287,7 +287,7 @@ def test_height_that_the_drone_contradicts_is_told(tmp_path: Path) -> None:
     assert any("34.0 m according to the drone" in warning for warning in warnings)
 
 
-def test_model_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_invalid_model_is_refused(tmp_path: Path) -> None:
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "cameras.bin").write_bytes(b"\xff" * 20)
     parts = {"sparse.model": tmp_path / "model"} | ingested(tmp_path, [], ["a.jpg"])

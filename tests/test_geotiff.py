@@ -66,7 +66,7 @@ def test_heights_are_read_back_where_they_were_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_overviews_average_what_is_there_and_nothing_else(tmp_path: Path) -> None:
+def test_overviews_average_valid_cells_only(tmp_path: Path) -> None:
     path = tmp_path / "dsm.tif"
     write_hill(path, hill_grid(gsd_m=0.05))
     with rasterio.open(path, overview_level=0) as raster:
@@ -201,7 +201,7 @@ def test_same_values_give_the_same_bytes(tmp_path: Path, name: str) -> None:
     assert files[0] == files[1]
 
 
-def test_what_does_not_fit_is_refused_and_leaves_the_old_file(tmp_path: Path) -> None:
+def test_mismatched_arrays_are_refused_and_the_old_file_is_kept(tmp_path: Path) -> None:
     grid = hill_grid()
     path = tmp_path / "dsm.tif"
     path.write_text("old")

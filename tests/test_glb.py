@@ -193,7 +193,7 @@ def read(tmp_path: Path, data: bytes) -> Scene:
     return glb.read(tmp_path / "file.glb")
 
 
-def test_others_files_are_read_however_they_are_laid_out(tmp_path: Path):
+def test_third_party_files_are_read_whatever_their_layout(tmp_path: Path):
     scene = read(tmp_path, foreign())
     assert scene.facts == SceneFacts("y up")
     found = scene.gaussians
@@ -303,7 +303,7 @@ def test_hostile_documents_are_refused(tmp_path: Path, put, value, message):
         read(tmp_path, foreign(lambda document: put(document, value)))
 
 
-def test_what_is_of_no_matter_may_be_anything(tmp_path: Path):
+def test_irrelevant_fields_may_have_any_value(tmp_path: Path):
     def anything(document: dict[str, Any]) -> None:
         document["bufferViews"][0]["extensions"] = 5
         document["meshes"][0]["primitives"] += [7, {"extensions": []}]
@@ -358,7 +358,9 @@ def test_hostile_containers_are_refused(tmp_path: Path, data: bytes, message: st
         (f"{SPLATTING}:ROTATION", np.nan, "not numbers"),
     ],
 )
-def test_values_that_are_no_splats_are_refused(tmp_path: Path, written: bytes, name: str, value: float, message: str):
+def test_values_that_are_not_valid_splats_are_refused(
+    tmp_path: Path, written: bytes, name: str, value: float, message: str
+):
     document, binary = parts(written)
     accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"][name]]
     start = len(written) - len(binary) + document["bufferViews"][accessor["bufferView"]]["byteOffset"]

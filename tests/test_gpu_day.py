@@ -43,7 +43,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def test_a_part_that_fails_or_hangs_leaves_what_it_had_and_the_others_go_on(tmp_path: Path) -> None:
+def test_a_part_that_fails_or_hangs_keeps_its_rows_and_the_others_run(tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
     parts = [
         GpuPart("beside", "pieces:well", {"count": 1}, beside=True),
@@ -62,7 +62,7 @@ def test_a_part_that_fails_or_hangs_leaves_what_it_had_and_the_others_go_on(tmp_
     assert not is_running(int(pid_file.read_text()))
 
 
-def test_what_there_is_no_time_for_is_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_without_enough_time_are_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu_parts, "LEAST_S", 1000.0)
     (outcome,) = run(tmp_path, [GpuPart("good", "pieces:well", {"count": 1})], 60.0)
     assert (outcome.state, outcome.rows) == ("not begun", [])

@@ -31,7 +31,7 @@ def test_every_command_has_a_page_of_help() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_help_says_what_is_done_read_and_left_in_two_screens(name: str) -> None:
+def test_help_states_what_is_done_read_and_written_in_two_screens(name: str) -> None:
     sentence = COMMANDS[name].help.partition("\n\n")[0]
     assert sentence.endswith(".")
     assert len(sentence) <= SENTENCE
@@ -43,7 +43,7 @@ def test_help_says_what_is_done_read_and_left_in_two_screens(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_the_examples_of_help_are_calls_that_splatpipe_takes(name: str, tmp_path: Path) -> None:
+def test_the_examples_in_help_are_valid_calls(name: str, tmp_path: Path) -> None:
     for example in PAGES[name].examples:
         first, *arguments = example.split()
         assert first == name

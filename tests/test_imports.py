@@ -66,14 +66,14 @@ def missing(path: Path, source: bytes) -> list[str]:
     return found
 
 
-def test_every_name_imported_from_our_own_modules_is_there() -> None:
+def test_every_name_imported_from_our_own_modules_exists() -> None:
     sources = [path for folder in IMPORTING for path in sorted((ROOT / folder).rglob("*.py"))]
     found = {str(path.relative_to(ROOT)): missing(path, path.read_bytes()) for path in sources}
     assert len(sources) > 100
     assert {path: names for path, names in found.items() if names} == {}
 
 
-def test_a_name_or_module_that_is_gone_is_noticed() -> None:
+def test_a_missing_name_or_module_is_noticed() -> None:
     source = b"from .scene import build_scene, gone\nfrom . import house, lost\nfrom splatpipe.nowhere import a"
     found = missing(ROOT / "demo" / "generate.py", source)
     assert found == ["splatpipe.demo.scene.gone", "splatpipe.demo.lost", "splatpipe.nowhere"]

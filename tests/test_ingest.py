@@ -307,7 +307,7 @@ def test_bad_files_are_left_out_and_named_with_reasons(folder: Path) -> None:
         assert any(name in warning for warning in result.warnings)
 
 
-def test_photos_are_known_by_content_and_not_by_suffix(folder: Path) -> None:
+def test_photos_are_recognised_by_content_and_not_by_suffix(folder: Path) -> None:
     shutil.move(folder / "a.jpg", folder / "a.dat")
     buffer = io.BytesIO()
     Image.fromarray(picture(3)).save(buffer, "PNG")
@@ -334,7 +334,7 @@ def test_pictures_with_a_second_one_inside_are_read_and_panoramas_and_raws_are_n
     assert "raw file" in result.left_out["raw.tif"]
 
 
-def test_decoding_tells_when_a_photo_has_changed_since(folder: Path) -> None:
+def test_decoding_detects_that_a_photo_has_changed(folder: Path) -> None:
     result = ingest(folder)
     save(folder / "a.jpg", 1, (WIDTH, WIDTH))
     with pytest.raises(SplatpipeError, match=r"a\.jpg has changed since"):
@@ -347,7 +347,7 @@ def test_decoding_tells_when_a_photo_has_changed_since(folder: Path) -> None:
         result.pixels("b.jpg")
 
 
-def test_photo_replaced_in_silence_is_refused_by_the_stage_that_reads_it(folder: Path, tmp_path: Path) -> None:
+def test_photo_replaced_unnoticed_is_refused_by_the_stage_that_reads_it(folder: Path, tmp_path: Path) -> None:
     """A photo replaced after ingest and before features: the keypoints would not match the key."""
     save(folder / "c.png", 3)
 
@@ -364,7 +364,7 @@ def test_photo_replaced_in_silence_is_refused_by_the_stage_that_reads_it(folder:
     assert again.outcome.ran == ["ingest"]  # size and times are as before, and it is found to be another all the same
 
 
-def test_twins_are_left_out(folder: Path) -> None:
+def test_duplicates_are_left_out(folder: Path) -> None:
     shutil.copy(folder / "a.jpg", folder / "copy of a.jpg")
     exif = Image.Exif()
     exif[271] = "edited"
@@ -524,7 +524,7 @@ def test_masks_that_do_not_fit_are_named(folder: Path) -> None:
     assert any("masks/b.png cannot be read" in warning for warning in result.warnings)
 
 
-def test_masks_that_leave_nothing_are_told(folder: Path) -> None:
+def test_masks_that_leave_nothing_are_reported(folder: Path) -> None:
     (folder / "masks").mkdir()
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(folder / "masks" / "a.png")
     result = ingest(folder)
@@ -545,7 +545,7 @@ def test_masks_beside_images_are_found_without_a_model(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["photos/sky_masks/a.png", "sky_masks/a.jpg.png"])
-def test_masks_of_the_sky_are_found_likewise_and_are_no_photos(folder: Path, place: str) -> None:
+def test_sky_masks_are_found_in_the_same_way_and_are_no_photos(folder: Path, place: str) -> None:
     path = folder.parent / place
     path.parent.mkdir()
     half_black(WIDTH, HEIGHT).save(path)
@@ -558,7 +558,7 @@ def test_masks_of_the_sky_are_found_likewise_and_are_no_photos(folder: Path, pla
     assert ingest(folder, out="off", masks=False).summary["sky_masks"] == 0
 
 
-def test_photo_with_both_masks_keeps_them_apart_and_a_black_sky_is_meant(folder: Path) -> None:
+def test_both_masks_of_a_photo_are_kept_apart_and_a_black_sky_mask_means_no_sky(folder: Path) -> None:
     for name in ("masks", "sky_masks"):
         (folder / name).mkdir()
     half_black(WIDTH, HEIGHT).save(folder / "masks" / "a.png")
@@ -655,7 +655,7 @@ def test_positions_angles_and_sigmas_are_read(folder: Path) -> None:
     assert (found["float.jpg"]["rtk"], found["float.jpg"]["sigma_horizontal_m"]) == ("float", 0.5)
 
 
-def test_the_file_of_positions_counts_and_says_so(folder: Path, tmp_path: Path) -> None:
+def test_the_position_file_takes_precedence_and_says_so(folder: Path, tmp_path: Path) -> None:
     save(folder / "c.jpg", 3, exif=drone_exif(gps_of(46.5, -91.5, 198.5)))
     geo = tmp_path / "geo.txt"
     geo.write_text("EPSG:4326\na.jpg -91.5001 46.5001 199 0 0 0 0.02 0.03\nz.jpg -91.5 46.5 199\n")
@@ -672,7 +672,7 @@ def test_the_file_of_positions_counts_and_says_so(folder: Path, tmp_path: Path) 
     assert any("does not name c.jpg" in warning for warning in result.warnings)
 
 
-def test_a_file_in_another_zone_is_told(folder: Path, tmp_path: Path) -> None:
+def test_a_file_in_another_zone_is_reported(folder: Path, tmp_path: Path) -> None:
     """46.5° N: a zone of UTM, 6°, is 459 km wide there."""
     for seed, name in enumerate("cde"):
         save(folder / f"{name}.jpg", seed + 3, exif=drone_exif(gps_of(46.5, -91.5, 198.5)))
@@ -698,7 +698,7 @@ def test_impossible_positions_are_left_out_and_named(folder: Path) -> None:
     assert len(result.photos) == 7
 
 
-def test_altitudes_of_two_datums_are_told(folder: Path) -> None:
+def test_altitudes_of_two_datums_are_reported(folder: Path) -> None:
     for seed, name in enumerate("cde"):
         exif = drone_exif(gps_of(46.5, -91.5, 198.5))
         save(folder / f"{name}.jpg", seed + 3, exif=exif, xmp=xmp_of(AbsoluteAltitude="165.5"))
@@ -720,7 +720,7 @@ def test_cameras_are_grouped_by_make_model_size_and_focal_length(folder: Path) -
     assert groups[1]["params"] == [groups[1]["focal_px"], 200.0, 150.0, 0.0]
 
 
-def test_dewarped_photos_are_another_camera_and_a_false_calibration_is_told(folder: Path) -> None:
+def test_dewarped_photos_are_another_camera_and_a_false_calibration_is_reported(folder: Path) -> None:
     for seed, (name, values) in enumerate(
         {
             "c.jpg": {"DewarpFlag": 0},
@@ -760,7 +760,7 @@ def test_a_dewarp_calibration_is_a_stated_lens_unless_the_drone_has_applied_it(f
 @pytest.mark.parametrize(
     "text", ["", "x", "2018;1,2,3", DEWARP.replace("2359.78", "nan"), DEWARP.replace("-7.71", "1e9")]
 )
-def test_a_broken_dewarp_calibration_is_none(folder: Path, text: str) -> None:
+def test_a_broken_dewarp_calibration_is_ignored(folder: Path, text: str) -> None:
     save(folder / "c.jpg", 3, exif=drone_exif(), xmp=xmp_of(DewarpFlag=0, DewarpData=text))
     assert set(map(str, ingest(folder).json("lenses.json")["lenses"])) == {"None"}
 
@@ -780,7 +780,7 @@ def test_a_given_lens_is_scaled_to_the_photos_and_refused_for_others(folder: Pat
         ingest(folder, out="two", lens=path)
 
 
-def test_a_given_lens_is_not_that_of_another_camera_of_the_same_shape(folder: Path) -> None:
+def test_a_given_lens_is_not_used_for_another_camera_of_the_same_shape(folder: Path) -> None:
     for seed, name in enumerate(("c.jpg", "d.jpg")):
         save(folder / name, 7 + seed, exif=drone_exif())
     path = folder.parent / "lens.txt"
@@ -864,7 +864,7 @@ def test_tiffs_with_none_or_several_orientations_are_taken(folder: Path, count: 
     assert (result.pixels("odd.tif") == picture(3)).all()
 
 
-def test_photos_with_odd_tags_are_taken_all_the_same(folder: Path) -> None:
+def test_photos_with_odd_tags_are_accepted(folder: Path) -> None:
     """Pillow warns of such tags, and warnings are errors here."""
     tags = ImageFileDirectory_v2()
     tags[271] = "Acme"

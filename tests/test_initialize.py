@@ -66,13 +66,13 @@ def test_points_on_top_of_each_other_and_few_points_have_a_positive_finite_size(
         assert np.isfinite(sizes).all() and (sizes > 0).all()
 
 
-def test_far_from_the_origin_sizes_are_as_precise() -> None:
+def test_sizes_are_as_precise_far_from_the_origin() -> None:
     xyz = RNG.normal(size=(200, 3))
     shift = np.array([500_000.0, 5_000_000.0, 100.0])
     np.testing.assert_allclose(point_sizes(xyz + shift, FAR + shift, 1.0), point_sizes(xyz, FAR, 1.0), rtol=1e-4)
 
 
-def test_limit_keeps_the_longest_tracks_in_their_order() -> None:
+def test_limit_keeps_the_longest_tracks_in_order() -> None:
     points = Points(
         np.zeros((4, 3)), np.zeros((4, 3), np.uint8), np.array([2, 5, 3, 5]), np.array([0.1, 0.9, 0.2, 0.3])
     )
@@ -97,7 +97,7 @@ def test_every_point_becomes_an_isotropic_gaussian_of_its_colour(tmp_path: Path)
     assert math.isclose(float(gaussians.quats.norm(dim=1).mean()), 1.0)
 
 
-def test_the_file_tells_how_many_are_of_sparse_points_whatever_was_left_out(tmp_path: Path) -> None:
+def test_the_file_states_how_many_are_of_sparse_points_whatever_was_left_out(tmp_path: Path) -> None:
     xyz = RNG.normal(size=(50, 3))
     xyz[7] = np.nan
     dataset = write_dataset(tmp_path / "dataset", xyz, np.zeros((50, 3), np.uint8))

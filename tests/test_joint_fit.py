@@ -38,7 +38,7 @@ def errors(fit: JointFit, source: Array) -> Array:
     return np.asarray(fit.similarity.apply(source) - TRUTH.apply(source))
 
 
-def test_control_places_and_the_flight_gets_its_offset() -> None:
+def test_control_determines_the_frame_and_the_flight_gets_its_offset() -> None:
     points, priors = observed()
     fit = fit_jointly(NEAR, points, priors)
     assert np.abs(errors(fit, points.source[:CONTROL])).max() < 0.05
@@ -103,7 +103,7 @@ def test_blunders_among_very_many_points_are_found() -> None:
     assert find_blunders(NEAR, many, Priors(np.zeros((0, 3))), 0.1) == (7, 123, 399)
 
 
-def test_point_is_where_rays_meet_as_well_as_its_covariance_says() -> None:
+def test_triangulated_point_is_as_accurate_as_its_covariance() -> None:
     normed = []
     for seed in range(60):
         seen, point = rays(seed)
@@ -115,7 +115,7 @@ def test_point_is_where_rays_meet_as_well_as_its_covariance_says() -> None:
     assert np.mean(normed) == pytest.approx(1.0, abs=0.3)
 
 
-def test_wrong_ray_is_found_and_parallel_ones_tell_nothing() -> None:
+def test_wrong_ray_is_found_and_parallel_ones_give_no_point() -> None:
     seen, point = rays()
     seen.rays[2] += [0.05, 0.0]
     found = triangulate(seen, 5.0)

@@ -75,7 +75,7 @@ def pinhole(width: int, height: int) -> pycolmap.Camera:
 
 
 @pytest.mark.parametrize("side", [400, 120])
-def test_resampled_strips_look_at_few_rows_and_have_the_same_bits(monkeypatch: pytest.MonkeyPatch, side: int) -> None:
+def test_resampled_strips_read_few_rows_and_have_the_same_bits(monkeypatch: pytest.MonkeyPatch, side: int) -> None:
     """One sample per pixel, and sixteen; barrel distortion bends the rows."""
     source = pycolmap.Camera(model="SIMPLE_RADIAL", width=400, height=400, params=[380, 200, 200, -0.05])
     target = pinhole(400, 400)

@@ -60,7 +60,7 @@ def test_a_model_whose_halves_disagree_is_bad(ring: Ring) -> None:
     assert found.score < judge(model_of(ring), ring.verified, TRUSTED).score - 0.05
 
 
-def test_the_photos_of_a_ghost_are_named(ring: Ring) -> None:
+def test_the_photos_of_a_misplaced_group_are_named(ring: Ring) -> None:
     ghost = (9, 10, 11, 12)
     poses = moved(ring, ghost, np.zeros(3), turn_up(30.0), 1.0)
     agreement = compare(model_of(ring, poses), ring.verified)
@@ -71,14 +71,16 @@ def test_the_photos_of_a_ghost_are_named(ring: Ring) -> None:
 
 
 @pytest.mark.parametrize("cameras", [TRUSTED, ROUGH])
-def test_a_focal_length_that_ran_away_is_bad(ring: Ring, cameras: list[dict[str, object]]) -> None:
+def test_an_implausible_focal_length_is_bad(ring: Ring, cameras: list[dict[str, object]]) -> None:
     found = judge(model_of(ring, focal=2.4 * FOCAL), ring.verified, cameras)
     assert found.level == "bad"
     assert any(reason.kind == "focal" and "2400 pixels, +140 %" in reason.text for reason in found.reasons)
 
 
 @pytest.mark.parametrize(("photos", "level"), [(2, "doubt"), (6, "bad")])
-def test_a_focal_length_of_few_photos_does_not_condemn_the_others(ring: Ring, photos: int, level: str) -> None:
+def test_a_focal_length_of_few_photos_does_not_affect_the_verdict_on_the_others(
+    ring: Ring, photos: int, level: str
+) -> None:
     stated = ring.verified.cameras[1]
     second = pycolmap.Camera(stated.todict())
     second.camera_id = 2
@@ -122,7 +124,7 @@ def test_the_distance_from_an_epipolar_line_is_that_of_the_noise() -> None:
     assert np.isinf(epipolar_errors(*exact, one, behind, 1e-3)).mean() > 0.95
 
 
-def test_positions_tell_a_bend_from_noise(ring: Ring) -> None:
+def test_positions_distinguish_a_bend_from_noise(ring: Ring) -> None:
     rng = np.random.default_rng(5)
     true = 10.0 * np.array([ring.centre(number) for number in range(1, 25)])  # metres; the ring's radius is 200
     noisy = disagreement(true + rng.normal(0.0, 3.0, true.shape), true)
@@ -133,7 +135,7 @@ def test_positions_tell_a_bend_from_noise(ring: Ring) -> None:
     assert off.median_m > 0.04 * off.size_m and off.smooth < 0.5
 
 
-def test_matches_that_are_the_models_own_observations_are_told_from_those_held_out(ring: Ring) -> None:
+def test_matches_that_are_the_models_own_observations_are_distinguished_from_others(ring: Ring) -> None:
     model = model_of(ring)
     rows = {number: {int(point): row for row, point in enumerate(shown)} for number, shown in ring.rows.items()}
     point = int(np.intersect1d(ring.rows[1], ring.rows[2])[0])

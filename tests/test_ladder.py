@@ -83,7 +83,7 @@ def whole(room: MappingInput) -> tuple[pycolmap.Reconstruction, ViewGraph]:
     return model, read_verified(room.database)
 
 
-def test_pairs_that_show_the_same_thing_are_proposed_and_hold(
+def test_overlapping_pairs_are_proposed_and_verified(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     model, verified = whole
@@ -141,7 +141,9 @@ def test_photos_are_registered_to_the_finished_model(
     assert found.model.num_points3D() > 0.9 * whole[0].num_points3D()
 
 
-def test_a_photo_without_pairs_gets_some(room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]) -> None:
+def test_a_photo_without_pairs_gets_new_ones(
+    room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
+) -> None:
     capture = thinned(room, lambda i, j: 8 not in (i, j), "no pairs")
     found = climb(capture, found_without(capture, whole, {8}), SparseConfig(), corner_photos.Recorder())
     assert_all_right(found, "more pairs")
@@ -162,7 +164,7 @@ def test_weak_keypoints_are_made_stronger(room: MappingInput, whole: tuple[pycol
     assert found.rungs[-1]["keypoints_added"] == len(found.colours) - len(before.colours) > 0
 
 
-def test_sub_models_are_joined_over_what_they_share(
+def test_sub_models_are_joined_by_common_points(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     model, verified = whole
@@ -217,7 +219,7 @@ def test_a_photo_of_another_place_is_not_placed(
     assert settle(work, wrong).model.num_reg_images() == COUNT - 1
 
 
-def test_where_nothing_is_left_nothing_changes(
+def test_if_all_photos_are_registered_nothing_changes(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     complete = MappingResult(whole[0], (), room.database, whole[1], room.colours)

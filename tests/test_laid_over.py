@@ -76,7 +76,7 @@ def test_gradients_of_the_definition_are_those_of_finite_differences() -> None:
 
 
 @pytest.mark.parametrize("kind", ["known", "unknown"])
-def test_any_number_of_threads_leaves_the_same_bits(kind: str) -> None:
+def test_any_number_of_threads_gives_the_same_bits(kind: str) -> None:
     given, found = RandomPicture(211, 313, kind), []
     for threads in (1, 2, 5):
         set_threads(threads)
@@ -110,7 +110,7 @@ def test_windows_show_what_the_whole_shows_and_their_gradients_add_up() -> None:
     assert torch.linalg.vector_norm(by_nodes - whole[3]) < GRADIENT_RTOL * torch.linalg.vector_norm(whole[3])
 
 
-def test_what_is_no_sky_may_be_anything() -> None:
+def test_values_outside_the_sky_do_not_matter() -> None:
     given = RandomPicture(30, 50, "known")
     expected = given.found()
     mask = given.behind.mask

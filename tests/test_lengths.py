@@ -43,7 +43,9 @@ def footage_of(photos: int, size: float, window: int = WINDOW) -> PhotoSizes:
 @pytest.mark.parametrize("photos", PHOTOS)
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("least", [1500, 7000, 30_000])
-def test_every_part_of_every_photo_is_seen_often_enough_at_every_size(photos: int, size: float, least: int) -> None:
+def test_every_window_of_every_photo_is_visited_often_enough_at_every_size(
+    photos: int, size: float, least: int
+) -> None:
     footage = footage_of(photos, size)
     found = lengths(footage, least)
     assert [level for level, _ in found] == list(range(footage.first_level, -1, -1))
@@ -56,7 +58,7 @@ def test_every_part_of_every_photo_is_seen_often_enough_at_every_size(photos: in
     assert growth_until(found) == sum(count for _, count in found[:-1]) + found[-1][1] // 2
 
 
-def test_few_photos_take_the_least_and_more_take_more_in_proportion() -> None:
+def test_few_photos_take_the_minimum_and_more_take_proportionally_more() -> None:
     totals = {photos: sum(count for _, count in lengths(footage_of(photos, 4.0), 7000)) for photos in PHOTOS}
     assert 7000 <= totals[11] < 7600 and list(totals.values()) == sorted(totals.values())
     assert totals[1000] == 2 * totals[500]
@@ -68,7 +70,7 @@ def test_few_photos_take_the_least_and_more_take_more_in_proportion() -> None:
     assert 0.7 < pixels / (7000 * 0.5e6) < 1.4
 
 
-def test_a_given_number_is_exactly_that_and_what_is_more_than_auto_goes_to_the_finest_size() -> None:
+def test_a_given_number_is_exact_and_the_excess_over_auto_goes_to_the_finest_size() -> None:
     footage = footage_of(50, 4.0)
     auto = lengths(footage, 7000)
     for iterations in (1, 2, 99, 5001, 7000, 31_017):
@@ -83,7 +85,7 @@ def test_a_given_number_is_exactly_that_and_what_is_more_than_auto_goes_to_the_f
     assert divided(footage_of(50, 0.3), 7000, 600) == [(0, 600)]
 
 
-def test_a_size_that_a_short_run_would_hardly_see_is_left_out() -> None:
+def test_a_size_that_a_short_run_would_hardly_use_is_left_out() -> None:
     footage = footage_of(50, 4.0)
     last = [divided(footage, 7000, iterations)[-1] for iterations in (300, 2000, 4000, 15_000)]
     assert [level for level, _ in last] == [2, 2, 1, 0]
@@ -97,7 +99,7 @@ def test_photos_of_several_sizes_begin_where_half_of_them_fit_in_whole() -> None
     assert PhotoSizes(((*SIZES[20.0], 40),), 0).first_level == 0
 
 
-def test_stretches_are_the_lengths_with_the_options_halvings_before_them() -> None:
+def test_phases_are_the_lengths_preceded_by_the_options_halvings() -> None:
     footage = footage_of(50, 4.0)
     found = stretches(footage, [(2, 100), (1, 20), (0, 60)], coarse_levels=1)
     assert found == (Stretch(3, 0, 50), Stretch(2, 0, 100), Stretch(1, WINDOW, 120), Stretch(0, WINDOW, 180))
@@ -159,7 +161,7 @@ def plan_of(size: float, **options: object) -> TrainingPlan:
     return make_plan(TrainConfig.model_validate(options), views, tiny_scene.split_of(views, 8), 1000, WINDOW)
 
 
-def test_a_plan_keeps_its_sizes_and_windows_and_tells_them() -> None:
+def test_a_plan_stores_and_reports_its_sizes_and_windows() -> None:
     plan = plan_of(4.0, least_iterations=7000)
     assert TrainingPlan.from_json(plan.to_json()) == plan and plan.last_iteration == plan.schedule.iterations
     assert plan.train_megapixels == pytest.approx(3.98, abs=0.01) and plan.megapixels is None
@@ -174,13 +176,13 @@ def test_a_plan_keeps_its_sizes_and_windows_and_tells_them() -> None:
     assert short.schedule.finest.level == 1 and short.train_megapixels == pytest.approx(1.0, abs=0.01)
 
 
-def test_windows_shrink_with_the_memory_and_no_further_than_is_of_use() -> None:
+def test_windows_shrink_with_the_memory_but_not_below_a_useful_size() -> None:
     assert window_within(10**12, WINDOW) == WINDOW and window_within(-1, WINDOW) == SMALLEST_WINDOW
     assert window_within(200_000_000, WINDOW) == math.floor(0.25 * 200_000_000 / PIXEL_BYTES) < WINDOW
     assert window_within(10**9, 0) == 0
 
 
-def test_lengths_are_light() -> None:
+def test_lengths_import_nothing_heavy() -> None:
     code = "import sys, splatpipe.pipeline.train.lengths; print({'numpy', 'torch', 'cv2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

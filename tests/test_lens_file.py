@@ -86,7 +86,7 @@ def test_every_format_means_the_same_lens(tmp_path: Path, text: str) -> None:
     assert float(apart_px(in_pixels(found.lens), true).max()) < 1e-3
 
 
-def test_formats_are_what_their_programs_compute(tmp_path: Path) -> None:
+def test_formats_agree_with_their_programs_formulas(tmp_path: Path) -> None:
     """Metashape's and Pix4D's own formulas, by hand, against COLMAP's projection of what was read."""
     x, y = 0.31, -0.22
     r2 = x * x + y * y
@@ -129,7 +129,7 @@ def test_metashapes_fisheye_and_fourth_coefficient_and_sensors(tmp_path: Path) -
     assert (found.lens.params[0], found.lens.params[4], found.lens.camera) == (3676.5, -0.01, "FC6310")
 
 
-def test_another_size_scales_and_another_shape_does_not_fit() -> None:
+def test_another_size_is_scaled_and_another_shape_is_refused() -> None:
     lens = StatedLens("SIMPLE_RADIAL", 4000, 3000, (3600.0, 2010.0, 1490.0, -0.1), "file")
     half = fitted(lens, 2000, 1500, 0.005)
     assert half is not None and half.params == (1800.0, 1005.0, 745.0, -0.1)

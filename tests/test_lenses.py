@@ -49,7 +49,7 @@ def test_a_brown_lens_is_found(scene: LensScene, calibrated: Calibrated) -> None
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_simple_lens_stays_simple_to_the_bit(seed: int) -> None:
+def test_a_simple_lens_stays_simple_and_bit_identical(seed: int) -> None:
     scene = make_scene([make_lens("SIMPLE_RADIAL", SIMPLE)], orbit(24, np.random.default_rng(seed)), seed, points=700)
     found, rows = calibrate(scene.model, scene.verified, {}, "auto", seed)
     assert found is scene.model
@@ -77,7 +77,7 @@ def test_each_camera_of_a_mixed_capture_gets_its_own() -> None:
     assert rms(apart_px(found.cameras[2], lenses[1], turn=True)) < 0.3
 
 
-def test_a_fisheye_is_recognised_by_what_the_simple_lens_leaves() -> None:
+def test_a_fisheye_is_recognised_by_the_simple_lenss_residuals() -> None:
     scene = make_scene([make_lens("OPENCV_FISHEYE", FISHEYE)], orbit(24, np.random.default_rng(3)), 3)
     wrong = make_lens("SIMPLE_RADIAL", (690.0, WIDTH / 2, HEIGHT / 2, -0.05))
     scene.model.cameras[1].model, scene.model.cameras[1].params = wrong.model, wrong.params
@@ -121,7 +121,7 @@ def test_a_stated_lens_is_refined_held_or_refused(scene: LensScene) -> None:
     assert rms(apart_px(mended.cameras[1], scene.lenses[1], turn=True)) < 2.0
 
 
-def test_a_stated_lens_is_taken_where_nothing_can_speak_against_it() -> None:
+def test_a_stated_lens_is_used_if_nothing_can_contradict_it() -> None:
     scene = make_scene([make_lens("FULL_OPENCV", BROWN)], orbit(3, np.random.default_rng(4)), 4)
     for number in [number for number, point in scene.model.points3D.items() if point.track.length() > 2]:
         scene.model.delete_point3D(number)
@@ -132,7 +132,7 @@ def test_a_stated_lens_is_taken_where_nothing_can_speak_against_it() -> None:
         assert found.num_reg_images() == 3 and rows[0]["stated"] == "file"
 
 
-def test_the_answer_has_the_same_bits_again(scene: LensScene, calibrated: Calibrated) -> None:
+def test_the_result_is_bit_identical_on_repetition(scene: LensScene, calibrated: Calibrated) -> None:
     first, rows = calibrated
     second, again = calibrate(scene.model, scene.verified, {}, "auto")
     assert rows == again
@@ -150,7 +150,7 @@ def test_focal_length_is_as_well_known_in_a_wide_model(scene: LensScene, calibra
 
 
 @pytest.mark.parametrize("name", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "RADIAL_FISHEYE"])
-def test_wide_and_narrow_see_the_same(name: str) -> None:
+def test_wide_and_narrow_models_project_alike(name: str) -> None:
     params = {
         "SIMPLE_RADIAL": SIMPLE,
         "RADIAL": (*SIMPLE, 0.02),
@@ -166,7 +166,7 @@ def test_wide_and_narrow_see_the_same(name: str) -> None:
     assert other.model_name == name and np.allclose(other.params, camera.params, rtol=0, atol=1e-12)
 
 
-def test_the_simplest_lens_is_near() -> None:
+def test_the_simplest_lens_is_close() -> None:
     brown = make_lens("FULL_OPENCV", BROWN)
     assert rms(apart_px(make_lens(*simplest(brown)), brown, turn=True)) < 5.0
     name, params = simplest(make_lens("OPENCV_FISHEYE", FISHEYE))

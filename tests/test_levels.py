@@ -73,7 +73,7 @@ def test_a_sky_far_away_leaves_the_wall_its_small_boxes() -> None:
     assert all((leaf.box[1] - leaf.box[0]).max() < 12.0 for leaf in near)
 
 
-def test_from_near_the_full_model_is_chosen_from_afar_the_root_and_every_part_is_shown_once() -> None:
+def test_the_full_model_is_chosen_nearby_and_the_root_far_away_and_every_part_is_shown_once() -> None:
     root = build_levels(a_wall(), most_per_node=100)
     assert select_nodes(root, np.array([5.0, 0.1, 5.0]), 1e9) == leaves(root)
     assert select_nodes(root, np.array([0.0, 1e9, 0.0]), 1000.0) == [root]
@@ -91,7 +91,7 @@ def test_levels_of_nothing_are_refused() -> None:
         build_levels(Gaussians.empty(0, 0))
 
 
-def test_where_all_are_enormous_they_have_levels_too() -> None:
+def test_huge_gaussians_have_levels_too() -> None:
     gaussians = a_wall(100)
     gaussians.log_scales[:] = 3.0
     root = build_levels(gaussians, 10)

@@ -139,7 +139,7 @@ def follow_the_curves(page: Page, points: int) -> None:
     assert 0.0 <= done < 100.0 and "iterations" in page.locator("#progress span").inner_text()
 
 
-def test_before_anything_is_there_the_page_says_so(tmp_path: Path, open_page: Callable) -> None:
+def test_the_page_says_that_there_is_nothing_yet(tmp_path: Path, open_page: Callable) -> None:
     (tmp_path / "out" / "stages").mkdir(parents=True)
     with serving(tmp_path / "out") as server:
         served: Served = server

@@ -58,7 +58,7 @@ def shown() -> LoadedModel:
     return LoadedModel(tiny_scene.true_model(), None, RenderOptions(3, depth=False), None, 0)
 
 
-def test_pictures_are_rendered_on_the_runs_device_as_far_as_its_memory_is_free(
+def test_images_are_rendered_on_the_runs_device_if_it_has_free_memory(
     view: View, card: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = pictures(shown(), view, 1, "cpu")
@@ -74,7 +74,7 @@ def test_pictures_are_rendered_on_the_runs_device_as_far_as_its_memory_is_free(
     assert card == ["cpu", "cpu"]
 
 
-def test_a_card_that_is_full_after_all_leaves_the_picture_to_the_cpu(
+def test_if_the_card_turns_out_full_the_cpu_renders(
     view: View, card: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = pictures(shown(), view, 1, "cpu")
@@ -98,7 +98,7 @@ def test_the_device_is_that_of_the_training_then_that_of_the_run() -> None:
     assert device_of(Contents({"train": Artifact(Path("train"), {})}), "cuda") == "cuda"
 
 
-def test_the_page_renders_as_the_run_at_work_was_told(
+def test_the_page_renders_on_the_device_of_the_current_run(
     view: View, card: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = ModelSource(tmp_path, "checkpoint", "stamp", None)
@@ -128,7 +128,7 @@ def left(stage: str, name: str, path: Path, digest: str) -> dict[str, Artifact]:
     return {stage: Artifact(path.parent, manifest)}
 
 
-def test_of_a_scene_in_blocks_the_coarse_model_then_that_of_a_block_is_shown(tmp_path: Path) -> None:
+def test_for_a_scene_in_blocks_the_coarse_model_and_then_a_blocks_is_shown(tmp_path: Path) -> None:
     begun = left("initialize", "splat", written(tmp_path / "init.ply"), "1" * 64)
     blocks = tmp_path / "blocks"
     checkpoint, model = (written(blocks / "coarse" / name) for name in ("checkpoint.npz", "model.ply"))

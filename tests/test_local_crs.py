@@ -13,7 +13,7 @@ NEAR_ENOUGH_M = 1e-3
 
 @pytest.mark.parametrize("crs", ["EPSG:32634", "EPSG:2180", "EPSG:4326", "EPSG:3857"])
 @pytest.mark.parametrize("half_m", [40.0, 2500.0])
-def test_it_is_proj_to_a_millimetre_all_over_the_scene(crs: str, half_m: float) -> None:
+def test_it_agrees_with_proj_to_a_millimetre_all_over_the_scene(crs: str, half_m: float) -> None:
     frame = Frame("enu", Similarity(1.0, np.eye(3), np.zeros(3)), Origin(52.2, 20.97, 110.0), crs=crs)
     world = open_world(frame)
     made = local_crs(world, np.array([[-half_m, -half_m, -20.0], [half_m, half_m, 60.0]]))

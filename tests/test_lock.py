@@ -72,7 +72,7 @@ def at_work_elsewhere(out: Path, name: str = LOCK_FILE) -> Iterator[threading.Ev
     thread.join()
 
 
-def test_who_holds_it_signs_it_and_takes_the_signature_back(out: Path) -> None:
+def test_the_holder_signs_the_lock_and_removes_the_signature(out: Path) -> None:
     path = out / "stages" / LOCK_FILE
     with locked(out):
         assert json.loads(path.read_text())["process"] == os.getpid()
@@ -80,7 +80,7 @@ def test_who_holds_it_signs_it_and_takes_the_signature_back(out: Path) -> None:
     assert path.read_text() == "" and not is_locked(out)
 
 
-def test_a_second_one_is_refused_and_a_killed_one_is_no_hindrance(out: Path) -> None:
+def test_a_second_holder_is_refused_and_a_killed_one_does_not_block(out: Path) -> None:
     with holder(out) as process:
         assert is_locked(out)
         with pytest.raises(UsageError, match=f"process {process.pid}\\) is working") as refused, locked(out):
@@ -94,7 +94,7 @@ def test_a_second_one_is_refused_and_a_killed_one_is_no_hindrance(out: Path) -> 
             assert told == []  # the kernel knows that it is dead: nothing to look for
 
 
-def test_who_waits_is_told_whom_for_and_goes_on_when_that_one_ends(out: Path) -> None:
+def test_a_waiting_process_names_the_holder_and_continues_when_it_ends(out: Path) -> None:
     told: list[str] = []
 
     def notify(text: str) -> None:
@@ -116,7 +116,7 @@ def test_another_machine_at_work_is_refused(out: Path) -> None:
     assert json.loads((out / "stages" / LOCK_FILE).read_text()) == ELSEWHERE
 
 
-def test_a_dead_machines_lock_that_a_server_keeps_is_told_how_to_break(out: Path) -> None:
+def test_the_message_says_how_to_break_a_dead_machines_lock_kept_by_a_server(out: Path) -> None:
     """NFS 3 holds it until that machine is back."""
     path = out / "stages" / LOCK_FILE
     with holder(out) as process:
@@ -130,7 +130,7 @@ def test_a_dead_machines_lock_that_a_server_keeps_is_told_how_to_break(out: Path
         assert process.poll() is None
 
 
-def test_of_two_signatures_over_each_other_the_last_one_is_read(out: Path) -> None:
+def test_of_two_overlapping_signatures_the_last_one_is_read(out: Path) -> None:
     """Two machines that lock nothing from each other cut the file before either writes; names are of any length."""
     path = out / "stages" / LOCK_FILE
     with locked(out):
@@ -143,7 +143,7 @@ def test_of_two_signatures_over_each_other_the_last_one_is_read(out: Path) -> No
     assert is_locked(out) is False and engine_lock._read_signature(path) is not None
 
 
-def test_another_machine_that_died_is_outlasted(out: Path) -> None:
+def test_the_lock_of_a_dead_machine_expires(out: Path) -> None:
     (out / "stages" / LOCK_FILE).write_text(json.dumps(ELSEWHERE))
     told: list[str] = []
     began_s = time.monotonic()
@@ -152,7 +152,7 @@ def test_another_machine_that_died_is_outlasted(out: Path) -> None:
     assert len(told) == 1 and "process 4711 on node7" in told[0]
 
 
-def test_another_machine_at_work_is_waited_for(out: Path) -> None:
+def test_waiting_for_another_running_machine(out: Path) -> None:
     told: list[str] = []
     with at_work_elsewhere(out) as over:
 
@@ -165,7 +165,7 @@ def test_another_machine_at_work_is_waited_for(out: Path) -> None:
             assert "waiting" in told[-1]
 
 
-def test_a_lock_that_is_given_back_elsewhere_is_taken_at_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_released_elsewhere_is_taken_at_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine_lock, "SILENCE_S", 10 * TIMEOUT_S)
     path = out / "stages" / LOCK_FILE
     path.write_text(json.dumps(ELSEWHERE))
@@ -174,7 +174,7 @@ def test_a_lock_that_is_given_back_elsewhere_is_taken_at_once(out: Path, monkeyp
         assert time.monotonic() - began_s < TIMEOUT_S
 
 
-def test_who_slept_too_long_finds_its_place_taken_and_leaves_the_signature(out: Path) -> None:
+def test_a_holder_that_was_suspended_too_long_loses_the_lock_and_leaves_the_new_signature(out: Path) -> None:
     path = out / "stages" / LOCK_FILE
     with locked(out) as hold:
         hold.confirm()
@@ -187,7 +187,7 @@ def test_who_slept_too_long_finds_its_place_taken_and_leaves_the_signature(out: 
     assert json.loads(path.read_text()) == ELSEWHERE
 
 
-def test_a_file_system_without_locks_is_refused_in_so_many_words(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_locks_is_refused_with_the_reason(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def none(_descriptor: int, _how: int) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
@@ -203,7 +203,7 @@ def test_a_file_system_without_locks_is_refused_in_so_many_words(out: Path, monk
         pass
 
 
-def test_two_that_sign_at_once_do_not_both_work(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_simultaneous_signers_do_not_both_get_the_lock(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = out / "stages" / LOCK_FILE
     monkeypatch.setattr(engine_lock, "mount_of", lambda path: Mount("/", "/mnt/c", "9p", ("rw",)))
     monkeypatch.setattr(time, "sleep", lambda seconds: path.write_text(json.dumps(ELSEWHERE)))
@@ -214,14 +214,14 @@ def test_two_that_sign_at_once_do_not_both_work(out: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     "left", ["1234\n", "null", "[]", "{", '{"process": 1}', "[" * 4000, '{"process": [], "host": 1}', "\xff" * 9000]
 )
-def test_what_is_no_signature_holds_nobody_up(out: Path, left: str) -> None:
+def test_an_invalid_signature_blocks_nobody(out: Path, left: str) -> None:
     (out / "stages" / LOCK_FILE).write_text(left, encoding="latin-1")
     assert not is_locked(out)
     with locked(out, notify=pytest.fail):
         assert is_locked(out)
 
 
-def test_a_link_in_the_locks_place_is_not_followed(out: Path, tmp_path: Path) -> None:
+def test_a_link_in_place_of_the_lock_file_is_not_followed(out: Path, tmp_path: Path) -> None:
     (tmp_path / "victim").write_text("mine")
     (out / "stages" / LOCK_FILE).symlink_to(tmp_path / "victim")
     with pytest.raises(MachineError, match="Cannot lock"), locked(out):
@@ -229,7 +229,7 @@ def test_a_link_in_the_locks_place_is_not_followed(out: Path, tmp_path: Path) ->
     assert (tmp_path / "victim").read_text() == "mine"
 
 
-def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> None:
+def test_shards_are_held_concurrently_and_exclude_a_whole_run(out: Path) -> None:
     with locked_shard(out, "train.1"), locked_shard(out, "train.2"):
         assert is_locked(out, "train.1") and not is_locked(out, "train.3") and not is_locked(out)
         assert running_shards(out) == ["train.1", "train.2"]
@@ -246,7 +246,7 @@ def test_shards_are_held_side_by_side_and_shut_out_who_wants_all(out: Path) -> N
     assert running_shards(out) == []
 
 
-def test_a_shard_made_on_another_machine_shuts_out_who_wants_it_or_all(out: Path) -> None:
+def test_a_shard_on_another_machine_excludes_the_same_shard_and_a_whole_run(out: Path) -> None:
     """On a file system where that machine's locks are invisible."""
     name = f"{LOCK_FILE}.train.1"
     with at_work_elsewhere(out, name) as over:
@@ -266,7 +266,7 @@ def test_a_shard_made_on_another_machine_shuts_out_who_wants_it_or_all(out: Path
             assert over.is_set() and (out / "stages" / name).read_bytes() == b""  # who died there holds up nobody else
 
 
-def test_no_shard_is_made_while_another_machine_has_all(out: Path) -> None:
+def test_no_shard_is_made_while_another_machine_holds_the_whole_out(out: Path) -> None:
     with at_work_elsewhere(out) as over:
         with pytest.raises(UsageError, match=r"node7.* is working in"), locked_shard(out, "train.1"):
             pass
@@ -274,7 +274,7 @@ def test_no_shard_is_made_while_another_machine_has_all(out: Path) -> None:
             assert over.is_set()
 
 
-def test_of_a_shard_and_a_run_elsewhere_that_sign_at_once_the_shard_gives_way(
+def test_a_shard_yields_to_a_run_elsewhere_that_signs_simultaneously(
     out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The run signs after the look at its file and before the shard's own signature can be seen there."""
@@ -293,7 +293,7 @@ def test_of_a_shard_and_a_run_elsewhere_that_sign_at_once_the_shard_gives_way(
         pass
 
 
-def test_a_shards_maker_that_slept_finds_its_signature_taken_off(out: Path) -> None:
+def test_a_suspended_shard_process_finds_its_signature_removed(out: Path) -> None:
     with locked_shard(out, "train.1") as hold:
         (out / "stages" / f"{LOCK_FILE}.train.1").write_bytes(b"")
         deadline_s = time.monotonic() + TIMEOUT_S

@@ -116,7 +116,7 @@ def test_damaged_files_of_the_kernel_are_no_limit(tmp_path: Path, own: str, limi
     assert seen(tree(tmp_path, files)) == (4, 16.0, 10.0)
 
 
-def test_a_share_of_a_processor_is_one(tmp_path: Path) -> None:
+def test_a_fraction_of_a_processor_counts_as_one(tmp_path: Path) -> None:
     files = {"proc/self/cgroup": "0::/\n", "proc/self/mountinfo": V2, "sys/fs/cgroup/cpu.max": "1000 100000\n"}
     assert available_cores(tree(tmp_path, files)) == 1
 
@@ -129,7 +129,7 @@ def test_names_of_mounts_are_read_as_the_kernel_writes_them() -> None:
     assert mount.options == ("rw", "noatime", "rw", "errors=continue")
 
 
-def test_this_machine_is_understood() -> None:
+def test_this_machine_is_read_correctly() -> None:
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     assert 0 < free_memory_bytes() <= available_memory_bytes() <= total
     assert 1 <= available_cores() <= 4

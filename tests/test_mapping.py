@@ -41,7 +41,7 @@ def error_gsd(model: pycolmap.Reconstruction, flight: SyntheticFlight) -> float:
     return float(np.sqrt(np.mean(errors**2))) / GSD_M
 
 
-def test_cameras_come_out_at_the_truth_for_all_that_is_wrong(
+def test_cameras_are_accurate_despite_wrong_matches_and_focal_length(
     mapped: list[pycolmap.Reconstruction], flight: SyntheticFlight
 ) -> None:
     """Although a fifth of the matches is wrong and the focal length starts 3 % off."""
@@ -52,9 +52,7 @@ def test_cameras_come_out_at_the_truth_for_all_that_is_wrong(
     assert error_gsd(mapped[0], flight) < 2.0 * error_gsd(oracle(flight), flight)
 
 
-def test_all_true_tracks_are_in_the_model_at_last(
-    mapped: list[pycolmap.Reconstruction], flight: SyntheticFlight
-) -> None:
+def test_all_true_tracks_are_in_the_final_model(mapped: list[pycolmap.Reconstruction], flight: SyntheticFlight) -> None:
     model = mapped[0]
     starts = np.searchsorted(flight.photo, np.arange(PHOTOS))
     votes, observed = [], 0
@@ -71,7 +69,7 @@ def test_all_true_tracks_are_in_the_model_at_last(
     assert observed > 0.9 * lengths[lengths >= 3].sum()
 
 
-def test_mapping_starts_from_a_part_of_the_matches(database: Path, tmp_path: Path) -> None:
+def test_mapping_starts_from_a_subset_of_the_matches(database: Path, tmp_path: Path) -> None:
     chosen = best_keypoints(read_verified(database), 100)
     kept, total = write_reduced(database, tmp_path / "best.db", chosen)
     whole, part = read_verified(database), read_verified(tmp_path / "best.db")
@@ -120,7 +118,7 @@ def test_the_same_seed_gives_the_same_bits(mapper: object, tmp_path: Path) -> No
     assert not list(tmp_path.glob("mapping-*"))
 
 
-def test_progress_is_told_and_an_interruption_ends_it(database: Path, tmp_path: Path) -> None:
+def test_progress_is_reported_and_an_interruption_ends_it(database: Path, tmp_path: Path) -> None:
     told = []
 
     def tell(placed: int, total: int, what: str) -> None:

@@ -214,7 +214,7 @@ def test_keys_move_remove_hide_and_take_back(marking: tuple[Served, Path], open_
     assert state(page)["point"] == "P17"
 
 
-def test_a_click_before_the_photo_is_there_marks_nothing(marking: tuple[Served, Path], open_page: Callable) -> None:
+def test_a_click_before_the_photo_is_loaded_marks_nothing(marking: tuple[Served, Path], open_page: Callable) -> None:
     """Else what is seen in one photo would be marked in the next."""
     server, file = marking
     page = opened(open_page, server).page
@@ -239,7 +239,7 @@ def read_points(file: Path) -> list[Any]:
     return list(read_control_file(file).points) if lines else []
 
 
-def test_a_mark_survives_the_server_s_death(gps_run: Path, open_page: Callable) -> None:
+def test_a_mark_survives_a_killed_server(gps_run: Path, open_page: Callable) -> None:
     file = gps_run.parent / "photos of a house" / "gcp_list.txt"
     file.unlink(missing_ok=True)
     options = ("--mark", "--points", gps_run.parent / "points.csv")
@@ -260,7 +260,7 @@ def test_a_mark_survives_the_server_s_death(gps_run: Path, open_page: Callable) 
         assert state(page)["waiting"] == 0
 
 
-def test_lines_of_others_stay_and_their_changes_count(gps_run: Path, open_page: Callable) -> None:
+def test_other_lines_of_the_file_are_kept_and_external_changes_are_read(gps_run: Path, open_page: Callable) -> None:
     file = gps_run.parent / "photos of a house" / "gcp_list.txt"
     x, y, z = TRUTH["P01"]["utm_m"]
     written = f"# by hand\r\nEPSG:32633\r\n{x:.4f} {y:.4f} {z:.4f} 1 2 ELSEWHERE.JPG P01 extra 7\r\n\r\n# end\r\n"
@@ -292,7 +292,7 @@ def posted(server: Served, body: bytes, *lines: str, path: str = "/api/mark/chan
     return server.ask(path, *headers, method="POST", body=body).status
 
 
-def test_only_the_page_s_own_words_are_written(marking: tuple[Served, Path], open_page: Callable) -> None:
+def test_only_requests_of_the_page_itself_are_written(marking: tuple[Served, Path], open_page: Callable) -> None:
     server, file = marking
     good = b'{"point": 0, "photo": 4, "action": "mark", "x": 10.5, "y": 20}'
     assert posted(server, good, token="x" * 43) == 403
@@ -348,7 +348,7 @@ def test_a_phone_shows_and_marks_by_touch(marking: tuple[Served, Path], open_pag
     assert watched.errors == []
 
 
-def test_what_cannot_be_marked_is_told(gps_run: Path, tmp_path: Path) -> None:
+def test_the_page_says_what_cannot_be_marked(gps_run: Path, tmp_path: Path) -> None:
     def told(points: Path | None = None) -> str:
         with pytest.raises(SplatpipeError) as caught:
             Marking(open_job(open_run_folder(gps_run, LINE), points))
@@ -375,7 +375,7 @@ def test_what_cannot_be_marked_is_told(gps_run: Path, tmp_path: Path) -> None:
     assert "km from the photos" in told(points)
 
 
-def test_three_points_make_a_frame_where_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
+def test_three_points_determine_a_frame_if_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
     """Before that no positions are predicted; then all others are, to a few pixels. Wrong marks are reported."""
     job = open_job(open_run_folder(gps_run, LINE), gps_run.parent / "points.csv")
     text = ControlText.begin(tmp_path / "gcp_list.txt", "EPSG:32633", False, NameFinder(job.photos))
@@ -412,7 +412,7 @@ def beside(line: list[list[float]], pixel: list[float]) -> float:
     return float(np.linalg.norm(a + along[:, None] * (b - a) - pixel, axis=1).min())
 
 
-def test_found_targets_count_like_marks_and_are_never_written(gps_run: Path, tmp_path: Path) -> None:
+def test_detected_targets_count_like_marks_and_are_never_written(gps_run: Path, tmp_path: Path) -> None:
     """A user's mark replaces a detection; a removed mark is detected again; a hidden one is not."""
     job = open_job(open_run_folder(gps_run, LINE), gps_run.parent / "points.csv")
     assert job.found == {}
@@ -463,7 +463,7 @@ def found_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_found_targets_are_shown_moved_and_refused_in_the_browser(found_run: Path, open_page: Callable) -> None:
+def test_detected_targets_are_shown_moved_and_rejected_in_the_browser(found_run: Path, open_page: Callable) -> None:
     file = found_run.parent / "photos of a house" / "control.csv"
     begun = file.read_text()
     with serving(found_run, "--mark") as server:

@@ -78,7 +78,7 @@ def artifact_page(out: Path) -> Path:
     return path
 
 
-def test_what_was_measured_is_in_the_page_and_not_in_the_artifact(out: Path) -> None:
+def test_measurements_are_in_the_page_and_not_in_the_artifact(out: Path) -> None:
     assert renew_viewer(out) == ""
     (section,), (volume,) = told(out)["sections"], told(out)["volumes"]
     assert (section["name"], section["length_m"], section["trace"]) == ("Section 1", 3.0, TRACE)
@@ -94,7 +94,7 @@ def test_a_hostile_name_stays_text(out: Path) -> None:
     assert told(out)["volumes"][0]["name"] == "</script><script>alert(1)</script>\ufffd\ufffd"
 
 
-def test_the_page_stays_and_the_store_takes_it_for_its_copy(out: Path) -> None:
+def test_the_page_is_kept_and_the_store_accepts_it_as_its_copy(out: Path) -> None:
     renew_viewer(out)
     page = out / "viewer.html"
     content, before = page.read_bytes(), page.stat()
@@ -122,14 +122,14 @@ def test_the_page_for_web_hosts_shows_the_same(out: Path) -> None:
     assert told(out)["sections"]
 
 
-def test_pages_that_differ_differ_in_size() -> None:
+def test_pages_with_different_contents_differ_in_size() -> None:
     one, other = (with_measurements(PLAIN, {"sections": [{"name": name}]}) for name in ("A", "B"))
     assert len(one) != len(other)
     assert with_measurements(one, {"sections": [{"name": "B"}]}) == other
     assert with_measurements(one, None) == PLAIN
 
 
-def test_what_belongs_to_another_surface_model_is_not_shown(out: Path) -> None:
+def test_measurements_on_another_surface_model_are_not_shown(out: Path) -> None:
     renew_viewer(out)
     store = Store(out)
     (artifact,) = store.artifacts("dsm")
@@ -146,7 +146,7 @@ def test_a_page_in_another_frame_shows_nothing(out: Path) -> None:
     assert told(out) is None
 
 
-def test_what_people_removed_is_not_shown(out: Path) -> None:
+def test_removed_measurements_are_not_shown(out: Path) -> None:
     (out / "volumes.json").unlink()
     renew_viewer(out)
     assert [len(told(out)[kind]) for kind in ("sections", "volumes")] == [1, 0]
@@ -164,7 +164,7 @@ def test_a_page_of_an_earlier_version_is_left_alone(out: Path) -> None:
     assert not (out / "viewer.html").exists()
 
 
-def test_the_report_tells_figures_to_what_they_are_known_to(out: Path) -> None:
+def test_the_report_rounds_figures_to_their_uncertainty(out: Path) -> None:
     surface = next(iter(Store(out).artifacts("dsm"))).parts["dsm.files"].digest
     amounts = {"cut_m3": 12_345.678, "cut_sigma_m3": 45.6, "fill_m3": 0.123456, "fill_sigma_m3": 0.0456}
     amounts |= {"net_m3": -3.0, "net_sigma_m3": 0.0}
@@ -221,14 +221,14 @@ def test_damaged_sections_are_not_shown(out: Path, items: Any) -> None:
 @pytest.mark.parametrize(
     "text", ["", "[]", "{", "\x00", "[" * 100_000, '{"format": 99}', '{"format": 1, "sections": []}']
 )
-def test_a_record_that_is_none_shows_nothing(out: Path, text: str) -> None:
+def test_an_invalid_record_shows_nothing(out: Path, text: str) -> None:
     (out / MEASURED).write_text(text)
     assert renew_viewer(out) == ""
     assert (out / "viewer.html").read_bytes() == PLAIN
     assert not outdated(out, "other")
 
 
-def test_a_record_of_any_size_is_not_read(out: Path) -> None:
+def test_a_huge_record_is_not_read(out: Path) -> None:
     os.truncate(out / MEASURED, measurements.LARGEST_FILE + 1)
     (surface,) = Store(out).artifacts("dsm")
     assert read_measurements(out, "volumes", surface.parts["dsm.files"].digest) == []

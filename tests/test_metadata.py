@@ -70,7 +70,7 @@ def test_no_exif_is_all_defaults() -> None:
         assert read_exif(picture) == Exif()
 
 
-def test_senseless_values_are_none() -> None:
+def test_nonsensical_values_are_ignored() -> None:
     exif = tagged(
         {271: "\0\0\x07\n ", 272: "M" * 5000, 274: 42},
         {0x9003: "0000:00:00 00:00:00", 0x920A: IFDRational(0, 0), 0xA405: 0, 0xA002: 0, 0xA003: 4_000_000_000}

@@ -65,7 +65,7 @@ def test_psnr_of_a_known_error():
     assert psnr(render, photo) == pytest.approx(expected, abs=ATOL)
 
 
-def test_masked_psnr_is_that_of_the_pixels_left():
+def test_masked_psnr_is_that_of_the_unmasked_pixels():
     photo, mask = image(12, 20), half_mask(12, 20)
     render = noisy(photo)
     assert psnr(render, photo, mask) == pytest.approx(psnr(render[:, 10:], photo[:, 10:]), abs=ATOL)
@@ -101,7 +101,7 @@ def numpy_psnr_cc(render: np.ndarray, photo: np.ndarray, counts: np.ndarray) -> 
 
 
 @pytest.mark.parametrize("size", [(15, 18), (70, 101)])
-def test_psnr_after_colour_fit_is_what_each_half_makes_of_the_other(size):
+def test_psnr_after_colour_fit_fits_each_half_on_the_other(size):
     photo, mask = 0.2 + 0.5 * image(*size), half_mask(*size)
     render = noisy(0.9 * photo, 0.02)
     everything = np.ones(size, bool)
@@ -110,7 +110,7 @@ def test_psnr_after_colour_fit_is_what_each_half_makes_of_the_other(size):
     assert psnr_cc(render, photo, mask) == pytest.approx(expected, abs=1e-8)
 
 
-def test_colour_fit_gains_nothing_from_what_it_is_scored_on():
+def test_colour_fit_is_independent_of_the_pixels_that_it_is_scored_on():
     """A map fitted on all pixels matches noise to noise a little; halves that share nothing cannot."""
     generator = torch.Generator().manual_seed(3)
     render, photo = (torch.rand(32, 32, 3, generator=generator, dtype=torch.float64) for _ in range(2))
@@ -118,7 +118,7 @@ def test_colour_fit_gains_nothing_from_what_it_is_scored_on():
     assert psnr_cc(render, photo) < -10 * math.log10(float(spread))  # worse than the photo's mean colour
 
 
-def test_vignettes_do_not_decide_the_colour_fit():
+def test_vignetting_does_not_affect_the_colour_fit():
     """Both halves have as much of the corners: the fit is as good as one on everything."""
     y, x = np.mgrid[:300, :400]
     fall = 1 - 0.5 * ((x - 200) ** 2 + (y - 150) ** 2) / 250**2
@@ -210,7 +210,7 @@ def test_gmsd_is_its_definition(size):
     assert gmsd(render, photo) == pytest.approx(numpy_gmsd(render.numpy(), photo.numpy()), abs=ATOL)
 
 
-def test_sharpness_tells_blur_from_overshoot():
+def test_sharpness_distinguishes_blur_from_overshoot():
     photo = image(64, 64)
     assert sharpness(photo, photo) == 1.0
     softer = [sharpness(blurred(photo, sigma), photo) for sigma in (0.5, 1.0, 2.0)]
@@ -219,7 +219,7 @@ def test_sharpness_tells_blur_from_overshoot():
     assert sharpness(torch.zeros(5, 5, 3), torch.ones(5, 5, 3)) == 1.0
 
 
-def test_every_measure_has_its_best_value_for_equal_images():
+def test_every_metric_has_its_best_value_for_equal_images():
     photo = image(40, 50)
     best = {"psnr": math.inf, "ssim": 1.0, "ms_ssim": 1.0, "gmsd": 0.0, "sharpness": 1.0}
     for name, value in best.items():
@@ -228,7 +228,7 @@ def test_every_measure_has_its_best_value_for_equal_images():
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
-def test_no_measure_looks_at_masked_pixels(name):
+def test_no_metric_depends_on_masked_pixels(name):
     photo, mask = image(40, 50), half_mask(40, 50)
     render = noisy(photo)
     other = torch.where(mask[..., None], render, 1 - render)
@@ -237,7 +237,7 @@ def test_no_measure_looks_at_masked_pixels(name):
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
-def test_measures_are_the_same_bits_for_any_number_of_threads(name):
+def test_metrics_are_bit_identical_for_any_number_of_threads(name):
     photo = image(230, 310, dtype=torch.float32)
     render, threads = noisy(photo), torch.get_num_threads()
     values = []
@@ -251,7 +251,7 @@ def test_measures_are_the_same_bits_for_any_number_of_threads(name):
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
-def test_measures_refuse_what_they_cannot_measure(name):
+def test_metrics_refuse_invalid_images(name):
     measure, photo = METRICS[name], image(12, 12)
     with pytest.raises(ValueError, match="no pixel"):
         measure(photo, photo, torch.zeros(12, 12, dtype=torch.bool))
@@ -261,7 +261,7 @@ def test_measures_refuse_what_they_cannot_measure(name):
         measure(photo[:5], photo)
 
 
-def test_windowed_measures_name_the_size_they_need():
+def test_windowed_metrics_name_the_size_that_they_need():
     with pytest.raises(ValueError, match="6 pixels"):
         ssim(image(5, 40), image(5, 40))
     with pytest.raises(ValueError, match="11 pixels"):

@@ -53,7 +53,7 @@ def test_a_zooms_steps_share_a_camera_as_long_as_they_are_alike() -> None:
     assert names == [["0.jpg", "1.jpg", "2.jpg", "3.jpg", "4.jpg"], ["5.jpg", "6.jpg", "7.jpg"], ["8.jpg"]]
 
 
-def test_digital_zoom_and_another_body_are_cameras_of_their_own() -> None:
+def test_digital_zoom_and_another_body_are_separate_cameras() -> None:
     _, names = grouped(
         photo("a.jpg", focal_35mm=28.0, serial="1"),
         photo("b.jpg", focal_35mm=29.0, serial="1"),
@@ -63,7 +63,7 @@ def test_digital_zoom_and_another_body_are_cameras_of_their_own() -> None:
     assert names == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"]]
 
 
-def test_upright_photos_are_of_the_same_camera_by_exif_and_of_the_same_lens_where_pixels_are_turned() -> None:
+def test_portrait_photos_have_the_same_camera_by_exif_and_the_same_lens_if_pixels_are_rotated() -> None:
     groups, names = grouped(
         photo("a.jpg"), photo("b.jpg", orientation=6), photo("c.jpg", (3000, 4000)), photo("d.jpg", (1600, 1200))
     )
@@ -73,7 +73,7 @@ def test_upright_photos_are_of_the_same_camera_by_exif_and_of_the_same_lens_wher
     assert groups[1].params[1:3] == (1500.0, 2000.0)
 
 
-def test_exif_of_another_size_is_scaled_and_said_so() -> None:
+def test_exif_for_another_size_is_scaled_with_a_note() -> None:
     """As for photos that were resized or cropped without updating their EXIF."""
     plane = {"model": "unheard of", "focal_plane_px_per_mm": 1000.0, "width": 4000, "height": 3000}
     photos = [photo("a.jpg", (1600, 1200), **plane), photo("b.jpg", (1600, 900), **plane), photo("c.jpg", **plane)]
@@ -134,7 +134,7 @@ def test_a_single_photos_focal_length_is_that_of_its_body() -> None:
     assert model.compute_mean_reprojection_error() < 0.6
 
 
-def test_sound_cameras_are_left_as_they_are_to_the_bit() -> None:
+def test_sound_cameras_are_unchanged_bit_for_bit() -> None:
     model, verified, groups = two_cameras(1.01)
     before = [np.asarray(image.cam_from_world().matrix()) for image in model.images.values()]
     assert hold_few(model, verified, groups) == []
@@ -142,7 +142,7 @@ def test_sound_cameras_are_left_as_they_are_to_the_bit() -> None:
     assert all((a == b).all() for a, b in zip(before, after, strict=True))
 
 
-def test_every_camera_is_told_with_its_photos_focal_length_and_error() -> None:
+def test_every_camera_is_reported_with_its_photos_focal_length_and_error() -> None:
     model, verified, groups = two_cameras(1.0)
     rows = camera_rows(model, verified, groups)
     assert [(row["name"], row["photos"], row["placed"]) for row in rows] == [("DJI FC330", 39, 39), ("DJI FC330", 1, 1)]

@@ -36,7 +36,7 @@ def digests(source: RunSource, folder: Path) -> dict[str, str]:
     return source.digests(table, 1, EventReporter("source", lambda _: None))
 
 
-def test_without_files_the_parts_are_there_and_no_file(folder: Path) -> None:
+def test_without_files_the_parts_exist_and_name_no_file(folder: Path) -> None:
     source = opened(folder)
     assert set(source.part_files) == PARTS
     assert not source.part_path("source.geo").is_file()
@@ -51,7 +51,7 @@ def test_control_is_found_by_its_name_with_the_photos_or_beside_them(folder: Pat
     assert opened(folder).part_path("source.control").resolve() == path.resolve()
 
 
-def test_the_photo_folder_comes_before_what_lies_beside_it(folder: Path) -> None:
+def test_the_photo_folder_takes_precedence_over_its_parent(folder: Path) -> None:
     for root in (folder, folder.parent):
         (root / "geo.txt").write_text(str(root))
     assert opened(folder).part_path("source.geo") == folder / "geo.txt"
@@ -74,7 +74,7 @@ def test_none_ignores_the_file_that_is_there(folder: Path) -> None:
     assert source.part_path("source.geo").read_text() == ""
 
 
-def test_a_change_is_felt_by_the_part_it_belongs_to_alone(folder: Path) -> None:
+def test_a_change_affects_only_its_own_part(folder: Path) -> None:
     control = folder / "gcp_list.txt"
     control.write_text("EPSG:32633\n")
     before = digests(opened(folder), folder)
@@ -136,7 +136,7 @@ def make_large(path: Path) -> None:
         (make_large, "too large"),
     ],
 )
-def test_a_named_file_that_cannot_be_one_is_named(
+def test_an_unusable_named_file_is_reported(
     folder: Path, tmp_path: Path, make: Callable[[Path], object], message: str
 ) -> None:
     path = tmp_path / "points.csv"

@@ -38,7 +38,7 @@ def compile_for_avx2(source: str, folder: Path) -> Path:
     return obj
 
 
-def test_the_objects_of_the_build_hold_nothing_global_but_their_kernel_tables() -> None:
+def test_the_builds_objects_have_no_global_symbols_but_their_kernel_tables() -> None:
     tag = f"cp{sys.version_info.major}{sys.version_info.minor}-*-{sysconfig.get_platform().replace('-', '_')}"
     (build,) = (ROOT / "build").glob(f"{tag.replace('.', '_')}/build.ninja")
     objects = re.findall(r"^build (CMakeFiles/kernels_(\w+)\.dir/\S+\.o):", build.read_text(), re.MULTILINE)

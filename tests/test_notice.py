@@ -24,7 +24,7 @@ def told() -> list[str]:
     return os.fsdecode(Path("told").read_bytes()).split("\0")[:-1]
 
 
-def test_the_command_finds_how_it_ended_in_its_environment(tmp_path: Path) -> None:
+def test_the_command_finds_the_outcome_in_its_environment(tmp_path: Path) -> None:
     report = tmp_path / "out" / "report.html"
     assert notify(WRITE, "done", "church", report) == ""
     assert told() == ["done", "church", str(report), str(report.parent)]
@@ -37,13 +37,13 @@ def test_no_name_becomes_a_part_of_the_command(tmp_path: Path) -> None:
     assert not Path("pwned").exists()
 
 
-def test_a_command_that_fails_is_told_without_its_words() -> None:
+def test_a_command_that_fails_is_reported_without_its_output() -> None:
     said = notify("exit 7 # token=hunter2", "done", "church", None)
     assert "exit code 7" in said and "hunter2" not in said
     assert "127" in notify("/no/such/command --token hunter2", "done", "church", None)
 
 
-def test_a_command_that_hangs_is_ended_with_what_it_started() -> None:
+def test_a_command_that_hangs_is_terminated_with_its_children() -> None:
     began_s = time.monotonic()
     said = notify("sh -c 'echo $$ > child; exec sleep 300' & sleep 300", "done", "church", None, time_limit_s=1.0)
     assert "did not end within 1 s" in said
@@ -61,6 +61,6 @@ def test_the_command_reads_nothing_and_writes_to_stderr(capfd: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("command", ["", "  \n", "a\0b", "x" * 10_000])
-def test_what_cannot_be_called_is_refused_before(command: str) -> None:
+def test_an_invalid_command_is_refused_beforehand(command: str) -> None:
     with pytest.raises(UsageError, match="--notify"):
         check_command(command)

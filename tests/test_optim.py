@@ -167,7 +167,7 @@ def test_state_follows_density_control():
     assert optimizer.take_skipped() == 0
 
 
-def test_restored_state_goes_on_with_the_same_bits():
+def test_restored_state_continues_with_the_same_bits():
     straight, resumed = parameters(40), parameters(40)
     optimizer, first = Adam(straight), Adam(resumed)
     for step in range(6):

@@ -9,7 +9,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.web import asset
 
 
-def test_the_browser_has_webgl2_and_tells_what_a_page_does_wrong(tmp_path: Path, open_page: Callable) -> None:
+def test_the_browser_has_webgl2_and_reports_a_pages_errors(tmp_path: Path, open_page: Callable) -> None:
     page = tmp_path / "page.html"
     page.write_text("<!doctype html><script>fetch('https://elsewhere.invalid/x').catch(() => 0); nothing.here</script>")
     watched = open_page(page.as_uri())
@@ -19,7 +19,7 @@ def test_the_browser_has_webgl2_and_tells_what_a_page_does_wrong(tmp_path: Path,
     assert any("nothing is not defined" in error for error in watched.errors)
 
 
-def test_a_script_that_was_not_built_is_told_with_what_to_do() -> None:
+def test_a_script_that_was_not_built_is_reported_with_what_to_do() -> None:
     with pytest.raises(MachineError, match=r"lacks nothing\.js"):
         asset("nothing.js")
     assert "--accent" in asset("page.css")

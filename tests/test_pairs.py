@@ -50,7 +50,7 @@ def strips(rows: int, columns: int, step_m: float = 10.0) -> np.ndarray:
     return np.array([[step_m * x, step_m * y, 40.0] for y in range(rows) for x in range(columns)])
 
 
-def test_few_photos_are_matched_with_all() -> None:
+def test_few_photos_are_matched_exhaustively() -> None:
     photos = layout(strips(2, 3))
     assert choose_pairing(photos, 6) == "exhaustive"
     assert len(select_pairs(photos, "exhaustive", 3, never)) == 15
@@ -89,19 +89,19 @@ def test_distant_groups_are_joined_by_the_nearest_photos() -> None:
     assert min(j for i, j in pairs if i < 12 <= j) == 12
 
 
-def test_positions_no_wider_than_their_noise_do_not_lead() -> None:
+def test_positions_no_wider_than_their_noise_are_not_used() -> None:
     photos = layout(strips(5, 8, step_m=1.0), sigma_m=5.0)
     assert not positions_tell(photos)
     assert choose_pairing(photos, 30) == "retrieval"
     assert positions_tell(layout(strips(5, 8, step_m=1.0), sigma_m=0.02))
 
 
-def test_one_position_for_all_does_not_lead() -> None:
+def test_identical_positions_are_not_used() -> None:
     positions = np.repeat([[0.0, 0.0, 10.0], [500.0, 0, 10.0]], 20, axis=0)
     assert not positions_tell(layout(positions))
 
 
-def test_photos_without_position_are_placed_by_likeness() -> None:
+def test_photos_without_position_are_paired_by_similarity() -> None:
     positions = strips(5, 8)
     positions[7] = UNKNOWN
     alike = np.full((40, 40), 9.0)
@@ -146,7 +146,7 @@ def test_folders_are_sequences_of_their_own() -> None:
     assert found == [list(range(10)), list(range(10, 20))]
 
 
-def test_connecting_takes_what_it_gets_where_nothing_is_known() -> None:
+def test_connecting_works_without_any_information() -> None:
     pairs = connect({(0, 1)}, 4, lambda _: np.full(4, np.inf))
     assert components(pairs, 4).max() == 0
     assert len(pairs) == 3
@@ -164,7 +164,7 @@ def scenes(seed: int) -> list[np.ndarray]:
     return photos
 
 
-def test_photos_of_one_scene_look_alike() -> None:
+def test_photos_of_one_scene_are_similar() -> None:
     costs = look_alike_costs(scenes(0), seed=0)
     for i in range(12):
         row = costs(i).copy()

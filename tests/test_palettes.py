@@ -30,7 +30,7 @@ def test_weights_move_a_codebook() -> None:
     assert 200 < int((codebook < 1.0).sum()) < 256  # the cube root of the weights: 10 to 1
 
 
-def test_few_numbers_are_kept() -> None:
+def test_few_distinct_numbers_are_kept() -> None:
     values = np.array([3.0, -1.0, 3.0, 0.25], np.float32)
     assert np.array_equal(fit_codebook(values)[nearest_codes(values, fit_codebook(values))], values)
     assert np.array_equal(fit_codebook(np.zeros(0, np.float32)), np.zeros(256, np.float32))
@@ -49,7 +49,7 @@ def test_a_palette_finds_clusters_and_nearly_the_nearest_entry() -> None:
     assert found.mean() < 1.05 * best.mean()
 
 
-def test_every_round_is_better_and_what_weighs_is_kept() -> None:
+def test_every_round_improves_and_heavy_entries_are_kept() -> None:
     generator = torch.Generator().manual_seed(3)
     rows = torch.randn(4000, 24, generator=generator)
     weights = torch.ones(4000)

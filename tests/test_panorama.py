@@ -41,7 +41,7 @@ def test_every_direction_mixes_four_neighbouring_cells() -> None:
     assert set(steps.tolist()) <= {1, COLUMNS - 1}  # around the back the last column meets the first
 
 
-def test_colours_that_follow_the_elevation_are_seen_where_they_belong() -> None:
+def test_colours_by_elevation_appear_at_their_elevation() -> None:
     rows = (np.arange(ROWS) + 0.5) / ROWS * 180.0 - 90.0
     colours = np.repeat(rows / 90.0, COLUMNS)[:, None].repeat(3, axis=1).astype(np.float32)
     camera = skies.look(pitch_deg=30.0, roll_deg=25.0)
@@ -61,7 +61,7 @@ def test_colours_do_not_depend_on_the_photo_but_on_the_direction() -> None:
     np.testing.assert_allclose(panorama.at(directions(turned)).detach().numpy(), every_pixel[::-1, ::-1], atol=1e-5)
 
 
-def test_well_below_the_horizon_the_background_stays() -> None:
+def test_well_below_the_horizon_the_background_is_kept() -> None:
     panorama = Panorama(skies.UP, torch.full((ROWS * COLUMNS, 3), 0.75))
     camera = skies.look(pitch_deg=0.0)
     seen = panorama.behind(camera, (0.25, 0.0, 1.0)).numpy()

@@ -82,7 +82,7 @@ def test_threads_do_not_change_a_bit_and_seeds_do() -> None:
     assert (matched(wall(), 2, seed=2)[0] != first[0]).any()
 
 
-def test_masked_pixels_have_no_plane_and_no_say() -> None:
+def test_masked_pixels_have_no_plane_and_no_influence() -> None:
     (grey, counts), others = wall()
     counts[20:40, 30:60] = 0
     planes, costs = matched(((grey, counts), others))
@@ -105,7 +105,7 @@ def test_given_planes_are_judged_as_they_are() -> None:
     assert np.isfinite(planes).all()
 
 
-def test_smaller_changes_mend_planes_that_are_nearly_right() -> None:
+def test_smaller_changes_refine_planes_that_are_nearly_right() -> None:
     errors = []
     for begun in (0, 5):
         planes, costs = np.zeros((3, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
@@ -115,11 +115,11 @@ def test_smaller_changes_mend_planes_that_are_nearly_right() -> None:
     assert errors[1] < 0.8 * errors[0] < 0.004, errors
 
 
-def test_one_other_photo_is_not_enough_to_be_alike() -> None:
+def test_one_other_photo_is_not_enough() -> None:
     assert matched(wall(1))[1].min() > 0.5
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_mismatched_inputs_are_refused() -> None:
     (grey, counts), others = wall()
     planes, costs = np.zeros((3, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
 

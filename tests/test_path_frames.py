@@ -19,12 +19,12 @@ def camera(place: tuple[float, float, float], turn: tuple[float, float, float] =
     return Camera("photo", 120, 90, 100.0, 100.0, 60.0, 45.0, pose)
 
 
-def test_the_nearest_photo_that_is_left_comes_next() -> None:
+def test_the_nearest_remaining_photo_comes_next() -> None:
     given = [camera((x, 0, 0)) for x in (0, 5, 1, 2)]
     assert [c.centre()[0] for c in nearest_first(given)] == [0, 1, 2, 5]
 
 
-def test_brighter_is_told_from_moved() -> None:
+def test_brighter_is_distinguished_from_moved() -> None:
     """A wall with a pattern at a distance of 10: the next frame sees it from a metre beside."""
     frames = []
     for x, brighter in ((0.0, 0), (1.0, 0), (1.0, 12)):

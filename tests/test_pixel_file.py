@@ -48,7 +48,7 @@ def test_a_photo_is_decoded_once_and_its_pixels_outlive_the_file(tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_photos_that_memory_holds_stay_as_they_are(tmp_path: Path) -> None:
+def test_photos_in_memory_are_unchanged(tmp_path: Path) -> None:
     decoded: Counter[int] = Counter()
     sources, _ = photos(decoded)
     with pixels_on_disk(sources, tmp_path, held_bytes=1 << 20) as mapped:
@@ -57,7 +57,7 @@ def test_photos_that_memory_holds_stay_as_they_are(tmp_path: Path) -> None:
         assert none == []
 
 
-def test_what_the_disk_has_no_room_for_stays_as_it_is(tmp_path: Path) -> None:
+def test_photos_without_disk_space_are_not_stored(tmp_path: Path) -> None:
     vast = PhotoSource(
         CAMERA, lambda: np.zeros((0, 0, 3), np.uint8), None, DistortionGrid(1 << 30, 1 << 30, 8.0, np.zeros((2, 2, 2)))
     )

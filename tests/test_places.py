@@ -52,7 +52,7 @@ def test_folders_are_left_out(said: str, shown: str) -> None:
         "a / b",
     ],
 )
-def test_what_is_no_folder_stays(said: str) -> None:
+def test_texts_that_are_no_folders_are_kept(said: str) -> None:
     assert PLACES.plain(said) == said
 
 
@@ -62,7 +62,7 @@ def test_markup_of_our_own_is_left_alone() -> None:
     assert PLACES.plain_value(7) == 7
 
 
-def test_a_root_as_out_names_nothing_else() -> None:
+def test_the_root_as_out_replaces_nothing_else() -> None:
     assert PathLabels.of(Path("/"), Path("/photos")).plain("a/b /photos/x.jpg") != "aOUTb"
 
 

@@ -57,7 +57,7 @@ def splat_bytes(tmp_path: Path, n: int = 3, degree: int = 0) -> bytes:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_parts_are_written_as_the_whole_and_are_what_was_promised(tmp_path, degree):
+def test_written_in_parts_the_file_is_the_same_and_complete(tmp_path, degree):
     parts, path = [random_gaussians(n, degree) for n in (5, 0, 12)], tmp_path / "parts.ply"
     write_splat(tmp_path / "whole.ply", Gaussians.concat(parts), [MIP_COMMENT])
     write_splat_parts(path, iter(parts), 17, degree, [MIP_COMMENT])

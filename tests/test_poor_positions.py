@@ -80,7 +80,7 @@ def stated_of(frame: Frame, what: str) -> dict[str, float]:
     return {"east": offset[0], "height": offset[2], **angles, "scale": told[f"scale_{what}_percent"]}
 
 
-def test_what_is_stated_of_positions_off_by_13_m_is_true() -> None:
+def test_stated_accuracy_of_positions_off_by_13_m_is_true() -> None:
     """Thirty draws: the truth within the stated 95 % in 25 or more, the stated sigmas as large as the errors are."""
     model = cameras()
     errors, sigmas, within = [], [], []
@@ -96,7 +96,7 @@ def test_what_is_stated_of_positions_off_by_13_m_is_true() -> None:
     assert (np.sum(within, axis=0) >= 25).all()
 
 
-def test_positions_wrong_by_far_are_named_among_noisy_ones() -> None:
+def test_gross_errors_are_reported_among_noisy_positions() -> None:
     rng = np.random.default_rng(4)
     centres = np.concatenate([CENTRES, CENTRES[:35] + np.array([1.0, 2.0, 3.0])])
     model = cameras(centres, np.concatenate([TURNS, TURNS[:35]]))
@@ -109,7 +109,7 @@ def test_positions_wrong_by_far_are_named_among_noisy_ones() -> None:
     assert abs(errors_of(frame, model)["scale"]) < stated_of(frame, "95")["scale"]
 
 
-def test_slow_errors_are_told_and_count_for_what_they_are() -> None:
+def test_correlated_errors_are_reported_and_accounted_for() -> None:
     """Errors that each position carries on from the one before: the mean of forty is hardly better than one."""
     rng, error = np.random.default_rng(1), np.zeros((40, 3))
     error[0] = rng.normal(size=3)
@@ -124,7 +124,7 @@ def test_slow_errors_are_told_and_count_for_what_they_are() -> None:
     assert all(abs(errors[name]) <= bounds[name] for name in errors)
 
 
-def test_what_residuals_do_not_show_is_common_to_all_positions() -> None:
+def test_errors_not_seen_in_residuals_are_common_to_all_positions() -> None:
     """Positions of stated 3 m that agree to 0.4 m are somewhere within 3 m; those that scatter as stated show all."""
     rng = np.random.default_rng(2)
     quiet, _ = placed(cameras(), CENTRES + rng.normal(size=CENTRES.shape) * [0.4, 0.4, 0.6])
@@ -195,7 +195,7 @@ def test_flights_share_errors_besides_their_noise() -> None:
     assert 1.5 < math.sqrt(fit.covariance[4, 4]) < 3.0
 
 
-def test_control_counts_poor_positions_for_what_they_are() -> None:
+def test_control_weights_poor_positions_by_their_actual_accuracy() -> None:
     model = cameras()
     places = CENTRES + 13.0 * np.random.default_rng(6).normal(size=CENTRES.shape)
     frame, _ = placed(model, places)

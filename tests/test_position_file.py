@@ -86,7 +86,7 @@ def test_angles_and_accuracies_of_a_csv(tmp_path: Path) -> None:
         (b"EPSG:4326\n\xff\xfe.jpg 1 2\n", "not UTF-8 text"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, text: str | bytes, message: str) -> None:
+def test_errors_are_reported_with_their_line(tmp_path: Path, text: str | bytes, message: str) -> None:
     with pytest.raises(SplatpipeError, match=message) as caught:
         read(tmp_path, text)
     assert caught.value.hint

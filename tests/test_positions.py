@@ -39,7 +39,7 @@ def places(tmp_path: Path, text: str, names: list[str]) -> dict[str, object]:
     return dict(read_places(tmp_path / "geo.txt", names).by_name)
 
 
-def test_the_file_comes_before_exif_and_exif_before_xmp(tmp_path: Path) -> None:
+def test_the_file_takes_precedence_over_exif_and_exif_over_xmp(tmp_path: Path) -> None:
     xmp = drone(GpsLatitude=47.0, GpsLongitude=13.0, AbsoluteAltitude=500.0)
     assert (one(photo("a.jpg", None, xmp)).latitude, one(photo("a.jpg", None, xmp)).source) == (47.0, "xmp")
     assert (one(photo("a.jpg", HERE, xmp)).latitude, one(photo("a.jpg", HERE, xmp)).source) == (47.8412, "exif")
@@ -50,7 +50,7 @@ def test_the_file_comes_before_exif_and_exif_before_xmp(tmp_path: Path) -> None:
     assert (position.altitude_m, position.altitude_source) == (512.0, "exif")
 
 
-def test_exif_without_a_fix_gives_way_to_xmp() -> None:
+def test_xmp_is_used_if_exif_has_no_fix() -> None:
     xmp = drone(GpsLatitude=47.0, GpsLongitude=13.0)
     assert one(photo("a.jpg", Gps(0.0, 0.0), xmp)).source == "xmp"
 
@@ -111,7 +111,7 @@ def test_a_file_with_heights_in_its_crs_declares_their_datum(tmp_path: Path) -> 
         assert one(photo("a.jpg"), places=stated).vertical == vertical
 
 
-def test_a_file_of_another_capture_is_refused_and_odd_names_are_told(tmp_path: Path) -> None:
+def test_a_file_of_another_capture_is_refused_and_unknown_names_are_reported(tmp_path: Path) -> None:
     with pytest.raises(SplatpipeError, match=r"geo.txt lists no photo of this capture: x.jpg, y.jpg"):
         places(tmp_path, "EPSG:4326\nx.jpg 13.5 47.8\ny.jpg 13.5 47.8\n", ["a.jpg"])
     (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg 13.5 47.8\nx.jpg 13.5 47.8\n")
@@ -132,7 +132,7 @@ def test_nadir_angles_are_the_same_view_as_a_gimbal(angles: tuple[float, float, 
     np.testing.assert_allclose(found, camera, atol=1e-12)
 
 
-def test_the_convention_is_told_by_the_views_of_a_camera() -> None:
+def test_the_convention_is_recognised_by_the_views_of_a_camera() -> None:
     assert tell_convention([-90.0, -89.5, -45.0]) == "gimbal"
     assert tell_convention([0.0, 1.5, -2.0, 45.0]) == "nadir"
     assert tell_convention([270.0]) == "gimbal"
@@ -159,7 +159,7 @@ def listed(**odd: Gps) -> PositionList:
     return read_positions(photos)
 
 
-def test_positions_that_cannot_be_right_are_named_with_the_reason() -> None:
+def test_impossible_positions_are_reported_with_the_reason() -> None:
     found = listed(far=Gps(47.8692, 13.5127, 512.0), swapped=Gps(13.5127, 47.8412, 512.0), zero=Gps(0.0, 0.0, 0.0))
     assert len(found.positions) == 12
     assert set(found.wrong) == {"far.jpg", "swapped.jpg", "zero.jpg"}

@@ -206,7 +206,7 @@ def test_tiny_and_huge_gaussians_agree_with_the_reference(log_scale: float) -> N
     compare(scene, random_camera(6), RenderOptions(0, near=0.2))
 
 
-def test_nothing_to_see_is_the_background() -> None:
+def test_an_empty_view_is_the_background() -> None:
     behind = random_scene(1, 20)
     behind.means[:, 2] = -5.0
     for scene in (behind, Gaussians.empty(0, 3)):
@@ -221,7 +221,7 @@ def test_nothing_to_see_is_the_background() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38, -3e38])
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_hostile_numbers_are_skipped_and_spare_the_others(name: str, value: float) -> None:
+def test_hostile_numbers_are_skipped_and_do_not_affect_the_others(name: str, value: float) -> None:
     scene, camera, options = random_scene(2), random_camera(2), RenderOptions(3, near=0.2)
     flat = getattr(scene, name).view(len(scene), -1)
     flat[5] = value
@@ -276,7 +276,7 @@ def test_a_render_keeps_its_instruction_set_for_its_gradient() -> None:
         torch.testing.assert_close(gradient, expected, rtol=0.0, atol=0.0)
 
 
-def test_more_pairs_than_indices_hold_are_refused() -> None:
+def test_more_pairs_than_indices_can_hold_are_refused() -> None:
     # 4096 tiles in a row, and each of 2^19 Gaussians covers them all: one pair more than 2^31 - 1.
     one = Gaussians.empty(1, 0)
     one.log_scales[:, :2] += 8.0  # a disc that faces the camera: one that reached its plane would be skipped
@@ -289,7 +289,7 @@ def test_more_pairs_than_indices_hold_are_refused() -> None:
     assert torch.isfinite(render(random_scene(1), random_camera(1), RenderOptions(3)).colour).all()  # it goes on
 
 
-def test_any_number_of_threads_leaves_the_same_bits() -> None:
+def test_any_number_of_threads_gives_the_same_bits() -> None:
     # Enough for several chunks of the binning, and Gaussians at one depth.
     scene = random_scene(9, 40_000, 1, size=-4.0)
     scene.means[:, 2] = (scene.means[:, 2] * 4).round() / 4
@@ -340,7 +340,7 @@ def test_backward_can_wait_and_be_repeated() -> None:
     assert torch.equal(gradients[0], expected)
 
 
-def test_strided_parameters_and_gradients_are_taken() -> None:
+def test_strided_parameters_and_gradients_are_accepted() -> None:
     scene, camera, options = random_scene(0), random_camera(0), RenderOptions(3)
     strided = scene.clone()
     strided.sh = scene.sh.transpose(1, 2).contiguous().transpose(1, 2)
@@ -354,7 +354,7 @@ def test_strided_parameters_and_gradients_are_taken() -> None:
     assert torch.equal(by_view, by_copy)
 
 
-def test_other_dtypes_are_for_the_reference() -> None:
+def test_other_dtypes_use_the_reference() -> None:
     scene = random_scene(0, 5).to(dtype=torch.float64)
     assert render(scene, random_camera(0, 8, 8), RenderOptions(0)).colour.dtype == torch.float64
     with pytest.raises(ValueError, match="float32"):

@@ -74,7 +74,7 @@ def test_ellipse_turns_with_its_quaternion() -> None:
     assert alpha[2, 10] == 0.0
 
 
-def test_opacity_compensation_keeps_the_energy_of_what_the_blur_widens() -> None:
+def test_opacity_compensation_keeps_the_energy_of_blurred_gaussians() -> None:
     sigma, z, focal = 0.01, 4.0, 40.0
     sharp = (focal * sigma / z) ** 2
     result = draw(gaussian([0.0, 0.0, z], sigma, 0.9, [1.0, 1.0, 1.0]), camera(focal=focal), antialias=True)
@@ -215,7 +215,7 @@ def test_chunks_of_rows_make_the_same_picture(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("name", PARAMETERS)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_gaussian_with_a_number_that_is_none_is_skipped(name: str, value: float) -> None:
+def test_a_gaussian_with_nan_is_skipped(name: str, value: float) -> None:
     scene = random_scene(1)
     getattr(scene, name).view(8, -1)[3, -1] = value
     scene.requires_grad_()
@@ -230,7 +230,7 @@ def test_a_gaussian_with_a_number_that_is_none_is_skipped(name: str, value: floa
         assert (tensor.grad[3] == 0).all()
 
 
-def test_arguments_that_make_no_sense_are_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     scene = random_scene(1)
     for view, options in (
         (camera(width=0), RenderOptions(1)),

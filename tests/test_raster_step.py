@@ -71,7 +71,7 @@ def test_the_fused_step_has_the_bits_of_backward_pass_and_step(count: int, sh_de
 
 @pytest.mark.parametrize("dropout", [False, True], ids=("whole", "dropout"))
 @pytest.mark.parametrize("magnitudes", [False, True], ids=("sums", "magnitudes"))
-def test_of_what_is_left_out_and_how_it_is_observed(dropout: bool, magnitudes: bool) -> None:
+def test_left_out_rows_and_statistics_are_the_same(dropout: bool, magnitudes: bool) -> None:
     start = spread_scene(500, 3)
     ours, right = (trained(start, fused, dropout, magnitudes) for fused in (True, False))
     assert all(torch.equal(mine, other) for mine, other in zip(ours, right, strict=True))
@@ -85,7 +85,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     assert all(torch.equal(one, other) for each in found[1:] for one, other in zip(found[0], each, strict=True))
 
 
-def test_gradients_that_are_not_finite_leave_their_rows_and_are_counted() -> None:
+def test_rows_with_gradients_that_are_not_finite_are_unchanged_and_counted() -> None:
     found = []
     for buffers in (GradientBuffers(), None):
         scene = random_scene(0).requires_grad_()
@@ -106,7 +106,7 @@ def test_gradients_that_are_not_finite_leave_their_rows_and_are_counted() -> Non
 
 
 @pytest.mark.parametrize("reason", ["another gradient", "other rows", "all rows"])
-def test_what_cannot_be_fused_is_done_one_after_the_other(reason: str) -> None:
+def test_steps_that_cannot_be_fused_run_separately(reason: str) -> None:
     found = []
     for buffers in (GradientBuffers(), None):
         scene = random_scene(1).requires_grad_()
@@ -121,7 +121,7 @@ def test_what_cannot_be_fused_is_done_one_after_the_other(reason: str) -> None:
 
 
 @pytest.mark.parametrize("dropout", [False, True], ids=("whole", "dropout"))
-def test_the_first_rows_alone_can_be_stepped(dropout: bool) -> None:
+def test_only_the_first_rows_can_be_stepped(dropout: bool) -> None:
     found, count = [], 330
     for fused in (True, False):
         whole = spread_scene(500, 3).requires_grad_()
@@ -165,7 +165,7 @@ def test_a_step_touches_no_row_that_is_not_seen() -> None:
             assert bool((moments[name][unseen] == 0.5).all()) and bool((moments[name][~unseen] != 0.5).any())
 
 
-def test_all_scales_are_held_at_the_first_step_and_after_rows_were_exchanged() -> None:
+def test_all_scales_are_clamped_at_the_first_step_and_after_rows_were_exchanged() -> None:
     scene, buffers = spread_scene(90, 3).requires_grad_(), GradientBuffers()
     optimizer, (least, most) = Adam(scene.tensors()), LIMITS["log_scales"]
     for exchanged in (False, True):

@@ -101,29 +101,29 @@ def cuda() -> CudaKernels:
 
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS.keys())
-def test_reference_of_a_part_is_the_wholes(part):
+def test_reference_of_a_window_matches_the_whole(part):
     check_part(part, torch.float64)
 
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS.keys())
-def test_native_of_a_part_is_the_wholes(isa, part):
+def test_native_of_a_window_matches_the_whole(isa, part):
     check_part(part, torch.float32)
 
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS.keys())
-def test_cuda_of_a_part_is_the_wholes(cuda, part):
+def test_cuda_of_a_window_matches_the_whole(cuda, part):
     with use_kernels(cuda):
         check_part(part, torch.float32)
 
 
 @pytest.mark.parametrize("change", [{"antialias": True}, {"magnitudes": True}, {"depth": True, "sh_degree": 0}])
-def test_variants_of_a_part_are_the_wholes(change):
+def test_variants_of_a_window_match_the_whole(change):
     options = RenderOptions(**(vars(OPTIONS) | change))
     check_part(PARTS["middle"], torch.float64, options)
     check_part(PARTS["middle"], torch.float32, options)
 
 
-def test_parts_of_a_part_are_the_wholes():
+def test_windows_of_a_window_match_the_whole():
     """A cut of a cut knows the whole, not what it was cut from."""
     camera = random_camera(4, *SIZE)
     at_once, in_two = camera.cut(21, 17, 33, 18), camera.cut(10, 10, 50, 40).cut(11, 7, 33, 18)
@@ -134,7 +134,7 @@ def test_parts_of_a_part_are_the_wholes():
 
 
 @pytest.mark.parametrize("backend", ["reference", "native", "cuda"])
-def test_limits_of_the_part_alone_would_show(cuda, backend):
+def test_the_scene_would_reveal_limits_of_the_window_itself(cuda, backend):
     """The scene has what it takes: with the part's own frustum, as of a small photo, the picture is another."""
     part = random_camera(4, *SIZE).cut(*PARTS["middle"])
     alone = Camera(part.name, part.width, part.height, part.fx, part.fy, part.cx, part.cy, part.cam_from_world)
@@ -146,7 +146,7 @@ def test_limits_of_the_part_alone_would_show(cuda, backend):
     assert relative(others["means"], gradients["means"]) > 20 * RTOL[torch.float32]
 
 
-def test_each_gaussian_that_reaches_a_pixel_is_visible_in_a_part():
+def test_each_gaussian_that_reaches_a_pixel_is_visible_in_a_window():
     """All windows of an image together see the Gaussians that the whole sees."""
     camera, weights = random_camera(4, *SIZE), upstream_of((0, 0, *SIZE))
     whole, gradients = rendered(camera, weights, torch.float32)
@@ -163,7 +163,7 @@ def test_each_gaussian_that_reaches_a_pixel_is_visible_in_a_part():
     assert all(relative(summed[name], gradient) < RTOL[torch.float32] for name, gradient in gradients.items())
 
 
-def test_a_window_that_makes_no_sense_is_refused():
+def test_an_invalid_window_is_refused():
     scene = random_scene(1, 5)
     parameters = tuple(getattr(scene, name) for name in PARAMETERS)
     outputs = (torch.empty(9, 8, 3), torch.empty(9, 8), None, torch.empty(5), torch.empty(5, dtype=torch.uint8))

@@ -59,7 +59,7 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ring, MappingInput]:
     return ring, capture_of(ring, tmp_path_factory.mktemp("weak") / "capture")
 
 
-def test_auto_takes_the_other_mapper_where_the_first_one_fails(weak: tuple[Ring, MappingInput]) -> None:
+def test_auto_uses_the_other_mapper_if_the_first_one_fails(weak: tuple[Ring, MappingInput]) -> None:
     ring, capture = weak
     found = reconstruct(capture, SparseConfig(), corner_photos.Recorder())
     assert found.model.num_reg_images() == 24
@@ -76,14 +76,14 @@ def test_photos_from_one_spot_are_not_placed_without_points(tmp_path: Path) -> N
     assert "from different positions" in refused.value.hint
 
 
-def test_a_mapper_that_was_asked_for_is_not_replaced(weak: tuple[Ring, MappingInput]) -> None:
+def test_a_requested_mapper_is_not_replaced(weak: tuple[Ring, MappingInput]) -> None:
     found = reconstruct(weak[1], SparseConfig(mapper="global"), corner_photos.Recorder())
     assert [row["how"] for row in found.tried] == ["global"]
     with pytest.raises(SplatpipeError, match="of 24 photos could be placed"):
         reconstruct(weak[1], SparseConfig(mapper="incremental"), corner_photos.Recorder())
 
 
-def test_the_number_of_threads_changes_no_bit_of_the_answer(weak: tuple[Ring, MappingInput]) -> None:
+def test_the_number_of_threads_changes_no_bit_of_the_result(weak: tuple[Ring, MappingInput]) -> None:
     one, two = (
         answers(reconstruct(replace(weak[1], threads=threads), SparseConfig(), corner_photos.Recorder()))
         for threads in (1, 2)
@@ -91,14 +91,14 @@ def test_the_number_of_threads_changes_no_bit_of_the_answer(weak: tuple[Ring, Ma
     assert one == two
 
 
-def test_nothing_is_mapped_twice_where_nothing_is_doubtful(tmp_path: Path) -> None:
+def test_nothing_is_mapped_twice_if_nothing_is_doubtful(tmp_path: Path) -> None:
     ring = make_ring(count=12, points=500, most=300)
     found = reconstruct(capture_of(ring, tmp_path / "capture"), SparseConfig(), corner_photos.Recorder())
     assert [(row["how"], row["chosen"]) for row in found.tried] == [("incremental", True)]
     assert far_off(ring, found.model) < 0.002
 
 
-def test_pairs_that_a_bent_model_foretells_prove_the_bend(tmp_path: Path) -> None:
+def test_pairs_predicted_by_a_bent_model_prove_the_bend(tmp_path: Path) -> None:
     """A chain whose joint no pair spans: nothing contradicts the bend before new pairs are matched."""
     ring = make_ring(reach=3)
     capture = capture_of(ring, tmp_path / "capture", reach=1)
@@ -118,7 +118,7 @@ def test_pairs_that_a_bent_model_foretells_prove_the_bend(tmp_path: Path) -> Non
     assert len(told[1].verified.matches) == len(verified.matches) + told[1].held
 
 
-def test_a_thin_chain_gets_more_pairs_and_ends_right(tmp_path: Path) -> None:
+def test_a_thin_chain_gets_more_pairs_and_is_mapped_correctly(tmp_path: Path) -> None:
     ring = make_ring(points=600, most=400)
     thin = capture_of(ring, tmp_path / "capture", reach=1)
     found = reconstruct(thin, SparseConfig(), corner_photos.Recorder())

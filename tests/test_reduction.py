@@ -73,7 +73,7 @@ def test_a_merge_keeps_mass_mean_and_covariance() -> None:
     np.testing.assert_allclose(merged.sh.numpy(), colours, rtol=1e-4, atol=1e-5)
 
 
-def test_what_a_merge_costs_is_the_divergence_of_shapes_and_the_variance_of_colours() -> None:
+def test_the_cost_of_a_merge_is_the_divergence_of_shapes_and_the_variance_of_colours() -> None:
     both = some_gaussians(12, degree=1, seed=4)
     moments = moments_of(both)
     merged = moments_of(merge_pairs(both.first(6), both.after(6)))
@@ -91,7 +91,7 @@ def test_what_a_merge_costs_is_the_divergence_of_shapes_and_the_variance_of_colo
         assert costs[k] == pytest.approx(shape + COLOUR_WEIGHT * variance, rel=1e-4)
 
 
-def test_what_would_make_a_wall_thick_costs_more_than_what_lies_beside_in_it() -> None:
+def test_merging_across_a_wall_costs_more_than_merging_within_it() -> None:
     wall = some_gaussians(3, degree=0)
     wall.means[:] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.5]])
     wall.log_scales[:] = torch.log(torch.tensor([1.0, 1.0, 0.01]))
@@ -116,7 +116,7 @@ def test_the_matching_is_the_greedy_one() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 59])
-def test_as_many_are_left_as_were_asked_for_and_their_mass_is_kept(count: int) -> None:
+def test_the_requested_number_is_left_and_mass_is_kept(count: int) -> None:
     thin = some_gaussians()
     thin.opacity_logits -= 4.0  # none becomes opaque
     reduced = reduce_to(thin, count)
@@ -129,7 +129,7 @@ def test_as_many_are_left_as_were_asked_for_and_their_mass_is_kept(count: int) -
     )
 
 
-def test_those_that_did_not_merge_stay_to_the_bit() -> None:
+def test_unmerged_gaussians_are_bit_identical() -> None:
     given = some_gaussians()
     reduced = reduce_to(given, 50)
     kept = {row.tobytes() for row in given.means.numpy()} & {row.tobytes() for row in reduced.means.numpy()}
@@ -142,7 +142,7 @@ def test_the_same_gaussians_give_the_same_bits() -> None:
     assert all(torch.equal(tensor, second.tensors()[name]) for name, tensor in first.tensors().items())
 
 
-def test_two_that_are_one_merge_before_all_others() -> None:
+def test_identical_gaussians_merge_first() -> None:
     given = some_gaussians(30)
     twin = given.select(torch.tensor([4]))
     reduced = reduce_to(Gaussians.concat([given, twin]), 30)
@@ -187,14 +187,14 @@ def degenerate(name: str) -> Gaussians:
         "the same",
     ],
 )
-def test_degenerate_input_is_reduced_as_any_other(name: str) -> None:
+def test_degenerate_input_is_reduced_like_any_other(name: str) -> None:
     for count in (1, 13, 39):
         reduced = reduce_to(degenerate(name), count)
         assert len(reduced) == count
         assert not any(bool(tensor.isnan().any()) for tensor in reduced.tensors().values())
 
 
-def test_what_nobody_draws_goes_first() -> None:
+def test_invisible_gaussians_are_removed_first() -> None:
     given = some_gaussians(40)
     given.means[3, 1], given.quats[5, 0], given.sh[7, 0, 0] = math.nan, math.inf, math.nan
     assert bool(reduce_to(given, 39).finite().all())

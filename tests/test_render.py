@@ -64,7 +64,7 @@ def parts(demo_run: Path) -> dict[str, Path]:
     return {name: part.path for name, part in open_run_folder(demo_run, LINE).lineage(EXPORT).items()}
 
 
-def test_every_run_leaves_a_film_that_a_browser_plays(demo_run: Path, parts: dict[str, Path], browser: Browser) -> None:
+def test_every_run_makes_a_film_that_a_browser_plays(demo_run: Path, parts: dict[str, Path], browser: Browser) -> None:
     film = demo_run / "flythrough.webm"
     told, pictures = decoded(browser, film, [0.5 / 25, 2.0 + 0.5 / 25, SECONDS - 0.5 / 25])
     assert told["duration"] == pytest.approx(SECONDS, abs=0.01)
@@ -80,7 +80,7 @@ def test_every_run_leaves_a_film_that_a_browser_plays(demo_run: Path, parts: dic
         assert psnr(picture, render_pixels(scene.model, cameras[number], scene.options)) > 30.0
 
 
-def test_the_film_of_the_demo_flies_outside_of_the_house(parts: dict[str, Path]) -> None:
+def test_the_film_of_the_demo_stays_outside_the_house(parts: dict[str, Path]) -> None:
     scene = open_scene(parts, 1, cpu())
     route = photo_film(scene.capture, 100, SECONDS)
     cameras = cameras_along(route, scene.lens(None), scene.capture.up)
@@ -90,7 +90,7 @@ def test_the_film_of_the_demo_flies_outside_of_the_house(parts: dict[str, Path])
     assert (centres[inside, 2] > 14.0).all()  # over the roof at most
 
 
-def test_stills_of_the_photos_are_those_that_were_measured(
+def test_stills_of_the_photos_are_those_that_were_evaluated(
     demo_run: Path, parts: dict[str, Path], tmp_path: Path
 ) -> None:
     told = rendered(demo_run, "--stills", "-o", tmp_path / "stills")
@@ -102,7 +102,7 @@ def test_stills_of_the_photos_are_those_that_were_measured(
         np.testing.assert_array_equal(np.asarray(Image.open(mine)), np.asarray(Image.open(picture)))
 
 
-def test_depths_are_metres_to_what_was_surveyed(demo_run: Path, parts: dict[str, Path], tmp_path: Path) -> None:
+def test_depths_are_metres_to_surveyed_points(demo_run: Path, parts: dict[str, Path], tmp_path: Path) -> None:
     told = rendered(demo_run, "--stills", "--what", "depth", "-o", tmp_path)
     control = json.loads(parts["georef.control"].read_text())
     poses = {entry["img_name"]: entry for entry in json.loads((demo_run / "cameras.json").read_text())}
@@ -152,7 +152,7 @@ def test_films_along_keyframes_have_their_length_and_size(
     assert psnr(*pictures) < 25.0 and all(np.std(picture) > 10.0 for picture in pictures)
 
 
-def test_an_orbit_is_made_below_out_and_a_lost_export_is_no_hindrance(demo_run: Path, tmp_path: Path) -> None:
+def test_an_orbit_is_written_below_out_even_without_an_export(demo_run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(demo_run, out, ignore=shutil.ignore_patterns("export-*", "features-*", "matches-*"))
     told = rendered(out, "--path", "orbit", "--seconds", 0.4, "--size", "64x36", "--threads", 1)
@@ -178,7 +178,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("wanted", "code", "message"), WRONG, ids=range(len(WRONG)))
-def test_wrong_wishes_are_told_before_anything_is_rendered(
+def test_invalid_requests_are_refused_before_anything_is_rendered(
     demo_run: Path, tmp_path: Path, wanted: RenderRequest, code: int, message: str
 ) -> None:
     (tmp_path / "broken.json").write_text("[{}]")
@@ -190,7 +190,7 @@ def test_wrong_wishes_are_told_before_anything_is_rendered(
     assert not (demo_run / "renders").exists()
 
 
-def test_an_out_without_a_splat_is_told(tmp_path: Path) -> None:
+def test_an_out_without_a_splat_is_reported(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="does not contain a run"):
         render_run(tmp_path, RenderRequest(), 1)
     (tmp_path / "stages").mkdir()
@@ -201,13 +201,13 @@ def test_an_out_without_a_splat_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments", [("--seconds", "0"), ("--seconds", "nan"), ("--fps", "1000"), ("--what", "beauty")]
 )
-def test_a_wrong_call_ends_with_its_code_and_no_traceback(demo_run: Path, arguments: tuple[str, ...]) -> None:
+def test_an_invalid_call_ends_with_its_exit_code_and_no_traceback(demo_run: Path, arguments: tuple[str, ...]) -> None:
     done = render(demo_run, *arguments)
     assert done.returncode == 2 and "Traceback" not in done.stderr and arguments[0] in done.stderr + "--what"
     assert json.loads(done.stdout)["exit_code"] == 2
 
 
-def test_keyframes_of_the_world_are_found_in_the_models_frame(tmp_path: Path) -> None:
+def test_keyframes_in_the_world_are_transformed_to_the_models_frame(tmp_path: Path) -> None:
     """The camera is at its keyframe, its target is centred, and up in the world is up in the image."""
     world = Similarity(12.5, rotation_from_vector(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
     path = tmp_path / "path.json"
@@ -256,7 +256,7 @@ def test_three_photos_are_enough_for_a_film(tmp_path: Path) -> None:
     assert recorder.steps[-1] == (10, 10)
 
 
-def test_no_seconds_no_way_and_no_time_leave_no_film(tmp_path: Path) -> None:
+def test_zero_seconds_no_path_or_no_time_give_no_film(tmp_path: Path) -> None:
     back = np.diag([-1.0, 1.0, -1.0, 1.0])  # turned round: nothing is in front of them
     away = [replace(camera, cam_from_world=back @ camera.cam_from_world) for camera in tiny_scene.cameras(3)]
     for name, options, said in (
@@ -272,7 +272,7 @@ def test_no_seconds_no_way_and_no_time_leave_no_film(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", ["641x360", "12x10", "9000x900", "big", "640x360x2"])
-def test_sizes_that_no_film_has_are_refused(size: str) -> None:
+def test_invalid_film_sizes_are_refused(size: str) -> None:
     with pytest.raises(ValueError):
         FlythroughConfig(size=size)
 
@@ -299,7 +299,7 @@ def test_normals_of_a_slanted_wall_are_its_own() -> None:
 
 
 @pytest.mark.parametrize("pixels", [1, 3000, 1 << 21])
-def test_pictures_made_strip_by_strip_are_those_of_one_piece(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_made_strip_by_strip_are_those_of_one_piece(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model, options = tiny_scene.true_model(), rasterizer.RenderOptions(sh_degree=0)
     sky = Panorama(np.array([0.0, 0.6, 0.8]), torch.rand(ROWS * COLUMNS, 3, generator=torch.Generator().manual_seed(1)))
     camera = tiny_scene.cameras()[0].scaled(151, 117)

@@ -76,7 +76,7 @@ def copy_of_run(demo_run: Path, tmp_path: Path) -> Path:
     return shutil.copytree(demo_run, tmp_path / "out")
 
 
-def test_a_run_leaves_a_report_that_opens_offline_without_a_request(
+def test_a_run_writes_a_report_that_opens_offline_without_a_request(
     demo_run: Path, open_page: Callable[..., object]
 ) -> None:
     watched = open_page((demo_run / "report.html").as_uri())
@@ -93,7 +93,7 @@ def test_a_run_leaves_a_report_that_opens_offline_without_a_request(
         assert state_of(watched, stage.name) == "finished"
 
 
-def test_links_lead_to_the_files_beside_it_and_nowhere_else(finished: Path, open_page: Callable[..., object]) -> None:
+def test_links_point_to_the_files_beside_it_and_nowhere_else(finished: Path, open_page: Callable[..., object]) -> None:
     watched = open_page((finished / "report.html").as_uri())
     links = watched.page.eval_on_selector_all("a[href]", "all => all.map(a => a.getAttribute('href'))")
     for link in links:
@@ -142,7 +142,7 @@ def test_held_out_photos_come_worst_first_and_the_slider_moves_the_cut(
     assert "100%" in view.locator(".render img").evaluate(cut)
 
 
-def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_places(
+def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_positions(
     finished: Path, open_page: Callable[..., object]
 ) -> None:
     """The drawn mark and circle are separated by the residual, in pixels of the crop."""
@@ -250,7 +250,7 @@ def test_a_run_that_failed_in_sparse_has_a_truthful_report(tmp_path: Path, open_
     assert watched.page.locator("#capture .chart").count() == 1  # where the photos say that they were taken
 
 
-def test_a_run_without_any_position_says_that_nothing_is_in_metres(
+def test_a_run_without_positions_says_that_nothing_is_in_metres(
     tmp_path: Path, open_page: Callable[..., object]
 ) -> None:
     photos = tmp_path / "photos"
@@ -312,7 +312,7 @@ def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Call
 @pytest.mark.parametrize(
     "part", ["georef.control", "evaluate.metrics", "sparse.summary", "train.history", "ingest.positions"]
 )
-def test_a_damaged_part_costs_its_chapter_and_not_the_report(copy_of_run: Path, part: str) -> None:
+def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, part: str) -> None:
     path = read_report_inputs(copy_of_run).part(part)
     path.write_text("[" + " " * (path.stat().st_size - 2) + "]")  # as long as it was, and something else
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
@@ -320,7 +320,7 @@ def test_a_damaged_part_costs_its_chapter_and_not_the_report(copy_of_run: Path, 
     assert "How it was made" in page
 
 
-def test_a_finished_run_whose_artifact_is_damaged_is_not_told_as_one_that_was_asked_to_end_there(
+def test_a_damaged_artifact_of_a_finished_run_is_not_reported_as_a_requested_end(
     copy_of_run: Path,
 ) -> None:
     (read_report_inputs(copy_of_run).part("sparse.summary").parent / "manifest.json").write_text("{")
@@ -395,7 +395,7 @@ def test_the_verdict_follows_the_figures(
     assert found.level == level
 
 
-def test_scale_bars_are_told_one_by_one(copy_of_run: Path) -> None:
+def test_scale_bars_are_reported_one_by_one(copy_of_run: Path) -> None:
     """Metric, not placed: lengths have a unit, and no axis is called east."""
     bars = [("P1", "P2", 12.5, 0.0012, True), ("P2", "P3", 8.0, -0.9, False), ("P3", "P9", 4.0, None, False)]
     rows = [dict(zip(("a", "b", "metres", "error_m", "used"), bar, strict=True)) for bar in bars]
@@ -416,7 +416,7 @@ def test_scale_bars_are_told_one_by_one(copy_of_run: Path) -> None:
     assert finding.level == "doubt"  # one bar, which no other proves
 
 
-def test_bad_cameras_are_the_first_words_of_page_and_console(
+def test_bad_cameras_are_the_headline_of_page_and_console(
     copy_of_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reason = {"level": "bad", "kind": "bent", "text": "40 of 90 pairs contradict it.", "hint": "Add photos."}
@@ -433,13 +433,13 @@ def test_bad_cameras_are_the_first_words_of_page_and_console(
     assert capsys.readouterr().err == ""
 
 
-def test_the_page_tells_which_mappers_were_tried(copy_of_run: Path) -> None:
+def test_the_page_lists_the_mappers_that_were_tried(copy_of_run: Path) -> None:
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
     table = page[page.index("Mapping methods tried") : page.index("Calibration</h3>")]
     assert "incremental" in table and "taken" in table and "nan" not in table
 
 
-def test_a_broken_off_run_is_told_from_a_running_one(copy_of_run: Path) -> None:
+def test_an_interrupted_run_is_distinguished_from_a_running_one(copy_of_run: Path) -> None:
     lines = (copy_of_run / "events.jsonl").read_text().splitlines()
     started = next(i for i, line in enumerate(lines) if '"stage_started"' in line and '"train"' in line)
     (copy_of_run / "events.jsonl").write_text("\n".join(lines[: started + 4]))
@@ -457,13 +457,13 @@ def test_a_report_that_cannot_be_written_does_not_spoil_a_good_run(copy_of_run: 
     assert json.loads(done.stdout)["error"] is None
 
 
-def test_report_of_a_folder_without_a_run_is_a_wrong_call(tmp_path: Path) -> None:
+def test_report_of_a_folder_without_a_run_is_a_usage_error(tmp_path: Path) -> None:
     done = splatpipe("report", tmp_path)
     assert done.returncode == 2 and "does not contain a run" in " ".join(done.stderr.replace("│", " ").split())
     assert not list(tmp_path.iterdir())
 
 
-def test_hundreds_of_photos_do_not_explode_it() -> None:
+def test_hundreds_of_photos_keep_the_report_small() -> None:
     views = [{"psnr": float(i)} for i in range(300)]
     assert len(chosen_views(views)) == 12 and chosen_views(views)[-1] is views[-1]
     seen = [{"photo": f"{i}.jpg", "pixel": [10.0, 10.0], "residual_px": [i / 100.0, 0.0]} for i in range(400)]
@@ -473,7 +473,7 @@ def test_hundreds_of_photos_do_not_explode_it() -> None:
     assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(chips) and (0, 0) not in chips
 
 
-def test_no_folder_outside_out_is_told(copy_of_run: Path) -> None:
+def test_no_folder_outside_out_is_named(copy_of_run: Path) -> None:
     secret = "/home/jane doe/customers/Brown"
     config = (copy_of_run / "config.toml").read_text()
     photos = tomllib.loads(config)["photos"]

@@ -101,7 +101,7 @@ def test_block_that_the_other_photos_contradict_is_left_out_and_little_else(robu
     assert robust.share_left_out() == pytest.approx(float((~counts).float().mean()) / 9.0, rel=1e-6)
 
 
-def test_a_device_that_works_on_all_cells_leaves_out_the_same(
+def test_a_device_that_processes_all_cells_leaves_out_the_same(
     robust: RobustMask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = RobustMask([camera.name for camera in cameras()])
@@ -148,7 +148,7 @@ def test_masked_pixels_stay_masked_and_are_not_judged(robust: RobustMask) -> Non
     assert bool((nothing == UNKNOWN).all())
 
 
-def test_exposure_and_detail_out_of_place_are_no_motion_but_a_block_is() -> None:
+def test_exposure_and_displaced_detail_are_not_motion_but_a_block_is() -> None:
     camera = cameras()[3]
     model, everywhere = true_photo(camera), torch.ones(camera.height, camera.width, dtype=torch.bool)
     for other in (model, model + 0.2, model.roll((1, 1), (0, 1)), model.roll(-1, 1)):
@@ -190,12 +190,12 @@ def test_threshold_is_the_quantile_of_all_known_cells() -> None:
     assert torch.isinf(robust.threshold).all()
 
 
-def test_share_rises_from_the_begin_of_density_control() -> None:
+def test_share_rises_from_the_beginning_of_density_control() -> None:
     shares = [share_at(0.1, 200, iteration) for iteration in (1, 200, 300, 400, 1000)]
     assert shares == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1])
 
 
-def test_a_visit_that_is_begun_again_is_as_if_there_had_been_one(robust: RobustMask) -> None:
+def test_a_repeated_visit_counts_once(robust: RobustMask) -> None:
     plain, camera = RenderOptions(sh_degree=3), cameras()[2]
     now = ScheduleStep(1, 1, 0.0, 0, 3, (0.0, 0.0, 0.0), 0.0, True)
     model = tiny_scene.true_model()
@@ -211,7 +211,7 @@ def test_a_visit_that_is_begun_again_is_as_if_there_had_been_one(robust: RobustM
         looked(robust, camera, colour)
 
 
-def test_memory_goes_through_arrays_and_refuses_another_shape(robust: RobustMask) -> None:
+def test_state_round_trips_through_arrays_and_refuses_another_shape(robust: RobustMask) -> None:
     an_epoch(robust)
     other = RobustMask([camera.name for camera in cameras()])
     other.load({name: tensor.clone() for name, tensor in robust.to_arrays().items()})
@@ -267,7 +267,7 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
     return TrainedRun(summary, float(np.mean(psnr)), kept[0], out)
 
 
-def test_held_out_photos_are_better_without_what_moved(scene: Path, tmp_path: Path) -> None:
+def test_held_out_photos_are_better_without_moving_objects(scene: Path, tmp_path: Path) -> None:
     off, on = trained(scene, tmp_path / "off", 0.0), trained(scene, tmp_path / "on", 0.05)
     assert on.psnr > off.psnr + 0.3
     assert "robust_left_out" not in off.summary and 0.01 < float(str(on.summary["robust_left_out"])) < 0.03
@@ -282,7 +282,7 @@ def test_held_out_photos_are_better_without_what_moved(scene: Path, tmp_path: Pa
     assert max(left_out.values()) < 0.02
 
 
-def test_killed_training_leaves_the_same_out_and_ends_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
+def test_killed_training_leaves_out_the_same_and_ends_with_the_same_bits(scene: Path, tmp_path: Path) -> None:
     whole = trained(scene, tmp_path / "whole", 0.05, 120)
     assert float(str(whole.summary["robust_left_out"])) > 0.0
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):

@@ -34,7 +34,7 @@ def bill(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return found
 
 
-def test_the_bill_is_what_cyclonedx_asks_for(bill: dict[str, Any]) -> None:
+def test_the_bill_meets_cyclonedxs_schema(bill: dict[str, Any]) -> None:
     assert (bill["bomFormat"], bill["specVersion"], bill["version"]) == ("CycloneDX", "1.6", 1)
     own = bill["metadata"]["component"]
     assert (own["name"], own["version"], own["type"]) == ("splatpipe", PROJECT["version"], "application")
@@ -50,7 +50,7 @@ def test_the_bill_is_what_cyclonedx_asks_for(bill: dict[str, Any]) -> None:
         assert {each["ref"], *each["dependsOn"]} <= set(references)
 
 
-def test_every_package_in_a_page_is_in_the_bill_as_it_is_locked(bill: dict[str, Any]) -> None:
+def test_every_package_in_a_page_is_in_the_bill_with_its_locked_version(bill: dict[str, Any]) -> None:
     locked = json.loads((ROOT / "pipeline/web/package-lock.json").read_text(encoding="utf-8"))["packages"]
     shipped = {path.removeprefix("node_modules/"): facts for path, facts in locked.items() if path}
     shipped = {name: facts["version"] for name, facts in shipped.items() if not facts.get("dev")}
@@ -66,7 +66,7 @@ def test_every_package_in_a_page_has_its_own_licence_in_the_wheel() -> None:
         assert f"{name} {version}\n{text}\n" in heads.replace("* /", "*/"), name
 
 
-def test_what_is_bundled_has_a_licence_that_the_wheel_takes_along(bill: dict[str, Any]) -> None:
+def test_bundled_code_has_a_licence_in_the_wheel(bill: dict[str, Any]) -> None:
     taken = {path for pattern in PROJECT["license-files"] for path in ROOT.glob(pattern)}
     for name in sbom.bundled_names(bill):
         if name != "cuda-runtime":  # its toolkit has it, and CMake puts it into a wheel with CUDA
@@ -102,7 +102,7 @@ def needed_by(requirements: Iterable[str]) -> set[str]:
     return {name for name, _ in found}
 
 
-def test_the_bill_has_what_a_run_needs_with_the_versions_that_were_tested(bill: dict[str, Any]) -> None:
+def test_the_bill_lists_a_runs_dependencies_with_the_tested_versions(bill: dict[str, Any]) -> None:
     named = {
         canonicalize_name(each["name"]): each for each in bill["components"] if each["purl"].startswith("pkg:pypi/")
     }

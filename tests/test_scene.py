@@ -25,7 +25,7 @@ def some_gaussians(count: int = 50, degree: int = 3) -> Gaussians:
 
 
 @pytest.mark.parametrize("axes", ["z up", "y up", "y down"])
-def test_turning_puts_up_where_the_axes_say_and_back(axes):
+def test_change_of_axes_moves_up_accordingly_and_back(axes):
     scene = Scene(some_gaussians(), FACTS)
     up = turn_of(axes, "z up") @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     assert up.tolist() == {"z up": [0, 0, 1], "y up": [0, 1, 0], "y down": [0, -1, 0]}[axes]
@@ -35,7 +35,7 @@ def test_turning_puts_up_where_the_axes_say_and_back(axes):
         torch.testing.assert_close(getattr(back, name), tensor, rtol=1e-5, atol=1e-5)
 
 
-def test_a_ply_keeps_its_bits_its_place_and_its_edits(tmp_path: Path):
+def test_a_ply_keeps_its_bits_georeference_and_edits(tmp_path: Path):
     path = tmp_path / "splat.ply"
     scene = Scene(some_gaussians(), FACTS)
     plain_ply.write(path, scene)
@@ -46,12 +46,12 @@ def test_a_ply_keeps_its_bits_its_place_and_its_edits(tmp_path: Path):
     assert "crs: EPSG:32634 (see georef.json)" in read_splat_header(path).comments
 
 
-def test_a_foreign_ply_is_y_down_and_nowhere(tmp_path: Path):
+def test_a_foreign_ply_is_y_down_without_georeference(tmp_path: Path):
     write_splat(tmp_path / "foreign.ply", some_gaussians(3))
     assert plain_ply.read(tmp_path / "foreign.ply").facts == SceneFacts("y down")
 
 
-def test_a_place_is_a_frame_and_back():
+def test_a_georeference_round_trips_through_a_frame():
     frame = frame_of(PLACE)
     assert facts_of(frame, antialias=True) == replace(FACTS, edits=())
     np.testing.assert_array_equal(frame.world_from_model.matrix(), np.eye(4))
@@ -79,7 +79,7 @@ GOOD = json.loads(FACTS.record())
         json.dumps(GOOD) + " " * MOST_RECORD_BYTES,
     ],
 )
-def test_a_record_that_is_not_ours_says_nothing(record):
+def test_a_foreign_record_is_ignored(record):
     otherwise = SceneFacts("y up")
     assert facts_of_record(record, otherwise) is otherwise
 

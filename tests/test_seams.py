@@ -54,7 +54,7 @@ def found(splat: Gaussians, coarse: Gaussians, line: PlanLine, cameras: list[Cam
     return {seam.kind: seam for seam in seams}
 
 
-def test_border_is_the_middle_of_its_pictures(splat: Gaussians, cameras: list[Camera]) -> None:
+def test_border_is_at_the_middle_of_its_images(splat: Gaussians, cameras: list[Camera]) -> None:
     line = BORDERS[1]
     over, height = border_cameras(splat, PLAN, line, cameras, building_site.OPTIONS)
     assert len(over) >= 6 and 0.6 * building_site.HEIGHT < height <= building_site.HEIGHT + 1.0
@@ -91,7 +91,7 @@ def test_step_of_colour_is_found_and_how_large(splat: Gaussians, coarse: Gaussia
     assert response.score > 2.0 * LIMITS["step"][0]
 
 
-def test_seam_on_a_part_of_a_border_is_told_where(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:
+def test_a_seam_on_part_of_a_border_is_located(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:
     line = BORDERS[1]
     part = PlanLine(tuple(line.place(20.0)), tuple(line.place(30.0)))
     seams = found(colour_step(splat, PLAN, part, 0.15), coarse, line, cameras)
@@ -99,12 +99,12 @@ def test_seam_on_a_part_of_a_border_is_told_where(splat: Gaussians, coarse: Gaus
     assert max(seams["colour"].start, 20.0) < min(seams["colour"].end, 30.0)  # a piece that has some of it
 
 
-def test_border_where_nothing_is_has_no_seam(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:
+def test_border_through_empty_space_has_no_seam(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:
     assert found(splat, coarse, PlanLine((300.0, 0.0), (300.0, 20.0)), cameras) == {}
     assert set(KINDS) == set(LIMITS)
 
 
-def test_benchmark_finds_what_it_plants(demo_run: Path) -> None:
+def test_benchmark_finds_planted_seams(demo_run: Path) -> None:
     """On the demo, whose splat also serves as the model without blocks: no alarm, and some of each kind found."""
     coarse = next((demo_run / "stages").glob("train-*/model.ply"))
     script = Path(__file__).parents[1] / "benchmarks" / "seams.py"

@@ -43,18 +43,18 @@ SAID = [
 
 
 @pytest.mark.parametrize(("stage", "summary", "said"), SAID)
-def test_a_summary_is_said_in_a_sentence(stage: str, summary: dict[str, Any], said: str) -> None:
+def test_a_summary_is_formatted_as_a_sentence(stage: str, summary: dict[str, Any], said: str) -> None:
     assert sentence(stage, summary) == said
 
 
-def test_every_stage_has_one_and_none_fails_on_what_it_does_not_know() -> None:
+def test_every_stage_has_a_sentence_and_none_fails_on_unknown_summaries() -> None:
     assert {stage.name for stage in LINE} == set(SENTENCES)
     for stage in LINE:
         assert sentence(stage.name, {}) in ("", "none needed")
         assert sentence(stage.name, dict.fromkeys(["photos", "note", "frames", "points", "positions"], "x")) is not None
 
 
-def test_the_verdict_comes_first_with_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verdict_starts_with_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
     doubt = VerdictLine("doubt", "Floaters", "Floaters in front of [bold]5[/] photos")
     show_verdict(Verdict("doubt", "Finished; 1 point to look at", "The run ended.", [doubt]))
     lines = capsys.readouterr().err.splitlines()

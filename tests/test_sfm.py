@@ -58,7 +58,7 @@ def reconstructed(capture: Inputs, tmp_path_factory: pytest.TempPathFactory) -> 
     return out, summary
 
 
-def test_cameras_come_out_where_they_were(reconstructed: tuple[Path, dict[str, object]]) -> None:
+def test_cameras_are_recovered(reconstructed: tuple[Path, dict[str, object]]) -> None:
     out, summary = reconstructed
     assert summary["registered"] == len(NAMES)
     model = pycolmap.Reconstruction(out / "sparse" / "sparse" / "0")
@@ -95,7 +95,7 @@ def test_the_number_of_threads_changes_no_bit(
     assert digests(tmp_path) == digests(reconstructed[0])
 
 
-def test_nothing_but_the_parts_is_left_behind(reconstructed: tuple[Path, dict[str, object]]) -> None:
+def test_only_the_parts_are_left_behind(reconstructed: tuple[Path, dict[str, object]]) -> None:
     assert set(digests(reconstructed[0])) == {
         "features/database.db",
         "features/colours.npy",

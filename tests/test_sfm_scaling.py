@@ -25,7 +25,7 @@ def flight() -> scene.SyntheticFlight:
     return scene.make_flight(COUNT, 0)
 
 
-def test_a_flight_has_the_observations_and_the_noise_that_are_asked_for(flight: scene.SyntheticFlight) -> None:
+def test_a_flight_has_the_requested_observations_and_noise(flight: scene.SyntheticFlight) -> None:
     per_photo = np.bincount(flight.photo)
     assert per_photo.min() > 1000 and per_photo.mean() > 1500
     assert np.bincount(flight.point).max() == scene.LONGEST_TRACK
@@ -66,14 +66,14 @@ def test_a_fifth_of_the_verified_matches_is_wrong_and_near_the_epipolar_line(
     assert np.percentile(off, 95) < 2.0 * scene.EPIPOLAR_PX  # the lens bends the true ones off a pinhole's lines
 
 
-def test_pairs_a_photo_are_bounded_for_any_number_of_photos(flight: scene.SyntheticFlight) -> None:
+def test_pairs_per_photo_are_bounded_for_any_number_of_photos(flight: scene.SyntheticFlight) -> None:
     small = 2 * len(scene.choose_pairs(flight, 0)) / COUNT
     large = 2 * len(scene.choose_pairs(scene.make_flight(90, 0, 10), 0)) / 90
     assert small < 30 and large < 30
     assert 2 * pairs_by_look(25) / 25 < 25
 
 
-def test_centres_are_held_against_the_truth_whatever_their_frame() -> None:
+def test_centres_are_compared_with_the_truth_whatever_their_frame() -> None:
     rng = np.random.default_rng(0)
     true = rng.normal(size=(20, 3)) * [100.0, 80.0, 5.0]
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]

@@ -99,7 +99,7 @@ def test_rotation_keeps_float32_and_its_input():
     )
 
 
-def test_what_is_no_rotation_or_no_band_is_refused():
+def test_invalid_rotations_and_bands_are_refused():
     sh = torch.zeros(1, 16, 3)
     for matrix in (torch.diag(torch.tensor([1.0, 1.0, -1.0])), 2 * torch.eye(3), torch.full((3, 3), torch.nan)):
         with pytest.raises(ValueError, match="rotation"):

@@ -99,7 +99,7 @@ def digests(out: Path) -> dict[str, object]:
     }
 
 
-def test_a_run_makes_the_shards_and_then_joins_them_and_a_second_one_reuses(numbers: Path, out: Path) -> None:
+def test_a_run_makes_the_shards_and_merges_them_and_a_second_one_reuses_them(numbers: Path, out: Path) -> None:
     first, events = walk(request_of(numbers, out))
     assert first.ran == ["read", "divide", *SHARDS, "sum", "show"]
     assert (out / "shown.txt").read_text() == str(TOTAL)
@@ -109,7 +109,7 @@ def test_a_run_makes_the_shards_and_then_joins_them_and_a_second_one_reuses(numb
     assert second.ran == [] and [event.stage for event in events if event.stage] == ["read", "divide", "sum", "show"]
 
 
-def test_shards_of_many_processes_each_killed_once_are_the_same_bits_as_one_runs(numbers: Path, tmp_path: Path) -> None:
+def test_shards_of_many_processes_each_killed_once_have_the_bits_of_a_single_run(numbers: Path, tmp_path: Path) -> None:
     """Each is killed with -9 between its two numbers, made again in another order, all three at once; then joined."""
     one, many = tmp_path / "one", tmp_path / "many"
     slow = {"sum": {"step_s": 0.4}}
@@ -134,7 +134,7 @@ def test_shards_of_many_processes_each_killed_once_are_the_same_bits_as_one_runs
     assert (many / "shown.txt").read_bytes() == (one / "shown.txt").read_bytes()
 
 
-def test_a_killed_shard_costs_itself(numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_shard_costs_only_itself(numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sharded.KILL_VARIABLE, "2")
     with pytest.raises(StageError, match=r"sum\.2 was ended by SIGKILL"):
         walk(request_of(numbers, out))
@@ -151,7 +151,7 @@ def test_a_killed_shard_costs_itself(numbers: Path, out: Path, monkeypatch: pyte
     assert (out / "shown.txt").read_text() == str(TOTAL)
 
 
-def test_the_walk_that_is_killed_in_a_shard_keeps_those_before_it(numbers: Path, out: Path) -> None:
+def test_a_run_killed_in_a_shard_keeps_those_before_it(numbers: Path, out: Path) -> None:
     slow = {"sum": {"step_s": 0.4}}
     with alone(numbers, out, "", **slow) as process:
         assert process.stdout is not None
@@ -162,7 +162,7 @@ def test_the_walk_that_is_killed_in_a_shard_keeps_those_before_it(numbers: Path,
     assert outcome.artifacts["sum.2"].summary["began_at"] == 1
 
 
-def test_two_writers_of_one_artifact_are_refused_and_of_two_are_not(
+def test_two_processes_may_write_two_artifacts_but_not_the_same_one(
     numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
@@ -186,7 +186,7 @@ def test_two_writers_of_one_artifact_are_refused_and_of_two_are_not(
     assert told.count("stage_started") == told.count("stage_finished") == told.count("stage_reused") == 1
 
 
-def test_no_shard_is_made_beside_a_run_that_has_the_folder_to_itself(
+def test_no_shard_is_made_during_a_run_that_has_exclusive_access(
     numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
@@ -197,7 +197,7 @@ def test_no_shard_is_made_beside_a_run_that_has_the_folder_to_itself(
     assert make_shard(request, 1).ran == ["sum.1"]
 
 
-def test_a_shard_needs_what_its_stage_reads_and_a_number_that_there_is(numbers: Path, out: Path) -> None:
+def test_a_shard_needs_its_stages_inputs_and_a_valid_number(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out), until="read")
     with pytest.raises(UsageError, match="needs the output of divide"):
         make_shard(request_of(numbers, out), 1)
@@ -211,7 +211,7 @@ def test_a_shard_needs_what_its_stage_reads_and_a_number_that_there_is(numbers: 
         runner.run_shard("divide", 1)
 
 
-def test_one_stage_alone_joins_what_is_there_and_a_rerun_makes_all_anew(numbers: Path, out: Path) -> None:
+def test_one_stage_alone_merges_existing_shards_and_a_rerun_makes_all_again(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out), until="divide")
     make_shard(request_of(numbers, out), 2)
     with open_session(request_of(numbers, out), lambda event: None) as runner:
@@ -229,7 +229,7 @@ def test_a_damaged_shard_is_made_again_when_it_is_needed(numbers: Path, out: Pat
     assert walk(request_of(numbers, out))[0].ran == ["sum.3", "sum"]
 
 
-def test_clean_keeps_the_shards_that_are_asked_for(numbers: Path, out: Path) -> None:
+def test_clean_keeps_the_shards_in_use(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out, divide={"piece": 1}))
     request = request_of(numbers, out)
     walk(request, until="divide")
@@ -249,7 +249,7 @@ def test_an_option_of_the_stage_reaches_its_shards_and_one_after_it_does_not(num
     assert outcome.artifacts["sum"].summary == {"total": TOTAL + len(NUMBERS)}
 
 
-def test_without_shards_the_stage_does_all_itself_and_a_part_that_counts_none_is_a_fault(
+def test_without_shards_the_stage_does_everything_and_a_missing_count_is_an_error(
     numbers: Path, out: Path, tmp_path: Path
 ) -> None:
     outcome, _ = walk(request_of(numbers, out, divide={"piece": 0}))
@@ -260,7 +260,7 @@ def test_without_shards_the_stage_does_all_itself_and_a_part_that_counts_none_is
         walk(request)
 
 
-def test_manifests_say_what_shards_took_and_were_thought_to_take(numbers: Path, out: Path) -> None:
+def test_manifests_state_what_shards_took_and_their_forecast(numbers: Path, out: Path) -> None:
     def forecast_needs(_summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
         return {"sum": Need(300, 9.0, 600), "sum.3": Need(100, 1.0, 10)}
 
@@ -304,7 +304,7 @@ def test_an_error_of_the_machines_or_the_inputs_stops_the_run_at_once(
     assert runner.outcome.ran == ["read", "divide"]
 
 
-def test_shards_are_told_of_before_their_stage() -> None:
+def test_shards_are_reported_before_their_stage() -> None:
     assert shards_first(["read", "sum", "show", "sum.1", "sum.2", "x.1"]) == [
         "read", "sum.1", "sum.2", "sum", "show", "x.1",
     ]  # fmt: skip

@@ -137,9 +137,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10.0 * np.log10(255.0**2 / max(np.mean((a.astype(float) - b.astype(float)) ** 2), 1e-9)))
 
 
-def test_it_is_whole_at_once_stays_whole_and_is_the_full_model_in_the_end(
-    site: Path, scene: ViewerScene, open_page: Callable
-) -> None:
+def test_it_is_complete_at_once_and_becomes_the_full_model(site: Path, scene: ViewerScene, open_page: Callable) -> None:
     nodes = nodes_of(site)
     page = open_page((site / "viewer.html").as_uri(), WIDTH, HEIGHT).page
     page.evaluate("() => splatpipe.complete()")
@@ -181,7 +179,7 @@ def test_the_full_model_is_what_our_rasterizer_renders(site: Path, model: Gaussi
         assert psnr(picture(page), ours) >= LIKE_OURS_DB
 
 
-def test_from_afar_and_out_of_sight_nothing_finer_is_asked_for(site: Path, open_page: Callable) -> None:
+def test_nothing_finer_is_requested_from_afar_or_out_of_sight(site: Path, open_page: Callable) -> None:
     with hosted(site / "web") as host:
         host.held = {node["file"] for node in nodes_of(site)[1:]}
         host.given.clear()
@@ -195,7 +193,7 @@ def test_from_afar_and_out_of_sight_nothing_finer_is_asked_for(site: Path, open_
         assert len(page.evaluate("() => splatpipe.shown().files")) == 1
 
 
-def test_no_more_gaussians_are_shown_than_allowed_wherever_one_has_looked(site: Path, open_page: Callable) -> None:
+def test_no_more_gaussians_are_shown_than_allowed_whatever_was_viewed(site: Path, open_page: Callable) -> None:
     with hosted(site / "web") as host:
         page = open_page(f"{host.address}/index.html", WIDTH, HEIGHT).page
         page.evaluate("() => splatpipe.ready.then(() => splatpipe.complete())")
@@ -207,7 +205,7 @@ def test_no_more_gaussians_are_shown_than_allowed_wherever_one_has_looked(site: 
             assert MOST_PER_NODE < page.evaluate("() => splatpipe.shown().gaussians") <= 600
 
 
-def test_a_file_that_is_lost_is_told_once_and_leaves_no_hole(site: Path, open_page: Callable) -> None:
+def test_a_missing_file_is_reported_once_and_leaves_no_hole(site: Path, open_page: Callable) -> None:
     leaf = next(node for node in nodes_of(site) if not node["children"])
     with hosted(site / "web") as host:
         host.missing = {leaf["file"]}
@@ -224,7 +222,7 @@ def test_a_file_that_is_lost_is_told_once_and_leaves_no_hole(site: Path, open_pa
         wait_until(lambda: page.evaluate("() => splatpipe.shown().gaussians") == COUNT)
 
 
-def test_photos_points_and_what_was_measured_are_as_in_the_page(
+def test_photos_points_and_measurements_are_as_in_the_page(
     site: Path, scene: ViewerScene, open_page: Callable, tmp_path: Path
 ) -> None:
     ring = {"x": [0.0, 2.0, 0.0, 0.0], "y": [0.0, 0.0, 2.0, 0.0], "z": [0.1, 0.1, 0.1, 0.1]}
@@ -246,7 +244,7 @@ def test_photos_points_and_what_was_measured_are_as_in_the_page(
 
 
 @pytest.mark.parametrize("text", ['{"format": 1, "nodes": [{', "<html>not found</html>"])
-def test_a_damaged_tree_is_told(site: Path, tmp_path: Path, open_page: Callable, text: str) -> None:
+def test_a_damaged_tree_is_reported(site: Path, tmp_path: Path, open_page: Callable, text: str) -> None:
     replaced(site, tmp_path, "levels.json", text.encode())
     with hosted(tmp_path) as host:
         page = open_page(f"{host.address}/index.html", WIDTH, HEIGHT).page
@@ -254,7 +252,7 @@ def test_a_damaged_tree_is_told(site: Path, tmp_path: Path, open_page: Callable,
         assert page.locator("#message").inner_text() == "levels.json is damaged."
 
 
-def test_opened_from_a_disk_it_says_what_to_do(site: Path, open_page: Callable) -> None:
+def test_opened_from_disk_it_says_what_to_do(site: Path, open_page: Callable) -> None:
     page = open_page((site / "web/index.html").as_uri(), WIDTH, HEIGHT).page
     page.locator("#loading.failed").wait_for()
     assert "do not allow for a page opened from disk" in page.locator("#message").inner_text()
@@ -270,7 +268,7 @@ def test_the_same_site_has_the_same_bytes(
             assert file.read_bytes() == (site / "web" / file.relative_to(tmp_path / "again")).read_bytes()
 
 
-def test_a_nodes_places_keep_millimetres_in_a_site_of_three_kilometres(
+def test_a_nodes_positions_keep_millimetres_in_a_site_of_three_kilometres(
     scene: ViewerScene, model: Gaussians, tmp_path: Path
 ) -> None:
     wide = model.clone()

@@ -37,7 +37,7 @@ def test_sky_above_a_camera_that_looks_at_the_zenith_is_found() -> None:
     assert mask[:-34].all() and not mask[-30:].any()
 
 
-def test_smooth_bluish_water_under_the_horizon_is_not_sky() -> None:
+def test_smooth_bluish_water_below_the_horizon_is_not_sky() -> None:
     photo, truth = skies.trace(skies.look(pitch_deg=0.0), blocks=())
     rows = np.arange(skies.HEIGHT)[:, None, None]
     pixels = np.where(rows > skies.HEIGHT // 2, np.array([120, 160, 200], np.uint8), photo.pixels)
@@ -59,7 +59,7 @@ def test_white_wall_under_its_roof_is_not_sky() -> None:
     assert not found(photo, skies.points_on((wall, roof))).any()
 
 
-def test_white_wall_up_to_the_top_is_not_sky_where_the_camera_looks_down() -> None:
+def test_white_wall_up_to_the_top_is_not_sky_if_the_camera_looks_down() -> None:
     wall = skies.Block(-30.0, 30.0, 4.0, 1.9, 0.0, WHITE)
     photo, _ = skies.trace(skies.look(pitch_deg=-35.0), (wall,))
     assert photo.pixels[0].min() > 220
@@ -74,7 +74,7 @@ def test_white_wall_up_to_the_top_is_not_sky_where_points_were_triangulated_on_i
     assert not found(photo, np.concatenate([skies.points_on(()), few])).any()
 
 
-def test_few_wrong_points_in_the_sky_cost_no_more_than_their_surroundings() -> None:
+def test_a_few_wrong_points_in_the_sky_affect_only_their_surroundings() -> None:
     photo, truth = skies.trace(skies.look())
     wrong = np.array([[-4.0, 20.0, 11.0], [2.0, 30.0, 16.0], [5.0, 25.0, 14.0]])
     points = np.concatenate([skies.points_on(), wrong])
@@ -91,7 +91,7 @@ def test_sky_of_any_colour_is_taken_from_a_mask() -> None:
     assert skies.overlap(found(masked, skies.points_on()), truth) > 0.95
 
 
-def test_masked_thing_that_does_not_reach_the_top_or_hides_points_is_not_sky() -> None:
+def test_masked_object_that_does_not_reach_the_top_or_hides_points_is_not_sky() -> None:
     photo, _ = skies.trace(skies.look(), sky=((0.9, 0.2, 0.1), (0.9, 0.5, 0.1)))
     person = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     person[120:200, 100:140] = True
@@ -113,7 +113,7 @@ def found_in_all(blocks: tuple[skies.Block, ...], points: np.ndarray) -> list[fl
     return [float(mask.unpacked().mean()) for mask in find_skies(cameras, lambda i: photos[i], points, skies.UP)]
 
 
-def test_white_wall_of_a_room_is_not_sky_where_other_photos_saw_its_ceiling() -> None:
+def test_white_wall_of_a_room_is_not_sky_if_other_photos_show_its_ceiling() -> None:
     floor = skies.points_on(ROOM)
     floor = floor[floor[:, 1] < 8.0]
     ceiling = np.random.default_rng(6).uniform([-9.0, 0.0, 7.5], [9.0, 8.0, 7.5], (150, 3))
@@ -121,7 +121,7 @@ def test_white_wall_of_a_room_is_not_sky_where_other_photos_saw_its_ceiling() ->
     assert max(found_in_all(ROOM, np.concatenate([floor, ceiling]))) == 0.0
 
 
-def test_sky_in_a_window_is_not_taken_where_its_lintel_is_above_the_picture() -> None:
+def test_sky_in_a_window_is_not_detected_if_its_lintel_is_above_the_image() -> None:
     window = (skies.Block(-9.0, -2.0, 8.0, 30.0), skies.Block(2.0, 9.0, 8.0, 30.0))
     walls = skies.points_on(window)
     lintel = np.random.default_rng(7).uniform([-2.0, 8.0, 8.5], [2.0, 8.0, 10.0], (60, 3))
@@ -129,7 +129,7 @@ def test_sky_in_a_window_is_not_taken_where_its_lintel_is_above_the_picture() ->
     assert max(found_in_all(window, np.concatenate([walls, lintel]))) == 0.0
 
 
-def test_branch_above_the_sky_and_wrong_points_in_it_take_none_away() -> None:
+def test_branch_above_the_sky_and_wrong_points_in_it_do_not_reduce_it() -> None:
     photo, truth = skies.trace(skies.look())
     random = np.random.default_rng(8)
     branch = random.uniform([-0.6, 6.0, 7.0], [0.8, 6.5, 8.0], (80, 3))
@@ -138,7 +138,7 @@ def test_branch_above_the_sky_and_wrong_points_in_it_take_none_away() -> None:
     assert not roofed(photo.camera, truth, points, skies.UP).any()
 
 
-def test_points_above_take_memory_by_their_number_alone() -> None:
+def test_points_above_take_memory_in_proportion_to_their_number_only() -> None:
     """Not by that of the columns of azimuth: a dense model has a million above, and each thread its own."""
     photo, truth = skies.trace(skies.look())
     points = np.random.default_rng(9).uniform([-30.0, 4.0, -30.0], [30.0, 30.0, 30.0], (100_000, 3))
@@ -162,7 +162,7 @@ def test_few_bright_patches_in_a_large_capture_are_no_sky() -> None:
     assert not is_open(indoors) and is_open(outdoors)
 
 
-def test_what_others_see_in_the_same_direction_decides() -> None:
+def test_other_photos_of_the_same_direction_decide() -> None:
     cameras = [skies.look(x=x) for x in (-1.0, 0.0, 1.0, 2.0)]
     sky = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     sky[:80] = True
@@ -196,7 +196,7 @@ def test_cameras_that_do_not_turn_count_as_held_upright() -> None:
     np.testing.assert_allclose(up_of(cameras, lambda _: traced, skies.points_on()), skies.UP, atol=1e-6)
 
 
-def test_what_is_drawn_is_taken_whatever_points_and_others_say() -> None:
+def test_sky_masks_override_points_and_other_photos() -> None:
     cameras = [skies.look(heading, x=0.1 * heading) for heading in (-6.0, -2.0, 2.0, 6.0)]
     traced = [skies.trace(camera) for camera in cameras]
     drawn = np.zeros(traced[0][1].shape, bool)

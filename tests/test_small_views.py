@@ -58,7 +58,9 @@ def test_nothing_is_shifted_where_the_size_is_no_multiple(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("suffix", "megapixels"), [(".jpg", 0.3), (".jpg", 5.0), (".png", 0.006)])
-def test_others_are_decoded_whole_and_have_the_same_bits(tmp_path: Path, suffix: str, megapixels: float) -> None:
+def test_other_formats_are_decoded_completely_with_the_same_bits(
+    tmp_path: Path, suffix: str, megapixels: float
+) -> None:
     view = view_of(tmp_path, textured(), suffix)
     camera, pixels, mask = small_view(view, megapixels)
     expected = reduced_view(view, megapixels)
@@ -66,7 +68,7 @@ def test_others_are_decoded_whole_and_have_the_same_bits(tmp_path: Path, suffix:
     np.testing.assert_array_equal(pixels, expected[1])
 
 
-def test_a_photo_is_what_its_content_says_not_its_name(tmp_path: Path) -> None:
+def test_a_photos_format_is_that_of_its_content_not_its_name(tmp_path: Path) -> None:
     view = view_of(tmp_path, textured(), ".png")
     named = View(view.camera, view.image_path.rename(tmp_path / "photo.JPG"), None)
     np.testing.assert_array_equal(small_view(named, 0.02)[1], reduced_view(named, 0.02)[1])

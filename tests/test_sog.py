@@ -86,7 +86,7 @@ def rows_of_file(path: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_decoded_by_the_letter_of_the_specification_it_is_what_was_coded(sh_degree: int) -> None:
+def test_decoded_literally_by_the_specification_it_is_what_was_encoded(sh_degree: int) -> None:
     gaussians = some_gaussians(700, sh_degree)
     table = decode(encode_sog(gaussians, in_order=True).files())
     logs = np.log1p(gaussians.means.abs().numpy())
@@ -101,7 +101,7 @@ def test_decoded_by_the_letter_of_the_specification_it_is_what_was_coded(sh_degr
     assert ("rest" in table) == (sh_degree > 0)
 
 
-def test_what_is_alike_is_kept_to_the_bit_in_the_palette() -> None:
+def test_identical_values_are_exact_in_the_palette() -> None:
     gaussians = some_gaussians(600)
     gaussians.sh[:, 1:] = gaussians.sh[:4, 1:].repeat(150, 1, 1).round(decimals=1)
     table = decode(encode_sog(gaussians, in_order=True).files())
@@ -120,7 +120,7 @@ def test_same_bytes_for_any_number_of_threads(tmp_path: Path) -> None:
     assert (tmp_path / "1.sog").read_bytes() == (tmp_path / "3.sog").read_bytes()
 
 
-def test_a_file_tells_its_frame_and_lies_y_down(tmp_path: Path) -> None:
+def test_a_file_states_its_frame_and_is_y_down(tmp_path: Path) -> None:
     scene = Scene(some_gaussians(50, 0), SceneFacts("z up", antialias=True, metres=True))
     write(tmp_path / "a.sog", scene)
     files = rows_of_file(tmp_path / "a.sog")
@@ -140,7 +140,7 @@ def test_values_that_are_not_finite_are_never_written() -> None:
 # ---- our reader ----
 
 
-def test_our_reader_reads_what_the_specification_says(tmp_path: Path) -> None:
+def test_our_reader_agrees_with_the_specification(tmp_path: Path) -> None:
     write(tmp_path / "a.sog", Scene(some_gaussians(400), SceneFacts("y down")))
     table = decode(rows_of_file(tmp_path / "a.sog"))
     found = read(tmp_path / "a.sog").gaussians
@@ -152,7 +152,7 @@ def test_our_reader_reads_what_the_specification_says(tmp_path: Path) -> None:
     assert np.allclose(torch.sigmoid(found.opacity_logits).numpy(), table["opacities"], atol=2e-6)
 
 
-def test_a_scene_comes_back_with_its_place_and_looks_the_same(tmp_path: Path) -> None:
+def test_a_scene_reads_back_with_its_georeference_and_looks_the_same(tmp_path: Path) -> None:
     place = SplatOrigin(47.8, 13.5, 515.0, "EPSG:3855", "EPSG:32633")
     scene = Scene(true_model(), SceneFacts("z up", metres=True, place=place, edits=({"what": "crop"},)))
     write(tmp_path / "a.sog", scene)
@@ -179,7 +179,7 @@ def test_a_folder_is_read_as_the_bundle_is(tmp_path: Path) -> None:
         )
 
 
-def test_of_somebody_else_it_is_y_down_and_nowhere(tmp_path: Path) -> None:
+def test_a_third_party_file_is_y_down_without_georeference(tmp_path: Path) -> None:
     images = encode_sog(some_gaussians(60, 1), antialias=True)
     bundle(tmp_path / "a.sog", images.files())
     assert read(tmp_path / "a.sog").facts == SceneFacts("y down", antialias=True)
@@ -283,7 +283,7 @@ LIES: dict[str, Callable[[Meta], None]] = {
 
 @pytest.mark.parametrize("bundled", [True, False], ids=["bundled", "folder"])
 @pytest.mark.parametrize("attack", LIES.values(), ids=LIES.keys())
-def test_lies_are_refused(attack: Callable[[Meta], None], bundled: bool, tmp_path: Path) -> None:
+def test_false_metadata_are_refused(attack: Callable[[Meta], None], bundled: bool, tmp_path: Path) -> None:
     images = encode_sog(some_gaussians(60, 2), in_order=True)
     attack(images.meta)
     files = {"meta.json": json.dumps(images.meta).encode(), **images.images}
@@ -296,7 +296,7 @@ def test_lies_are_refused(attack: Callable[[Meta], None], bundled: bool, tmp_pat
         read(tmp_path / "a.sog" if bundled else tmp_path)
 
 
-def test_a_damaged_record_is_none(tmp_path: Path) -> None:
+def test_a_damaged_record_is_ignored(tmp_path: Path) -> None:
     for record in (17, "no JSON", {"format": 1}, [[]], {"format": 1, "axes": "z up", "edits": 3}):
         images = encode_sog(some_gaussians(8, 0))
         images.meta["splatpipe"] = record
@@ -362,7 +362,7 @@ def test_broken_archives_are_refused(tmp_path: Path) -> None:
         read(tmp_path / "not there.sog")
 
 
-def test_archives_that_unpack_to_more_than_they_are_worth_are_refused(tmp_path: Path) -> None:
+def test_archives_that_unpack_to_too_much_are_refused(tmp_path: Path) -> None:
     files, path = encode_sog(some_gaussians(60, 0)).files(), tmp_path / "a.sog"
     bundle(path, {**files, "means_l.webp": files["means_l.webp"] + b"\0" * 50_000_000}, zipfile.ZIP_DEFLATED)
     with pytest.raises(SplatpipeError, match="larger"):

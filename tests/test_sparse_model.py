@@ -33,7 +33,7 @@ def test_whole_model_is_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("lost", [1, 10**6])
-def test_file_that_is_cut_off_is_a_full_disk(
+def test_truncated_file_is_reported_as_a_full_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, lost: int
 ) -> None:
     whole = pycolmap.Reconstruction.write_binary

@@ -29,7 +29,7 @@ READ = [kind for kind in SPLAT_FORMATS if any(each.reads and each.module == kind
 
 
 @pytest.mark.parametrize("kind", READ, ids=lambda kind: kind.name)
-def test_every_format_is_written_by_its_name_read_by_its_content_and_keeps_its_place(tmp_path: Path, kind):
+def test_every_format_is_written_by_name_read_by_content_and_keeps_its_georeference(tmp_path: Path, kind):
     scene = in_unit_quats(Scene(some_gaussians(300), FACTS))
     path = tmp_path / kind.file
     assert format_of_name(path) == kind
@@ -61,12 +61,12 @@ def test_the_copy_for_viewers_is_y_down(tmp_path: Path):
     torch.testing.assert_close(read.gaussians.means[:, 1], -scene.gaussians.means[:, 2])
 
 
-def test_a_splat_from_nowhere_becomes_a_ply_as_viewers_take_it(tmp_path: Path):
+def test_a_splat_without_georeference_becomes_a_ply_in_viewers_axes(tmp_path: Path):
     write_scene(tmp_path / "a.ply", Scene(some_gaussians(5), SceneFacts("y up")))
     assert read_scene(tmp_path / "a.ply").facts.axes == "y down"
 
 
-def test_the_newest_iteration_of_a_model_folder_is_taken(tmp_path: Path):
+def test_the_newest_iteration_of_a_model_folder_is_read(tmp_path: Path):
     for number, count in ((7000, 3), (30000, 4), (200, 5)):
         folder = tmp_path / f"point_cloud/iteration_{number}"
         folder.mkdir(parents=True)
@@ -76,7 +76,7 @@ def test_the_newest_iteration_of_a_model_folder_is_taken(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["nothing.ply", "folder", "text.ply", "empty.sog", "other.bin"])
-def test_what_is_no_splat_is_said(tmp_path: Path, name):
+def test_a_file_that_is_no_splat_is_reported(tmp_path: Path, name):
     (tmp_path / "folder").mkdir()
     (tmp_path / "text.ply").write_text("ply of sorts")
     (tmp_path / "empty.sog").write_bytes(b"")
@@ -85,7 +85,7 @@ def test_what_is_no_splat_is_said(tmp_path: Path, name):
         read_scene(tmp_path / name)
 
 
-def test_endings_and_names_that_are_none_are_refused(tmp_path: Path):
+def test_unknown_suffixes_and_names_are_refused(tmp_path: Path):
     with pytest.raises(UsageError, match="extension"):
         format_of_name(Path("a.xyz"))
     with pytest.raises(UsageError, match="no format"):
@@ -97,13 +97,13 @@ def test_endings_and_names_that_are_none_are_refused(tmp_path: Path):
     assert format_of_content(_written(tmp_path)).name == "ply"
 
 
-def test_a_place_that_cannot_be_written_is_said(tmp_path: Path):
+def test_an_unwritable_path_is_reported(tmp_path: Path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(MachineError, match="Cannot write"):
         write_scene(tmp_path / "file" / "a.ply", Scene(some_gaussians(2)))
 
 
-def test_a_file_is_there_whole_or_as_before(tmp_path: Path):
+def test_a_file_is_complete_or_unchanged(tmp_path: Path):
     path = _written(tmp_path)
     before = path.read_bytes()
     broken = Scene(some_gaussians(4))
@@ -114,7 +114,7 @@ def test_a_file_is_there_whole_or_as_before(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path):
+def test_a_nonempty_folder_is_left_alone(tmp_path: Path):
     write_scene(tmp_path / "model", Scene(some_gaussians(4)))
     with pytest.raises(UsageError, match="is an existing folder"):
         write_scene(tmp_path / "model", Scene(some_gaussians(5)))
@@ -123,7 +123,7 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path):
     assert len(read_scene(tmp_path / "model").gaussians) == 4
 
 
-def test_quaternions_get_unit_length_and_none_is_no_rotation():
+def test_quaternions_are_normalized_and_zero_becomes_the_identity():
     made = some_gaussians(3)
     made.quats[1] = 0.0
     unit = in_unit_quats(Scene(made)).gaussians.quats

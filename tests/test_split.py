@@ -44,7 +44,7 @@ def test_its_part_names_both_kinds_in_order(
 
 
 @pytest.mark.parametrize("config", [SplitConfig(every=1), SplitConfig(views="photo_99")])
-def test_a_split_that_leaves_nothing_or_names_nobody_is_refused(
+def test_a_split_that_leaves_nothing_or_names_unknown_photos_is_refused(
     inputs: Inputs, tmp_path: Path, config: SplitConfig
 ) -> None:
     with pytest.raises(SplatpipeError) as raised:

@@ -97,7 +97,7 @@ def apart_deg(quats: np.ndarray, others: torch.Tensor) -> np.ndarray:
     return np.degrees(2.0 * np.arccos(np.minimum(np.abs((quats * unit.numpy()).sum(axis=1)), 1.0)))
 
 
-def test_version_2_differs_in_its_rotations_alone() -> None:
+def test_version_2_differs_only_in_its_rotations() -> None:
     made = some_gaussians()
     head, found = read(spz_bytes(made, antialias=False, version=2))
     head_3, found_3 = read(spz_bytes(made, antialias=False))
@@ -127,7 +127,7 @@ def test_every_parameter_reads_back_within_half_a_step_of_its_code() -> None:
     assert apart_deg(found["quats"], made.quats).max() < 0.25  # three components, each within half of 1 / 722
 
 
-def test_harmonics_are_finer_where_more_is_seen_of_them() -> None:
+def test_harmonics_are_finer_where_they_are_more_visible() -> None:
     made = some_gaussians(400)
     made.sh.clamp_(-0.45, 0.45)
     weight = torch.sigmoid(made.opacity_logits) * made.log_scales.sort(dim=1).values[:, 1:].mean(dim=1).exp()
@@ -140,7 +140,7 @@ def test_harmonics_are_finer_where_more_is_seen_of_them() -> None:
     assert in_order[-40:].max() < 4.1  # 8 at most
 
 
-def test_positions_are_as_fine_as_the_gaussians_are_small() -> None:
+def test_precision_of_positions_follows_the_gaussians_size() -> None:
     made = some_gaussians(400)
     for log_scale, bits in ((0.0, 12), (-6.0, 13), (-30.0, 16)):  # at most 16: 100 units fill 24 bits
         made.log_scales[:] = log_scale
@@ -149,7 +149,7 @@ def test_positions_are_as_fine_as_the_gaussians_are_small() -> None:
         np.testing.assert_allclose(found["means"], matched(made, found["means"]).means, atol=0.5 / 2**bits + 1e-5)
 
 
-def test_a_far_gaussian_is_brought_in_along_its_ray_and_shrunk_alike() -> None:
+def test_a_far_gaussian_is_moved_in_along_its_ray_and_shrunk_in_proportion() -> None:
     made = some_gaussians(1000)
     made.means[7] = torch.tensor([3e6, 4e6, 0.0])
     head, found = read(spz_bytes(made, antialias=False))
@@ -162,13 +162,13 @@ def test_a_far_gaussian_is_brought_in_along_its_ray_and_shrunk_alike() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_lower_degrees_are_as_long_as_their_terms(degree: int) -> None:
+def test_lower_degrees_store_only_their_terms(degree: int) -> None:
     head, found = read(spz_bytes(some_gaussians(5, degree), antialias=False))
     assert head["degree"] == degree
     assert found["sh"].shape == (5, (degree + 1) ** 2 - 1, 3)
 
 
-def test_the_same_gaussians_give_the_same_bytes_and_none_give_a_file() -> None:
+def test_the_same_gaussians_give_the_same_bytes_and_zero_give_a_valid_file() -> None:
     assert spz_bytes(some_gaussians(), antialias=True) == spz_bytes(some_gaussians(), antialias=True)
     head, found = read(spz_bytes(some_gaussians(0), antialias=False))
     assert len(found["means"]) == 0
@@ -202,7 +202,7 @@ def version_4(data: bytes, degree: int = 3, extensions: bytes = b"", flags: int 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
 @pytest.mark.parametrize("version", [2, 3, 4])
-def test_the_reader_says_what_the_letter_says(tmp_path: Path, monkeypatch, version: int, degree: int) -> None:
+def test_the_reader_agrees_with_a_literal_decoder(tmp_path: Path, monkeypatch, version: int, degree: int) -> None:
     monkeypatch.setattr(spz, "_ROWS", 128)
     data = spz_bytes(some_gaussians(300, degree), antialias=True, version=min(version, 3))
     _, found = read(data)
@@ -225,7 +225,7 @@ def test_version_1_has_half_floats(tmp_path: Path) -> None:
     assert spz.read(tmp_path / "a.spz").gaussians.means.tolist() == [[1.5, -2.25, 300.0]]
 
 
-def test_the_record_is_no_part_of_what_other_readers_see(tmp_path: Path) -> None:
+def test_the_record_is_invisible_to_other_readers(tmp_path: Path) -> None:
     scene = Scene(some_gaussians(300), FACTS)
     spz.write(tmp_path / "a.spz", scene)
     data = (tmp_path / "a.spz").read_bytes()
@@ -261,7 +261,7 @@ def attacked(tmp_path: Path, data: bytes, said: str) -> None:
         spz.read(tmp_path / "a.spz")
 
 
-def test_gzip_files_that_lie_are_an_error(tmp_path: Path) -> None:
+def test_false_gzip_files_are_an_error(tmp_path: Path) -> None:
     raw = gzip.decompress(spz_bytes(some_gaussians(300), antialias=False))
 
     def lying(at: int, layout: str, value: int) -> bytes:
@@ -280,7 +280,7 @@ def test_gzip_files_that_lie_are_an_error(tmp_path: Path) -> None:
     attacked(tmp_path, gzip.compress(bomb, mtime=0), "promised")
 
 
-def test_zstd_files_that_lie_are_an_error(tmp_path: Path) -> None:
+def test_false_zstd_files_are_an_error(tmp_path: Path) -> None:
     whole = version_4(spz_bytes(some_gaussians(300), antialias=False))
 
     def lying(at: int, layout: str, value: int) -> bytes:
@@ -299,7 +299,7 @@ def test_zstd_files_that_lie_are_an_error(tmp_path: Path) -> None:
     attacked(tmp_path, whole[:20], "cut off")
 
 
-def test_files_of_other_axes_are_refused_and_other_extensions_passed_over(tmp_path: Path) -> None:
+def test_files_with_other_axes_are_refused_and_unknown_extensions_skipped(tmp_path: Path) -> None:
     data = spz_bytes(some_gaussians(300), antialias=False)
     orbit = struct.pack("<IIfff", 0xADBE0002, 12, 0.0, 1.0, 2.0)
     for value, fits in ((4, True), (0, True), (7, False)):

@@ -34,7 +34,7 @@ def rows_of(gaussians: Gaussians) -> list[int]:
     return (gaussians.means[:, 0].to(torch.int64) // 3).tolist()
 
 
-def test_dense_points_fill_half_of_the_cap_evenly_and_the_sparse_ones_stay() -> None:
+def test_dense_points_fill_half_of_the_cap_evenly_and_the_sparse_ones_are_kept() -> None:
     start = numbered()
     assert start.within(2 * len(start.gaussians)) is start.gaussians
     half = rows_of(start.within(2 * SPARSE + 100))
@@ -52,14 +52,14 @@ def test_the_count_is_known_without_the_gaussians() -> None:
         assert len(start.within(cap)) == started(SPARSE, SWEPT, cap) <= cap
 
 
-def test_a_file_that_does_not_tell_has_sparse_points_only(tmp_path: Path) -> None:
+def test_a_file_without_the_count_has_sparse_points_only(tmp_path: Path) -> None:
     gaussians = numbered().gaussians
     for comments, sparse in (([], 140), ([sparse_comment(40)], 40), ([sparse_comment(900)], 140), (["40"], 140)):
         write_splat(tmp_path / "init.ply", gaussians, comments)
         assert read_start(tmp_path / "init.ply").sparse == sparse
 
 
-def test_density_control_grows_by_its_schedule_from_what_a_cap_has_left_of_the_start(
+def test_density_control_grows_by_its_schedule_from_the_capped_initial_gaussians(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")

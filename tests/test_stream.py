@@ -108,7 +108,7 @@ def test_photos_have_the_size_asked_for_and_its_camera(
         assert (mask is None) == (photo.mask is None) and (mask is None or np.array_equal(photo.mask.numpy(), mask))
 
 
-def test_reduced_pixel_is_the_mean_of_those_below_it(dataset: Path) -> None:
+def test_reduced_pixel_is_the_mean_of_its_source_pixels(dataset: Path) -> None:
     view = load_views(dataset)[0]
     full = load_colour(view).astype(float)
     _, half, _ = reduced_view(view, None, 1)
@@ -168,7 +168,7 @@ def test_photos_are_decoded_once_and_the_files_are_not_needed_again(dataset: Pat
 
 
 @pytest.mark.parametrize("begun", [1, 12])
-def test_a_stream_that_goes_on_with_other_looks_is_as_one_begun_with_them(
+def test_a_stream_continued_with_another_sequence_equals_one_begun_with_it(
     dataset: Path, cache: Path, begun: int
 ) -> None:
     views = load_views(dataset)
@@ -236,7 +236,7 @@ def largest_file(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_full_disk_is_told_with_what_to_do(dataset: Path, cache: Path) -> None:
+def test_full_disk_is_reported_with_what_to_do(dataset: Path, cache: Path) -> None:
     with pytest.raises(MachineError, match="decoded photos cannot be kept") as failure, largest_file(30_000):
         streamed(load_views(dataset), cache, [0] * 30)
     assert "Free some space" in failure.value.hint
@@ -244,7 +244,7 @@ def test_full_disk_is_told_with_what_to_do(dataset: Path, cache: Path) -> None:
         PhotoStream.over([], [], 0, 1, cache / "gone")
 
 
-def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_and_that_is_told(
+def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_with_a_note(
     dataset: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views = load_views(dataset)
@@ -259,7 +259,7 @@ def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_and_that_is_told(
         assert len(recorder.warnings) == warnings
 
 
-def test_photos_wanted_once_are_not_stored(dataset: Path, cache: Path) -> None:
+def test_photos_needed_once_are_not_stored(dataset: Path, cache: Path) -> None:
     views = load_views(dataset)
     with PhotoStream.over(views, [TrainingSize()] * len(views), 0, 1, cache) as photos:
         assert photos.wanted_bytes() == 0

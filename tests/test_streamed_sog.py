@@ -79,7 +79,7 @@ def test_runs_fill_their_files_one_after_another(written: Path) -> None:
         assert len(sog.read(written / meta["filenames"][file]).gaussians) == end
 
 
-def test_what_lies_in_a_leaf_is_in_its_box_and_is_what_the_model_has_there(written: Path, wall: Scene) -> None:
+def test_contents_of_a_leaf_are_the_models_in_its_box(written: Path, wall: Scene) -> None:
     meta = read_meta(written)
     files = [sog.read(written / name).gaussians.means.numpy() for name in meta["filenames"]]
     found = []
@@ -96,7 +96,7 @@ def test_what_lies_in_a_leaf_is_in_its_box_and_is_what_the_model_has_there(writt
     assert nearest.min(0).max() < 0.02 and nearest.min(1).max() < 0.02  # a SOG's quantum at 300 m
 
 
-def test_the_record_says_where_it_lies(written: Path) -> None:
+def test_the_record_has_the_georeference(written: Path) -> None:
     assert facts_of_record(json.dumps(read_meta(written)["splatpipe"]), SceneFacts()) == FACTS
 
 
@@ -107,7 +107,7 @@ def test_the_same_levels_give_the_same_bytes(written: Path, wall: Scene, root: L
     assert all((written / name).read_bytes() == (tmp_path / name).read_bytes() for name in names)
 
 
-def test_levels_of_an_earlier_one_are_taken_away_and_other_files_stay(
+def test_levels_of_an_earlier_export_are_removed_and_other_files_kept(
     wall: Scene, root: LevelNode, tmp_path: Path
 ) -> None:
     write_streamed_sog(tmp_path, wall, root)

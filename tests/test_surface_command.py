@@ -82,7 +82,7 @@ def test_the_report_shows_heights_and_the_orthophoto(demo_run: Path) -> None:
         assert text in page
 
 
-def test_products_ask_for_what_they_are_made_from_and_keep_the_rest() -> None:
+def test_products_request_their_inputs_and_keep_the_rest() -> None:
     assert options_for(None, None, None).keys() == {"depths", "dsm", "ortho"}
     table = options_for("cloud, facades", 0.02, "both")
     assert table["cloud"] == {"enabled": True, "spacing_m": 0.02}
@@ -108,7 +108,7 @@ def test_other_sections_are_refused(text: str) -> None:
             parse_lines(text)
 
 
-def test_a_mesh_without_its_library_is_refused_and_not_remembered(
+def test_a_mesh_without_its_library_is_refused_and_the_request_not_stored(
     demo_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def missing(name: str) -> None:
@@ -123,7 +123,9 @@ def test_a_mesh_without_its_library_is_refused_and_not_remembered(
     assert (demo_run / "config.toml").read_bytes() == before
 
 
-def test_a_run_without_scale_is_told_so_at_once_unless_it_is_placed_anew(demo_run: Path, tmp_path: Path) -> None:
+def test_a_run_without_scale_is_refused_at_once_unless_it_is_georeferenced_again(
+    demo_run: Path, tmp_path: Path
+) -> None:
     out = shutil.copytree(demo_run, tmp_path / "out")
     for path in (out / "stages").glob("georef-*/frame.json"):
         text = path.read_text()
@@ -135,7 +137,7 @@ def test_a_run_without_scale_is_told_so_at_once_unless_it_is_placed_anew(demo_ru
         check_possible(out, options_for("ortho", None, None))
 
 
-def test_what_was_measured_is_told_in_lines() -> None:
+def test_measurements_are_printed_line_by_line() -> None:
     section = {"name": "Section 1", "length_m": 41.767, "share_with_height": 0.98, "height_sigma_m": 0.0171}
     volume = {"polygon": 2, "name": "", "cut_m3": 23.834, "cut_sigma_m3": 0.9, "fill_m3": 0.0, "fill_sigma_m3": 0.01}
     told = {"sections": [{**section, "dxf": "section-1.dxf"}], "volumes": [volume]}
@@ -150,12 +152,12 @@ def test_a_section_without_length_is_refused() -> None:
         MeasurementRequest.of(["1,2,1,2.0"], None, "rim")
 
 
-def test_polygons_that_are_nowhere_are_refused(tmp_path: Path) -> None:
+def test_polygons_outside_the_surface_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no file"):
         MeasurementRequest.of([], tmp_path / "heap.geojson", "rim")
 
 
-def test_lines_are_taken_whole_or_not_at_all() -> None:
+def test_lines_are_parsed_completely_or_refused() -> None:
     assert len(parse_lines(";".join(["388700,5299700,388710.5,5299710.5"] * 200))) == 200
     with pytest.raises(UsageError, match="too many"):
         parse_lines(";".join(["388700,5299700,388710.5,5299710.5"] * 400))

@@ -181,7 +181,7 @@ def test_fences_cars_and_crowns_are_no_walls() -> None:
     assert find_walls(fence.select(np.zeros(0, np.int64))) == []
 
 
-def test_depths_are_of_the_wall_and_pictures_of_its_colour() -> None:
+def test_depths_and_colours_are_those_of_the_wall() -> None:
     made = south()
     wall = made.wall
     places = places_of(made)
@@ -213,7 +213,7 @@ def test_eaves_beyond_the_relief_are_not_smeared_over_the_wall(monkeypatch: pyte
     assert np.nanmax(made.depth) < 0.3
 
 
-def test_the_raster_goes_from_corner_to_corner() -> None:
+def test_the_raster_extends_from_corner_to_corner() -> None:
     corners = south().corners()
     true = np.array([[-4.0, -3.0], [4.0, -3.0], [4.0, -3.0], [-4.0, -3.0]])
     assert np.abs(corners[:, :2] - true).max() < 2.0 * PIXEL_M
@@ -230,7 +230,7 @@ def test_threads_change_no_bit_of_an_elevation() -> None:
     assert np.array_equal(many.colour, south().colour)
 
 
-def test_specks_go_and_edges_stay() -> None:
+def test_specks_are_removed_and_edges_kept() -> None:
     depth = np.zeros((600, 40), np.float32)
     depth[:, 20:] = -0.16
     depth[300:, :3] = np.nan
@@ -240,7 +240,7 @@ def test_specks_go_and_edges_stay() -> None:
     assert np.array_equal(elevation_module.without_specks(depth), depth, equal_nan=True)
 
 
-def test_a_hole_beside_a_window_is_the_walls() -> None:
+def test_a_hole_beside_a_window_is_filled_with_the_wall() -> None:
     depth = np.zeros((40, 60))
     depth[:, :20] = -0.16
     depth[18:22, 20:30] = np.nan
@@ -284,7 +284,7 @@ def stated_line() -> tuple[float, float, float, float]:
     return tuple(ends[:, :2].ravel().tolist())
 
 
-def test_files_of_a_stated_wall_are_read_by_others(tmp_path: Path) -> None:
+def test_files_of_a_stated_wall_are_read_by_other_programs(tmp_path: Path) -> None:
     report = Quiet()
     make_facades(task(stated_line()), tmp_path, report)
     told = json.loads((tmp_path / "facades.json").read_text())
@@ -322,7 +322,7 @@ def test_files_of_a_stated_wall_are_read_by_others(tmp_path: Path) -> None:
     assert sorted(report.shares) == report.shares
 
 
-def test_a_killed_call_goes_on_with_the_same_bytes(tmp_path: Path) -> None:
+def test_a_killed_call_resumes_with_the_same_bytes(tmp_path: Path) -> None:
     area = PlanArea.seen_from_above([(np.array([[-5.0, -4.0], [5.0, -4.0], [5.0, -2.0], [-5.0, -2.0]]),)])
     for folder in (tmp_path / "whole", tmp_path / "killed"):
         folder.mkdir()
@@ -343,14 +343,14 @@ def test_a_killed_call_goes_on_with_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "whole" / "south.png").stat().st_mtime_ns == before
 
 
-def test_a_line_where_nothing_stands_is_refused(tmp_path: Path) -> None:
+def test_a_line_without_a_wall_is_refused(tmp_path: Path) -> None:
     x1, y1, x2, y2 = stated_line()
     for line in ((x1, y1 + 50, x2, y2 + 50), (x2, y2, x1, y1), (x1, y1, x1, y1), (float("nan"), y1, x2, y2)):
         with pytest.raises(SplatpipeError, match="No wall seen by the photos"):
             make_facades(task(line), tmp_path, Quiet())
 
 
-def test_without_walls_the_list_is_empty_and_said_to_be(tmp_path: Path) -> None:
+def test_without_walls_the_list_is_empty_with_a_note(tmp_path: Path) -> None:
     away = PlanArea.seen_from_above([(np.array([[50.0, 50.0], [60.0, 50.0], [60.0, 60.0]]),)])
     report = Quiet()
     assert make_facades(task(area=away), tmp_path, report) == []
@@ -358,7 +358,7 @@ def test_without_walls_the_list_is_empty_and_said_to_be(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "facades.json").read_text())["facades"] == []
 
 
-def test_openings_are_level_rectangles_and_what_juts_out_is_traced() -> None:
+def test_openings_are_level_rectangles_and_projections_are_traced() -> None:
     sheet = wall_sheet(Wall("south", np.array([0.0, 0.0]), np.array([8.0, 0.0]), 0.0, 4.0), 0.02)
     depth = np.random.default_rng(3).normal(0.0, 0.008, (200, 400)).astype(np.float32)
     depth[50:120, 60:110] = -0.16  # a window: 1.2 to 2.2 m, 1.6 to 3 m high
@@ -379,6 +379,6 @@ def test_openings_are_level_rectangles_and_what_juts_out_is_traced() -> None:
     assert np.abs(whole.min(axis=0)).max() < 0.05
 
 
-def test_the_scene_is_what_these_tests_take_it_for() -> None:
+def test_the_scene_meets_the_assumptions_of_these_tests() -> None:
     assert WALLS == (-4.0, 4.0, -3.0, 3.0)
     assert ROOF[2] == -3.5

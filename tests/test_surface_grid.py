@@ -39,7 +39,7 @@ def test_grid_is_proj_to_a_fifth_of_a_millimetre_over_three_kilometres(crs: str)
     assert np.abs(grid.local_from_cells(cells) - points).max() < 2.0 * LATTICE_M
 
 
-def test_centre_of_a_cell_is_where_pyproj_has_it() -> None:
+def test_centre_of_a_cell_agrees_with_pyproj() -> None:
     grid = hill_grid(placed("EPSG:25832", "ellipsoidal"), 0.03)
     tile = next(t for t in grid.tiles() if t.column > 0 and t.row > 0)
     heights = np.full((tile.height, tile.width), 123.4)
@@ -54,7 +54,7 @@ def test_centre_of_a_cell_is_where_pyproj_has_it() -> None:
     assert abs(float((there - origin) @ up) - centre[2]) < LATTICE_M
 
 
-def test_places_that_are_not_known_stay_unknown_and_change_no_other() -> None:
+def test_unknown_places_stay_unknown_and_change_no_other() -> None:
     grid = make_grid(placed(), box(1500.0, 1500.0, -20.0, 60.0), 0.03)
     points = local(box(1500.0, 1500.0, -20.0, 60.0), 50)
     with_holes = points.copy()
@@ -64,7 +64,7 @@ def test_places_that_are_not_known_stay_unknown_and_change_no_other() -> None:
     assert np.isnan(found[hole]).all() and np.array_equal(found[~hole], whole[~hole])
 
 
-def test_lines_of_grids_of_one_cell_are_the_same_lines() -> None:
+def test_grids_with_the_same_cell_have_common_grid_lines() -> None:
     one, other = (make_grid(placed(), box(half, half), 0.03) for half in (10.0, 17.77))
     for grid in (one, other):
         corner = np.array(grid.transform @ (0.0, 0.0)) / grid.cell
@@ -84,7 +84,7 @@ def test_grid_covers_the_scene_and_tiles_cover_the_grid_once() -> None:
     assert (seen == 1).all()
 
 
-def test_cells_are_neat_in_the_unit_of_the_crs_and_as_large_as_asked_on_the_ground() -> None:
+def test_cells_are_round_in_the_unit_of_the_crs_and_of_the_requested_size_on_the_ground() -> None:
     assert cell_size(open_map(placed()), 0.027963) == 0.028
     assert cell_size(open_map(placed()), 0.02) == 0.02  # though a metre of UTM is 0.9996 of the ground's
     assert cell_size(open_map(placed("EPSG:3857", "unknown")), 0.02) == pytest.approx(0.02 * 1.63, rel=0.01)
@@ -116,7 +116,7 @@ def test_heights_of_a_geographic_crs_stay_in_its_datum() -> None:
     assert crs.crs_from_local(np.zeros((1, 3)))[0, 2] == pytest.approx(110.0)
 
 
-def test_code_of_the_crs_is_in_what_is_written() -> None:
+def test_files_contain_the_code_of_the_crs() -> None:
     for text in ("EPSG:25832", "EPSG:25832+7837", "EPSG:5555", "EPSG:4326", ""):
         heights = {"EPSG:25832+7837": "EPSG:7837", "EPSG:5555": "EPSG:5783"}.get(text, "unknown")
         assert open_map(placed(text, heights)).horizontal.to_json_dict()["id"]["authority"] == "EPSG"
@@ -149,13 +149,13 @@ def test_scene_of_a_single_place_is_one_cell() -> None:
         (placed(), -box(10.0, 10.0), 0.02, "no extent"),
     ],
 )
-def test_what_has_no_grid_is_said(frame: Frame, scene: np.ndarray, gsd_m: float, message: str) -> None:
+def test_scenes_without_a_grid_are_reported(frame: Frame, scene: np.ndarray, gsd_m: float, message: str) -> None:
     with pytest.raises(SplatpipeError, match=message) as error:
         make_grid(frame, scene, gsd_m)
     assert error.value.hint
 
 
-def test_pyproj_is_as_it_was_after_a_grid() -> None:
+def test_pyprojs_settings_are_unchanged_after_a_grid() -> None:
     before = pyproj.datadir.get_data_dir(), pyproj.network.is_network_enabled()
     grid: Grid = hill_grid()
     assert (pyproj.datadir.get_data_dir(), pyproj.network.is_network_enabled()) == before

@@ -86,7 +86,7 @@ def test_edges_neither_grow_nor_shrink() -> None:
     assert abs(int(higher.sum()) - int((true_height(east, north) > 1.5).sum())) < 0.02 * higher.sum()
 
 
-def test_noise_holes_and_wild_patches_are_borne() -> None:
+def test_noise_holes_and_wrong_patches_are_tolerated() -> None:
     off, clear = errors(made_noisy())
     flat = off[clear]
     assert np.isfinite(flat).mean() > 0.995
@@ -115,7 +115,7 @@ def test_tiles_threads_and_memory_change_no_bit() -> None:
         assert np.array_equal(part.photos, whole.photos[cut])
 
 
-def test_what_is_too_much_at_once_is_made_in_parts() -> None:
+def test_large_rasters_are_made_in_parts() -> None:
     whole, parts = made_noisy(), tile_heights(capture(noisy()), WHOLE, most=60_000)  # of 180,000
     assert np.array_equal(parts.height, whole.height, equal_nan=True)
     assert np.array_equal(parts.sigma, whole.sigma, equal_nan=True)
@@ -144,14 +144,14 @@ def test_a_turned_sheet_gives_the_same_surface() -> None:
     assert np.allclose(sheet.place(sheet.local(places)), places, equal_nan=True)
 
 
-def test_what_two_photos_see_has_no_height() -> None:
+def test_places_that_only_two_photos_see_have_no_height() -> None:
     two = tuple(replace(found, confidence=np.minimum(found.confidence, 1).astype(np.uint8)) for found in exact()[:2])
     made = tile_heights(capture(two), WHOLE)
     assert np.isnan(made.height).all()
     assert not made.photos.any()
 
 
-def test_nothing_seen_is_nothing() -> None:
+def test_without_views_there_are_no_heights() -> None:
     for maps in ((), tuple(replace(f, depth=np.zeros_like(f.depth)) for f in exact()[:3])):
         made = tile_heights(capture(maps), Tile(0, 0, 10, 12))
         assert made.height.shape == (10, 12)
@@ -173,7 +173,7 @@ def test_a_floating_patch_that_others_look_through_is_no_roof() -> None:
     assert np.abs(off[clear]).max() < 0.1 * PIXEL_M
 
 
-def test_small_holes_are_filled_and_told() -> None:
+def test_small_holes_are_filled_and_counted() -> None:
     maps = []
     for found in exact():
         points = found.camera.project(np.array([[5.5, -5.5, 0.0]]))[0]
@@ -189,7 +189,7 @@ def test_small_holes_are_filled_and_told() -> None:
     assert made.sigma[made.photos == 1].min() >= CELL_M - 1e-6
 
 
-def test_a_hole_at_a_wall_is_ground_and_a_wide_one_stays() -> None:
+def test_a_hole_at_a_wall_is_filled_with_ground_and_a_wide_one_is_left() -> None:
     height = np.zeros((9, 30))
     height[:, :5] = 3.0
     height[3:6, 5] = np.nan
@@ -223,7 +223,7 @@ def test_a_lattice_without_cells_is_refused(arguments: tuple[float, float, float
         Lattice(*arguments)
 
 
-def test_a_shelf_keeps_within_its_limit() -> None:
+def test_a_cache_keeps_within_its_limit() -> None:
     shelf: LruCache[str] = LruCache(25)
     loads: list[str] = []
 

@@ -177,7 +177,7 @@ def refused(call: Callable[..., object], *given: object) -> None:
         call(*given)
 
 
-def test_votes_of_what_does_not_fit_are_refused() -> None:
+def test_votes_of_mismatched_arrays_are_refused() -> None:
     found, good = maps()[0], native_camera(maps()[0].camera)
     lattice, tile, relief = (0.0, 0.0, 0.1), (0, 0, 8, 9), (0.0, 5.0)
     for bad in ((0.0, 0.0, 0.0), (0.0, np.nan, 0.1), (0.0, 0.0, np.inf)):

@@ -33,7 +33,7 @@ def test_kills_and_full_disks_leave_no_half_product(tmp_path: Path) -> None:
         assert raster.count == 1
 
 
-def test_what_fails_leaves_the_old_file_and_nothing_beside_it(tmp_path: Path) -> None:
+def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_beside_it(tmp_path: Path) -> None:
     path = tmp_path / "a[1].tif"  # a name that is no pattern
     path.write_text("old")
     (tmp_path / ".a[1].tif.999999.making").mkdir()

@@ -46,7 +46,7 @@ def test_a_model_that_is_too_high_has_that_bias_normal_to_its_slopes() -> None:
     assert judged(house()[0] - GSD, where=~on_roof())["bias"] == pytest.approx(-1.0)
 
 
-def test_half_a_cell_aside_tells_on_slopes_alone() -> None:
+def test_a_shift_by_half_a_cell_affects_only_slopes() -> None:
     """Away from steps the ground is as good; a slope is off by what it rises on the way, both slopes oppositely."""
     heights = house()[0]
     shifted = 0.5 * (heights + np.roll(heights, 1, axis=1))
@@ -57,14 +57,14 @@ def test_half_a_cell_aside_tells_on_slopes_alone() -> None:
     assert max(abs(row["bias"]), row["nmad"]) > 0.6  # of two values alone the median may be one: then the bias tells
 
 
-def test_a_whole_cell_aside_is_forgiven_at_steps_and_not_farther_off() -> None:
+def test_a_shift_by_a_whole_cell_is_tolerated_at_steps_only() -> None:
     heights = house()[0]
     assert judged(np.roll(heights, 2, axis=0), where=~on_roof())["within_3"] == 1.0
     assert judged(np.roll(heights, 4, axis=0), where=~on_roof())["within_3"] < 1.0
 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
-def test_noise_is_measured_as_it_is(sigma: float) -> None:
+def test_noise_is_measured_correctly(sigma: float) -> None:
     """The NMAD of 10,000 normal errors is their deviation to 2 %."""
     noise = np.random.default_rng(1).normal(0.0, sigma * GSD, (SIZE, SIZE))
     row = judged(house()[0] + noise, where=~on_roof())
@@ -72,7 +72,7 @@ def test_noise_is_measured_as_it_is(sigma: float) -> None:
     assert row["p95"] == pytest.approx(1.96 * sigma, rel=0.05)
 
 
-def test_outliers_cannot_hide() -> None:
+def test_outliers_are_noticed() -> None:
     """6 % of gross errors hardly affect bias and NMAD, but fail the share."""
     found, rng = house()[0], np.random.default_rng(2)
     found[rng.random(found.shape) < 0.06] += 1.0
@@ -80,7 +80,7 @@ def test_outliers_cannot_hide() -> None:
     assert abs(row["bias"]) < 0.01 and row["nmad"] < 0.1 and row["within_3"] < 0.95 and row["p95"] > 3.0
 
 
-def test_what_is_missing_is_wrong() -> None:
+def test_missing_cells_count_as_wrong() -> None:
     found, rng = house()[0], np.random.default_rng(3)
     found[rng.random(found.shape) < 0.3] = np.nan
     row = judged(found)
@@ -96,7 +96,7 @@ def test_nothing_to_measure_is_no_figure() -> None:
     assert figures(np.zeros(0), GSD) == {"cells": 0}
 
 
-def test_steps_are_found_and_slopes_are_none() -> None:
+def test_steps_are_found_and_slopes_are_not_steps() -> None:
     heights, cosine = house()
     near = near_steps(heights, 4 * GSD, 2)
     inside = np.zeros_like(near)
@@ -109,7 +109,7 @@ def test_steps_are_found_and_slopes_are_none() -> None:
     assert near_steps(nothing, 4 * GSD, 1)[5, 6] and not near_steps(nothing, 4 * GSD, 1)[5, 8]
 
 
-def test_psnr_counts_what_is_missing_as_black() -> None:
+def test_psnr_counts_missing_pixels_as_black() -> None:
     rng = np.random.default_rng(4)
     truth = rng.integers(60, 200, (80, 80, 3), np.uint8)
     every = np.ones((80, 80), bool)
@@ -122,7 +122,7 @@ def test_psnr_counts_what_is_missing_as_black() -> None:
     assert psnr(fitted_colours(darker, truth, every), truth, every) > 45.0 > 15.0 > psnr(darker, truth, every)
 
 
-def test_rmse_fails_where_one_is_not_found() -> None:
+def test_rmse_fails_if_one_is_not_found() -> None:
     assert rmse(np.array([[3.0, 4.0], [0.0, 0.0]])) == pytest.approx(np.sqrt(12.5))
     assert rmse(np.array([[0.0, 0.0], [np.nan, np.nan]])) is None
     assert rmse(np.zeros((0, 2))) is None
@@ -149,7 +149,7 @@ def edges_of(picture: np.ndarray) -> dict[str, float]:
     return edge_figures(edge_distances(picture, truth, mask, np.ones(mask.shape, bool)))
 
 
-def test_edges_of_the_true_picture_are_where_they_are() -> None:
+def test_edges_of_the_true_image_are_found_in_place() -> None:
     row = edges_of(roof_picture()[0])
     assert row["edges"] > 150 and row["median"] == 0.0 and row["p95"] == 0.0 and row["lost"] == 0.0
     noisy = roof_picture()[0] + np.random.default_rng(5).normal(0, 4, (300, 300, 1))
@@ -233,6 +233,6 @@ def test_a_doubled_wall_costs_precision_and_half_a_wall_recall() -> None:
     assert reached(np.zeros(0), bound) == 0.0
 
 
-def test_one_point_of_a_place_is_kept() -> None:
+def test_one_point_per_voxel_is_kept() -> None:
     points = np.concatenate([np.zeros((50, 3)), np.full((1, 3), 1.0)])
     assert len(thinned(points, GSD)) == 2 and len(thinned(np.zeros((0, 3)), GSD)) == 0

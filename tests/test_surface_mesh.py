@@ -71,7 +71,7 @@ def test_the_same_mesh_has_one_order() -> None:
     assert again.areas().sum() == pytest.approx(2.25)
 
 
-def test_crumbs_go_and_pieces_stay() -> None:
+def test_crumbs_are_removed_and_large_pieces_kept() -> None:
     mesh = together(sheet(0.0, 8), sheet(10.0, 2), sheet(20.0, 4))
     assert without_crumbs(mesh, 0.9).areas().sum() == pytest.approx(4.0 + 1.0)
     kept = without_crumbs(mesh, 1.1)
@@ -119,7 +119,7 @@ def test_vertices_have_the_photos_colours_and_hidden_ones_their_neighbours() -> 
     assert (vertex_colours(exact_photos(), unseen, 1) == 128).all()
 
 
-def test_files_are_read_by_others_where_they_lie(tmp_path: Path) -> None:
+def test_files_are_read_by_other_programs_in_the_right_place(tmp_path: Path) -> None:
     mesh = sheet(3.0, 2, height=7.0)
     colours = np.arange(27, dtype=np.uint8).reshape(9, 3) * 9
     uncertain = replace(FRAME, residuals={"uncertainty": {"horizontal_m": 0.02}})
@@ -146,7 +146,7 @@ def test_files_are_read_by_others_where_they_lie(tmp_path: Path) -> None:
     assert placed["boundary"]["wgs84"]["coordinates"] == [[[*degrees[0][0], degrees[0][0][0]]]]
 
 
-def test_glb_says_light_in_sixteen_bits_and_no_lamp(tmp_path: Path) -> None:
+def test_glb_has_16_bit_linear_colours_and_is_unlit(tmp_path: Path) -> None:
     colours = np.tile(np.array([[0, 30, 255]], np.uint8), (9, 1))
     write_mesh(tmp_path, ColouredMesh(sheet(0.0, 2), colours), FRAME, None)
     data = (tmp_path / "mesh.glb").read_bytes()
@@ -159,12 +159,12 @@ def test_glb_says_light_in_sixteen_bits_and_no_lamp(tmp_path: Path) -> None:
     assert "KHR_materials_unlit" in scene["materials"][0]["extensions"]
 
 
-def test_few_triangles_are_left_as_they_are() -> None:
+def test_few_triangles_are_unchanged() -> None:
     mesh = sheet(0.0, 3)
     assert decimated(mesh, 18) is mesh
 
 
-def test_the_whole_mesh_or_how_to_get_it(tmp_path: Path) -> None:
+def test_the_complete_mesh_or_how_to_install_open3d(tmp_path: Path) -> None:
     """open3d is an extra: if it is missing, the error says how to install it; no other test here needs it."""
     task = MeshTask(run_surface(FRAME, photos(noise_px=0.1, wild=0.03)), house_site(), 2.0 * GSD_M, 4000, 1)
     if find_spec("open3d") is None:

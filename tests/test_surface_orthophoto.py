@@ -75,7 +75,7 @@ def psnr(colour: np.ndarray, true: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / np.mean(np.square(colour - true))))
 
 
-def test_it_is_what_a_look_straight_down_would_be() -> None:
+def test_it_is_the_view_straight_down() -> None:
     assert made().known.all()
     assert psnr(made().colour, truth(FINE, WHOLE)) > 30.0
 
@@ -85,7 +85,7 @@ def test_walls_do_not_lean() -> None:
     assert red.mean() < 1e-3
 
 
-def test_nothing_is_shown_twice_beside_the_eaves() -> None:
+def test_nothing_is_duplicated_beside_the_eaves() -> None:
     east, north = np.moveaxis(FINE.centres(WHOLE), -1, 0)
     near = (edge_distance(east, north) < 1.0) & (edge_distance(east, north) > 0.15) & (true_height(east, north) == 0.0)
     off = np.abs(made().colour.astype(float) - truth(FINE, WHOLE)).max(axis=-1)
@@ -98,13 +98,13 @@ def test_stripes_keep_their_contrast() -> None:
     assert made().colour[..., 1][lawn].std() > 0.9 * truth(FINE, WHOLE)[..., 1][lawn].std()
 
 
-def test_exposures_are_levelled() -> None:
+def test_exposures_are_equalised() -> None:
     left = np.log2(album().levels.gain[:, 1] * EXPOSURES)
     assert np.ptp(left) < 0.06
     assert np.ptp(np.log2(EXPOSURES)) > 0.4
 
 
-def test_dark_corners_are_levelled() -> None:
+def test_dark_corners_are_equalised() -> None:
     """Photos through a lens that loses half of the light in the corners."""
     plain = plain_album()
     sources = []
@@ -139,14 +139,14 @@ def test_tiles_and_threads_change_no_bit() -> None:
             assert np.array_equal(getattr(part, name), getattr(made(), name)[cut])
 
 
-def test_what_is_too_much_at_once_is_made_in_parts() -> None:
+def test_large_rasters_are_made_in_parts() -> None:
     parts = tile_orthophoto(album(), WHOLE, most=1)
     for name in ("colour", "label", "photos", "known"):
         assert np.array_equal(getattr(parts, name), getattr(made(), name))
     assert parts.tile == WHOLE
 
 
-def test_a_cell_that_nobody_sees_is_filled_and_told() -> None:
+def test_a_cell_that_no_photo_sees_is_filled_and_counted() -> None:
     whole = album()
     height = whole.surface.height.copy()
     height[20:24, 20:24] += 3.0  # photos see the lawn there, three metres lower
@@ -160,7 +160,7 @@ def test_a_cell_that_nobody_sees_is_filled_and_told() -> None:
     assert not part.colour[101:, :59].any()
 
 
-def test_far_from_all_that_is_seen_there_is_no_colour() -> None:
+def test_far_from_visible_cells_there_is_no_colour() -> None:
     known = np.zeros((60, 60), np.bool_)
     known[:, 0] = True
     colour = np.full((60, 60, 3), 9, np.uint8)
@@ -232,7 +232,7 @@ def test_a_seam_runs_where_two_photos_look_alike() -> None:
     assert (colour[0, 20, crossings[0]] == colour[1, 20, crossings[0]]).all()
 
 
-def test_what_one_photo_of_five_shows_is_not_shown() -> None:
+def test_objects_in_one_of_five_photos_are_not_shown() -> None:
     colour = np.full((5, 60, 60, 3), 90, np.uint8)
     colour[3, 20:40, 20:40] = 240  # a car that had driven on; elsewhere this photo is the best
     cost = np.full((5, 60, 60), 300, np.uint16)
@@ -252,7 +252,7 @@ def test_of_many_photos_the_best_are_kept() -> None:
     assert np.array_equal(kept, seen & (cost <= limit))  # more than so many only where costs are the same
 
 
-def test_heights_between_cells_are_straight_on_slopes_and_sharp_at_steps() -> None:
+def test_heights_between_cells_are_linear_on_slopes_and_sharp_at_steps() -> None:
     lattice = Lattice(0.0, 2.0, 0.5, 4, 4)
     height = np.tile(np.array([0.0, 0.2, 0.4, 5.0], np.float32), (4, 1))
     field = HeightField(lattice, height)

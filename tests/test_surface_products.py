@@ -106,7 +106,7 @@ def centres(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return raster.read(), t.c + t.a * columns, t.f + t.e * rows
 
 
-def test_a_site_is_as_large_and_as_fine_as_its_photos() -> None:
+def test_a_site_has_the_extent_and_resolution_of_its_photos() -> None:
     found = site()
     assert 0.09 < found.gsd_m < 0.13  # 20 m away, 200 pixels of focal length; those around are nearer to the house
     assert found.low_m < -2.0
@@ -124,7 +124,7 @@ def test_a_site_ends_at_its_boundary() -> None:
     assert np.abs(found.reach).max() <= 5.5
 
 
-def test_depths_that_reach_too_far_for_a_site_are_refused() -> None:
+def test_depths_too_far_apart_for_a_site_are_refused() -> None:
     found = sources()[0].load()
     pose = found.camera.cam_from_world.copy()
     pose[:3, 3] -= pose[:3, :3] @ [100_000.0, 100_000.0, 0.0]
@@ -140,7 +140,7 @@ def test_of_a_site_in_many_small_parts_the_largest_is_kept() -> None:
     assert np.argwhere(covered).tolist() == [[0, 0], [0, 1]]
 
 
-def test_a_stage_that_finds_no_site_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stage_without_a_site_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dsm_stage, "open_run_surface", lambda *_: run_surface(FRAME, photos(), HOUSE))
     monkeypatch.setattr(dsm_stage, "measure_extent", lambda *_: None)
     told = InterruptingReporter()
@@ -149,7 +149,7 @@ def test_a_stage_that_finds_no_site_says_so_and_ends(tmp_path: Path, monkeypatch
     assert load_site(tmp_path / "site.json") is None
 
 
-def test_what_is_there_already_is_told_of_as_done(made: Path, tmp_path: Path) -> None:
+def test_existing_parts_are_reported_as_done(made: Path, tmp_path: Path) -> None:
     shutil.copytree(made / "work", tmp_path / "work")
     told = InterruptingReporter()
     dsm(tmp_path, report=told)
@@ -175,7 +175,7 @@ def test_a_broken_site_is_refused(tmp_path: Path, text: str) -> None:
         load_site(tmp_path / "site.json")
 
 
-def test_heights_are_where_they_are_and_end_at_the_boundary(made: Path) -> None:
+def test_heights_are_in_place_and_end_at_the_boundary(made: Path) -> None:
     (height,), east, north = centres(made / "dsm.tif")
     known = height != -9999.0
     inside = HOUSE.contains(np.stack([east.ravel(), north.ravel(), 0 * east.ravel()], axis=1)).reshape(east.shape)
@@ -185,7 +185,7 @@ def test_heights_are_where_they_are_and_end_at_the_boundary(made: Path) -> None:
     assert np.abs(height - true_height(east, north))[clear].max() < 0.02
 
 
-def test_confidence_tells_photos_and_millimetres(made: Path) -> None:
+def test_confidence_has_photos_and_millimetres(made: Path) -> None:
     (height,), _, _ = centres(made / "dsm.tif")
     (photos, sigma), _, _ = centres(made / "dsm_confidence.tif")
     known = height != -9999.0
@@ -195,7 +195,7 @@ def test_confidence_tells_photos_and_millimetres(made: Path) -> None:
     assert 5 < np.median(sigma[known]) < 100
 
 
-def test_contours_are_there_in_cad_and_not_on_a_map_without_a_place(made: Path) -> None:
+def test_without_georeference_there_are_cad_contours_and_no_geojson(made: Path) -> None:
     assert (made / "contours.dxf").stat().st_size > 1000
     assert not (made / "contours.geojson").exists()
 
@@ -228,7 +228,7 @@ def test_the_orthophoto_covers_all_that_the_surface_model_does(
     assert np.array_equal(whole, part)
 
 
-def test_known_cells_are_told_by_blocks_and_end_with_the_raster(made: Path) -> None:
+def test_known_cells_are_counted_by_blocks_up_to_the_rasters_edge(made: Path) -> None:
     (height,), _, _ = centres(made / "dsm.tif")
     known, (rows, columns) = known_cells(made / "dsm.tif"), np.nonzero(height != -9999.0)
     assert known.any_in(Tile(int(rows[0]), int(columns[0]), 1, 1))
@@ -238,7 +238,7 @@ def test_known_cells_are_told_by_blocks_and_end_with_the_raster(made: Path) -> N
 
 
 @pytest.mark.parametrize("product", [dsm, ortho])
-def test_an_interrupted_product_goes_on_with_the_same_bytes(made: Path, tmp_path: Path, product: Callable) -> None:
+def test_an_interrupted_product_resumes_with_the_same_bytes(made: Path, tmp_path: Path, product: Callable) -> None:
     for name in ("dsm.tif",) if product is ortho else ():
         (tmp_path / name).write_bytes((made / name).read_bytes())
     with pytest.raises(KeyboardInterrupt):

@@ -61,7 +61,7 @@ def across(folder: Path, sources: tuple[DepthSource, ...] = ()) -> Section:
     return cut_section(house(folder), line_of(*ACROSS), grid().crs, sources, threads=1)
 
 
-def test_heights_are_the_surfaces(tmp_path: Path) -> None:
+def test_heights_are_those_of_the_surface(tmp_path: Path) -> None:
     found = across(tmp_path)
     north = ACROSS[1] + found.distance_m
     off = found.height - 512.0 - true_height(np.full(len(north), ACROSS[0]), north)
@@ -115,7 +115,7 @@ def test_a_trace_lies_on_the_surface_and_keeps_peaks_and_holes(tmp_path: Path) -
     assert None in few["height"]
 
 
-def test_a_polygon_is_laid_onto_the_surface(tmp_path: Path) -> None:
+def test_a_polygon_is_draped_over_the_surface(tmp_path: Path) -> None:
     ring = np.array([[-9.0, -7.0], [9.0, -7.0], [9.0, 7.0], [-9.0, -3.0]])  # over the house, and beside the hole
     surface = house(tmp_path)
     (trace,) = polygon_trace(surface, (ring,), grid().crs, 200)
@@ -133,7 +133,7 @@ def test_a_polygon_is_laid_onto_the_surface(tmp_path: Path) -> None:
     assert len(nowhere["z"]) == 8
 
 
-def test_files_are_read_by_others(tmp_path: Path) -> None:
+def test_files_are_read_by_other_programs(tmp_path: Path) -> None:
     sources = tuple(DepthSource(camera, lambda camera=camera: depths_of(camera)) for camera in cameras()[::4])
     section = across(tmp_path, sources)
     told = write_section(tmp_path, "section-1", section, grid().crs)
@@ -162,7 +162,7 @@ def test_files_are_read_by_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("local", [(1.0, 1.0, 1.0, 1.0), (200.0, 0.0, 300.0, 0.0), (0.0, 0.0, 9e6, 0.0)])
-def test_a_line_of_nothing_is_refused(tmp_path: Path, local: tuple[float, ...]) -> None:
+def test_a_line_without_data_is_refused(tmp_path: Path, local: tuple[float, ...]) -> None:
     start = line_of(0.0, 0.0, 1.0, 1.0)
     line = (start[0] + local[0], start[1] + local[1], start[0] + local[2], start[1] + local[3])
     with pytest.raises(SplatpipeError, match="The section"):

@@ -77,7 +77,7 @@ def counted(site: TruthGrid, raster: Raster) -> dict[str, dict[str, float]]:
     return {row["what"]: row for row in measure_dsm(site, raster)}
 
 
-def test_reliefs_are_what_parallel_rays_hit(surface: Triangles) -> None:
+def test_reliefs_are_where_parallel_rays_hit(surface: Triangles) -> None:
     rng = np.random.default_rng(0)
     for view in (top_view(0.53), facade_view("south", 0.307), facade_view("east", 0.307)):
         found = relief_in(view, surface)
@@ -132,7 +132,7 @@ def test_the_truth_is_perfect_and_all_of_it_counts(perfect: tuple[Raster, TruthG
     assert both * CELL_M**2 > 500.0  # of the 1,500 m² flown over
 
 
-def test_a_model_a_gsd_too_high_is_told(perfect: tuple[Raster, TruthGrid]) -> None:
+def test_a_model_one_gsd_too_high_is_noticed(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
     rows = counted(site, replace(raster, bands=raster.bands + GSD_M))
     assert rows["ground"]["bias"] == pytest.approx(1.0, abs=1e-6)
@@ -151,7 +151,7 @@ def test_a_model_that_ends_early_or_has_no_data_is_incomplete(perfect: tuple[Ras
     assert row["complete"] == row["within_3"] < 0.5
 
 
-def test_a_smoothed_model_is_wrong_at_the_eaves_which_count_apart(perfect: tuple[Raster, TruthGrid]) -> None:
+def test_a_smoothed_model_is_wrong_at_the_eaves_which_count_separately(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
     held = raster.bands[0]
     smooth = sum(np.roll(held, (r, c), (0, 1)) for r in (-1, 0, 1) for c in (-1, 0, 1)) / 9.0
@@ -187,7 +187,7 @@ def test_elevations_are_judged_by_their_walls(truth: SceneTruth) -> None:
     assert corners["south"] == pytest.approx(0.1 / GSD_M)
 
 
-def test_an_elevation_seen_from_inside_is_no_wall_s(surface: Triangles) -> None:
+def test_an_elevation_seen_from_inside_matches_no_wall(surface: Triangles) -> None:
     facade = wall_facade("south", surface)
     mirrored = replace(facade, corners=facade.corners[[1, 0, 3, 2]])
     assert matching([facade], "south") is facade
@@ -207,7 +207,7 @@ def plate(size: float = 16.0) -> tuple[Triangles, list[TrueView]]:
     return triangles, sights
 
 
-def test_photos_see_what_nothing_hides() -> None:
+def test_photos_see_what_is_not_occluded() -> None:
     sights = plate()[1]
     places = np.array([[0.0, 0, 0], [3.0, 1, 0], [0, 0, -0.5], [500.0, 0, 0]])
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
@@ -234,7 +234,7 @@ def test_clouds_and_meshes_are_judged_on_both_sides(monkeypatch: pytest.MonkeyPa
     assert nothing["f1"] == 0.0
 
 
-def test_targets_are_found_where_they_are() -> None:
+def test_targets_are_located() -> None:
     """Painted at eight times the size, 18 px wide, off the middle of a pixel; shown aside, told so; gone, missing."""
     y, x = (np.mgrid[:1280, :1280] + 0.5) / 8.0
     place = np.array([80.375, 79.625])
@@ -248,7 +248,7 @@ def test_targets_are_found_where_they_are() -> None:
     assert np.isnan(target_difference(picture, np.array([20.0, 140.0]))).all()
 
 
-def test_the_true_picture_falls_on_the_product_s_pixels(perfect: tuple[Raster, TruthGrid], tmp_path: Path) -> None:
+def test_the_true_image_is_aligned_with_the_products_pixels(perfect: tuple[Raster, TruthGrid], tmp_path: Path) -> None:
     """Return an image whose colours encode their position, east and south."""
     view = top_view(0.1)
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
@@ -266,7 +266,7 @@ def test_the_true_picture_falls_on_the_product_s_pixels(perfect: tuple[Raster, T
     assert 0.3 < whole.mean() < 0.9 and not whole[0, 0]
 
 
-def test_way_to_a_crs_is_straight_enough_and_turns_back() -> None:
+def test_transformation_to_a_crs_is_linear_enough_and_invertible() -> None:
     world, grid = open_world(true_frame(CRS)), grid_of(1.0)
     way = straight(lambda points: grid.to_grid(world.crs_from_local(points)), grid.cell)
     points = np.random.default_rng(0).uniform([-20, -20, 0], [20, 20, 9], (50, 3))
@@ -292,7 +292,7 @@ def write_products(out: Path, raster: Raster, surface: Triangles) -> None:
     (out / "facades.json").write_text(text)
 
 
-def test_files_are_measured_and_what_is_missing_fails(
+def test_files_are_measured_and_missing_ones_fail(
     perfect: tuple[Raster, TruthGrid], truth: SceneTruth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_products(tmp_path, perfect[0], truth.triangles)
@@ -342,7 +342,7 @@ def test_readers_know_their_frames(tmp_path: Path) -> None:
     "text",
     ["", "{}", '[{"name": "a"}]', '[{"name": "a", "corners": [[0, 0, 0]], "depth": "none.tif"}]', '{"facades": 3}'],
 )
-def test_elevations_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
+def test_invalid_elevations_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "facades.json").write_text(text)
     with pytest.raises(UsageError):
         read_facades(tmp_path / "facades.json", lambda points: points)
@@ -360,13 +360,13 @@ def test_a_raster_without_a_crs_is_refused_and_nan_is_no_data(tmp_path: Path) ->
         read_raster(tmp_path / "without.tif")
 
 
-def test_nothing_to_measure_is_said(tmp_path: Path) -> None:
+def test_nothing_to_measure_is_reported(tmp_path: Path) -> None:
     command = [sys.executable, BENCHMARKS / "surface_truth.py", tmp_path]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "has none of" in done.stderr
 
 
-def test_noisy_depths_err_as_they_say() -> None:
+def test_noisy_depths_have_the_stated_errors() -> None:
     """A level plane 20 m below: 0.3 px of parallax over a base of 4 m, 10 % without depth, 2 % nonsense."""
     camera = Camera("a", 400, 300, 280.0, 280.0, 200.0, 150.0, np.eye(4))
     depth, sure = np.full((300, 400), 20.0, np.float32), np.full((300, 400), 6, np.uint8)
@@ -381,7 +381,7 @@ def test_noisy_depths_err_as_they_say() -> None:
     np.testing.assert_array_equal(found, again)
 
 
-def test_depth_maps_come_back_from_their_files(tmp_path: Path) -> None:
+def test_depth_maps_read_back_from_their_files(tmp_path: Path) -> None:
     sights = plate()[1]
     cameras = [sight.camera for sight in sights]
     depths = [np.where(np.isfinite(sight.depth), sight.depth, 0.0).astype(np.float32) for sight in sights]

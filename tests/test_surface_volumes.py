@@ -101,7 +101,7 @@ def test_a_pit_is_filled_and_a_prism_cut(tmp_path: Path) -> None:
     assert above.cut.m3 == pytest.approx(32.0 + 256.0, rel=5e-3)
 
 
-def test_an_outline_cuts_cells(tmp_path: Path) -> None:
+def test_an_outline_divides_cells(tmp_path: Path) -> None:
     grid = grid_of("local")
     surface = surface_file(tmp_path, grid, np.ones((grid.height, grid.width)))
     triangle = PlanArea.seen_from_above([(np.array([[0.03, 0.02], [4.01, 0.57], [1.53, 3.96]]),)])
@@ -143,7 +143,7 @@ def test_a_stated_height_has_the_datums_uncertainty(tmp_path: Path) -> None:
     assert measure_volume(surface, square(5.0), grid.crs, "rim", datum_sigma_m=0.05).net.sigma_m3 < 0.1
 
 
-def test_what_has_no_height_is_told_and_not_filled(tmp_path: Path) -> None:
+def test_cells_without_height_are_reported_and_not_filled(tmp_path: Path) -> None:
     grid = grid_of("local")
     east, north = plan_of(grid)
     surface = surface_file(tmp_path, grid, np.where((np.abs(east) < 2.0) & (np.abs(north) < 2.0), np.nan, 1.0))
@@ -152,7 +152,7 @@ def test_what_has_no_height_is_told_and_not_filled(tmp_path: Path) -> None:
     assert found.area_m2 - found.known_m2 == pytest.approx(16.0, rel=2e-2)
 
 
-def test_a_base_that_nobody_knows_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_base_is_refused(tmp_path: Path) -> None:
     grid = grid_of("local")
     east, _ = plan_of(grid)
     surface = surface_file(tmp_path, grid, np.where(np.abs(east) < 2.0, 1.0, np.nan))
@@ -166,7 +166,7 @@ def test_a_base_that_nobody_knows_is_refused(tmp_path: Path) -> None:
             measure_volume(surface, square(1e7), grid.crs, base)
 
 
-def test_the_file_tells_each_polygon_in_plain_units(tmp_path: Path) -> None:
+def test_the_file_lists_each_polygon_with_units(tmp_path: Path) -> None:
     grid = grid_of("utm")
     east, north = plan_of(grid)
     surface = surface_file(tmp_path, grid, cone(east, north), 0.01)

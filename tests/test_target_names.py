@@ -65,23 +65,23 @@ def assert_true(marks: TargetMarks, least: int) -> None:
         assert max(off) < 1.0
 
 
-def test_coded_targets_are_the_points_with_their_numbers_without_any_position() -> None:
+def test_coded_targets_are_assigned_by_number_without_any_position() -> None:
     assert_true(named(finds(kind="apriltag_36h11"), None), len(NAMES))
 
 
-def test_quadrants_are_the_points_that_lie_where_they_are_though_all_is_misplaced_and_strangers_are_there() -> None:
+def test_quadrants_are_assigned_by_place_despite_an_offset_and_false_detections() -> None:
     marks = named([*strangers(60), *finds()], MISPLACED)
     assert_true(marks, len(NAMES) - 1)
 
 
-def test_three_numbered_targets_name_the_quadrants_where_photos_have_no_positions() -> None:
+def test_three_numbered_targets_identify_the_quadrants_if_photos_have_no_positions() -> None:
     coded = ("P01", "P06", "P12")
     quadrants = [name for name in NAMES if name not in coded]
     assert_true(named([*finds(coded, "4x4_250"), *finds(quadrants)], None), len(NAMES) - 1)
     assert named(finds(quadrants), None).named == ()
 
 
-def test_a_quadrant_where_no_point_is_gets_no_name() -> None:
+def test_a_quadrant_without_a_point_gets_no_name() -> None:
     known = [name for name in NAMES if name not in ("P05", "P16")]
     rows = [NAMES.index(name) for name in known]
     expected = ExpectedPoints(tuple(known), PLACES[rows], MISPLACED)
@@ -100,7 +100,7 @@ def test_a_coded_target_that_lies_elsewhere_than_its_point_is_refused() -> None:
     assert marks.refused["coded targets elsewhere than their points"] == 2
 
 
-def test_one_false_find_among_a_targets_is_left_out_by_geometry() -> None:
+def test_one_false_detection_of_a_target_is_rejected_by_geometry() -> None:
     right = finds(("P02",), "6x6_250")
     wrong = replace(right[0], x=WIDTH - right[0].x, y=HEIGHT - right[0].y)
     marks = named([wrong, *right[1:]], MISPLACED)

@@ -82,12 +82,12 @@ def test_a_photo_without_targets_has_none() -> None:
     assert find_quadrant_targets(np.zeros((3, 3, 3), np.uint8)) == []
 
 
-def test_numbers_of_names() -> None:
+def test_numbers_are_read_from_names() -> None:
     told = [number_of(name) for name in ("GCP12", "P07", "tag 3", "corner", "A1-20", "9" * 9)]
     assert told == [12, 7, 3, None, 20, None]
 
 
-def test_constellation_moved_turned_and_with_strangers_is_recognised() -> None:
+def test_displaced_rotated_constellation_with_false_points_is_recognised() -> None:
     rng = np.random.default_rng(6)
     points = rng.uniform([-30, -30, 0], [30, 30, 8], (9, 3))
     points[4, 2] = np.nan
@@ -100,13 +100,13 @@ def test_constellation_moved_turned_and_with_strangers_is_recognised() -> None:
     assert overlay(strangers, points, {}) is None
 
 
-def test_a_lattice_that_fits_in_two_ways_is_not_guessed() -> None:
+def test_an_ambiguous_lattice_is_not_assigned() -> None:
     grid = np.stack(np.meshgrid(np.arange(4) * 10.0, np.arange(3) * 10.0), axis=-1).reshape(-1, 2)
     points = np.concatenate([grid, np.zeros((12, 1))], axis=1)
     assert overlay(points[:8] + np.array([4.0, 0.0, 0.0]), points, {}) is None
 
 
-def test_scale_bars_give_metres_and_name_the_one_that_is_wrong(tmp_path: Path) -> None:
+def test_scale_bars_give_metres_and_the_wrong_one_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "scale_bars.csv"
     path.write_text("name_a;name_b;metres;sigma\nA;B;10,00;0.002\nB;C;5.0;\nA;C;9.0;0.01\n# rest\nA;X;1;\n")
     bars = read_scale_bars(path)
@@ -144,7 +144,7 @@ def test_broken_scale_bars_are_refused_with_their_line(tmp_path: Path, text: str
         read_scale_bars(path)
 
 
-def test_control_file_of_points_alone_takes_marks_later(tmp_path: Path) -> None:
+def test_control_file_with_points_only_accepts_marks_later(tmp_path: Path) -> None:
     path = tmp_path / "control.csv"
     path.write_text("EPSG:32633\nname,x,y,z\nP1,1,2,3\nP2,4,5,6\n")
     point = read_control_file(path).points[0]

@@ -95,7 +95,7 @@ def test_an_iteration_calls_every_hook_in_order(plan: TrainingPlan) -> None:
     assert state.history.density[-1]["pruned"] == 1
 
 
-def test_a_picture_and_a_penalty_change_what_is_learnt(plan: TrainingPlan) -> None:
+def test_an_image_and_a_penalty_change_what_is_learnt(plan: TrainingPlan) -> None:
     learnt = []
     for techniques in (Techniques(), Techniques((Tint(),))):
         state = TrainState.begin(tiny_scene.true_model(), plan, techniques)
@@ -104,7 +104,7 @@ def test_a_picture_and_a_penalty_change_what_is_learnt(plan: TrainingPlan) -> No
     assert learnt[1] < learnt[0]
 
 
-def test_a_photo_of_which_nothing_counts_leaves_techniques_alone(plan: TrainingPlan) -> None:
+def test_a_photo_without_counting_pixels_does_not_affect_techniques(plan: TrainingPlan) -> None:
     tint, photo = Tint(), photos()[0]
     state = TrainState.begin(tiny_scene.true_model(), plan, Techniques((tint,)))
     nothing = torch.zeros(photo.colour.shape[:2], dtype=torch.bool)

@@ -92,7 +92,7 @@ def apart(found: np.ndarray, expected: np.ndarray | torch.Tensor) -> float:
     return float(max(between.min(axis=0).max(), between.min(axis=1).max()))
 
 
-def test_the_tree_is_the_levels_and_lies_on_the_earth_at_its_root_alone(tmp_path: Path):
+def test_the_tree_has_the_levels_and_only_its_root_is_georeferenced(tmp_path: Path):
     scene, root = two_levels()
     matrix = np.arange(16.0).reshape(4, 4)
     write_tiles(tmp_path, scene, root, matrix)
@@ -141,7 +141,7 @@ def test_our_own_reader_finds_each_nodes_gaussians_within_the_files_steps(tmp_pa
         assert (off <= step / 2.0 + 1e-5)[step > 0.0].all() and (off < 0.25 + 1e-5).all()
 
 
-def test_tiles_of_an_earlier_tileset_are_taken_away_and_other_files_stay(tmp_path: Path):
+def test_tiles_of_an_earlier_tileset_are_removed_and_other_files_kept(tmp_path: Path):
     scene, root = two_levels()
     write_tiles(tmp_path, scene, root, np.eye(4))
     (tmp_path / "tiles/own.glb").write_bytes(b"mine")
@@ -151,7 +151,7 @@ def test_tiles_of_an_earlier_tileset_are_taken_away_and_other_files_stay(tmp_pat
     assert files == ["notes.txt", "tiles/0.glb", "tiles/own.glb", "tileset.json"]
 
 
-def test_attributes_are_those_that_cesium_takes(tmp_path: Path):
+def test_attributes_are_those_that_cesium_reads(tmp_path: Path):
     scene, root = two_levels()
     write_tiles(tmp_path, scene, root, np.eye(4))
     document, _ = parts((tmp_path / "tiles/0.glb").read_bytes())
@@ -190,7 +190,7 @@ def test_points_lie_on_the_earth_where_pyproj_says(tmp_path: Path):
     assert apart(ecef, expected) < 1e-3
 
 
-def test_programs_of_esri_are_told_the_crs_and_how_to_reach_it(tmp_path: Path):
+def test_files_give_esri_programs_the_crs_and_its_transformation(tmp_path: Path):
     scene, root = two_levels()
     write_tiles_on_globe(tmp_path, scene, root)
     told = tileset(tmp_path)
@@ -217,14 +217,14 @@ def test_programs_of_esri_are_told_the_crs_and_how_to_reach_it(tmp_path: Path):
         (replace(PLACE, crs=""), {"wkid": 32634, "vcsWkid": 115700}),
     ],
 )
-def test_only_what_is_known_of_a_crs_is_told(tmp_path: Path, place: SplatOrigin, said: dict[str, int] | None):
+def test_only_known_facts_of_a_crs_are_written(tmp_path: Path, place: SplatOrigin, said: dict[str, int] | None):
     scene, root = two_levels()
     placement = write_tiles_on_globe(tmp_path, replace(scene, facts=replace(FACTS, place=place)), root)
     assert tileset(tmp_path)["extensions"].get("ESRI_crs") == said
     assert placement.approximate == (place.vertical_datum == "unknown")
 
 
-def test_a_crs_without_a_number_is_told_by_its_definition(tmp_path: Path):
+def test_a_crs_without_a_code_is_written_as_its_definition(tmp_path: Path):
     scene, root = two_levels()
     own = "+proj=tmerc +lat_0=52 +lon_0=21 +k=1 +x_0=5000 +y_0=2000 +ellps=GRS80 +units=m"
     write_tiles_on_globe(tmp_path, replace(scene, facts=replace(FACTS, place=replace(PLACE, crs=own))), root)
@@ -233,7 +233,7 @@ def test_a_crs_without_a_number_is_told_by_its_definition(tmp_path: Path):
     assert pyproj.CRS.from_wkt(told["wkt2"]).is_projected
 
 
-def test_tiles_of_a_splat_from_nowhere_are_refused(tmp_path: Path):
+def test_tiles_of_a_splat_without_georeference_are_refused(tmp_path: Path):
     scene, root = two_levels()
     nowhere = replace(scene, facts=replace(FACTS, place=None))
     with pytest.raises(SplatpipeError, match="need a georeferenced splat") as caught:

@@ -138,7 +138,7 @@ def killed() -> None:
 
 
 @pytest.mark.parametrize("when", [1, 2, 11, 26, 35, 60])
-def test_killed_training_goes_on_and_ends_with_the_same_bits(
+def test_killed_training_resumes_and_ends_with_the_same_bits(
     scene: Path, undisturbed: Path, tmp_path: Path, when: int
 ) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
@@ -193,7 +193,7 @@ def test_interrupt_saves_a_checkpoint_and_is_passed_on(scene: Path, undisturbed:
     assert digest(trained(scene, tmp_path)) == digest(undisturbed)
 
 
-def test_going_on_with_another_instruction_set_is_told(
+def test_resuming_with_another_instruction_set_is_reported(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
@@ -205,7 +205,7 @@ def test_going_on_with_another_instruction_set_is_told(
     assert len(recorder.warnings) == 1 and "resumes on other" in recorder.warnings[0]
 
 
-def test_broken_checkpoint_is_told_and_ignored(scene: Path, undisturbed: Path, tmp_path: Path) -> None:
+def test_broken_checkpoint_is_reported_and_ignored(scene: Path, undisturbed: Path, tmp_path: Path) -> None:
     (tmp_path / loop.CHECKPOINT).write_bytes(b"half a checkpoint")
     recorder = tiny_scene.Recorder()
     train.run(QUICK, make_inputs(scene), tmp_path, recorder)
@@ -231,7 +231,7 @@ def test_cap_holds_and_is_reported(scene: Path, tmp_path: Path) -> None:
     assert sum(event["held_back"] for event in events) > 0
 
 
-def test_fewer_gaussians_than_points_may_be_asked_for(scene: Path, tmp_path: Path) -> None:
+def test_fewer_gaussians_than_points_may_be_requested(scene: Path, tmp_path: Path) -> None:
     config = QUICK.model_copy(update={"max_gaussians": 20, "sh_degree": 1})
     gaussians = read_splat(trained(scene, tmp_path, config) / "model.ply")
     assert 0 < len(gaussians) <= 20 and gaussians.sh_degree == 1
@@ -271,7 +271,7 @@ def test_gradients_that_are_not_finite_skip_that_gaussian_and_are_counted(
     assert json.loads((tmp_path / "history.json").read_text())["skipped_gradients"] > 0
 
 
-def test_missing_device_is_told(scene: Path, tmp_path: Path) -> None:
+def test_missing_device_is_reported(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(MachineError, match="CUDA"):
         train.run(QUICK, make_inputs(scene, device="cuda"), tmp_path, tiny_scene.Recorder())
 

@@ -46,7 +46,7 @@ def make_small_plan(config: TrainConfig) -> TrainingPlan:
     return make_plan(config, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
 
 
-def test_losses_read_in_bunches_add_up_as_one_by_one() -> None:
+def test_losses_read_in_batches_add_up_as_one_by_one() -> None:
     values = torch.rand(100, generator=torch.Generator().manual_seed(0))
     values[7], values[31] = torch.nan, torch.inf
     found = []
@@ -60,7 +60,7 @@ def test_losses_read_in_bunches_add_up_as_one_by_one() -> None:
     assert found[0] == found[1] == found[2] and found[0]["loss_count"] == 98
 
 
-def test_rows_are_taken_where_old_and_new_do_not_fit_side_by_side() -> None:
+def test_rows_are_selected_even_if_old_and_new_do_not_fit_together() -> None:
     class Tight(Tensor):
         def __getitem__(self, rows: object) -> Tensor:
             raise torch.OutOfMemoryError("out of memory")
@@ -85,7 +85,7 @@ def test_rows_are_moved_within_their_memory() -> None:
         assert torch.equal(moved, values[rows]) and moved.is_contiguous() and moved.data_ptr() == tensor.data_ptr()
 
 
-def test_a_checkpoint_fetches_one_array_at_a_time_and_is_the_file_of_all_at_once(
+def test_a_checkpoint_fetches_one_array_at_a_time_with_the_same_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     training = TrainState.begin(tiny_scene.true_model(), make_small_plan(ALL), Techniques())
@@ -110,7 +110,7 @@ def test_a_checkpoint_fetches_one_array_at_a_time_and_is_the_file_of_all_at_once
     assert list(again) == list(checkpoint.arrays)
 
 
-def test_memory_that_ends_while_rows_are_moved_is_no_shortage_to_be_answered() -> None:
+def test_memory_that_runs_out_while_rows_are_moved_is_not_handled_as_a_shortage() -> None:
     class Tight(Tensor):
         looks, is_cuda = 0, True
 
@@ -147,7 +147,7 @@ def test_the_cpus_rows_are_copied(monkeypatch: pytest.MonkeyPatch) -> None:
     assert torch.equal(tensors["a"], values[rows])
 
 
-def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_growth_ends_when_the_device_has_no_memory_left(monkeypatch: pytest.MonkeyPatch) -> None:
     model = tiny_scene.true_model(100)
     each = limits.device_bytes_per_gaussian(3)
     for free, room in ((None, 500), (10**9, 500), (100 * limits.DEVICE_PASSING_BYTES + 50 * each, 150), (0, 100)):
@@ -162,7 +162,7 @@ def test_growth_ends_where_the_device_has_no_room_for_more(monkeypatch: pytest.M
     assert len(training.gaussians) == tiny_scene.GAUSSIANS + 3
 
 
-def test_a_limit_of_memory_is_the_devices_where_that_trains() -> None:
+def test_a_memory_limit_applies_to_the_device_that_trains() -> None:
     each, recorder = limits.device_bytes_per_gaussian(3), tiny_scene.Recorder()
     pixels = tiny_scene.WIDTH * tiny_scene.HEIGHT
     limit = limits.FIXED_BYTES + pixels * limits.PIXEL_BYTES + 5000 * each
@@ -172,7 +172,7 @@ def test_a_limit_of_memory_is_the_devices_where_that_trains() -> None:
     assert 708 + 12 < each < limits.bytes_per_gaussian(TrainConfig().sh_degree)
 
 
-def test_a_devices_share_of_memory_is_the_whole_again_after_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_has_all_its_memory_again_after_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     shares: list[float] = []
     monkeypatch.setattr(devices, "kernels_of", lambda device: None)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=8000))
@@ -215,7 +215,7 @@ def budgeted(seconds: float, device: Device) -> tuple[TrainingPlan, PlanningInpu
     return plan, PlanningInput(config, InitialGaussians(tiny_scene.true_model(100), 100), views, 1, Machine(), device)
 
 
-def test_a_budgets_forecast_is_measured_where_a_device_works(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_budgets_forecast_is_measured_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     free: list[int | None] = [None]
     monkeypatch.setattr(planning, "free_bytes", lambda device: free[0])
     cuda = Device("cuda", torch.device("cuda", 0))
@@ -226,7 +226,7 @@ def test_a_budgets_forecast_is_measured_where_a_device_works(monkeypatch: pytest
     assert pilot(*budgeted(60.0, cuda)).options.max_gaussians == 20_000
 
 
-def test_a_trial_that_a_device_does_not_hold_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_that_does_not_fit_on_the_device_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def measure(*given: object) -> object:
         raise torch.OutOfMemoryError("out of memory")
 
@@ -259,7 +259,7 @@ def test_rows_lie_along_a_curve_after_density_control() -> None:
     assert step(sorted_.means) < 0.25 * step(means)
 
 
-def test_a_card_that_is_left_alone_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unused_card_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
     notes: list[str] = []
     monkeypatch.setattr(cuda_driver, "has_card", lambda: False)
@@ -272,7 +272,7 @@ def test_a_card_that_is_left_alone_is_told_once(monkeypatch: pytest.MonkeyPatch)
     assert len(notes) == 2 and "kornia" in notes[1] and notes[1] == notes[1].strip()
 
 
-def test_a_training_tells_of_the_card_that_it_leaves_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_training_reports_a_card_that_it_does_not_use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
     monkeypatch.setattr(cuda_driver, "has_card", lambda: True)
     tiny_scene.write_dataset(tmp_path / "dataset")

@@ -70,7 +70,7 @@ def test_each_score_of_density_control_has_its_threshold(density: str, gradient:
     assert (found.gradient, found.last, found.reset_every) == (gradient, 15_000, resets)
 
 
-def test_published_density_takes_the_rates_resets_and_pruning_of_that_method_however_short_the_run() -> None:
+def test_published_density_has_the_rates_resets_and_pruning_of_that_method_however_short_the_run() -> None:
     for iterations in (1500, 30_000):
         schedule = resolve_schedule(TrainConfig(iterations=iterations, density="published"))
         assert schedule.rates == Rates(opacity=0.05, boost=1.0, sparse=False, by_distance=False)
@@ -122,7 +122,7 @@ def test_short_runs_take_longer_steps() -> None:
     assert schedule.at(7500).means_rate == pytest.approx(4.0 * 1.6e-6)
 
 
-def test_what_holds_in_an_iteration_is_told_by_the_schedule() -> None:
+def test_the_schedule_determines_each_iterations_settings() -> None:
     schedule = resolve_schedule(TrainConfig(iterations=1000, background="white"))
     first, later, flat = schedule.at(1), schedule.at(600), schedule.at(550, flat_at=500)
     assert (first.sh_degree, later.sh_degree) == (0, 3) and (first.is_observed, later.is_observed) == (True, False)
@@ -163,7 +163,7 @@ def test_cameras_in_one_place_are_refused_with_a_hint() -> None:
     assert raised.value.hint
 
 
-def test_plan_is_written_once_and_taken_as_it_is(tmp_path: Path) -> None:
+def test_plan_is_written_once_and_then_reused(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     first = make_plan(TrainConfig(iterations=50), views(), tiny_scene.split_of(views(), 2), 9)
     assert load_or_write_plan(path, lambda: first) == first
@@ -180,7 +180,7 @@ def test_plan_is_written_once_and_taken_as_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "{}", '{"format": 1}', '{"format": 99}', '{"format": 1, "options": {}}']
 )
-def test_broken_plan_is_written_anew(tmp_path: Path, text: str) -> None:
+def test_broken_plan_is_written_again(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.json"
     path.write_text(text)
     fresh = make_plan(TrainConfig(), views(), tiny_scene.split_of(views(), 2), 9)
@@ -188,7 +188,7 @@ def test_broken_plan_is_written_anew(tmp_path: Path, text: str) -> None:
     assert json.loads(path.read_text())["format"] == 4
 
 
-def test_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
+def test_checkpoint_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.npz"
     arrays = {"means": np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)}
     save_checkpoint(path, "plan", Checkpoint(arrays, {"iteration": 7, "loss": 0.1}))
@@ -198,7 +198,7 @@ def test_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["checkpoint.npz"]
 
 
-def test_damaged_and_foreign_checkpoints_are_told(tmp_path: Path) -> None:
+def test_damaged_and_foreign_checkpoints_are_reported(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.npz"
     with pytest.raises(FileNotFoundError):
         load_checkpoint(path, "plan")
@@ -216,7 +216,7 @@ def test_damaged_and_foreign_checkpoints_are_told(tmp_path: Path) -> None:
             load_checkpoint(path, "plan")
 
 
-def test_failed_save_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_save_keeps_the_previous_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "checkpoint.npz"
     save_checkpoint(path, "plan", Checkpoint({}, {"iteration": 1}))
 

@@ -99,7 +99,7 @@ def test_sky_begins_with_the_colours_that_the_photos_show(scene: Path) -> None:
     assert bool(torch.isfinite(sky.panorama.colours).all())
 
 
-def test_sky_that_the_user_drew_is_the_sky(scene: Path, tmp_path: Path) -> None:
+def test_sky_masks_are_the_sky(scene: Path, tmp_path: Path) -> None:
     shutil.copytree(scene / "dataset", tmp_path / "dataset")
     name = load_views(scene / "dataset")[2].camera.name
     drawn = np.zeros((skies.HEIGHT, skies.WIDTH), np.uint8)
@@ -114,7 +114,7 @@ def test_sky_that_the_user_drew_is_the_sky(scene: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(seen.mask.numpy(), drawn > 0)
 
 
-def test_cells_that_no_photo_shows_lie_between_their_neighbours() -> None:
+def test_cells_that_no_photo_shows_are_interpolated() -> None:
     total = np.zeros((CELLS, 4))
     total[20 * COLUMNS : 21 * COLUMNS] = [8.0, 4.0, 2.0, 10.0]
     total[30 * COLUMNS : 31 * COLUMNS] = [2.0, 4.0, 8.0, 10.0]
@@ -130,7 +130,7 @@ def empty_render(camera: Camera) -> Render:
     return Render(torch.zeros(camera.height, camera.width, 3), blank, blank, blank, blank, none.bool(), none)
 
 
-def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() -> None:
+def test_constant_sky_is_learnt_in_a_few_steps_and_only_from_pixels_of_the_sky() -> None:
     camera = skies.look(pitch_deg=30.0).scaled(80, 60)
     mask = np.zeros((60, 80), bool)
     mask[:30] = True
@@ -148,7 +148,7 @@ def test_constant_sky_is_learnt_in_some_steps_and_only_from_pixels_of_the_sky() 
     assert float(learnt[-10:].mean()) > 0.4  # the dark wall below did not get into it
 
 
-def test_a_sky_that_was_trained_elsewhere_is_seen_and_stays() -> None:
+def test_a_sky_trained_elsewhere_is_rendered_and_unchanged() -> None:
     camera = skies.look(pitch_deg=30.0).scaled(80, 60)
     mask = np.zeros((60, 80), bool)
     mask[:30] = True
@@ -164,7 +164,7 @@ def test_a_sky_that_was_trained_elsewhere_is_seen_and_stays() -> None:
     np.testing.assert_array_equal(given.panorama.colours.numpy(), colours)
 
 
-def test_skies_come_back_for_the_photos_that_are_asked_for(tmp_path: Path) -> None:
+def test_skies_are_returned_for_the_requested_photos(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     sizes = {"flight 1/é": (5, 7), "b": (3, 3), "none": (1, 9)}
     masks = {name: SkyMask.packed(rng.random(size) > 0.5) for name, size in sizes.items()}
@@ -180,7 +180,7 @@ def test_skies_come_back_for_the_photos_that_are_asked_for(tmp_path: Path) -> No
         read_skies(tmp_path / "skies.npz", {"b"})
 
 
-def test_away_from_the_sky_nothing_shines_through_but_the_colour_given() -> None:
+def test_away_from_the_sky_only_the_given_colour_shines_through() -> None:
     camera = skies.look(pitch_deg=30.0)
     mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     mask[:60] = True
@@ -194,7 +194,7 @@ def test_away_from_the_sky_nothing_shines_through_but_the_colour_given() -> None
     torch.testing.assert_close(unknown[:120], torch.full((120, skies.WIDTH, 3), 0.125))  # nothing is known of it
 
 
-def test_penalty_is_the_mean_opacity_before_the_sky() -> None:
+def test_penalty_is_the_mean_opacity_in_front_of_the_sky() -> None:
     camera = skies.look()
     mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     mask[:60] = True
@@ -238,7 +238,7 @@ class Kill(BaseException):
 
 
 @pytest.mark.parametrize("when", [2, 25])
-def test_killed_training_goes_on_to_the_same_bits(scene: Path, tmp_path: Path, when: int) -> None:
+def test_killed_training_resumes_with_the_same_bits(scene: Path, tmp_path: Path, when: int) -> None:
     step = loop.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
@@ -256,7 +256,7 @@ def test_killed_training_goes_on_to_the_same_bits(scene: Path, tmp_path: Path, w
     assert digest == trained(scene, tmp_path / "whole")[0]
 
 
-def test_checkpoint_without_its_sky_is_told_and_the_training_starts_afresh(scene: Path, tmp_path: Path) -> None:
+def test_checkpoint_without_its_sky_is_reported_and_the_training_starts_again(scene: Path, tmp_path: Path) -> None:
     sky = SkyModel.begin(load_views(scene / "dataset"), scene / "dataset", 1)
     assert sky is not None
     before = sky.panorama.colours.detach().clone()
@@ -294,7 +294,7 @@ def test_held_out_views_are_rendered_with_the_sky(scene: Path, tmp_path: Path) -
     assert render[-20:].max() == 0.0
 
 
-def test_a_budget_measures_iterations_with_the_sky_and_leaves_it_as_it_was(scene: Path) -> None:
+def test_a_budget_measures_iterations_with_the_sky_and_does_not_change_it(scene: Path) -> None:
     views, start = load_views(scene / "dataset"), read_splat(scene / "init.ply")
     sky = SkyModel.begin(views, scene / "dataset", 1)
     assert sky is not None

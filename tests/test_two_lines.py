@@ -25,7 +25,7 @@ def artifact(cpu: float, sizes: tuple[int, ...]) -> Artifact:
     return Artifact(Path(), told)
 
 
-def test_stages_that_both_lines_need_are_nobodys_own() -> None:
+def test_stages_of_both_pipelines_belong_to_neither() -> None:
     rows = stage_rows("photos", {"sparse": artifact(8.0, (1,)), "depths": artifact(90.0, (10, 20))})
     assert [(row["line"], row["stage"], row["cpu"], row["bytes"]) for row in rows] == [
         ("both", "sparse", 8.0, 1),
@@ -34,7 +34,7 @@ def test_stages_that_both_lines_need_are_nobodys_own() -> None:
     assert rows[0]["machine"] == "x86_64, 2 threads, cpu"
 
 
-def test_figures_stand_with_the_product_that_they_are_of(tmp_path: Path) -> None:
+def test_figures_are_in_their_products_row(tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_bytes(b"ply" * 100)
     (tmp_path / "dsm.tif").write_bytes(b"tif")
     tables = {

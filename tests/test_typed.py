@@ -50,7 +50,7 @@ def mypy(python: Path, folder: Path, text: str) -> subprocess.CompletedProcess[s
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_a_users_mypy_knows_splatpipe_and_its_modules(user_python: Path, tmp_path: Path) -> None:
+def test_a_users_mypy_finds_splatpipe_and_its_modules(user_python: Path, tmp_path: Path) -> None:
     done = mypy(user_python, tmp_path, GOOD)
     assert done.returncode == 0, done.stdout
 

@@ -92,7 +92,9 @@ def largest_file(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_a_disk_that_runs_full_is_told_and_the_run_goes_on_with_room(numbers: Path, tmp_path: Path) -> None:
+def test_a_disk_that_runs_full_is_reported_and_the_run_resumes_once_there_is_space(
+    numbers: Path, tmp_path: Path
+) -> None:
     disk = tmp_path / "disk"
     with mounted(disk) as able:
         limit = (64 if able else 8) << 20
@@ -107,7 +109,7 @@ def test_a_disk_that_runs_full_is_told_and_the_run_goes_on_with_room(numbers: Pa
         goes_on(numbers, disk / "out", ["count", "tell"])
 
 
-def test_a_disk_that_is_full_from_the_first_is_told(numbers: Path, tmp_path: Path) -> None:
+def test_a_disk_that_is_full_from_the_start_is_reported(numbers: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     walk(request_of(numbers, out))
     before = (out / "events.jsonl").read_bytes()
@@ -117,7 +119,7 @@ def test_a_disk_that_is_full_from_the_first_is_told(numbers: Path, tmp_path: Pat
     goes_on(numbers, out, [])
 
 
-def test_a_read_only_disk_is_told(numbers: Path, tmp_path: Path) -> None:
+def test_a_read_only_disk_is_reported(numbers: Path, tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     with mounted(disk) as able:
         out = disk / "out"
@@ -140,7 +142,7 @@ def test_a_read_only_disk_is_told(numbers: Path, tmp_path: Path) -> None:
     ("which", "error", "code", "ran"),
     [("out", MachineError, EXIT_MACHINE, ["add", "count", "tell"]), ("numbers", SplatpipeError, EXIT_INPUT, LINE)],
 )
-def test_a_folder_that_vanishes_is_told_and_nothing_is_put_in_its_place(
+def test_a_folder_that_vanishes_is_reported_and_not_replaced(
     numbers: Path, tmp_path: Path, which: str, error: type[SplatpipeError], code: int, ran: list[str]
 ) -> None:
     out, stage = tmp_path / "out", "add" if which == "out" else "read"
@@ -157,7 +159,7 @@ def test_a_folder_that_vanishes_is_told_and_nothing_is_put_in_its_place(
     goes_on(numbers, out, ran)
 
 
-def test_photos_that_are_gone_before_are_told_and_what_they_left_stays(numbers: Path, tmp_path: Path) -> None:
+def test_missing_photos_are_reported_and_earlier_results_are_kept(numbers: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     walk(request_of(numbers, out))
     numbers.rename(tmp_path / "elsewhere")
@@ -167,7 +169,7 @@ def test_photos_that_are_gone_before_are_told_and_what_they_left_stays(numbers: 
     goes_on(numbers, out, [])
 
 
-def test_a_limit_on_processes_is_told(numbers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limit_on_processes_is_reported(numbers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr(sys, "executable", str(numbers))  # a folder: the kernel starts none
@@ -187,7 +189,7 @@ def test_every_event_is_one_line_of_json_without_colours(tmp_path: Path) -> None
     assert first.data["message"] == HOSTILE and second.data == {"name": "loss", "value": None, "step": None}
 
 
-def test_a_line_that_a_power_cut_tore_spoils_no_other(tmp_path: Path) -> None:
+def test_a_line_truncated_by_a_power_cut_affects_no_other(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     path.write_bytes(b'{"kind": "note", "sta')
     log = EventLog(path)
@@ -197,7 +199,7 @@ def test_a_line_that_a_power_cut_tore_spoils_no_other(tmp_path: Path) -> None:
     assert parse_event(torn) is None and (parsed := parse_event(whole)) and parsed.data["message"] == "after"
 
 
-def test_a_full_disk_leaves_whole_lines_in_the_log(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_complete_lines_in_the_log(tmp_path: Path) -> None:
     log = EventLog(tmp_path / "events.jsonl")
     log(Event("note", "train", {"message": "before"}))
     with largest_file(200), pytest.raises(OSError, match=r"No space|too large"):
@@ -217,7 +219,7 @@ def test_the_log_has_no_colours_whatever_the_terminal(
     assert "no terminal here" in log and "\x1b" not in log
 
 
-def test_no_name_colours_or_commands_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+def test_no_name_sends_colours_or_commands_to_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
     hostile = "\x1b[31mred\x1b]0;title\x07\x9b2J[bold]\ttab"
     say(hostile)
     show_error(MachineError(hostile, hostile))
@@ -248,7 +250,7 @@ def splatpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
 
 
-def test_a_notice_tells_of_a_bad_end_and_keeps_json_alone_on_stdout(tmp_path: Path) -> None:
+def test_a_notice_reports_a_failure_and_leaves_only_json_on_stdout(tmp_path: Path) -> None:
     command = 'echo "$SPLATPIPE_STATE,$SPLATPIPE_CAPTURE" > told; echo said; exit 3 # token=hunter2'
     done = splatpipe("run", "no photos", "the; touch out", "--notify", command, "--json", cwd=tmp_path)
     assert done.returncode == EXIT_INPUT and json.loads(done.stdout)["exit_code"] == EXIT_INPUT
@@ -284,7 +286,7 @@ def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> 
         holder.kill()
 
 
-def test_a_fault_of_ours_is_told_where_nothing_temporary_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_internal_error_is_reported_even_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a read-only root without /dev/shm."""
     monkeypatch.setattr(tempfile, "tempdir", "/nowhere")
     assert "ValueError: odd" in for_the_user(ValueError("odd")).message

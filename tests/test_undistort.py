@@ -118,7 +118,7 @@ def test_pixels_are_where_the_pinhole_camera_says(model: str, model_scale: float
 
 @pytest.mark.parametrize("model", CAMERAS)
 @pytest.mark.parametrize("megapixels", [0.1, 2.0])
-def test_no_pixel_looks_beyond_the_photo(model: str, megapixels: float) -> None:
+def test_no_pixel_samples_beyond_the_photo(model: str, megapixels: float) -> None:
     source = make_camera(model)
     target = pinhole_camera(source, megapixels, 1)
     x, y = np.meshgrid(np.arange(target.width) + 0.5, np.arange(target.height) + 0.5)
@@ -150,13 +150,13 @@ def test_strips_join_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (resampling.resample(photo, source, target) == whole).all()
 
 
-def test_a_pinhole_photo_of_the_right_size_is_left_as_it_is() -> None:
+def test_a_pinhole_photo_of_the_right_size_is_unchanged() -> None:
     source = make_camera("PINHOLE")
     photo = blobs(source)
     assert resampling.resample(photo, source, pinhole_camera(source, 2.0, 1)) is photo
 
 
-def test_masks_go_along_and_count_only_whole_pixels(tmp_path: Path) -> None:
+def test_masks_are_undistorted_and_count_only_whole_pixels(tmp_path: Path) -> None:
     source = make_camera("SIMPLE_RADIAL")
     photo = blobs(source)
     mask = np.full(photo.shape[:2], 255, np.uint8)
@@ -176,7 +176,7 @@ def test_masks_go_along_and_count_only_whole_pixels(tmp_path: Path) -> None:
     assert small[true > 304].all()
 
 
-def test_masks_of_the_sky_go_along_likewise(tmp_path: Path) -> None:
+def test_sky_masks_are_undistorted_too(tmp_path: Path) -> None:
     source = make_camera("SIMPLE_RADIAL")
     photo = blobs(source)
     mask = np.full(photo.shape[:2], 255, np.uint8)
@@ -194,7 +194,7 @@ def test_masks_of_the_sky_go_along_likewise(tmp_path: Path) -> None:
     assert views[0].sky_path.read_bytes() == (tmp_path / "masked/dataset/masks/a.png.png").read_bytes()
 
 
-def test_what_is_written_carries_no_exif_and_keeps_its_name(tmp_path: Path) -> None:
+def test_written_photos_have_no_exif_and_keep_their_names(tmp_path: Path) -> None:
     source = make_camera("SIMPLE_RADIAL")
     names = ["a.JPG", "b.tif", "c.png", "ohne Endung"]
     inputs = corner_photos.write_capture(tmp_path / "in", dict.fromkeys(names, blobs(source)))
@@ -214,7 +214,7 @@ def test_what_is_written_carries_no_exif_and_keeps_its_name(tmp_path: Path) -> N
     assert formats == {"a.JPG": "JPEG", "b.tif": "TIFF", "c.png": "PNG", "ohne Endung": "JPEG"}
 
 
-def test_the_model_keeps_what_is_seen_and_fits(tmp_path: Path) -> None:
+def test_the_model_keeps_visible_points_and_fits(tmp_path: Path) -> None:
     source = make_camera("OPENCV")
     names = ["a.png", "b.png"]
     inputs = corner_photos.write_capture(tmp_path / "in", dict.fromkeys(names, blobs(source)))
@@ -252,7 +252,7 @@ def test_a_text_model_without_observations_keeps_its_points(tmp_path: Path) -> N
     assert set(points.errors_px) == {-1.0}
 
 
-def test_photos_that_are_not_there_or_do_not_fit_are_named(tmp_path: Path) -> None:
+def test_missing_or_mismatched_photos_are_named(tmp_path: Path) -> None:
     source = make_camera("SIMPLE_RADIAL")
     pictures = dict.fromkeys(["a.png", "b.png", "c.png"], blobs(source))
     pictures["c.png"] = pictures["c.png"][:600]
@@ -267,7 +267,7 @@ def test_photos_that_are_not_there_or_do_not_fit_are_named(tmp_path: Path) -> No
         run(inputs, tmp_path / "elsewhere", tmp_path / "none")
 
 
-def test_a_broken_model_is_the_users_to_mend(tmp_path: Path) -> None:
+def test_a_broken_model_is_a_user_error(tmp_path: Path) -> None:
     inputs = corner_photos.write_capture(tmp_path / "in", {"a.png": blobs(make_camera("PINHOLE"))})
     write_model(tmp_path / "model", make_camera("PINHOLE"), ["a.png", "b.png"])
     images = tmp_path / "model" / "images.bin"

@@ -58,12 +58,12 @@ def run(arguments: list[str], folder: Path, extra: Mapping[str, str]) -> subproc
     return subprocess.run(command, cwd=folder, env={**environ, **extra}, capture_output=True, text=True, check=False)
 
 
-def test_every_version_stands_for_the_sources_that_are_there() -> None:
+def test_every_version_matches_the_present_sources() -> None:
     told = record.complaint(ROOT)
     assert not told, told
 
 
-def test_a_changed_answer_without_a_raised_version_is_noticed(copy: Path) -> None:
+def test_a_changed_result_without_a_raised_version_is_noticed(copy: Path) -> None:
     replace(copy / "pipeline/splat/free_space.py", r"^CELLS = \d+", "CELLS = 99")
     noticed = complained_of(copy)
     assert "train" in noticed and not noticed & {"ingest", "features", "matches", "sparse", "georef"}
@@ -95,14 +95,14 @@ def test_comments_docstrings_and_formatting_do_not_count(copy: Path) -> None:
     assert record.complaint(copy) == ""
 
 
-def test_a_version_is_recorded_with_the_sources_that_it_stands_for(copy: Path) -> None:
+def test_a_version_is_recorded_with_its_sources(copy: Path) -> None:
     replace(copy / record.LINE_FILE, r'("matches",\n\s+version=)\d+', r"\g<1>99")
     assert complained_of(copy) == {"matches"}
     record.write(copy, record.present(copy))
     assert record.complaint(copy) == "" and record.recorded(copy)["matches"].version == 99
 
 
-def test_each_stage_is_compared_on_what_was_left_before(tmp_path: Path) -> None:
+def test_each_stage_is_compared_on_earlier_outputs(tmp_path: Path) -> None:
     """A stage with changed output needs a raised version; one that reads it but behaves as before does not."""
     checkout = copy_sources(tmp_path / "checkout")
     shutil.copy(ROOT / "pyproject.toml", checkout)

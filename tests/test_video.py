@@ -39,7 +39,7 @@ def write(path: Path, count: int = 20, fps: int = 25, size: tuple[int, int] = (W
 
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
-def test_a_browser_plays_a_film_of_the_wanted_length_size_and_pictures(
+def test_a_browser_plays_a_film_of_the_requested_length_size_and_contents(
     suffix: str, tmp_path: Path, browser: Browser
 ) -> None:
     film = write(tmp_path / f"a film{suffix}", 20, 10)
@@ -53,14 +53,14 @@ def test_a_browser_plays_a_film_of_the_wanted_length_size_and_pictures(
 
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
-def test_the_same_frames_leave_the_same_bytes(suffix: str, tmp_path: Path) -> None:
+def test_the_same_frames_give_the_same_bytes(suffix: str, tmp_path: Path) -> None:
     one, other = (write(tmp_path / f"{name}{suffix}", 12) for name in ("one", "other"))
     assert hashlib.sha256(one.read_bytes()).digest() == hashlib.sha256(other.read_bytes()).digest()
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([one.name, other.name])
 
 
 @pytest.mark.parametrize(("fps", "count"), [(1, 1), (7, 15), (24, 49), (30, 31), (120, 121)])
-def test_any_speed_and_number_of_frames_is_whole(fps: int, count: int, tmp_path: Path) -> None:
+def test_films_of_any_frame_rate_and_length_are_complete(fps: int, count: int, tmp_path: Path) -> None:
     film = write(tmp_path / "film.webm", count, fps, (64, 48))
     reader = cv2.VideoCapture(str(film), cv2.CAP_FFMPEG)
     read = 0
@@ -69,7 +69,7 @@ def test_any_speed_and_number_of_frames_is_whole(fps: int, count: int, tmp_path:
     assert read == count
 
 
-def test_a_broken_off_film_leaves_nothing_and_spares_the_earlier_one(tmp_path: Path) -> None:
+def test_an_interrupted_film_leaves_nothing_and_keeps_the_earlier_one(tmp_path: Path) -> None:
     path = tmp_path / "film.webm"
     path.write_bytes(b"earlier")
 
@@ -83,12 +83,12 @@ def test_a_broken_off_film_leaves_nothing_and_spares_the_earlier_one(tmp_path: P
     assert [found.name for found in tmp_path.iterdir()] == ["film.webm"] and path.read_bytes() == b"earlier"
 
 
-def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_reported(tmp_path: Path) -> None:
     with pytest.raises(MachineError, match="Cannot write"):
         VideoWriter(tmp_path / "none" / "film.webm", (WIDTH, HEIGHT), 25)
 
 
-def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
     """A file size limit stands in for a full disk: OpenCV reports neither."""
     code = f"""
 import resource, signal, sys
@@ -115,7 +115,7 @@ def test_sides_are_even_and_suffixes_known(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_said_on_stderr(tmp_path: Path) -> None:
+def test_nothing_is_printed_on_stderr(tmp_path: Path) -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_video; from pathlib import Path\n"
         f"test_video.write(Path({str(tmp_path)!r}) / 'film.webm', 3); print('still heard', file=sys.stderr)"

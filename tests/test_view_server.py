@@ -161,7 +161,7 @@ PATHS = [
 
 
 @pytest.mark.parametrize("path", PATHS, ids=[path[:40] for path in PATHS])
-def test_a_path_that_is_none_of_a_run_s_deliverables_is_refused(served: Served, path: str) -> None:
+def test_a_path_outside_a_runs_deliverables_is_refused(served: Served, path: str) -> None:
     assert refused(served.ask(path))
     assert refused(served.ask(path, method="HEAD"))
     assert refused(served.ask(path, "Range: bytes=0-99"))
@@ -170,7 +170,7 @@ def test_a_path_that_is_none_of_a_run_s_deliverables_is_refused(served: Served, 
 @pytest.mark.parametrize(
     "raw", [b"/splat.ply\0", b"/\0", b"/splat.ply\xff", b"/..\xc0\xafsecret.txt", b"/a b", b"/a\tb"]
 )
-def test_bytes_that_are_no_path_are_refused(served: Served, raw: bytes) -> None:
+def test_invalid_paths_are_refused(served: Served, raw: bytes) -> None:
     assert refused(served.ask(raw))
 
 
@@ -204,7 +204,7 @@ def test_a_host_that_is_not_this_machine_is_refused(served: Served, host: str | 
         assert refused(served.ask(path, host=host))
 
 
-def test_hosts_of_this_machine_are_answered_through_a_tunnel_s_port_too(served: Served) -> None:
+def test_hosts_of_this_machine_are_answered_on_a_tunnels_port_too(served: Served) -> None:
     for host in (f"127.0.0.1:{served.port}", f"localhost:{served.port}", "localhost:9000", "localhost"):
         assert served.ask("/", host=host).status == 200
     assert refused(served.send(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: elsewhere.example\r\n\r\n"))
@@ -232,13 +232,13 @@ def test_a_page_of_another_origin_reads_nothing(served: Served, home: Path, open
 
 
 @pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "get"])
-def test_methods_that_are_not_reading_are_refused(served: Served, home: Path, method: str) -> None:
+def test_methods_other_than_reading_are_refused(served: Served, home: Path, method: str) -> None:
     before = (home / "out" / "splat.ply").read_bytes()
     assert refused(served.ask("/splat.ply", "Content-Length: 3", method=method, body=b"bad"))
     assert (home / "out" / "splat.ply").read_bytes() == before
 
 
-def test_writing_takes_the_secret_of_the_page(served: Served) -> None:
+def test_writing_requires_the_pages_secret(served: Served) -> None:
     posted = ("Content-Type: application/json", "Content-Length: 2")
     assert served.ask("/api/mark/change", *posted, method="POST", body=b"{}").status == 403
     assert served.ask("/", *posted, "X-Splatpipe-Token: ", method="POST", body=b"{}").status == 403
@@ -254,7 +254,7 @@ def test_headers_without_end_are_refused(served: Served) -> None:
     assert refused(served.ask("/", *[f"X-{k}: {k}" for k in range(20_000)]))
 
 
-def test_files_come_whole_and_in_ranges_as_they_are(served: Served, home: Path) -> None:
+def test_files_are_served_unchanged_completely_or_in_ranges(served: Served, home: Path) -> None:
     data = (home / "out" / "splat.ply").read_bytes()
     whole = served.ask("/splat.ply")
     assert (whole.status, whole.body, whole.headers["accept-ranges"]) == (200, data, "bytes")
@@ -280,14 +280,14 @@ def test_files_come_whole_and_in_ranges_as_they_are(served: Served, home: Path) 
         assert (answer := served.ask("/splat.ply", f"Range: {asked}")).status == 200 and len(answer.body) == size
 
 
-def test_a_file_that_is_known_is_not_sent_again(served: Served, home: Path) -> None:
+def test_a_cached_file_is_not_sent_again(served: Served, home: Path) -> None:
     tag = served.ask("/metrics.json").headers["etag"]
     assert (again := served.ask("/metrics.json", f"If-None-Match: {tag}")).status == 304 and again.body == b""
     assert served.ask("/metrics.json", "Range: bytes=0-3", f"If-Range: {tag}").status == 206
     assert served.ask("/metrics.json", "Range: bytes=0-3", 'If-Range: "another"').status == 200
 
 
-def test_every_answer_forbids_what_a_browser_might_make_of_it(served: Served) -> None:
+def test_every_response_has_restrictive_headers(served: Served) -> None:
     for path in ("/", "/live", "/metrics.json", "/splat.ply", "/assets/live.js", "/api/live", "/none", "/../none"):
         headers = served.ask(path).headers
         assert headers["x-content-type-options"] == "nosniff" and headers["referrer-policy"] == "no-referrer"
@@ -297,7 +297,7 @@ def test_every_answer_forbids_what_a_browser_might_make_of_it(served: Served) ->
         assert "server" not in headers and "access-control-allow-origin" not in headers
 
 
-def test_it_listens_on_the_loopback_address_alone(served: Served) -> None:
+def test_it_listens_on_the_loopback_address_only(served: Served) -> None:
     with pytest.raises(OSError), socket.create_connection(("127.0.0.2", served.port), timeout=5):
         pass
     listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines() if " 0A " in line]
@@ -307,7 +307,7 @@ def test_it_listens_on_the_loopback_address_alone(served: Served) -> None:
 
 
 @pytest.mark.parametrize(("width", "height", "touch"), [(1440, 900, False), (390, 844, True)])
-def test_the_landing_page_leads_to_what_there_is(
+def test_the_landing_page_links_to_existing_files(
     served: Served, open_page: Callable, width: int, height: int, touch: bool
 ) -> None:
     watched = open_page(f"{served.address}/", width, height, touch)
@@ -347,7 +347,7 @@ def test_the_viewer_opens_from_here_with_its_splat_inside_or_beside_it(served: S
         assert [url.rpartition("/")[2] for url in watched.requests] == (["splat.spz"] if "live" in address else [])
 
 
-def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> None:
+def test_invalid_calls_are_reported(demo_run: Path, tmp_path: Path) -> None:
     def view(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", *map(str, arguments), "--no-browser"]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
@@ -365,7 +365,7 @@ def test_what_is_wrong_with_the_call_is_told(demo_run: Path, tmp_path: Path) -> 
     assert done.returncode == 2 and "--mark" in done.stderr
 
 
-def test_a_published_port_of_a_container_is_answered_and_the_host_is_checked_all_the_same(demo_run: Path) -> None:
+def test_a_containers_published_port_is_answered_and_the_host_still_checked(demo_run: Path) -> None:
     """127.0.0.2 is this machine, too, and not the address that is listened on without --bind."""
 
     def status(port: int, host: str) -> int:
@@ -382,13 +382,13 @@ def test_a_published_port_of_a_container_is_answered_and_the_host_is_checked_all
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_it_ends_when_asked_to(demo_run: Path, number: signal.Signals, code: int) -> None:
+def test_it_ends_on_request(demo_run: Path, number: signal.Signals, code: int) -> None:
     with serving(demo_run) as server:
         server.process.send_signal(number)
         assert server.process.wait(timeout=TIMEOUT_S) == code
 
 
-def test_a_file_behind_a_link_or_a_pipe_is_not_there(tmp_path: Path) -> None:
+def test_a_file_behind_a_link_or_a_pipe_is_not_found(tmp_path: Path) -> None:
     (tmp_path / "out" / "real").mkdir(parents=True)
     (tmp_path / "out" / "real" / "file").write_bytes(b"x")
     (tmp_path / "out" / "linked").symlink_to("real")
@@ -418,7 +418,7 @@ def test_a_file_behind_a_link_or_a_pipe_is_not_there(tmp_path: Path) -> None:
         open_inside(out, "real/file\0")
 
 
-def test_ranges_are_read_as_http_has_them() -> None:
+def test_ranges_are_parsed_as_in_http() -> None:
     assert wanted_range(None, 10) is None and wanted_range("bytes=3-1", 10) is None
     assert wanted_range("bytes=3-", 10) == (3, 10) and wanted_range("bytes=-3", 10) == (7, 10)
     assert wanted_range("bytes=0-99", 10) == (0, 10)
@@ -427,7 +427,7 @@ def test_ranges_are_read_as_http_has_them() -> None:
             wanted_range(asked, size)
 
 
-def test_a_log_of_rubbish_is_passed_over(tmp_path: Path) -> None:
+def test_a_garbage_log_is_ignored(tmp_path: Path) -> None:
     good = {"kind": "run_started", "stage": "", "data": {"stages": ["train"]}, "time_s": 1.0}
     lines = [json.dumps(good), "", "{", "[]", "null", '{"kind": 1}', "[" * 100_000, "x" * 400_000]
     lines += [json.dumps({**good, "data": {"stages": 3}}), json.dumps({**good, "kind": "metric", "data": {}})]

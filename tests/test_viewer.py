@@ -148,7 +148,7 @@ def test_the_demos_ridge_is_as_long_as_it_was_built(demo_run: Path, view: Opened
     assert page.locator(".measured").inner_text() == f"{length:.2f} m"
 
 
-def test_coordinates_are_projs(demo_run: Path, view: Opened) -> None:
+def test_coordinates_agree_with_proj(demo_run: Path, view: Opened) -> None:
     page = view(demo_run / "viewer.html")
     origin = load_frame(part(demo_run, "georef", "frame")).origin
     assert origin is not None
@@ -162,7 +162,7 @@ def test_coordinates_are_projs(demo_run: Path, view: Opened) -> None:
     np.testing.assert_allclose(found, np.stack([easting, northing, height], axis=1), rtol=0.0, atol=1e-4)
 
 
-def test_the_place_under_the_cursor_is_told_in_the_runs_crs(demo_run: Path, view: Opened) -> None:
+def test_the_place_under_the_cursor_is_shown_in_the_runs_crs(demo_run: Path, view: Opened) -> None:
     page = view(demo_run / "viewer.html")
     page.mouse.move(300, 200)
     point = page.evaluate("() => splatpipe.pick(300, 200)")
@@ -193,7 +193,7 @@ def test_a_click_on_a_frustum_moves_the_camera_into_it(demo_run: Path, view: Ope
     np.testing.assert_allclose(state(page)["position"], camera["centre"], atol=1e-9)
 
 
-def test_a_large_splat_lies_beside_its_page_which_asks_for_it_or_loads_it_from_a_server(
+def test_a_large_splat_is_a_separate_file_that_the_page_requests_or_loads_from_a_server(
     tmp_path: Path, open_page: Callable
 ) -> None:
     write_tiny(tmp_path, largest_bytes=1e5)
@@ -225,7 +225,7 @@ class QuietHandler(SimpleHTTPRequestHandler):
         pass
 
 
-def test_a_damaged_splat_is_told(tiny: Path, tmp_path: Path, open_page: Callable) -> None:
+def test_a_damaged_splat_is_reported(tiny: Path, tmp_path: Path, open_page: Callable) -> None:
     text = (tiny / "viewer.html").read_text(encoding="utf-8")
     begin = text.index('id="splat">') + len('id="splat">')
     (tmp_path / "cut.html").write_text(text[: begin + 4000] + text[text.index("</script>", begin) :], encoding="utf-8")
@@ -264,7 +264,7 @@ def test_without_a_scale_lengths_have_no_metres(tiny: Path, view: Opened) -> Non
     assert page.evaluate("() => splatpipe.crsOf([1, 2, 3])") is None
 
 
-def test_blur_without_antialiasing_the_sky_and_an_off_centre_lens_are_ours(tiny: Path, view: Opened) -> None:
+def test_blur_without_antialiasing_the_sky_and_an_off_centre_lens_match_our_renderer(tiny: Path, view: Opened) -> None:
     camera = tiny_scene.cameras()[2]
     page = view(tiny / "viewer.html", camera.width, camera.height)
     page.evaluate("name => splatpipe.goToCamera(name)", camera.name)
@@ -275,7 +275,7 @@ def test_blur_without_antialiasing_the_sky_and_an_off_centre_lens_are_ours(tiny:
     assert psnr(picture(page), ours) >= LIKE_OURS_DB
 
 
-def test_the_last_splat_of_a_batch_is_drawn_whole(tmp_path: Path, view: Opened) -> None:
+def test_the_last_splat_of_a_batch_is_drawn_completely(tmp_path: Path, view: Opened) -> None:
     """Many are drawn at a time, 16,384 at most: of twice as many, the large one is in the middle from either side."""
     camera = tiny_scene.cameras()[4]
     count = 2 * 16384 - 1
@@ -348,7 +348,7 @@ def test_fingers_turn_and_pinch_on_a_phone(tiny: Path, view: Opened) -> None:
         assert box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["y"] + box["height"] <= 844
 
 
-def test_points_take_the_splats_place_and_measurements_are_taken_back(tiny: Path, view: Opened) -> None:
+def test_points_replace_the_splat_and_measurements_can_be_undone(tiny: Path, view: Opened) -> None:
     page = view(tiny / "viewer.html")
     splats = picture(page)
     page.evaluate("() => splatpipe.showInterface(true)")
@@ -374,7 +374,7 @@ def test_points_take_the_splats_place_and_measurements_are_taken_back(tiny: Path
     assert page.locator("#hint").inner_text().startswith("Click the first point")
 
 
-def test_next_and_previous_count_from_the_photo_chosen_last(tiny: Path, view: Opened) -> None:
+def test_next_and_previous_start_from_the_last_chosen_photo(tiny: Path, view: Opened) -> None:
     page = view(tiny / "viewer.html")
     page.evaluate("() => splatpipe.goToCamera(splatpipe.facts.cameras[0].name)")
     page.keyboard.type("nNb")  # faster than the view travels
@@ -382,7 +382,7 @@ def test_next_and_previous_count_from_the_photo_chosen_last(tiny: Path, view: Op
 
 
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844), (844, 390)])
-def test_nothing_that_floats_over_the_model_hides_another(tiny: Path, view: Opened, width: int, height: int) -> None:
+def test_no_two_panels_over_the_model_overlap(tiny: Path, view: Opened, width: int, height: int) -> None:
     page = view(tiny / "viewer.html", width, height)
     page.keyboard.press("m")
     page.locator("#compass").evaluate("element => element.removeAttribute('hidden')")
@@ -457,7 +457,7 @@ def test_on_a_phone_the_list_is_folded_and_leaves_room(tiny_measured: Path, view
     wait_until(lambda: box["y"] + box["height"] < page.evaluate("() => splatpipe.project([0, 0, 1]).y") < where["y"])
 
 
-def test_the_screenshot_is_the_picture(tiny: Path, view: Opened, tmp_path: Path) -> None:
+def test_the_screenshot_is_the_rendered_image(tiny: Path, view: Opened, tmp_path: Path) -> None:
     page = view(tiny / "viewer.html")
     page.evaluate("() => splatpipe.complete()")
     with page.expect_download() as download:

@@ -108,7 +108,7 @@ def said(photos: list[TrainingPhoto], weights: list[float], penalties: bool) -> 
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_windows_say_what_the_whole_photo_says_by_their_shares(masked: bool) -> None:
+def test_windows_weighted_by_their_shares_give_the_whole_photos_loss(masked: bool) -> None:
     mask = torch.rand(CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)) > 0.3 if masked else None
     if mask is not None:
         mask[:60, 100:] = False  # a window of which little counts
@@ -122,7 +122,7 @@ def test_windows_say_what_the_whole_photo_says_by_their_shares(masked: bool) -> 
         assert float((found[name] - value).norm()) < FLOAT32 * float(value.norm()), name
 
 
-def test_what_is_behind_a_window_is_what_is_behind_the_whole_there() -> None:
+def test_the_background_of_a_window_is_that_of_the_whole_there() -> None:
     sky = the_sky()
     whole = sky.panorama.behind(CAMERA, LATE.background).detach()
     for part in windows(the_photo()):
@@ -252,7 +252,7 @@ def left_out(photos: list[TrainingPhoto]) -> Tensor:
     return found
 
 
-def test_moving_things_are_left_out_of_windows_as_of_the_whole_photo() -> None:
+def test_moving_objects_are_left_out_of_windows_as_of_the_whole_photo() -> None:
     outs, scores = [], []
     for divided in (False, True):
         robust = RobustMask([camera.name for camera in cameras()])
@@ -275,7 +275,7 @@ def test_moving_things_are_left_out_of_windows_as_of_the_whole_photo() -> None:
     assert float(((scores[0] - scores[1]).abs() < 0.02)[known].float().mean()) > 0.98
 
 
-def test_a_window_that_shows_nothing_of_a_cell_leaves_what_is_known_of_it() -> None:
+def test_a_window_that_does_not_show_a_cell_keeps_its_state() -> None:
     robust = RobustMask([cameras()[2].name])
     first, *_, last = windows(with_a_car(2), CAR_PIXELS)
     visited(robust, [first])
@@ -286,6 +286,6 @@ def test_a_window_that_shows_nothing_of_a_cell_leaves_what_is_known_of_it() -> N
     assert torch.equal(robust.scores[0][known], after_one[0][known])
 
 
-def test_the_moment_is_one_in_which_everything_takes_part() -> None:
+def test_in_the_tested_iteration_every_technique_takes_part() -> None:
     assert isinstance(LATE, ScheduleStep) and DistortionLoss(0.5, 20).is_counted(LATE.place)
     assert np.isfinite(gaussians().means.detach().numpy()).all()

@@ -61,7 +61,7 @@ def test_windows_are_nearly_equal_cells_that_cover_the_picture_once(width: int, 
     assert max(window.width / window.height, window.height / window.width) < windows.MOST_OBLONG + 0.2
 
 
-def test_a_window_begins_on_a_node_of_the_sky_once_it_is_grown_by_what_ssim_sees() -> None:
+def test_a_window_grown_by_ssims_reach_begins_on_a_node_of_the_sky() -> None:
     assert SSIM_WINDOW // 2 == windows.REACH_PX and windows.NODES_PX == STEP_PX
     for window in windows_of(1000, 700, 90_000):
         cut = window.grown(1000, 700)
@@ -70,7 +70,7 @@ def test_a_window_begins_on_a_node_of_the_sky_once_it_is_grown_by_what_ssim_sees
         assert (window.top - cut.top, cut.bottom - window.bottom) == (5 * (window.top > 0), 5 * (window.bottom < 700))
 
 
-def test_what_fits_is_whole_and_what_can_not_be_divided_so_far_is_divided_as_far_as_it_goes() -> None:
+def test_photos_that_fit_are_whole_and_others_are_divided_as_far_as_possible() -> None:
     assert windows_of(100, 50, 5000) == windows_of(100, 50, 0) == [PixelRectangle(0, 0, 100, 50)]
     assert all(min(window.width, window.height) >= windows.NODES_PX for window in windows_of(100, 50, 10))
 
@@ -170,7 +170,7 @@ def test_window_of_an_iteration_does_not_depend_on_where_the_stream_began(views:
             assert torch.equal(one.colour, other.colour) and one.inner == other.inner and one.share == other.share
 
 
-def test_one_decode_fills_all_levels_and_is_told(views: list[View], tmp_path: Path) -> None:
+def test_one_decode_fills_all_levels_and_is_reported(views: list[View], tmp_path: Path) -> None:
     asked = [TrainingSize(2)] * 9 + [TrainingSize(1, 400)] * 18 + [TrainingSize(0, PIXELS)] * 18
     usual = streamed(views, tmp_path, asked)
     recorder = tiny_scene.Recorder()
@@ -184,7 +184,7 @@ def test_one_decode_fills_all_levels_and_is_told(views: list[View], tmp_path: Pa
 
 
 @pytest.mark.parametrize(("window_pixels", "fits"), [(250_000, True), (0, False)])
-def test_windows_want_no_more_memory_of_a_large_photo(tmp_path: Path, window_pixels: int, fits: bool) -> None:
+def test_windows_of_a_large_photo_need_no_more_memory(tmp_path: Path, window_pixels: int, fits: bool) -> None:
     width, height = 4000, 3000
     picture = tmp_path / "photo.png"
     cv2.imwrite(str(picture), np.full((height, width, 3), 128, np.uint8))
