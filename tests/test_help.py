@@ -53,7 +53,7 @@ def test_the_examples_in_help_are_valid_calls(name: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_help_leads_to_a_page_that_names_the_command(name: str) -> None:
-    pages = [ROOT / page for page in PAGES[name].read_on.split(", ")]
+    pages = [ROOT / page for page in PAGES[name].see_also.split(", ")]
     assert all(page.is_file() for page in pages)
 
 

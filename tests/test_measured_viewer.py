@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from splatpipe.pipeline.app import measurements
-from splatpipe.pipeline.app.measured_viewer import renew_viewer
+from splatpipe.pipeline.app.measured_viewer import update_viewer
 from splatpipe.pipeline.app.measurements import MEASURED, outdated, read_measurements, write_measurements
 from splatpipe.pipeline.app.report.measures import measures
 from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
@@ -79,7 +79,7 @@ def artifact_page(out: Path) -> Path:
 
 
 def test_measurements_are_in_the_page_and_not_in_the_artifact(out: Path) -> None:
-    assert renew_viewer(out) == ""
+    assert update_viewer(out) == ""
     (section,), (volume,) = told(out)["sections"], told(out)["volumes"]
     assert (section["name"], section["length_m"], section["trace"]) == ("Section 1", 3.0, TRACE)
     assert (volume["net_m3"], volume["base"]) == (2.5, "rim")
@@ -88,24 +88,24 @@ def test_measurements_are_in_the_page_and_not_in_the_artifact(out: Path) -> None
 
 
 def test_a_hostile_name_stays_text(out: Path) -> None:
-    renew_viewer(out)
+    update_viewer(out)
     page = (out / "viewer.html").read_text(encoding="utf-8")
     assert page.count("</script>") == PLAIN.decode().count("</script>")
     assert told(out)["volumes"][0]["name"] == "</script><script>alert(1)</script>\ufffd\ufffd"
 
 
 def test_the_page_is_kept_and_the_store_accepts_it_as_its_copy(out: Path) -> None:
-    renew_viewer(out)
+    update_viewer(out)
     page = out / "viewer.html"
     content, before = page.read_bytes(), page.stat()
-    renew_viewer(out)
+    update_viewer(out)
     store = Store(out)
     (artifact,) = store.artifacts("export")
     store.deliver(artifact, EXPORT)
     assert (page.stat().st_ino, page.stat().st_mtime_ns) == (before.st_ino, artifact_page(out).stat().st_mtime_ns)
     newer = make(store, EXPORT, artifact.manifest["inputs"]["reads"], "newer ")
     assert told(out) is None
-    renew_viewer(out)
+    update_viewer(out)
     assert page.read_bytes() == content
     parts = open_run_folder(out, LINE).lineage(EXPORT)
     assert parts["export.viewer"].path.parent == newer.folder
@@ -114,11 +114,11 @@ def test_the_page_is_kept_and_the_store_accepts_it_as_its_copy(out: Path) -> Non
 def test_the_page_for_web_hosts_shows_the_same(out: Path) -> None:
     (out / "web").mkdir()
     (out / "web/index.html").write_bytes(PLAIN)
-    assert renew_viewer(out) == ""
+    assert update_viewer(out) == ""
     assert (out / "web/index.html").read_bytes() == (out / "viewer.html").read_bytes() != PLAIN
     (out / "web/index.html").write_bytes(b"<title>of an earlier version</title>")
     (out / "viewer.html").write_bytes(PLAIN)
-    assert "web/index.html was written by an earlier version" in renew_viewer(out)
+    assert "web/index.html was written by an earlier version" in update_viewer(out)
     assert told(out)["sections"]
 
 
@@ -130,11 +130,11 @@ def test_pages_with_different_contents_differ_in_size() -> None:
 
 
 def test_measurements_on_another_surface_model_are_not_shown(out: Path) -> None:
-    renew_viewer(out)
+    update_viewer(out)
     store = Store(out)
     (artifact,) = store.artifacts("dsm")
     newer = make(store, DSM, artifact.manifest["inputs"]["reads"], "newer ")
-    renew_viewer(out)
+    update_viewer(out)
     assert (out / "viewer.html").read_bytes() == PLAIN
     assert outdated(out, newer.parts["dsm.files"].digest)
     assert not outdated(out, artifact.parts["dsm.files"].digest)
@@ -142,25 +142,25 @@ def test_measurements_on_another_surface_model_are_not_shown(out: Path) -> None:
 
 def test_a_page_in_another_frame_shows_nothing(out: Path) -> None:
     make(Store(out), EXPORT, digests(make(Store(out), GEOREF, {}, "moved "), "georef.frame"))
-    renew_viewer(out)
+    update_viewer(out)
     assert told(out) is None
 
 
 def test_removed_measurements_are_not_shown(out: Path) -> None:
     (out / "volumes.json").unlink()
-    renew_viewer(out)
+    update_viewer(out)
     assert [len(told(out)[kind]) for kind in ("sections", "volumes")] == [1, 0]
     (out / "sections/section-1.csv").unlink()
-    renew_viewer(out)
+    update_viewer(out)
     assert (out / "viewer.html").read_bytes() == PLAIN
 
 
 def test_a_page_of_an_earlier_version_is_left_alone(out: Path) -> None:
     (out / "viewer.html").write_bytes(b"<title>House</title>")
-    assert "earlier version" in renew_viewer(out)
+    assert "earlier version" in update_viewer(out)
     assert (out / "viewer.html").read_bytes() == b"<title>House</title>"
     (out / "viewer.html").unlink()
-    assert renew_viewer(out) == ""
+    assert update_viewer(out) == ""
     assert not (out / "viewer.html").exists()
 
 
@@ -214,7 +214,7 @@ def test_damaged_sections_are_not_shown(out: Path, items: Any) -> None:
     value["sections"]["items"] = items
     value["volumes"]["items"][0]["trace"] = [{"x": [], "y": []}]
     (out / MEASURED).write_text(json.dumps(value))
-    renew_viewer(out)
+    update_viewer(out)
     assert (out / "viewer.html").read_bytes() == PLAIN
 
 
@@ -223,7 +223,7 @@ def test_damaged_sections_are_not_shown(out: Path, items: Any) -> None:
 )
 def test_an_invalid_record_shows_nothing(out: Path, text: str) -> None:
     (out / MEASURED).write_text(text)
-    assert renew_viewer(out) == ""
+    assert update_viewer(out) == ""
     assert (out / "viewer.html").read_bytes() == PLAIN
     assert not outdated(out, "other")
 

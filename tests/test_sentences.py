@@ -27,7 +27,8 @@ SAID = [
     (
         "georef",
         GEOREF | {"tables": {"check": SURVEYED, "control": None}, "model_bent": False},
-        "From 12 control points; 6 check points off by 6.7 mm across and 9.9 mm in height (RMSE); 1 point left out",
+        "From 12 control points; 6 check points off by 6.7 mm horizontally and 9.9 mm in height (RMSE); "
+        "1 point left out",
     ),
     (
         "train",

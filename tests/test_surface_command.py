@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import rasterio
 
-from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measured_lines
+from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measurement_lines
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_length
 from splatpipe.pipeline.surface import tsdf
@@ -141,10 +141,10 @@ def test_measurements_are_printed_line_by_line() -> None:
     section = {"name": "Section 1", "length_m": 41.767, "share_with_height": 0.98, "height_sigma_m": 0.0171}
     volume = {"polygon": 2, "name": "", "cut_m3": 23.834, "cut_sigma_m3": 0.9, "fill_m3": 0.0, "fill_sigma_m3": 0.01}
     told = {"sections": [{**section, "dxf": "section-1.dxf"}], "volumes": [volume]}
-    first, second = measured_lines(Path("out"), told)
+    first, second = measurement_lines(Path("out"), told)
     assert first == "Section 1: 41.77 m, 98% with heights, accurate to 1.7 cm: out/sections/section-1.dxf"
     assert second == "Polygon 2: cut 23.83 ± 0.90 m³, fill 0.00 ± 0.01 m³: out/volumes.json"
-    assert measured_lines(Path("out"), {}) == []
+    assert measurement_lines(Path("out"), {}) == []
 
 
 def test_a_section_without_length_is_refused() -> None:

@@ -242,7 +242,7 @@ def test_time_left_is_that_of_all_shards_unless_one_is_made_alone(
     console(Event("progress", "train.2", {"done": 5.0, "total": 10.0, "what": "training", "unit": "iterations"}))
     console.close()
     shown = " ".join(capfd.readouterr().err.split())
-    assert "5/10 iterations" in shown and ("with the 2 that follow" in shown) == told
+    assert "5/10 iterations" in shown and ("including the 2 remaining" in shown) == told
 
 
 def splatpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:

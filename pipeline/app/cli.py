@@ -14,7 +14,7 @@ from splatpipe.pipeline.app.cli_batch import batch
 from splatpipe.pipeline.app.cli_check import check
 from splatpipe.pipeline.app.cli_edit import OrderedCommand, edit
 from splatpipe.pipeline.app.cli_formats import convert, export
-from splatpipe.pipeline.app.cli_help import helped
+from splatpipe.pipeline.app.cli_help import with_help
 from splatpipe.pipeline.app.cli_options import (
     BoundaryOption,
     ConfigOption,
@@ -41,14 +41,14 @@ from splatpipe.pipeline.app.cli_options import (
     UntilOption,
     WaitOption,
     WhatOption,
-    expanded,
+    expand_user,
     stages,
 )
 from splatpipe.pipeline.app.cli_runs import (
     Overrides,
     RunSession,
     check_stage,
-    existing,
+    existing_request,
     overrides,
     print_forecast,
     request_of,
@@ -78,7 +78,7 @@ app = typer.Typer(
 )
 
 
-helped(app)(batch)
+with_help(app)(batch)
 
 
 def _show_version(wanted: bool) -> None:
@@ -98,7 +98,7 @@ def _root(
     pass
 
 
-@helped(app)
+@with_help(app)
 def run(
     photos: PhotosArgument,
     out: OutArgument,
@@ -137,7 +137,7 @@ def run(
             runner.walk(until=until, rerun=again)
 
 
-@helped(app)
+@with_help(app)
 def demo(
     out: OutArgument,
     preset: PresetOption = "demo",
@@ -160,7 +160,7 @@ def demo(
     run(capture_path(), out, preset, None, assignments, **budgets, **machine, **ending)
 
 
-@helped(app)
+@with_help(app)
 def stage(
     name: Annotated[str, typer.Argument(metavar="NAME", autocompletion=stages, help="The stage to run.")],
     out: OutArgument,
@@ -172,20 +172,20 @@ def stage(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run one stage of an existing OUT again, and no others except the one that divides it; or one of its shards."""
+    """Run one stage of an existing OUT again, or one of its shards; no other stage except the one that divides it."""
     with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         check_stage(name)
         if shard is not None and assignments:
             raise UsageError("All shards of a stage have the same options.", hint="Omit either --set or --shard.")
-        done.reports = shard is None
-        request = existing(out, overrides(None, assignments, None).tables, device, threads)
+        done.writes_report = shard is None
+        request = existing_request(out, overrides(None, assignments, None).tables, device, threads)
         with RunSession(request, wait, "" if shard is None else f"{name}.{shard}") as runner:
             done.outcome = runner.outcome
             runner.run_alone(name) if shard is None else runner.run_shard(name, shard)
 
 
-@helped(app)
+@with_help(app)
 def georef(
     out: OutArgument,
     gcp: Annotated[
@@ -204,12 +204,12 @@ def georef(
         done.notify_by(notify)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
         tables = [*control, *overrides(None, assignments, None).tables]
-        with RunSession(existing(out, tables, device, threads), wait) as runner:
+        with RunSession(existing_request(out, tables, device, threads), wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
 
 
-@helped(app)
+@with_help(app)
 def surface(
     out: OutArgument,
     products: Annotated[
@@ -254,7 +254,7 @@ def surface(
     as_json: JsonOption = False,
 ) -> None:
     """Make surface products of a finished run: orthophoto, surface model, façades, cloud, mesh; sections, volumes."""
-    from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measure_surface, measured_lines
+    from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measure_surface, measurement_lines
     from splatpipe.pipeline.engine.quantities import parse_length
     from splatpipe.stages.products import options_for
 
@@ -262,23 +262,23 @@ def surface(
         done.notify_by(notify)
         wanted = MeasurementRequest.of(section or [], volume, base)
         products = "dsm" if products is None and wanted.anything else products
-        asked = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
-        tables = [asked, *overrides(None, assignments, None).tables]
-        request = existing(out, tables, device, threads)
+        products_table = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
+        tables = [products_table, *overrides(None, assignments, None).tables]
+        request = existing_request(out, tables, device, threads)
         check_possible(out, *tables)
         with RunSession(request, wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
             if wanted.anything:
                 measured = measure_surface(out, wanted, threads or available_cores())
-                done.details, done.news = {"surface": measured}, measured_lines(out, measured)
+                done.details, done.result_lines = {"surface": measured}, measurement_lines(out, measured)
 
 
-helped(app)(export)
-helped(app)(convert)
+with_help(app)(export)
+with_help(app)(convert)
 
 
-@helped(app)
+@with_help(app)
 def render(
     out: OutArgument,
     path: PathOption = "cameras",
@@ -300,7 +300,7 @@ def render(
         done.details = {"render": render_run(out, wanted, threads or available_cores(), device)}
 
 
-@helped(app)
+@with_help(app)
 def view(
     out: OutArgument,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for a free one.")] = 0,
@@ -316,15 +316,15 @@ def view(
     ] = None,
 ) -> None:
     """Show a run in the browser: training progress and results; with --mark, mark control points."""
-    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.console import print_line
     from splatpipe.pipeline.app.view.server import ViewOptions, serve
 
     if points is not None and not mark:
         raise UsageError("--points needs --mark.", hint="Add --mark.")
-    serve(out, ViewOptions(port, bind, browser, mark, points), say)
+    serve(out, ViewOptions(port, bind, browser, mark, points), print_line)
 
 
-@helped(app)
+@with_help(app)
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Show the status of each stage: what is valid, what is out of date, and why."""
     from splatpipe.pipeline.app.console import show_status
@@ -332,16 +332,16 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
     from splatpipe.pipeline.engine.session import status_of
 
     with CommandSummary(out, as_json) as done:
-        statuses = list(line_status(*status_of(existing(out))))
+        statuses = list(line_status(*status_of(existing_request(out))))
         done.details = {"stages": [status_as_json(status) for status in statuses]}
     if not as_json:
         show_status(statuses)
 
 
-@helped(app)
+@with_help(app)
 def report(out: OutArgument, as_json: JsonOption = False) -> None:
     """Write OUT/report.html again from the existing results."""
-    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.console import print_line
     from splatpipe.pipeline.app.report import make_report
     from splatpipe.pipeline.engine.run_folder import LOG_FILE, open_run_folder
     from splatpipe.stages.line import LINE
@@ -350,27 +350,27 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
         open_run_folder(out, LINE)
         path = make_report(out, out / LOG_FILE)
         done.details = {"outputs": [str(path)]}
-    say(str(path))
+    print_line(str(path))
 
 
-@helped(app)
+@with_help(app)
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the current configuration no longer uses."""
-    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.console import print_line
     from splatpipe.pipeline.engine.line import line_status
     from splatpipe.pipeline.engine.lock import locked
     from splatpipe.pipeline.engine.session import status_of
 
     with CommandSummary(out, as_json) as done:
-        line, store = status_of(existing(out))
-        with locked(store.out, notify=say):
+        line, store = status_of(existing_request(out))
+        with locked(store.out, notify=print_line):
             keep = [entry for status in line_status(line, store) for entry in status.to_keep]
             removed, freed = store.remove_stale(keep)
         done.details = {"removed": removed, "freed_bytes": freed}
-        say(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")
+        print_line(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")
 
 
-@helped(app)
+@with_help(app)
 def options(preset: PresetOption = "standard") -> None:
     """List every option with its value in a preset and its description."""
     from splatpipe.pipeline.app.console import show_table
@@ -381,31 +381,31 @@ def options(preset: PresetOption = "standard") -> None:
     show_table(rows, ("option", "value", "what it does"))
 
 
-@helped(app)
+@with_help(app)
 def doctor(
     out: Annotated[
         Path | None,
-        typer.Argument(callback=lambda path: path and expanded(path), help="Folder for the results of runs."),
+        typer.Argument(callback=lambda path: path and expand_user(path), help="Folder for the results of runs."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check this machine: its capabilities, and problems to resolve before a run."""
-    from splatpipe.pipeline.app.cautions import cautions
-    from splatpipe.pipeline.app.console import say, show_table
+    from splatpipe.pipeline.app.console import print_line, show_table
     from splatpipe.pipeline.app.doctor import examine
+    from splatpipe.pipeline.app.machine_warnings import machine_warnings
 
     place = out or Path.cwd()
-    findings, warnings = examine(place), cautions(place)
+    findings, warnings = examine(place), machine_warnings(place)
     if as_json:
-        print_json({**findings, "warnings": [caution.as_json() for caution in warnings]})
+        print_json({**findings, "warnings": [warning.as_json() for warning in warnings]})
         return
     show_table([(name, str(value)) for name, value in findings.items()], ("what", "found"))
-    for caution in warnings:
-        say(f"! {caution.message} {caution.hint}")
+    for warning in warnings:
+        print_line(f"! {warning.message} {warning.hint}")
 
 
-helped(app)(check)
-helped(app, cls=OrderedCommand)(edit)
+with_help(app)(check)
+with_help(app, cls=OrderedCommand)(edit)
 
 
 def _stop(number: int, _frame: FrameType | None) -> NoReturn:
@@ -426,9 +426,9 @@ def main() -> NoReturn:
             )
         raise
     except StopSignal as error:
-        from splatpipe.pipeline.app.console import say
+        from splatpipe.pipeline.app.console import print_line
 
-        say(f"{error} {error.hint}")
+        print_line(f"{error} {error.hint}")
         sys.exit(error.exit_code)
     except Exception as error:
         from splatpipe.pipeline.app.console import show_error

@@ -65,7 +65,7 @@ def batch(
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run many captures, unattended: what is finished is reused, what fails stops no other."""
+    """Run many captures unattended: finished results are reused, and a failed capture does not stop the others."""
     from splatpipe.pipeline.app.batch.capture_list import with_files_from
     from splatpipe.pipeline.app.batch.planning import Settings
     from splatpipe.pipeline.app.batch.snakemake_process import open_profile
@@ -115,14 +115,14 @@ def _run(captures: Path, out: Path, settings: Settings, profile: Profile, comman
     from splatpipe.pipeline.app.batch.driver import Driver, Notifications, fresh_call, hold, summary, with_unlisted
     from splatpipe.pipeline.app.batch.planning import make_plan
     from splatpipe.pipeline.app.batch.publication import PAGE_FILE
-    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.console import print_line
 
     listed = read_captures(captures, out)
     with hold(out.resolve()) as lock:
         call = fresh_call(out)
         call.write_plan(with_unlisted(make_plan(listed, call, settings)))
-        state = Driver(call, profile, Notifications(say, command)).run(lock)
-    say(f"{summary(state.captures)}. {out / PAGE_FILE}")
+        state = Driver(call, profile, Notifications(print_line, command)).run(lock)
+    print_line(f"{summary(state.captures)}. {out / PAGE_FILE}")
     return state
 
 
@@ -144,6 +144,6 @@ def _dry_run(captures: Path, out: Path, settings: Settings, profile: Profile) ->
 def _print(out: Path, state: BatchState | None, code: int, error: BaseException | None) -> None:
     from splatpipe.pipeline.app.batch.state import as_json
 
-    told: dict[str, Any] = {} if state is None else as_json(state)
+    facts: dict[str, Any] = {} if state is None else as_json(state)
     trouble = None if error is None else {"message": str(error), "hint": getattr(error, "hint", "")}
-    print_json({**told, "out": str(out), "exit_code": code, "error": trouble})
+    print_json({**facts, "out": str(out), "exit_code": code, "error": trouble})

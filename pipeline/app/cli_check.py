@@ -35,7 +35,7 @@ def check(
     """Check a capture while still on site: its problems, and the time and memory of a run."""
     page = page.expanduser()
     with CommandSummary(page, as_json) as done:
-        from splatpipe.pipeline.app.console import RunConsole, say
+        from splatpipe.pipeline.app.console import RunConsole, print_line
         from splatpipe.pipeline.app.preflight.examination import examine_capture
         from splatpipe.pipeline.app.preflight.findings import as_json as preflight_as_json
         from splatpipe.pipeline.app.preflight.page import write_page
@@ -43,8 +43,8 @@ def check(
         from splatpipe.pipeline.engine.events import EventReporter
         from splatpipe.pipeline.engine.machine import available_cores
 
-        asked = overrides(config, assignments, None)
-        configs = {preset: asked.resolve(load_preset(preset)) for preset in PRESETS}
+        given = overrides(config, assignments, None)
+        configs = {preset: given.resolve(load_preset(preset)) for preset in PRESETS}
         console = RunConsole()
         try:
             report = EventReporter("check", console)
@@ -61,23 +61,23 @@ def check(
             ) from error
         failed = preflight.worst == "error"
         done.details = {**facts, "exit_code": EXIT_INPUT if failed else 0, "outputs": [str(page)]}
-        say(str(page))
+        print_line(str(page))
     if failed:
         raise typer.Exit(EXIT_INPUT)
 
 
 def _show(preflight: Preflight) -> None:
-    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.console import print_line
 
     for finding in preflight.findings:
-        say(f"{SIGNS[finding.severity]} {finding.message} {finding.hint}".rstrip())
+        print_line(f"{SIGNS[finding.severity]} {finding.message} {finding.hint}".rstrip())
     for forecast in preflight.forecasts:
         text = f"{forecast.preset}: {forecast.memory_bytes / 1e9:.1f} GB of memory, {forecast.seconds / 60.0:.0f} min, "
         text += f"{forecast.disk_bytes / 1e9:.1f} GB on the disk"
         text += f", trained in {forecast.blocks} blocks" if forecast.blocks > 1 else ""
-        say(f"  {text}" + (f"; lacks {forecast.lacking}" if forecast.lacking else ""))
+        print_line(f"  {text}" + (f"; lacks {forecast.lacking}" if forecast.lacking else ""))
     verdict = {
         "error": "This capture cannot be reconstructed as it stands",
         "warning": "It can be reconstructed, with the limitations above",
     }
-    say(f"{len(preflight.photos)} photos. {verdict.get(preflight.worst or '', 'No problems found')}.")
+    print_line(f"{len(preflight.photos)} photos. {verdict.get(preflight.worst or '', 'No problems found')}.")

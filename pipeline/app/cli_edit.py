@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from splatpipe.pipeline.app.cli_options import JsonOption, ThreadsOption, expanded
+from splatpipe.pipeline.app.cli_options import JsonOption, ThreadsOption, expand_user
 from splatpipe.pipeline.app.command_summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
@@ -32,10 +32,10 @@ def _repeated(metavar: str, help_text: str, panel: str) -> Any:
 
 
 SourceArgument = Annotated[
-    Path, typer.Argument(metavar="IN", callback=expanded, help="A splat of any format, or the OUT of a run.")
+    Path, typer.Argument(metavar="IN", callback=expand_user, help="A splat of any format, or the OUT of a run.")
 ]
 TargetArgument = Annotated[
-    Path, typer.Argument(metavar="OUT", callback=expanded, help="The new file; its extension sets the format.")
+    Path, typer.Argument(metavar="OUT", callback=expand_user, help="The new file; its extension sets the format.")
 ]
 BoxOption = Annotated[
     list[str] | None, _repeated("X1,Y1,X2,Y2", "Keep what is inside a box; with heights: X1,Y1,Z1,X2,Y2,Z2.", CROP)
@@ -192,11 +192,11 @@ def _edit(
 
 
 def _show(facts: Mapping[str, Any]) -> None:
-    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.console import print_line
 
     for step in facts["steps"]:
         before, after = step["gaussians"]
         change = f"{before:,} Gaussians" if before == after else f"{before:,} → {after:,} Gaussians"
-        say(f"{step['step']}: {change}")
+        print_line(f"{step['step']}: {change}")
     for path in facts["outputs"]:
-        say(path)
+        print_line(path)

@@ -15,9 +15,9 @@ from splatpipe.pipeline.app.cli_options import (
     SetOption,
     ThreadsOption,
     WaitOption,
-    expanded,
+    expand_user,
 )
-from splatpipe.pipeline.app.cli_runs import RunSession, existing, overrides
+from splatpipe.pipeline.app.cli_runs import RunSession, existing_request, overrides
 from splatpipe.pipeline.app.command_summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
@@ -33,10 +33,10 @@ FormatOption = Annotated[
 ]
 SplatArgument = Annotated[
     Path,
-    typer.Argument(metavar="IN", callback=expanded, help="PLY, SPZ, SOG or GLB, or a trainer's model folder."),
+    typer.Argument(metavar="IN", callback=expand_user, help="PLY, SPZ, SOG or GLB, or a trainer's model folder."),
 ]
 TargetArgument = Annotated[
-    Path, typer.Argument(metavar="OUT", callback=expanded, help="Its extension sets the format.")
+    Path, typer.Argument(metavar="OUT", callback=expand_user, help="Its extension sets the format.")
 ]
 
 
@@ -50,14 +50,14 @@ def export(
     notify: NotifyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Export a finished run in more formats, to OUT/export: docs/formats.md says which program reads which."""
+    """Export a finished run in more formats, to OUT/export; docs/formats.md lists which programs read them."""
     from splatpipe.pipeline.app.formats import check_possible, with_formats
 
     with CommandSummary(out, as_json) as done:
         done.notify_by(notify)
         tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
         check_possible(out, formats)
-        with RunSession(existing(out, tables, device, threads), wait) as runner:
+        with RunSession(existing_request(out, tables, device, threads), wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
 
@@ -70,7 +70,7 @@ def convert(
 ) -> None:
     """Convert a splat file to another format; its georeference is kept."""
     with CommandSummary(target, as_json) as done:
-        from splatpipe.pipeline.app.console import say
+        from splatpipe.pipeline.app.console import print_line
         from splatpipe.pipeline.app.formats import convert_file
         from splatpipe.pipeline.splat.formats.files import format_of_name
 
@@ -79,4 +79,4 @@ def convert(
             raise UsageError(f"{target} is the input file.", hint="Choose another output file.")
         facts: dict[str, Any] = convert_file(source, target, kind)
         done.details = {"convert": facts}
-        say(f"{facts['gaussians']:,} Gaussians, {facts['bytes'] / 1e6:.1f} MB: {target}")
+        print_line(f"{facts['gaussians']:,} Gaussians, {facts['bytes'] / 1e6:.1f} MB: {target}")

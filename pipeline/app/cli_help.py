@@ -11,8 +11,7 @@ import typer
 
 RUN_EXITS = (
     "0 done, 1 the photos or files cannot be used, 2 invalid command line, 3 a stage failed, 4 this machine lacks "
-    "something; "
-    "130 and 143 stopped: the same command goes on."
+    "something; 130 and 143 stopped: repeat the command to resume."
 )
 
 
@@ -23,13 +22,13 @@ class HelpPage:
     Args:
         about: What it reads and writes.
         examples: Example calls, without the program's name.
-        read_on: The documentation page.
+        see_also: The documentation page.
         exits: Exit codes, if relevant.
     """
 
     about: str
     examples: tuple[str, ...]
-    read_on: str
+    see_also: str
     exits: str = ""
 
     def epilog(self) -> str:
@@ -38,7 +37,7 @@ class HelpPage:
         parts = ["Examples:" if len(self.examples) > 1 else "Example:", calls]
         if self.exits:
             parts.append(f"Exit codes: {self.exits}")
-        return "\n\n".join([*parts, f"See also: {self.read_on}"])
+        return "\n\n".join([*parts, f"See also: {self.see_also}"])
 
 
 PAGES = {
@@ -53,8 +52,7 @@ PAGES = {
     ),
     "demo": HelpPage(
         "Reads 40 rendered photos of a farmhouse with control points, which ship with the package. Writes to OUT "
-        "what a "
-        "run of your own photos would write; it takes minutes and 1.2 GB of memory.",
+        "what a run on your own photos would write; it takes minutes and 1.2 GB of memory.",
         ("demo out/demo",),
         "README.md, docs/products.md",
         RUN_EXITS,
@@ -66,13 +64,11 @@ PAGES = {
         ("batch CAPTURES OUT --dry-run", "batch captures.toml OUT --retries 3"),
         "docs/unattended.md",
         "0 all captures succeeded, 1 some failed, 2 invalid command line or list, 3 Snakemake failed, 4 this "
-        "machine lacks "
-        "something; 130 and 143 stopped.",
+        "machine lacks something; 130 and 143 stopped.",
     ),
     "stage": HelpPage(
         "Reads the artifacts of earlier stages in OUT. Writes the stage's own; stages that depend on it become out "
-        "of date "
-        "(see splatpipe status), and splatpipe run makes them again.",
+        "of date (see splatpipe status), and splatpipe run runs them again.",
         ("stage evaluate OUT", "stage train OUT --shard 2"),
         "docs/rooms.md, docs/blocks.md",
         RUN_EXITS,
@@ -92,8 +88,7 @@ PAGES = {
         RUN_EXITS,
     ),
     "export": HelpPage(
-        "Reads a finished run. Writes the files to OUT/export; each records which way is up and its place on the "
-        "earth.",
+        "Reads a finished run. Writes the files to OUT/export; each records its up axis and its georeference.",
         ("export OUT --format spz,tiles",),
         "docs/formats.md",
         RUN_EXITS,
@@ -110,13 +105,13 @@ PAGES = {
         "docs/viewing.md",
     ),
     "view": HelpPage(
-        "Reads OUT, also during a run. Serves pages to this machine only, until Ctrl-C; writes nothing, except "
-        "with --mark the control points' places in the photos.",
+        "Reads OUT, even during a run. Serves pages to this machine only, until Ctrl-C; writes nothing, except "
+        "with --mark the positions of control points in the photos.",
         ("view OUT", "view OUT --mark --points control.csv"),
         "docs/viewing.md",
     ),
     "status": HelpPage(
-        "Reads OUT, also during a run, and changes nothing.",
+        "Reads OUT, even during a run, and changes nothing.",
         ("status OUT",),
         "docs/rooms.md",
     ),
@@ -149,8 +144,8 @@ PAGES = {
     ),
     "edit": HelpPage(
         "Reads a splat of any format, or a run. Writes a new file, a record of the steps beside it "
-        "(NAME.edits.json), and "
-        "pictures before and after. Coordinates are in the splat's CRS, or local if it is not georeferenced.",
+        "(NAME.edits.json), and pictures before and after. Coordinates are in the splat's CRS, or local if it is not "
+        "georeferenced.",
         (
             "edit OUT site.sog --crop-polygon site.geojson --reduce 50MB",
             "edit splat.ply moved.ply --rotate 37 --move 0,0,1.5",
@@ -160,7 +155,7 @@ PAGES = {
 }
 
 
-def helped(app: typer.Typer, **how: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def with_help(app: typer.Typer, **how: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorator that registers a function as a command with its help page.
 
     Args:

@@ -10,7 +10,7 @@ import typer
 from splatpipe.pipeline.engine.errors import UsageError
 
 
-def expanded(path: Path) -> Path:
+def expand_user(path: Path) -> Path:
     """Expand ``~`` in a path; other paths are returned unchanged.
 
     Raises:
@@ -42,9 +42,11 @@ def devices(incomplete: str) -> list[str]:
 
 
 PhotosArgument = Annotated[
-    Path, typer.Argument(callback=expanded, help="Folder of photos, or a COLMAP folder with images/ and sparse/0.")
+    Path, typer.Argument(callback=expand_user, help="Folder of photos, or a COLMAP folder with images/ and sparse/0.")
 ]
-OutArgument = Annotated[Path, typer.Argument(callback=expanded, help="Folder for the results; a stopped run resumes.")]
+OutArgument = Annotated[
+    Path, typer.Argument(callback=expand_user, help="Folder for the results; a stopped run resumes.")
+]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="TOML file of options, which override the preset's.")
 ]
@@ -120,7 +122,7 @@ TargetOption = Annotated[
     typer.Option(
         "--output",
         "-o",
-        callback=lambda path: path and expanded(path),
+        callback=lambda path: path and expand_user(path),
         help="Film file (.webm, or .mp4, four times slower) or folder of stills. Default: in OUT/renders.",
     ),
 ]

@@ -1,4 +1,4 @@
-"""What a pipeline command needs before it can start: resolved options, the request, an open session."""
+"""Preparation of a pipeline command: resolved options, the request, an open session."""
 
 from __future__ import annotations
 
@@ -105,17 +105,19 @@ def spent_s() -> float:
 def print_forecast(request: Request, until: str | None) -> None:
     """Print the forecast for the whole pipeline, before its first training."""
     from splatpipe.pipeline.app.command_summary import PART_VARIABLE
-    from splatpipe.pipeline.app.console import say
+    from splatpipe.pipeline.app.console import print_line
     from splatpipe.pipeline.app.preflight.start import forecast_text
 
     trained = any((request.out / "stages").glob("train-*"))
     if trained or until is not None or PART_VARIABLE in os.environ:
         return
-    if told := forecast_text(request):
-        say(told)
+    if text := forecast_text(request):
+        print_line(text)
 
 
-def existing(out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0) -> Request:
+def existing_request(
+    out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0
+) -> Request:
     """The request that runs OUT again with the given overrides."""
     from splatpipe.pipeline.engine.run_folder import open_run_folder
     from splatpipe.stages.line import LINE
@@ -159,7 +161,7 @@ def status_as_json(status: StageStatus) -> dict[str, Any]:
 
 
 class RunSession:
-    """An open session whose events go to the terminal, which is restored whatever happens."""
+    """An open session whose events go to the terminal; the terminal is restored even after an error."""
 
     def __init__(self, request: Request, wait: bool = False, shard: str = "") -> None:
         self._request, self._wait, self._shard = request, wait, shard
@@ -176,19 +178,19 @@ class RunSession:
         self._console.close()
         try:
             if not self._shard:
-                self._renew_viewer()
+                self._update_viewer()
         finally:
             stopped = self._session.__exit__(*error)
         return stopped
 
-    def _renew_viewer(self) -> None:
+    def _update_viewer(self) -> None:
         """Update the measurements in the viewer while OUT is locked; problems are only reported."""
-        from splatpipe.pipeline.app.console import say
-        from splatpipe.pipeline.app.measured_viewer import renew_viewer
+        from splatpipe.pipeline.app.console import print_line
+        from splatpipe.pipeline.app.measured_viewer import update_viewer
 
         try:
-            trouble = renew_viewer(self._request.out)
+            trouble = update_viewer(self._request.out)
         except (OSError, SplatpipeError) as error:
             trouble = f"viewer.html could not be updated: {error}"
         if trouble:
-            say(trouble)
+            print_line(trouble)

@@ -31,10 +31,10 @@ class CommandSummary:
     """Reports the success or failure of a command: a summary on stderr, one JSON object for programs."""
 
     outcome: Outcome | None = None
-    reports: bool = True  # false when running a single shard: others may be working in OUT, and the report covers all
+    writes_report: bool = True  # false for a single shard: others may be running in OUT, and the report covers them all
     details: Mapping[str, Any] | None = None
-    news: Sequence[str] = ()
-    _reported: Path | None = None
+    result_lines: Sequence[str] = ()
+    _report_path: Path | None = None
     _command: str | None = None
 
     def __init__(self, out: Path, as_json: bool) -> None:
@@ -59,18 +59,18 @@ class CommandSummary:
         if isinstance(error, GeneratorExit | SystemExit):
             return
         step = error is None and PART_VARIABLE in os.environ
-        if self.outcome is not None and self.reports and not step and not _insists(error):
+        if self.outcome is not None and self.writes_report and not step and not _interrupted_again(error):
             self._report(error)
         if error is None and self.outcome is not None:
             self._show(self.outcome, seconds)
         if self._as_json:
             print_json({**self._as_object(error, seconds), **(self.details or {})})
-        if self._command is not None and not _insists(error):
+        if self._command is not None and not _interrupted_again(error):
             self._notify(self._command, error)
 
     def _notify(self, command: str, error: BaseException | None) -> None:
         """Call the user's command; its problems are reported and do not affect the run."""
-        from splatpipe.pipeline.app.console import say
+        from splatpipe.pipeline.app.console import print_line
 
         state: State = "done" if error is None else "failed"
         limit_s = TIME_LIMIT_S
@@ -78,21 +78,21 @@ class CommandSummary:
             state = "stopped"
             limit_s = max(LEAST_NOTICE_S, getattr(error, "at_s", time.monotonic()) + NOTICE_S - time.monotonic())
         out = self._out.resolve()
-        trouble = notify(command, state, out.name, self._reported and self._reported.resolve(), out, limit_s)
+        trouble = notify(command, state, out.name, self._report_path and self._report_path.resolve(), out, limit_s)
         if trouble:
-            say(trouble)
+            print_line(trouble)
 
     def _report(self, error: BaseException | None) -> None:
         """Write the report; its problems are reported and do not affect the run."""
-        from splatpipe.pipeline.app.console import say
+        from splatpipe.pipeline.app.console import print_line
         from splatpipe.pipeline.app.report import make_report
         from splatpipe.pipeline.engine.run_folder import LOG_FILE
 
         until_s = error.at_s + STOP_S if isinstance(error, StopSignal) else None
         try:
-            self._reported = make_report(self._out, self._out / LOG_FILE, until_s=until_s)
+            self._report_path = make_report(self._out, self._out / LOG_FILE, until_s=until_s)
         except SplatpipeError as trouble:
-            say(f"{trouble.message} {trouble.hint}".strip())
+            print_line(f"{trouble.message} {trouble.hint}".strip())
 
     def _show(self, outcome: Outcome, seconds: float) -> None:
         from splatpipe.pipeline.app.console import show_accuracy, show_bad_cameras, show_outputs, show_verdict
@@ -100,8 +100,8 @@ class CommandSummary:
         if (verdict := _verdict(self._out)) is not None:
             show_verdict(verdict)
         show_accuracy(*_accuracy(outcome))
-        took = seconds if outcome.ran or self.news else None
-        show_outputs(self._out, took, self._files(outcome), self.news)
+        took = seconds if outcome.ran or self.result_lines else None
+        show_outputs(self._out, took, self._files(outcome), self.result_lines)
         if "sparse" in outcome.artifacts:
             show_bad_cameras(outcome.artifacts["sparse"].summary.get("verdict") or {})
 
@@ -110,7 +110,7 @@ class CommandSummary:
 
         made = [(stage, outcome.artifacts[stage.name]) for stage in LINE if stage.name in outcome.artifacts]
         files = [self._out / name for stage, artifact in made for name in artifact.deliverables(stage)]
-        return [path for path in [*files, *filter(None, [self._reported])] if path.is_file()]
+        return [path for path in [*files, *filter(None, [self._report_path])] if path.is_file()]
 
     def _as_object(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
         outcome = self.outcome
@@ -134,7 +134,7 @@ class CommandSummary:
         }
 
 
-def _insists(error: BaseException | None) -> bool:
+def _interrupted_again(error: BaseException | None) -> bool:
     """Whether the user pressed Ctrl-C again during the shutdown: then nothing is waited for."""
     before = None if error is None else error.__context__
     while before is not None and not isinstance(before, StopSignal):

@@ -70,7 +70,7 @@ class RunConsole:
         self._live: Progress | None = None
         self._task: TaskID | None = None
         self._stage_started_s = time.monotonic()
-        self._plain_said_s = 0.0
+        self._plain_printed_s = 0.0
         self._what = ""
         self._shards = ShardTimes()
 
@@ -90,7 +90,7 @@ class RunConsole:
         self._order = list(data["stages"])
 
     def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
-        self._stage_started_s = self._plain_said_s = time.monotonic()
+        self._stage_started_s = self._plain_printed_s = time.monotonic()
         self._what = ""
         self._shards.begin(stage, None if stage in self._order else data.get("shard"))  # None: the shard is run alone
         if not self._console.is_terminal:
@@ -121,9 +121,9 @@ class RunConsole:
             if what != self._what:
                 self._live.reset(self._task, total=total)
             self._live.update(self._task, completed=done, total=total, description=description, unit=unit)
-        elif not self._console.is_terminal and time.monotonic() - self._plain_said_s > PLAIN_INTERVAL_S:
+        elif not self._console.is_terminal and time.monotonic() - self._plain_printed_s > PLAIN_INTERVAL_S:
             now = time.monotonic()
-            self._plain_said_s = now
+            self._plain_printed_s = now
             left = (now - self._stage_started_s) * (total - done) / done if done else 0.0
             of_all = self._shards.left(now - self._stage_started_s, done, total) if unit == "iterations" else ""
             self._console.print(
@@ -202,7 +202,7 @@ class ShardTimes:
         whole = seconds * total / done
         each = [*self._took.get(self._stage, {}).values(), whole]
         left = whole - seconds + self._after * sum(each) / len(each)
-        return f", {_duration(left)} with the {self._after} that follow"
+        return f", {_duration(left)} including the {self._after} remaining"
 
 
 def escape(text: str) -> str:
@@ -243,14 +243,14 @@ def show_verdict(verdict: Verdict) -> None:
         console.print(f"  [{colour}]{mark}[/] [bold]{escape(finding.title)}[/]  {escape(finding.text)}", soft_wrap=True)
 
 
-def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], news: Sequence[str] = ()) -> None:
+def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], result_lines: Sequence[str] = ()) -> None:
     """Print a run's outputs.
 
     Args:
         out: OUT.
         seconds: Duration of the run; None if everything was reused.
         files: Its files.
-        news: Measurement results, one line each.
+        result_lines: Measurement results, one line each.
     """
     console = Console(file=sys.stderr, highlight=False)
     done = "All results are up to date: nothing to do." if seconds is None else f"Done in {_duration(seconds)}."
@@ -261,7 +261,7 @@ def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], news: 
         sizes[shown] = sizes.get(shown, 0) + path.stat().st_size
     for path, size in sizes.items():
         console.print(f"  {escape(str(path))}  [dim]{_bytes(size)}[/]", soft_wrap=True)
-    for line in news:
+    for line in result_lines:
         console.print(f"[bold]{escape(line)}[/]", soft_wrap=True)
     if seconds is None:
         console.print(f"[dim]To run again, change an option or --rerun a stage. Results: {escape(str(out))}[/]")
@@ -309,8 +309,8 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
         bounds = [_bounds(table.get(f"interval_95_{name}_m")) for name in ("horizontal", "vertical")]
         shown.add_row(title, str(table["count"]), *figures, *bounds)
     console.print(shown)
-    for told in _offsets([flight for _, table in groups for flight in table.get("flights", [])]):
-        console.print(told, soft_wrap=True)
+    for line in _offsets([flight for _, table in groups for flight in table.get("flights", [])]):
+        console.print(line, soft_wrap=True)
     if 0 < len(points) <= POINTS_SHOWN:
         console.print(_points_table(points, {point["name"]: point for point in splat["points"]}))
         for point in points:
@@ -368,7 +368,7 @@ def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
     Console(highlight=False).print(table)
 
 
-def say(text: str) -> None:
+def print_line(text: str) -> None:
     """Print one line for the user on stderr."""
     Console(file=sys.stderr, highlight=False).print(escape(text), soft_wrap=True)
 

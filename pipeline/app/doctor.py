@@ -32,7 +32,7 @@ def examine(place: Path) -> dict[str, JSON]:
         "results folder": str(place),
         "its file system": _file_system(place),
         "its free disk space": _free(place),
-        "at work there": _at_work(place),
+        "at work there": _running(place),
         **versions(),
         "rasterizer": f"native, {isa_name()} (of {', '.join(isa_names())})",
         "CUDA": _cuda(),
@@ -72,7 +72,7 @@ def _file_system(place: Path) -> str:
     return "unknown" if mount is None else f"{mount.kind} at {mount.point}"
 
 
-def _at_work(place: Path) -> str:
+def _running(place: Path) -> str:
     if is_locked(place):
         return "a run"
     return ", ".join(running_shards(place)) or "nobody"

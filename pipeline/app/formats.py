@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 NEED_METRES, NEED_PLACE = {"laz"}, {"tiles"}
 
 
-def with_formats(out: Path, asked: str) -> dict[str, Any]:
+def with_formats(out: Path, formats: str) -> dict[str, Any]:
     """The option that adds formats to those that a run already exports.
 
     Raises:
         UsageError: if there is no such format.
     """
     before = open_run_folder(out, LINE).config(LineConfig)[1].export.formats
-    return {"export": {"formats": ",".join(dict.fromkeys((*format_names(before), *_parsed(asked))))}}
+    return {"export": {"formats": ",".join(dict.fromkeys((*format_names(before), *_parse_names(formats))))}}
 
 
-def check_possible(out: Path, asked: str) -> None:
+def check_possible(out: Path, formats: str) -> None:
     """Check that a run can be exported to formats before anything starts.
 
     Raises:
@@ -38,7 +38,7 @@ def check_possible(out: Path, asked: str) -> None:
     part = open_run_folder(out, LINE).lineage(GEOREF).get("georef.frame")
     if part is None:
         return
-    frame, names = load_frame(part.path), set(_parsed(asked))
+    frame, names = load_frame(part.path), set(_parse_names(formats))
     for missing, needing in ((not frame.in_metres, NEED_METRES), (frame.origin is None, NEED_PLACE)):
         if missing and names & needing:
             raise SplatpipeError(
@@ -47,7 +47,7 @@ def check_possible(out: Path, asked: str) -> None:
             )
 
 
-def _parsed(text: str) -> tuple[str, ...]:
+def _parse_names(text: str) -> tuple[str, ...]:
     try:
         names = format_names(text)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Puts measurements on the surface model into OUT/viewer.html and OUT/web/index.html.
+"""Adds measurements on the surface model to OUT/viewer.html and OUT/web/index.html.
 
 The stage `export` writes the page before there is a surface model, and sections can be cut on a finished run at any
 time. So measurements are put into the copy of the page in OUT; the artifact itself is unchanged. The page keeps its
@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from splatpipe.pipeline.app.measurements import any_measured, is_number, read_measurements, title_of
+from splatpipe.pipeline.app.measurements import has_measurements, is_number, read_measurements, title_of
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.web.measured_page import PAGE, SITE_PAGE, with_measurements
@@ -24,7 +24,7 @@ PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "
 LARGEST = 1e9  # of a coordinate, metres: larger ones are not on the earth, and a chart's steps are lost in rounding
 
 
-def renew_viewer(out: Path) -> str:
+def update_viewer(out: Path) -> str:
     """Update the viewers in OUT to show exactly the measurements that are still valid.
 
     Only the holder of OUT's lock may call this.
@@ -39,12 +39,12 @@ def renew_viewer(out: Path) -> str:
         OSError: if the disk is full or not writable; each page is either unchanged or updated.
     """
     pages = [name for name in (PAGE, SITE_PAGE) if (out / name).is_file()]
-    if not pages or not any_measured(out):
+    if not pages or not has_measurements(out):
         return ""
     shown, trouble = shown_measurements(out), ""
     for name in pages:
         try:
-            _renew(out / name, shown)
+            _update(out / name, shown)
         except ValueError:
             trouble = (
                 f"{name} was written by an earlier version and cannot show measurements; update it with: "
@@ -53,16 +53,16 @@ def renew_viewer(out: Path) -> str:
     return trouble
 
 
-def _renew(path: Path, shown: Mapping[str, Any] | None) -> None:
-    """Put measurements into a page and keep its mtime; a page that already shows them is left alone."""
+def _update(path: Path, shown: Mapping[str, Any] | None) -> None:
+    """Put measurements into a page without changing its mtime; a page that already shows them is left alone."""
     page = path.read_bytes()
-    renewed = with_measurements(page, shown)
-    if renewed == page:
+    updated = with_measurements(page, shown)
+    if updated == page:
         return
     stamp = path.stat()
 
     def fill(file: IO[bytes]) -> None:
-        file.write(renewed)
+        file.write(updated)
         file.flush()  # a later flush would change its mtime
         os.utime(file.fileno(), ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
 
@@ -80,11 +80,11 @@ def shown_measurements(out: Path) -> dict[str, Any] | None:
         return None
     sections = read_measurements(out, "sections", surface.digest, frame.digest)
     volumes = read_measurements(out, "volumes", surface.digest, frame.digest)
-    told = {
+    current = {
         "sections": [_section(item) for item in sections if _is_section_trace(item.get("trace"))],
         "volumes": [_volume(item) for item in volumes if _is_polygon_trace(item.get("trace"))],
     }
-    return told if any(told.values()) else None
+    return current if any(current.values()) else None
 
 
 def _section(item: Mapping[str, Any]) -> dict[str, Any]:

@@ -44,12 +44,12 @@ def read_measurements(out: Path, kind: Kind, surface: str, frame: str = "") -> I
     Returns:
         The figures of each, with its ``trace``; empty if the file is missing, damaged, or of another model.
     """
-    kept = _kept(out).get(kind)
-    if not isinstance(kept, dict) or not surface or kept.get("surface") != surface:
+    stored = _stored(out).get(kind)
+    if not isinstance(stored, dict) or not surface or stored.get("surface") != surface:
         return []
-    if frame and kept.get("frame") != frame:
+    if frame and stored.get("frame") != frame:
         return []
-    items = kept.get("items")
+    items = stored.get("items")
     if not isinstance(items, list) or not all(_is_whole(item, kind) for item in items):
         return []
     if kind == "volumes":
@@ -57,16 +57,16 @@ def read_measurements(out: Path, kind: Kind, surface: str, frame: str = "") -> I
     return [item for item in items if (out / SECTIONS / str(item.get("csv"))).is_file()]
 
 
-def any_measured(out: Path) -> bool:
+def has_measurements(out: Path) -> bool:
     """Whether anything was measured, on whatever surface model."""
-    return bool(_kept(out))
+    return bool(_stored(out))
 
 
 def outdated(out: Path, surface: str) -> bool:
     """Whether OUT still has measurements, but of another surface model."""
-    kept = {kind: found for kind, found in _kept(out).items() if isinstance(found, dict)}
+    stored = {kind: found for kind, found in _stored(out).items() if isinstance(found, dict)}
     there = [kind for kind, name in (("sections", SECTIONS), ("volumes", VOLUMES)) if (out / name).exists()]
-    return any(kept[kind].get("items") and kept[kind].get("surface") != surface for kind in there if kind in kept)
+    return any(stored[kind].get("items") and stored[kind].get("surface") != surface for kind in there if kind in stored)
 
 
 def title_of(item: Mapping[str, Any]) -> str:
@@ -88,7 +88,7 @@ def write_measurements(out: Path, kind: Kind, digests: tuple[str, str], items: S
     Raises:
         OSError: if the disk is full or not writable.
     """
-    value = {**_kept(out), "format": FORMAT, kind: {"surface": digests[0], "frame": digests[1], "items": list(items)}}
+    value = {**_stored(out), "format": FORMAT, kind: {"surface": digests[0], "frame": digests[1], "items": list(items)}}
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=True)
     write_durably(out / MEASURED, text)
 
@@ -107,7 +107,7 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and abs(value) <= sys.float_info.max  # NaN is not; an int may be any size
 
 
-def _kept(out: Path) -> dict[str, Any]:
+def _stored(out: Path) -> dict[str, Any]:
     path = out / MEASURED
     try:
         if path.stat().st_size > LARGEST_FILE:

@@ -59,8 +59,8 @@ def notify(
         nothing did.
     """
     folder = out or (report.parent if report is not None else None)
-    told = {"STATE": state, "CAPTURE": name, "REPORT": str(report or ""), "OUT": str(folder or "")}
-    environment = os.environ | {f"SPLATPIPE_{key}": value.replace("\0", "") for key, value in told.items()}
+    values = {"STATE": state, "CAPTURE": name, "REPORT": str(report or ""), "OUT": str(folder or "")}
+    environment = os.environ | {f"SPLATPIPE_{key}": value.replace("\0", "") for key, value in values.items()}
     try:
         process = subprocess.Popen(
             [SHELL, "-c", command],

@@ -19,7 +19,7 @@ SHARED = Path(__file__).resolve().parent / "templates"
 # Bidirectional control characters, which reverse the text that follows.
 TURNING = frozenset("\u200e\u200f\u061c\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 UNPRINTABLE = frozenset(("Cc", "Cs", "Cn", "Co", "Zl", "Zp"))  # Unicode categories
-REPLACED = "\ufffd"  # replaces invisible and bidirectional control characters
+REPLACEMENT = "\ufffd"  # replaces invisible and bidirectional control characters
 
 
 def page_text(
@@ -60,7 +60,7 @@ def page_text(
 def printable(name: object) -> str:
     """A name safe to display: without invisible characters, line breaks and bidirectional controls."""
     text = str(name)
-    return "".join(REPLACED if unicodedata.category(c) in UNPRINTABLE or c in TURNING else c for c in text)
+    return "".join(REPLACEMENT if unicodedata.category(c) in UNPRINTABLE or c in TURNING else c for c in text)
 
 
 def one_line(message: object) -> str:

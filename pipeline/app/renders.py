@@ -70,7 +70,7 @@ class RenderRequest:
     fps: int = 25
     to: Path | None = None
 
-    def checked(self) -> tuple[What, tuple[int, int] | None]:
+    def validate(self) -> tuple[What, tuple[int, int] | None]:
         """Validate; returns what to render, and its size in pixels or None.
 
         Raises:
@@ -125,27 +125,27 @@ class RenderTask:
     Attributes:
         scene: The trained scene, in the model frame.
         world_from_model: Transform to the world frame of `splat.ply`.
-        wanted: What to render.
+        request: What to render.
         keyframes: Keyframes from the path's file; None without one.
         size: Image size in pixels; None for one like that of the training images.
     """
 
     scene: TrainedScene
     world_from_model: Similarity
-    wanted: RenderRequest
+    request: RenderRequest
     keyframes: Keyframes | None
     size: tuple[int, int] | None
 
     def film(self) -> list[Camera]:
         """The camera of each film frame, in the model frame."""
-        seconds, fps = self.wanted.seconds, self.wanted.fps
+        seconds, fps = self.request.seconds, self.request.fps
         capture, lens = self.scene.capture, self.scene.lens(self.size)
         if self.keyframes is not None:
             distance = followed_photos(capture)[1] * self.world_from_model.scale
             route, angles = self.keyframes.film(distance, fps, seconds)
             return self._from_world(route, self._lenses(angles, len(route)))
         frames = max(1, round(seconds * fps))
-        route = orbit(capture, frames) if self.wanted.path == "orbit" else photo_film(capture, frames, seconds)
+        route = orbit(capture, frames) if self.request.path == "orbit" else photo_film(capture, frames, seconds)
         return cameras_along(route, lens, capture.up)
 
     def stills(self) -> tuple[list[str], list[Camera]]:
@@ -153,7 +153,7 @@ class RenderTask:
         if self.keyframes is not None:
             route = self.keyframes.route
             cameras = self._from_world(route, self._lenses(self.keyframes.angles_deg, len(route)))
-        elif self.wanted.path == "orbit":
+        elif self.request.path == "orbit":
             capture = self.scene.capture
             cameras = cameras_along(orbit(capture, ORBIT_STILLS), self.scene.lens(self.size), capture.up)
         else:
@@ -179,12 +179,12 @@ class RenderTask:
         return cameras
 
 
-def render_run(out: Path, wanted: RenderRequest, threads: int, device: str = "auto") -> dict[str, Any]:
+def render_run(out: Path, request: RenderRequest, threads: int, device: str = "auto") -> dict[str, Any]:
     """Render a trained run.
 
     Args:
         out: Its OUT.
-        wanted: What to render.
+        request: What to render.
         threads: Threads of the rasterizer, at least 1.
         device: ``auto``, ``cpu`` or ``cuda``.
 
@@ -195,38 +195,38 @@ def render_run(out: Path, wanted: RenderRequest, threads: int, device: str = "au
         SplatpipeError: if there is nothing to render, or the request is invalid.
         MachineError: if the device does not work.
     """
-    what, size = wanted.checked()
+    what, size = request.validate()
     chosen = choose_device(device)
-    keyframes = None if wanted.path in OWN_PATHS else read_keyframes(_file(wanted.path))
+    keyframes = None if request.path in OWN_PATHS else read_keyframes(_keyframe_file(request.path))
     parts = _parts(out)
-    target = wanted.target(out)
+    target = request.target(out)
     console, began = RunConsole(), time.monotonic()
-    console(Event("stage_started", "render", {"reason": f"{what} along {wanted.path}"}))
+    console(Event("stage_started", "render", {"reason": f"{what} along {request.path}"}))
     try:
         with same_bits(threads):
             similarity = load_frame(parts["georef.frame"]).world_from_model
-            task = RenderTask(open_scene(parts, threads, chosen), similarity, wanted, keyframes, size)
-            told = _render(task, what, target, EventReporter("render", console))
+            task = RenderTask(open_scene(parts, threads, chosen), similarity, request, keyframes, size)
+            summary = _render(task, what, target, EventReporter("render", console))
     finally:
         console.close()
-    console(Event("stage_finished", "render", {"seconds": time.monotonic() - began, "summary": told}))
-    return told
+    console(Event("stage_finished", "render", {"seconds": time.monotonic() - began, "summary": summary}))
+    return summary
 
 
 def _render(task: RenderTask, what: What, target: Path, report: Reporter) -> dict[str, Any]:
     pictures = FrameRenderer(task.scene, what, task.world_from_model.rotation, task.world_from_model.scale)
-    if not task.wanted.stills:
+    if not task.request.stills:
         cameras = task.film()
         pictures = replace(pictures, depths=depth_range(pictures, cameras))
-        write_film(FilmFile(target, task.wanted.fps), cameras, pictures.pixels, report)
+        write_film(FilmFile(target, task.request.fps), cameras, pictures.pixels, report)
     else:
         names, cameras = task.stills()
         pictures = replace(pictures, depths=depth_range(pictures, cameras))
         for done, (name, camera) in enumerate(zip(names, cameras, strict=True), start=1):
             write_still(target / name, pictures, camera)
             report.progress(done, len(cameras), "rendering", "pictures")
-    told = {"pictures": len(cameras), "width": cameras[0].width, "height": cameras[0].height, "file": str(target)}
-    return told if what != "depth" else told | {"nearest": pictures.depths[0], "farthest": pictures.depths[1]}
+    summary = {"pictures": len(cameras), "width": cameras[0].width, "height": cameras[0].height, "file": str(target)}
+    return summary if what != "depth" else summary | {"nearest": pictures.depths[0], "farthest": pictures.depths[1]}
 
 
 def write_still(stem: Path, pictures: FrameRenderer, camera: Camera) -> None:
@@ -256,7 +256,7 @@ def _write(path: Path, array: np.ndarray) -> None:
     path.write_bytes(data.tobytes())
 
 
-def _file(path: str) -> Path:
+def _keyframe_file(path: str) -> Path:
     file = Path(path).expanduser()
     if not file.is_file():
         raise UsageError(f"There is no file {path[:200]}.", hint="--path takes cameras, orbit, or a keyframe file.")

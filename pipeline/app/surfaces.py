@@ -125,34 +125,35 @@ def check_possible(out: Path, *tables: dict[str, Any]) -> None:
     """
     from splatpipe.pipeline.survey.frames import load_frame
 
-    asked, run = {stage for table in tables for stage in table}, open_run_folder(out, LINE)
-    placed_anew = not {*NO_PRODUCTS, "splat_depths"}.issuperset(asked)
+    changed, run = {stage for table in tables for stage in table}, open_run_folder(out, LINE)
+    georeferenced_again = not {*NO_PRODUCTS, "splat_depths"}.issuperset(changed)
     frame = run.lineage(GEOREF).get("georef.frame")
-    if frame is not None and not placed_anew and not load_frame(frame.path).in_metres:
+    if frame is not None and not georeferenced_again and not load_frame(frame.path).in_metres:
         raise SplatpipeError(
             "The run has no metric scale, so no surface products can be made.",
             hint=f"Give it control (splatpipe georef {out} --gcp FILE), scale bars, or photos with positions.",
         )
-    if "mesh" in asked and run.config(LineConfig, *tables)[1].mesh.enabled:
+
+    if "mesh" in changed and run.config(LineConfig, *tables)[1].mesh.enabled:
         from splatpipe.pipeline.surface.tsdf import open3d
 
         open3d()
 
 
-def measured_lines(out: Path, told: Mapping[str, Any]) -> list[str]:
+def measurement_lines(out: Path, measured: Mapping[str, Any]) -> list[str]:
     """The measurements as text, one line each.
 
     Args:
         out: OUT.
-        told: As ``measure_surface`` returns it.
+        measured: As ``measure_surface`` returns it.
     """
     lines = []
-    for section in told.get("sections", ()):
+    for section in measured.get("sections", ()):
         sigma_m = section["height_sigma_m"]
-        sure = "" if sigma_m is None else f", accurate to {sigma_m * 100.0:.1f} cm"
-        known = f"{section['length_m']:.2f} m, {section['share_with_height']:.0%} with heights{sure}"
-        lines.append(f"{section['name']}: {known}: {out / SECTIONS / section['dxf']}")
-    for volume in told.get("volumes", ()):
+        accuracy = "" if sigma_m is None else f", accurate to {sigma_m * 100.0:.1f} cm"
+        text = f"{section['length_m']:.2f} m, {section['share_with_height']:.0%} with heights{accuracy}"
+        lines.append(f"{section['name']}: {text}: {out / SECTIONS / section['dxf']}")
+    for volume in measured.get("volumes", ()):
         name = volume["name"] or f"Polygon {volume['polygon']}"
         kinds = (f"{kind} {volume[f'{kind}_m3']:.2f} ± {volume[f'{kind}_sigma_m3']:.2f} m³" for kind in ("cut", "fill"))
         lines.append(f"{name}: {', '.join(kinds)}: {out / VOLUMES}")
@@ -179,7 +180,7 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
     from splatpipe.pipeline.surface.volume_file import write_volumes
 
     surface = _open_surface(out)
-    told: dict[str, Any] = {}
+    measured: dict[str, Any] = {}
     aside = out / UNFINISHED
     shutil.rmtree(aside, ignore_errors=True)  # of a killed command
     try:
@@ -187,18 +188,18 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
         sections = _sections(surface, wanted.lines, aside, threads)
         volumes = _volumes(surface, wanted)
         if sections:
-            write_measurements(out, "sections", surface.digests, ())  # none, in case this is killed on the way
+            write_measurements(out, "sections", surface.digests, ())  # in case this is killed before the end
             _publish(aside, out / SECTIONS)
             write_measurements(out, "sections", surface.digests, sections)
-            told["sections"] = [_without_trace(item) for item in sections]
+            measured["sections"] = [_without_trace(item) for item in sections]
     finally:
         shutil.rmtree(aside, ignore_errors=True)
     if volumes:
-        told["volumes"] = [_without_trace(item) for item in volumes]
+        measured["volumes"] = [_without_trace(item) for item in volumes]
         write_measurements(out, "volumes", surface.digests, ())
-        write_volumes(out / VOLUMES, told["volumes"], surface.crs)
+        write_volumes(out / VOLUMES, measured["volumes"], surface.crs)
         write_measurements(out, "volumes", surface.digests, volumes)
-    return told
+    return measured
 
 
 def _open_surface(out: Path) -> _SurfaceModel:
@@ -231,8 +232,8 @@ def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threa
     found = []
     for number, line in enumerate(lines, 1):
         section = cut_section(surface.model, line, surface.crs, sources, threads)
-        told = write_section(folder, f"section-{number}", section, surface.crs)
-        found.append({**told, "trace": section_trace(section, surface.crs, most)})
+        facts = write_section(folder, f"section-{number}", section, surface.crs)
+        found.append({**facts, "trace": section_trace(section, surface.crs, most)})
     return found
 
 

@@ -59,7 +59,7 @@ def thumbnail(path: Path, side: int, orientation: int = 1) -> Thumbnail | None:
     return None if stamp is None else _thumbnail(path, side, orientation, stamp)
 
 
-def cut_out(path: Path, width: int, height: int) -> Thumbnail | None:
+def crop_middle(path: Path, width: int, height: int) -> Thumbnail | None:
     """Crop the middle of a photo at full resolution; None if the photo cannot be read at all.
 
     Args:
@@ -77,12 +77,12 @@ def cut_out(path: Path, width: int, height: int) -> Thumbnail | None:
 
 def _file_stamp(path: Path) -> tuple[int, int] | None:
     try:
-        told = path.stat()
+        status = path.stat()
     except (OSError, ValueError):
         return None
-    if not stat.S_ISREG(told.st_mode) or told.st_size > MOST_BYTES:  # reading a pipe would block
+    if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:  # reading a pipe would block
         return None
-    return told.st_mtime_ns, told.st_size
+    return status.st_mtime_ns, status.st_size
 
 
 @lru_cache(maxsize=MOST_KEPT)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from splatpipe.pipeline.app.batch.plan import Call, StageJob
-from splatpipe.pipeline.app.cli_runs import existing
+from splatpipe.pipeline.app.cli_runs import existing_request
 from splatpipe.pipeline.engine.line import StageStatus, line_status
 from splatpipe.pipeline.engine.needs import Need, of_shard
 from splatpipe.pipeline.engine.session import status_of
@@ -65,7 +65,7 @@ def tell_shards(call: Call, key: str, threads: int) -> None:
         key: The capture's key.
         threads: Threads per job.
     """
-    request = existing(call.out / call.plan().capture(key).name)
+    request = existing_request(call.out / call.plan().capture(key).name)
     statuses = list(line_status(*status_of(request)))
     summaries = {each.stage.name: each.artifact.summary for each in statuses if each.artifact is not None}
     call.write_shards(key, shard_jobs(missing_shards(statuses), request.forecast_needs(summaries), threads))

@@ -10,7 +10,7 @@ from pathlib import Path
 from splatpipe.pipeline.app.page_file import printable
 from splatpipe.pipeline.app.preflight.findings import Finding, PhotoFacts, Preflight
 from splatpipe.pipeline.app.report.wording import number
-from splatpipe.pipeline.app.thumbnails import Thumbnail, cut_out, thumbnail
+from splatpipe.pipeline.app.thumbnails import Thumbnail, crop_middle, thumbnail
 from splatpipe.pipeline.photos.photo_list import photo_root
 
 SIDE = 260  # pixels of a thumbnail's longer side
@@ -98,7 +98,7 @@ def _pictured(
     inside = ".." not in Path(name).parts and not Path(name).is_absolute()
     picture = None
     if inside:
-        picture = cut_out(path, *CUT) if close else thumbnail(path, SIDE)
+        picture = crop_middle(path, *CUT) if close else thumbnail(path, SIDE)
     return FindingPicture(printable(name), picture, facts_in_words(finding, photo), beside)
 
 

@@ -71,13 +71,13 @@ class ViewOptions:
     points: Path | None = None
 
 
-def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
+def serve(out: Path, options: ViewOptions, print_line: Callable[[str], None]) -> None:
     """Serve a run until Ctrl-C.
 
     Args:
         out: Its folder.
         options: Options of the server.
-        say: Prints a line for the user.
+        print_line: Prints a line for the user.
 
     Raises:
         SplatpipeError: if there is no run, or nothing to mark.
@@ -89,15 +89,15 @@ def serve(out: Path, options: ViewOptions, say: Callable[[str], None]) -> None:
     live, token = Live(run), secrets.token_urlsafe(32)
     pages = Pages(run, live, token)
     try:
-        routes = [*(_marking(pages, options, say) if options.mark else ()), *pages.routes()]
+        routes = [*(_marking(pages, options, print_line) if options.mark else ()), *pages.routes()]
         start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
         start += "mark" if options.mark else "live" if run.is_running else ""
         _take_signals_back()
 
         def ready() -> None:
             if bind != ADDRESS:
-                say(f"It listens on {bind}: publish the port to this machine only (-p {ADDRESS}:PORT:PORT).")
-            say(f"Open {start} (Ctrl-C to stop)")
+                print_line(f"It listens on {bind}: publish the port to this machine only (-p {ADDRESS}:PORT:PORT).")
+            print_line(f"Open {start} (Ctrl-C to stop)")
             if options.open_browser:
                 threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
 
@@ -129,7 +129,7 @@ def _take_signals_back() -> None:
         signal.signal(number, signal.getsignal(number))
 
 
-def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> list[Route]:
+def _marking(pages: Pages, options: ViewOptions, print_line: Callable[[str], None]) -> list[Route]:
     """The routes for marking."""
     from splatpipe.pipeline.app.view.mark_routes import MarkPages
     from splatpipe.pipeline.app.view.marking import Marking
@@ -137,7 +137,7 @@ def _marking(pages: Pages, options: ViewOptions, say: Callable[[str], None]) -> 
 
     marking = Marking(open_job(pages.run, options.points))
     pages.marking = True
-    say(f"Marks are saved to {marking.job.text.path}")
+    print_line(f"Marks are saved to {marking.job.text.path}")
     return MarkPages(marking, pages).routes()
 
 

@@ -1,7 +1,7 @@
-"""Warns before a run about properties of a folder and its machine that make runs slow, unsafe or impossible.
+"""Warnings before a run about properties of a folder and its machine that make runs slow, unsafe or impossible.
 
-Based on the kernel's files alone: which file systems propagate locks to other machines is documented, and cannot be
-tested here.
+They come from the kernel's files alone: which file systems propagate locks to other machines is documented and cannot
+be tested here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WSL = "microsoft"  # in the kernel's release string, case-insensitive
 
 
 @dataclass(frozen=True)
-class Caution:
+class MachineWarning:
     """A warning in one sentence, and what to do about it."""
 
     message: str
@@ -35,7 +35,7 @@ class Caution:
         return asdict(self)
 
 
-def cautions(place: Path, root: Path = Path("/")) -> list[Caution]:
+def machine_warnings(place: Path, root: Path = Path("/")) -> list[MachineWarning]:
     """All warnings for a run that writes to a folder.
 
     Args:
@@ -46,18 +46,18 @@ def cautions(place: Path, root: Path = Path("/")) -> list[Caution]:
     kernel = release.read_text(encoding="utf-8", errors="replace") if release.is_file() else ""
     mount = mount_of(place, mounts(root))
     in_wsl = WSL in kernel.casefold()
-    found = [] if mount is None else _of_mount(place, mount, in_wsl=in_wsl)
-    return [*found, *_of_wsl(kernel, available_memory_bytes(root))]
+    found = [] if mount is None else _mount_warnings(place, mount, in_wsl=in_wsl)
+    return [*found, *_wsl_warnings(kernel, available_memory_bytes(root))]
 
 
-def _of_mount(place: Path, mount: Mount, *, in_wsl: bool) -> Sequence[Caution]:
+def _mount_warnings(place: Path, mount: Mount, *, in_wsl: bool) -> Sequence[MachineWarning]:
     found = []
     where = f"{place} is on {mount.kind} (mounted at {mount.point})"
     if "ro" in mount.options:
-        found.append(Caution(f"{where}, which is read-only.", "Choose another OUT."))
+        found.append(MachineWarning(f"{where}, which is read-only.", "Choose another OUT."))
     if mount.kind in WINDOWS_KINDS or (in_wsl and "drvfs" in mount.options):
         found.append(
-            Caution(
+            MachineWarning(
                 f"{where}: file access goes through another system and is many times slower, and locks apply to "
                 "this one only.",
                 "Choose an OUT in the Linux file system, such as ~/out, and copy the results from there; photos may "
@@ -66,16 +66,15 @@ def _of_mount(place: Path, mount: Mount, *, in_wsl: bool) -> Sequence[Caution]:
         )
     elif option := _unshared_locks(mount):
         found.append(
-            Caution(
+            MachineWarning(
                 f"{where}{option}: its locks apply to this machine only; another machine working in the same OUT "
-                "is detected by "
-                "its heartbeat, within half a minute.",
+                "is detected by its heartbeat, within half a minute.",
                 "Use an OUT from one machine at a time, or mount it with locks (NFS 4, or 3 with its lock service).",
             )
         )
     elif mount.kind in IN_MEMORY:
         found.append(
-            Caution(f"{where}: its files take up memory and are lost at shutdown.", "Choose an OUT on a disk.")
+            MachineWarning(f"{where}: its files take up memory and are lost at shutdown.", "Choose an OUT on a disk.")
         )
     return found
 
@@ -89,15 +88,15 @@ def _unshared_locks(mount: Mount) -> str:
     return ", passed through from another system" if passed_on and mount.kind not in FUSE_WITH_LOCKS else ""
 
 
-def _of_wsl(kernel: str, memory_bytes: int) -> Sequence[Caution]:
+def _wsl_warnings(kernel: str, memory_bytes: int) -> Sequence[MachineWarning]:
     if WSL not in kernel.casefold():
         return []
     if "wsl2" not in kernel.casefold():
-        return [Caution("This is WSL 1, which is untested.", "Convert it: wsl --set-version DISTRIBUTION 2")]
+        return [MachineWarning("This is WSL 1, which is untested.", "Convert it: wsl --set-version DISTRIBUTION 2")]
     if 0 < memory_bytes < SMALL_WSL_BYTES:
         return [
-            Caution(
-                f"WSL gives Linux {memory_bytes / 1e9:.1f} GB: by default half of what Windows has.",
+            MachineWarning(
+                f"WSL gives Linux {memory_bytes / 1e9:.1f} GB of memory: by default half of what Windows has.",
                 "For more, write [wsl2] and memory=24GB into .wslconfig in your Windows profile, then: wsl --shutdown",
             )
         ]

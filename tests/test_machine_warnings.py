@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.app.cautions import cautions
+from splatpipe.pipeline.app.machine_warnings import machine_warnings
 
 ROOT = "24 1 8:1 / / rw,relatime shared:1 - ext4 /dev/sda1 rw\n"
 WSL2 = "5.15.167.4-microsoft-standard-WSL2\n"
@@ -17,7 +17,7 @@ WINDOWS_DRIVE = (
 
 
 def told(root: Path, place: str, *, mounted: str = "", kernel: str = "6.8.0-45-generic\n", gb: int = 64) -> list[str]:
-    """The cautions on a system of these texts."""
+    """The warnings on a system of these texts."""
     texts = {
         "proc/self/mountinfo": ROOT + mounted,
         "proc/sys/kernel/osrelease": kernel,
@@ -26,10 +26,10 @@ def told(root: Path, place: str, *, mounted: str = "", kernel: str = "6.8.0-45-g
     for name, text in texts.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(text)
-    return [f"{caution.message} {caution.hint}" for caution in cautions(Path(place), root)]
+    return [f"{warning.message} {warning.hint}" for warning in machine_warnings(Path(place), root)]
 
 
-def test_a_local_disk_needs_no_caution(tmp_path: Path) -> None:
+def test_a_local_disk_needs_no_warning(tmp_path: Path) -> None:
     assert told(tmp_path, "/home/jane/out") == []
     assert told(tmp_path, "/home/jane/out", kernel=WSL2) == []
     assert told(tmp_path, "/", mounted=WINDOWS_DRIVE, kernel=WSL2) == []
@@ -86,4 +86,4 @@ def test_the_mount_that_hides_another_counts(tmp_path: Path) -> None:
 
 
 def test_a_system_without_these_files_is_no_fault(tmp_path: Path) -> None:
-    assert cautions(Path("/anything"), tmp_path) == []
+    assert machine_warnings(Path("/anything"), tmp_path) == []
