@@ -22,10 +22,10 @@ from PIL import Image
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.console import show_bad_cameras
 from splatpipe.pipeline.app.report import make_report, write_report
-from splatpipe.pipeline.app.report.capturing import unit_of
+from splatpipe.pipeline.app.report.capture import unit_of
+from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
 from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
-from splatpipe.pipeline.app.report.placing import placing_chapter
 from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
@@ -59,7 +59,7 @@ def headline(watched: object) -> str:
 
 
 def state_of(watched: object, stage: str) -> str:
-    row = watched.page.locator("#making tr", has=watched.page.get_by_role("rowheader", name=stage, exact=True))  # type: ignore[attr-defined]
+    row = watched.page.locator("#processing tr", has=watched.page.get_by_role("rowheader", name=stage, exact=True))  # type: ignore[attr-defined]
     return str(row.locator("td").first.inner_text())
 
 
@@ -88,7 +88,7 @@ def test_a_run_writes_a_report_that_opens_offline_without_a_request(
     metrics = json.loads((demo_run / "metrics.json").read_text())
     assert f"{metrics['psnr']:.2f}" in said and f"{metrics['gaussians']:,}" in said
     table = metrics["accuracy"]["tables"]["check"]
-    assert f"{table['rmse_3d_m']:.3f}" in watched.page.locator("#placing table").first.inner_text()
+    assert f"{table['rmse_3d_m']:.3f}" in watched.page.locator("#georeferencing table").first.inner_text()
     for stage in LINE:
         assert state_of(watched, stage.name) == "finished"
 
@@ -211,7 +211,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     assert watched.page.locator("#files .stale").count() == watched.page.locator("#files tr").filter(
         has_text=re.compile(r"splat\.|\.glb|cameras\.json|georef\.json|metrics\.json|viewer\.html|flythrough")
     ).count() > 0  # fmt: skip
-    row = watched.page.locator("#making tr", has_text="stopped").inner_text()
+    row = watched.page.locator("#processing tr", has_text="stopped").inner_text()
     assert "MB" in row or "GB" in row  # its memory is known though it never ended
 
 
@@ -317,7 +317,7 @@ def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, 
     path.write_text("[" + " " * (path.stat().st_size - 2) + "]")  # as long as it was, and something else
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert page.count("This part could not be read") == 1
-    assert "How it was made" in page
+    assert "Processing</h2>" in page
 
 
 def test_a_damaged_artifact_of_a_finished_run_is_not_reported_as_a_requested_end(
@@ -404,7 +404,7 @@ def test_scale_bars_are_reported_one_by_one(copy_of_run: Path) -> None:
     rewrite(inputs.part("georef.frame"), lambda told: told.update(kind="arbitrary", metres=True, origin=None))
     rewrite(inputs.part("georef.accuracy"), lambda told: told.update(scale=scale))
     inputs = read_report_inputs(copy_of_run)
-    chapter = placing_chapter(inputs, None)
+    chapter = georeferencing_chapter(inputs, None)
     assert chapter is not None
     facts = dict(chapter["facts"])
     assert "position and heading are arbitrary" in facts["Frame"] and "per pixel" in facts["Ground sample distance"]
@@ -443,7 +443,7 @@ def test_an_interrupted_run_is_distinguished_from_a_running_one(copy_of_run: Pat
     lines = (copy_of_run / "events.jsonl").read_text().splitlines()
     started = next(i for i, line in enumerate(lines) if '"stage_started"' in line and '"train"' in line)
     (copy_of_run / "events.jsonl").write_text("\n".join(lines[: started + 4]))
-    assert "Broken off in train" in report_page(read_report_inputs(copy_of_run), drawn=False)
+    assert "Interrupted in train" in report_page(read_report_inputs(copy_of_run), drawn=False)
     with (copy_of_run / "stages" / ".lock").open("rb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert "Still running in train" in report_page(read_report_inputs(copy_of_run), drawn=False)

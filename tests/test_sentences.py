@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from splatpipe.pipeline.app.console import show_verdict
-from splatpipe.pipeline.app.report.verdict import Verdict, VerdictLine
+from splatpipe.pipeline.app.report.run_history import RunHistory, StageHistory, StageMessages
+from splatpipe.pipeline.app.report.verdict import Verdict, VerdictLine, judge
 from splatpipe.pipeline.app.sentences import SENTENCES, sentence
 from splatpipe.stages.line import LINE
 
@@ -63,3 +65,19 @@ def test_the_verdict_starts_with_what_is_doubtful(capsys: pytest.CaptureFixture[
         "! Finished; 1 point to look at.  The run ended.",
         "  ! Floaters  Floaters in front of [bold]5[/] photos",
     ]
+
+
+def test_the_verdict_states_a_doubtful_focal_length_once() -> None:
+    text = "The focal length went from 1035 to 702 pixels, -32 %."
+    reason = {"level": "doubt", "kind": "focal", "text": text, "hint": ""}
+    messages = StageMessages(warnings=[(text, ""), ("2 of 40 photos could not be placed: a.jpg, b.jpg.", "")])
+    camera = {"has_prior": True, "prior_focal_px": 1035.0, "focal_px": 702.0}
+    inputs = SimpleNamespace(
+        history=RunHistory(stages={"sparse": StageHistory("sparse", "finished", messages=messages)}),
+        artifacts={},
+        read={"sparse.summary": {"verdict": {"level": "doubt", "reasons": [reason]}}}.get,
+        summary={"sparse": PLACED | {"cameras": [camera]}}.get,
+    )
+    texts = {finding.title: finding.text for finding in judge(inputs).findings}  # type: ignore[arg-type]
+    assert texts["Cameras"] == text and "Focal length" not in texts
+    assert texts["Warnings"] == "The run gave 1 other warning."

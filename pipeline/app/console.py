@@ -24,7 +24,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from splatpipe.pipeline.app.report.verdict import Verdict
+from splatpipe.pipeline.app.report.verdict import CAMERAS, Verdict
 from splatpipe.pipeline.app.sentences import sentence
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
@@ -234,11 +234,13 @@ def show_status(statuses: Iterable[StageStatus]) -> None:
 
 
 def show_verdict(verdict: Verdict) -> None:
-    """Print the verdict on a run, the report's first lines."""
+    """Print the verdict on a run, the report's first lines; ``show_bad_cameras`` prints why cameras are bad."""
     console = Console(file=sys.stderr, highlight=False)
     mark, colour = MARKS[verdict.level]
     console.print(f"\n[bold {colour}]{mark} {escape(verdict.headline)}.[/]  {escape(verdict.text)}", soft_wrap=True)
     for finding in verdict.findings:
+        if (finding.title, finding.level) == (CAMERAS, "bad"):
+            continue
         mark, colour = MARKS[finding.level]
         console.print(f"  [{colour}]{mark}[/] [bold]{escape(finding.title)}[/]  {escape(finding.text)}", soft_wrap=True)
 

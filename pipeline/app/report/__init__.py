@@ -76,8 +76,8 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
         return now_s > end_s and (_stamp(path) != before or now_s > began_s + LEAST_S)
 
     try:
-        with log.open("a", encoding="utf-8") as said:
-            code = _run(command, said, over, out)
+        with log.open("a", encoding="utf-8") as stream:
+            code = _run(command, stream, over, out)
     except OSError as error:
         raise MachineError(f"The report could not be written: {error.strerror}.") from error
     if _stamp(path) == before or (code != 0 and until_s is None):
@@ -85,12 +85,12 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     return path
 
 
-def _run(command: Sequence[str], said: IO[str], over: Callable[[], bool], out: Path) -> int:
+def _run(command: Sequence[str], log: IO[str], over: Callable[[], bool], out: Path) -> int:
     """Run a process to its end or until its time is up; returns its exit code. An interrupted wait also kills it.
 
     Its unfinished files in OUT are removed; another process may be writing a report there at the same time.
     """
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
     try:
         while process.poll() is None and not over():
             time.sleep(POLL_S)
@@ -103,7 +103,7 @@ def _run(command: Sequence[str], said: IO[str], over: Callable[[], bool], out: P
 
 def _stamp(path: Path) -> tuple[int, int] | None:
     try:
-        told = path.stat()
+        info = path.stat()
     except OSError:
         return None
-    return told.st_mtime_ns, told.st_ino
+    return info.st_mtime_ns, info.st_ino

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.page_file import page_text
 from splatpipe.pipeline.app.path_labels import PathLabels
-from splatpipe.pipeline.app.report.capturing import capture_chapter, registration_chapter
-from splatpipe.pipeline.app.report.learning import training_chapter, views_chapter
-from splatpipe.pipeline.app.report.making import files_chapter, making_chapter, said_chapter
-from splatpipe.pipeline.app.report.placing import placing_chapter
+from splatpipe.pipeline.app.report.capture import capture_chapter, registration_chapter
+from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
+from splatpipe.pipeline.app.report.processing import files_chapter, messages_chapter, processing_chapter
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.surfaces import surfaces_chapter
+from splatpipe.pipeline.app.report.training import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -48,13 +48,13 @@ def _render(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None
     chapters = {
         "capture": _guarded(lambda: capture_chapter(inputs, geometry, drawn=drawn) if _checked(inputs) else None),
         "registration": _guarded(lambda: registration_chapter(inputs, geometry) if _matched(inputs) else None),
-        "placing": _guarded(lambda: placing_chapter(inputs, geometry)),
+        "georeferencing": _guarded(lambda: georeferencing_chapter(inputs, geometry)),
         "training": _guarded(lambda: training_chapter(inputs, drawn=drawn)),
         "views": _guarded(lambda: views_chapter(inputs, drawn=drawn)),
         "surfaces": _guarded(lambda: surfaces_chapter(inputs, drawn=drawn)),
-        "making": _guarded(lambda: making_chapter(inputs, drawn=drawn)),
+        "processing": _guarded(lambda: processing_chapter(inputs, drawn=drawn)),
         "files": _guarded(lambda: files_chapter(inputs)),
-        "said": _guarded(lambda: said_chapter(inputs)),
+        "messages": _guarded(lambda: messages_chapter(inputs)),
     }
     return page_text(
         TEMPLATES,

@@ -17,7 +17,7 @@ from splatpipe.stages.options import LineConfig
 
 MAX_JSON_BYTES = 256 << 20  # an accuracy report of thousands of points is far smaller
 
-BAD = ("failed", "stopped", "broken off", "running")
+BAD = ("failed", "stopped", "interrupted", "running")
 
 
 @dataclass(frozen=True)

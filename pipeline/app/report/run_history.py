@@ -11,7 +11,7 @@ from splatpipe.pipeline.engine.events import Event, parse_event
 from splatpipe.pipeline.engine.stage import shards_first
 
 Facts = Mapping[str, Any]
-State = Literal["finished", "reused", "failed", "stopped", "broken off", "running", "not reached"]
+State = Literal["finished", "reused", "failed", "stopped", "interrupted", "running", "not reached"]
 
 MAX_BYTES = 64 << 20  # read from the end of the file: events of hundreds of runs
 MAX_LINE = 1 << 20
@@ -102,7 +102,7 @@ class RunHistory:
     @property
     def culprit(self) -> StageHistory | None:
         """The stage in which it failed or is running."""
-        bad = ("failed", "stopped", "broken off", "running")
+        bad = ("failed", "stopped", "interrupted", "running")
         return next((stage for stage in self.stages.values() if stage.state in bad), None)
 
     @property
@@ -158,7 +158,7 @@ class _EventReader:
         history.stages = {name: history.stages[name] for name in shards_first(history.stages)}
         for stage in history.stages.values():
             if stage.state == "running" and not running:
-                stage.state = "broken off"
+                stage.state = "interrupted"
         return history
 
     def _run_started(self, _name: str, data: Facts) -> None:

@@ -52,21 +52,21 @@ def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
 
 def _measured(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
     """Sections and volumes, with thumbnails of the first sections."""
-    told = measures(inputs)
-    for number, row in enumerate(told["sections"]):
+    tables = measures(inputs)
+    for number, row in enumerate(tables["sections"]):
         path = row.pop("picture")
         row |= _small_picture(path, SECTION_SIDE) if drawn and path is not None and number < MOST_SECTIONS else {}
-    return told
+    return tables
 
 
 def _facades(inputs: ReportInputs, *, drawn: bool) -> list[dict[str, Any]]:
     """Façades, largest first, with thumbnails of the first ones."""
     if not inputs.summary("facades").get("facades"):
         return []
-    told = inputs.read_in_part("facades.files", "facades/facades.json")["facades"]
-    told = sorted(told, key=lambda each: -float(each["area_m2"]))
+    facades = inputs.read_in_part("facades.files", "facades/facades.json")["facades"]
+    facades = sorted(facades, key=lambda each: -float(each["area_m2"]))
     rows = []
-    for number, each in enumerate(told):
+    for number, each in enumerate(facades):
         row = {"name": str(each["name"]), "area": f"{float(each['area_m2']):.1f} m²"}
         row["known"] = f"{100.0 * float(each['share_with_depth']):.0f} %"
         path = _file(inputs, "facades.files", f"facades/{each['picture']}")
@@ -109,8 +109,8 @@ def _pictures(inputs: ReportInputs) -> list[dict[str, Any]]:
     path = _file(inputs, "dsm.files", "dsm.tif")
     relief = None if path is None else relief_picture(path, PICTURE_SIDE)
     if relief is not None:
-        told = f"dsm.tif: from {relief.low:.1f} (violet) to {relief.high:.1f} (yellow), lit from the north-west"
-        found.append(("surface model", told, relief.pixels))
+        text = f"dsm.tif: from {relief.low:.1f} (violet) to {relief.high:.1f} (yellow), lit from the north-west"
+        found.append(("surface model", text, relief.pixels))
     return [
         {"name": name, "text": text, "source": jpeg(pixels[..., ::-1].copy(), QUALITY)}
         | {"width": pixels.shape[1], "height": pixels.shape[0]}

@@ -52,38 +52,41 @@ class Verdict:
 def judge(inputs: ReportInputs) -> Verdict:
     """Judge a run by its results so far; unreadable parts are skipped, and reported in their own chapters."""
     findings: list[VerdictLine] = []
-    for look in (_cameras, _photos, _reprojection, _focal, _place, _splat, _views, _floaters):
+    for criterion in (_cameras, _photos, _reprojection, _focal, _georeference, _splat, _views, _floaters):
         try:
-            findings += filter(None, [look(inputs)])
+            findings += filter(None, [criterion(inputs)])
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
-    ended, text = _ended(inputs)
-    told = sum(len(stage.messages.warnings) for stage in inputs.history.stages.values())
-    if told:
-        findings.append(VerdictLine("doubt", "Warnings", f"The run gave {plural(told, 'warning')}."))
+    ending, text = _ending(inputs)
+    listed = tuple(str(reason["text"]) for reason in _camera_reasons(inputs))  # their warnings are not counted again
+    stages = inputs.history.stages.values()
+    warnings = sum(not message.endswith(listed) for stage in stages for message, _ in stage.messages.warnings)
+    if warnings:
+        what = "other warning" if listed else "warning"
+        findings.append(VerdictLine("doubt", "Warnings", f"The run gave {plural(warnings, what)}."))
     wrong = next((it for it in findings if it.title == CAMERAS and it.level == "bad"), None)
-    if ended is not None and (ended.level == "bad" or wrong is None):
-        return Verdict(ended.level, ended.title, ended.text, findings)
+    if ending is not None and (ending.level == "bad" or wrong is None):
+        return Verdict(ending.level, ending.title, ending.text, findings)
     if wrong is not None:  # results based on them cannot be better
-        return Verdict("bad", CAMERAS_BAD, " ".join(filter(None, [text, ended.text if ended else ""])), findings)
+        return Verdict("bad", CAMERAS_BAD, " ".join(filter(None, [text, ending.text if ending else ""])), findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
     if any(finding.level == "bad" for finding in doubtful):
         return Verdict("bad", "Finished, but with a serious problem", text, findings)
     if doubtful:
         return Verdict("doubt", f"Finished; {plural(len(doubtful), 'point')} to check", text, findings)
-    return Verdict("good", "Finished without findings", text, findings)
+    return Verdict("good", "Finished; no problems found", text, findings)
 
 
-def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
+def _ending(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
     """A line on how the run ended if it was not successful, and a sentence on when."""
     history = inputs.history
     when = f"{moment(history.ended_s)}, after {duration(history.ended_s - history.began_s)}"
     if not history.stages:
         return VerdictLine("bad", "Nothing has run yet", "The folder has no record of a run that began."), ""
     if history.complete:
-        gone = [name for name in history.stages if name == stage_name(name) and name not in inputs.artifacts]
-        if gone:
-            lost = f"It ended on {when}, but what {', '.join(gone)} made is missing or can no longer be read."
+        missing = [name for name in history.stages if name == stage_name(name) and name not in inputs.artifacts]
+        if missing:
+            lost = f"It ended on {when}, but what {', '.join(missing)} made is missing or can no longer be read."
             return VerdictLine(
                 "bad", "Finished, but its results are damaged", f"{lost} Repeat the command to restore it."
             ), ""
@@ -98,22 +101,26 @@ def _ended(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
     kept = "Finished stages are kept: repeat the command to resume."
     if history.running:
         return VerdictLine(
-            "doubt", f"Still running{where}", f"{_far(inputs)} Events up to {moment(history.ended_s)}."
+            "doubt", f"Still running{where}", f"{_progress_text(inputs)} Events up to {moment(history.ended_s)}."
         ), ""
     if stage is not None and stage.state == "stopped":
-        return VerdictLine("bad", f"Stopped{where} before it was finished", f"{_far(inputs)} {when}. {kept}"), ""
+        return VerdictLine(
+            "bad", f"Stopped{where} before it was finished", f"{_progress_text(inputs)} {when}. {kept}"
+        ), ""
     if stage is not None and stage.state == "failed":
-        said = " ".join(filter(None, [stage.message, stage.hint]))
-        return VerdictLine("bad", f"Failed{where}", f"{said} ({when})"), ""
+        reason = " ".join(filter(None, [stage.message, stage.hint]))
+        return VerdictLine("bad", f"Failed{where}", f"{reason} ({when})"), ""
     if history.message and history.exit_code:
         return VerdictLine(
             "bad", f"Failed{where}", " ".join(filter(None, [history.message, history.hint])) + f" ({when})"
         ), ""
-    lost = f"Its events end abruptly: it was killed, or the machine went down. {_far(inputs)} Last heard {when}."
-    return VerdictLine("bad", f"Broken off{where}", f"{lost} {kept}"), ""
+    lost = (
+        f"Its events end abruptly: it was killed, or the machine went down. {_progress_text(inputs)} Last event {when}."
+    )
+    return VerdictLine("bad", f"Interrupted{where}", f"{lost} {kept}"), ""
 
 
-def _far(inputs: ReportInputs) -> str:
+def _progress_text(inputs: ReportInputs) -> str:
     """How far the last stage got."""
     stage = inputs.history.culprit
     if stage is None or not stage.messages.progress:
@@ -124,17 +131,29 @@ def _far(inputs: ReportInputs) -> str:
 
 def _cameras(inputs: ReportInputs) -> VerdictLine | None:
     """The mapping stage's own verdict on the cameras."""
-    told = inputs.read("sparse.summary").get("verdict") or {"level": "good"}
-    if told["level"] == "good":
+    reasons = _camera_reasons(inputs)
+    if not reasons:
         return None
-    worst = [reason for reason in told["reasons"] if reason["level"] == told["level"]]
-    text = " ".join(f"{reason['text']} {reason['hint']}".strip() for reason in worst)
-    return VerdictLine(told["level"], CAMERAS, text)
+    return VerdictLine(reasons[0]["level"], CAMERAS, " ".join(f"{it['text']} {it['hint']}".strip() for it in reasons))
+
+
+def _camera_reasons(inputs: ReportInputs) -> list[Mapping[str, Any]]:
+    """The mapping stage's worst reasons to doubt the cameras; empty if there are none or they cannot be read."""
+    try:
+        verdict = inputs.read("sparse.summary")["verdict"]
+        return [reason for reason in verdict["reasons"] if reason["level"] == verdict["level"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return []
+
+
+def _is_camera_reason(inputs: ReportInputs, kind: str) -> bool:
+    """Whether the verdict on the cameras already reports a reason of this kind."""
+    return any(reason.get("kind") == kind for reason in _camera_reasons(inputs))
 
 
 def _photos(inputs: ReportInputs) -> VerdictLine | None:
     sparse = inputs.summary("sparse")
-    if not sparse:
+    if not sparse or _is_camera_reason(inputs, "placed"):
         return None
     photos, placed = int(sparse["photos"]), int(sparse["registered"])
     level: Level = "good" if placed >= PLACED_GOOD * photos else "doubt" if placed >= PLACED_DOUBT * photos else "bad"
@@ -149,9 +168,9 @@ def _reprojection(inputs: ReportInputs) -> VerdictLine | None:
     if error is None:
         return None
     level: Level = "good" if error <= ERROR_GOOD_PX else "doubt" if error <= ERROR_DOUBT_PX else "bad"
-    told = {"good": "points and observations agree", "doubt": "more than usual"}
-    told["bad"] = "the cameras contradict each other"
-    return VerdictLine(level, "Reprojection error", f"{error:.2f} pixels on average: {told[level]}.")
+    meaning = {"good": "points and observations agree", "doubt": "more than usual"}
+    meaning["bad"] = "the cameras contradict each other"
+    return VerdictLine(level, "Reprojection error", f"{error:.2f} pixels on average: {meaning[level]}.")
 
 
 def _focal(inputs: ReportInputs) -> VerdictLine | None:
@@ -165,6 +184,8 @@ def _focal(inputs: ReportInputs) -> VerdictLine | None:
         return None
     if max(off) <= FOCAL_GOOD:
         return VerdictLine("good", "Focal length", f"Calibrated within {share(max(off), 1)} of the photos' metadata.")
+    if _is_camera_reason(inputs, "focal"):
+        return None
     return VerdictLine("doubt", "Focal length", f"Calibrated {share(max(off), 1)} away from the photos' metadata.")
 
 
@@ -172,7 +193,7 @@ UNPLACED = "Lengths and heights can be measured; its position on the earth and n
 SCALE_GOOD = 0.005  # relative standard deviation of scale bars: five millimetres per metre
 
 
-def _place(inputs: ReportInputs) -> VerdictLine | None:
+def _georeference(inputs: ReportInputs) -> VerdictLine | None:
     if "georef" not in inputs.artifacts:
         return None
     frame = inputs.read("georef.frame")
@@ -201,8 +222,8 @@ def _place(inputs: ReportInputs) -> VerdictLine | None:
     off = (
         f"they scatter by {length(gps.get('rmse_horizontal_m'))} horizontally, {length(gps.get('rmse_up_m'))} in height"
     )
-    told = (report.get("uncertainty") or {}).get("sentence")
-    worth = f", {told}" if told else ""
+    uncertainty = (report.get("uncertainty") or {}).get("sentence")
+    worth = f", {uncertainty}" if uncertainty else ""
     text = (
         f"Georeferenced by the photos' own positions alone ({off}){worth}: there is no control or check point "
         "to verify it."
@@ -212,17 +233,17 @@ def _place(inputs: ReportInputs) -> VerdictLine | None:
 
 def _checked(table: Mapping[str, Any], gsd: float | None) -> VerdictLine:
     horizontal, vertical = table["rmse_horizontal_m"], table["rmse_up_m"]
-    told = f"{plural(table['count'], 'check point')} {'are' if table['count'] > 1 else 'is'} off by "
-    told += f"{length(horizontal)} horizontally and {length(vertical)} in height (root mean square)"
+    text = f"{plural(table['count'], 'check point')} {'are' if table['count'] > 1 else 'is'} off by "
+    text += f"{length(horizontal)} horizontally and {length(vertical)} in height (root mean square)"
     if not gsd:
-        return VerdictLine("doubt", "Accuracy", f"{told}.")
-    told += f", {number((horizontal or 0.0) / gsd, 1)} and {number((vertical or 0.0) / gsd, 1)} ground sample distances"
+        return VerdictLine("doubt", "Accuracy", f"{text}.")
+    text += f", {number((horizontal or 0.0) / gsd, 1)} and {number((vertical or 0.0) / gsd, 1)} ground sample distances"
     good = (horizontal or 0.0) <= HORIZONTAL_GSDS * gsd and (vertical or 0.0) <= VERTICAL_GSDS * gsd
     if table["count"] < FEW_CHECKS:
-        return VerdictLine("doubt", "Accuracy", f"{told}; so few points prove little.")
+        return VerdictLine("doubt", "Accuracy", f"{text}; so few points prove little.")
     bounds = f"{HORIZONTAL_GSDS:g} and {VERTICAL_GSDS:g}"
     verdict = "as expected of a careful survey" if good else f"more than the {bounds} that are usual"
-    return VerdictLine("good" if good else "doubt", "Accuracy", f"{told}: {verdict}.")
+    return VerdictLine("good" if good else "doubt", "Accuracy", f"{text}: {verdict}.")
 
 
 def _splat(inputs: ReportInputs) -> VerdictLine | None:
@@ -257,13 +278,13 @@ def _views(inputs: ReportInputs) -> VerdictLine | None:
         return VerdictLine("doubt", "Held-out photos", text)
     if not views:
         return VerdictLine("doubt", "Held-out photos", "No photo was held out, so image quality cannot be measured.")
-    worst_of = min(views, key=_likeness)
-    value, worst = _likeness(mean), _likeness(worst_of)
+    worst_of = min(views, key=_view_psnr)
+    value, worst = _view_psnr(mean), _view_psnr(worst_of)
     level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
-    told = {"good": "good image quality", "doubt": "fair image quality", "bad": "poor image quality"}[level]
+    quality = {"good": "good image quality", "doubt": "fair image quality", "bad": "poor image quality"}[level]
     at = f", at {size} megapixels" if (size := judged_size(metrics)) else ""
     text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded}{at} "
-    text += f"({value:.1f} after colour fit), SSIM {number(mean['ssim'], 2)}: {told}"
+    text += f"({value:.1f} after colour fit), SSIM {number(mean['ssim'], 2)}: {quality}"
     if level == "good" and worst < PSNR_DOUBT_DB:
         return VerdictLine(
             "doubt", "Held-out photos", f"{text} on average, but not of {worst_of['name']} ({worst:.1f} dB)."
@@ -271,7 +292,7 @@ def _views(inputs: ReportInputs) -> VerdictLine | None:
     return VerdictLine(level, "Held-out photos", f"{text}.")
 
 
-def _likeness(measures: Mapping[str, Any]) -> float:
+def _view_psnr(measures: Mapping[str, Any]) -> float:
     """PSNR, exposure compensated if available."""
     return float(measures["psnr_cc"] if measures.get("psnr_cc") is not None else measures["psnr"])
 

@@ -20,7 +20,7 @@ MOST_BARS = 20
 AXES = ("east", "north", "up", "horizontal", "3d")
 
 
-def placing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter | None:
+def georeferencing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter | None:
     """The chapter on the model's georeference and its accuracy; None if georef did not finish.
 
     Args:
@@ -77,17 +77,21 @@ def _frame_facts(
         ("Vertical datum", _vertical(str(frame.get("vertical_datum", "unknown")), named=named)),
         ("Ground sample distance", f"{length(report.get('gsd_m'))} per pixel"),
     ]
-    told = (report.get("uncertainty") or {}).get("sentence")
-    if told:
-        facts.append(("From the photo positions alone", str(told)))
+    text = (report.get("uncertainty") or {}).get("sentence")
+    if text:
+        facts.append(("From the photo positions alone", str(text)))
     if control.get("file"):
-        told = f"{control['file']}, in {control.get('crs')}; marks assumed accurate to {control.get('sigma_pixel')} px"
-        facts.append(("Control file", told))
-    bent = summary.get("model_bent")
-    if bent is not None:
+        text = f"{control['file']}, in {control.get('crs')}; marks assumed accurate to {control.get('sigma_pixel')} px"
+        facts.append(("Control file", text))
+    adjusted = summary.get("model_bent")
+    if adjusted is not None:
         moved = f"{number(summary.get('moved_px'), 3)} px"
-        told = f"bent the model by {moved}" if bent else f"fits it as it is (bending would move the photos by {moved})"
-        facts.append(("Control and the model", told if summary.get("moved_px") is not None else "not adjusted"))
+        text = (
+            f"the model was adjusted to it, by {moved} in the photos"
+            if adjusted
+            else f"the model fits it unadjusted (an adjustment would move it by {moved} in the photos)"
+        )
+        facts.append(("Control and the model", text if summary.get("moved_px") is not None else "not adjusted"))
     return facts + _bars(report)
 
 
@@ -122,8 +126,8 @@ def _crs(inputs: ReportInputs, frame: Mapping[str, Any]) -> str:
     from splatpipe.pipeline.survey.georeference import accuracy_in_words
 
     path = inputs.part("export.georef")
-    told = read_json(path) if path is not None else {}
-    crs = told.get("crs") if isinstance(told, Mapping) else None
+    georeference = read_json(path) if path is not None else {}
+    crs = georeference.get("crs") if isinstance(georeference, Mapping) else None
     if not isinstance(crs, Mapping):
         return str(frame.get("crs") or "the UTM zone of the origin")
     operation = crs.get("operation", {})
@@ -213,8 +217,8 @@ def _marks(index: int, point: Mapping[str, Any], chips: Mapping[tuple[int, int],
         if chip is not None:
             residual = seen.get("residual_px")
             off = None if not residual else math.hypot(*residual)
-            told = {"chip": chip, "photo": str(seen["photo"]), "off": number(off, 2), "used": seen.get("used", True)}
-            entries.append((-(off or 0.0), j, told))
+            crop = {"chip": chip, "photo": str(seen["photo"]), "off": number(off, 2), "used": seen.get("used", True)}
+            entries.append((-(off or 0.0), j, crop))
     role = str(point["role"]).replace("_", " ")
     return {
         "name": str(point["name"]),

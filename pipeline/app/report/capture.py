@@ -38,10 +38,10 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
         ("Masks", _masks(summary)),
     ]
     cameras = inputs.read("ingest.cameras").get("cameras", [])
-    told = summary.get("camera_groups") or [{}] * len(cameras)
+    groups = summary.get("camera_groups") or [{}] * len(cameras)
     chapter: Chapter = {
         "facts": [fact for fact in facts if fact[1]],
-        "cameras": [_camera(camera, row) for camera, row in zip(cameras, told, strict=False)],
+        "cameras": [_camera(camera, row) for camera, row in zip(cameras, groups, strict=False)],
         "left_out": left_out[:MOST_LISTED],
         "left_out_more": max(0, len(left_out) - MOST_LISTED),
     }
@@ -160,21 +160,21 @@ def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     return {"charts": [{"svg": svg, "text": text} for svg, text in drawn]}
 
 
-def _source(told: object) -> str:
+def _source(source: object) -> str:
     """The source of a value in words: ``xmp-calibrated`` becomes XMP calibrated."""
-    words = str(told or "").replace("-", " ")
+    words = str(source or "").replace("-", " ")
     return words.replace("exif", "EXIF").replace("xmp", "XMP")
 
 
-def _camera(camera: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, str]:
+def _camera(camera: Mapping[str, Any], group: Mapping[str, Any]) -> dict[str, str]:
     make, model = str(camera.get("make") or ""), str(camera.get("model_name") or "")
     name = (model if model.casefold().startswith(make.casefold()) else f"{make} {model}").strip() or "unknown camera"
     known = _source(camera.get("focal_source"))
     focal = f"{number(camera.get('focal_px'), 1)} px" + (f" ({known})" if known else "")
     size = f"{count(camera.get('width'))} × {count(camera.get('height'))}"
-    if told.get("exif_size"):
+    if group.get("exif_size"):
         size += " ({} from {} × {})".format(
-            "cropped" if told.get("cropped") else "reduced", *map(count, told["exif_size"])
+            "cropped" if group.get("cropped") else "reduced", *map(count, group["exif_size"])
         )
     return {"name": name, "photos": count(camera.get("photos")), "size": size, "focal": focal}
 
@@ -183,7 +183,7 @@ def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str,
     """A camera's estimated calibration, and which parameters were refined."""
     prior, focal = camera.get("prior_focal_px"), camera.get("focal_px")
     change = (focal / prior - 1.0) if camera.get("has_prior") and prior and focal else math.nan
-    told = f"{change:+.2%}".replace("%", " %") if math.isfinite(change) else "–"
+    change_text = f"{change:+.2%}".replace("%", " %") if math.isfinite(change) else "–"
     stated = f"{number(prior, 1)} px" if camera.get("has_prior") else "not stated"
     model = str(camera.get("model", ""))
     if lens.get("freed"):
@@ -196,7 +196,7 @@ def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str,
         "model": model,
         "prior": stated + (f" ({source})" if source else ""),
         "focal": f"{number(focal, 1)} px",
-        "change": told,
+        "change": change_text,
         "error": f"{number(camera.get('error_px'), 2)} px",
     }
 
@@ -246,12 +246,12 @@ def _span(times: Sequence[str]) -> str:
 def _positions(summary: Mapping[str, Any], positions: Sequence[Mapping[str, Any]]) -> str:
     if not positions:
         return "none of the photos has a position"
-    told = f"{len(positions):,} photos"
+    text = f"{len(positions):,} photos"
     sources = ", ".join(_source(source) for source in summary.get("position_sources", []))
-    told += f", from {sources}" if sources else ""
+    text += f", from {sources}" if sources else ""
     flights = summary.get("flights")
-    told += f", {count(flights)} flights" if isinstance(flights, int) and flights > 1 else ""
+    text += f", {count(flights)} flights" if isinstance(flights, int) and flights > 1 else ""
     horizontal, vertical = summary.get("sigma_horizontal_m"), summary.get("sigma_vertical_m")
     if horizontal is not None:
-        told += f"; taken to be good to {length(horizontal)} horizontally, {length(vertical)} in height"
-    return told
+        text += f"; taken to be good to {length(horizontal)} horizontally, {length(vertical)} in height"
+    return text

@@ -40,7 +40,7 @@ RECORDS = {
 }
 
 
-def making_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
+def processing_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
     """The chapter on processing: stages, machine, versions, seeds, options.
 
     Args:
@@ -107,11 +107,11 @@ def files_chapter(inputs: ReportInputs) -> Chapter:
     }
 
 
-def said_chapter(inputs: ReportInputs) -> Chapter:
+def messages_chapter(inputs: ReportInputs) -> Chapter:
     """Warnings and notes of the run, stage by stage."""
     stages = inputs.history.stages
-    warnings = [(name, *told) for name, stage in stages.items() for told in stage.messages.warnings]
-    notes = [(name, told) for name, stage in stages.items() for told in stage.messages.notes]
+    warnings = [(name, *message) for name, stage in stages.items() for message in stage.messages.warnings]
+    notes = [(name, message) for name, stage in stages.items() for message in stage.messages.notes]
     return {"warnings": warnings, "notes": notes}
 
 
@@ -155,24 +155,24 @@ def _forecast(needs: Sequence[Mapping[str, Any]]) -> str:
 
 def _made_otherwise(inputs: ReportInputs, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Stages reused from an earlier run with other versions, and these versions."""
-    told = []
+    stages = []
     for name, artifact in inputs.artifacts.items():
         other = artifact.manifest.get("versions", {})
         differ = [f"{what} {value}" for what, value in other.items() if versions.get(what) != value]
         if differ:
-            told.append((name, ", ".join(differ)))
-    return told
+            stages.append((name, ", ".join(differ)))
+    return stages
 
 
 def _machine(machine: Mapping[str, Any]) -> str:
-    told = [str(machine[name]) for name in ("system", "processor") if machine.get(name)]
+    parts = [str(machine[name]) for name in ("system", "processor") if machine.get(name)]
     if machine.get("cores"):
-        told.append(f"{count(machine['cores'])} cores")
+        parts.append(f"{count(machine['cores'])} cores")
     if machine.get("threads"):
-        told.append(f"{plural(int(machine['threads']), 'thread')} used")
+        parts.append(f"{plural(int(machine['threads']), 'thread')} used")
     if machine.get("device") not in (None, "auto"):
-        told.append(f"device {machine['device']}")
-    return ", ".join(told)
+        parts.append(f"device {machine['device']}")
+    return ", ".join(parts)
 
 
 def _options(options: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -89,7 +89,9 @@ def views_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     views = sorted(metrics["per_view"], key=lambda view: view["psnr"] if view.get("psnr") is not None else -1.0)
     if "whole" in metrics:  # a view that shows nothing inside the boundary has no figures, and goes last
         views = sorted(views, key=lambda view: view.get("psnr") is None)
-    measures = [(name, *told) for name, told in MEASURES.items() if any(view.get(name) is not None for view in views)]
+    measures = [
+        (name, *column) for name, column in MEASURES.items() if any(view.get(name) is not None for view in views)
+    ]
     chapter: Chapter = {
         "titles": [title for _, title, _ in measures],
         "rows": [_row(view, measures) for view in views[:MOST_ROWS]],
@@ -170,7 +172,7 @@ def _curves(inputs: ReportInputs, history: Mapping[str, Any]) -> dict[str, dict[
 def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | None) -> list[dict[str, Any]]:
     from splatpipe.pipeline.app.report.charts import training_curve
 
-    told = {
+    labels = {
         "loss": (
             "loss (L1 + D-SSIM)",
             True,
@@ -179,7 +181,7 @@ def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | 
         "gaussians": ("Gaussians", False, "Number of Gaussians, as density control adds and prunes them."),
     }
     charts = []
-    for name, (label, log, text) in told.items():
+    for name, (label, log, text) in labels.items():
         curve = {step: value for step, value in curves.get(name, {}).items() if value == value}
         if len(curve) > 1:
             charts.append({"svg": training_curve(label, curve, planned, log), "text": text})
@@ -193,14 +195,14 @@ def _last(curve: Mapping[float, float]) -> float | None:
 def _why_earlier(summary: Mapping[str, Any]) -> str:
     if parts := summary.get("flat"):  # of a training in blocks
         blocks = len(parts.keys() - {"coarse"})
-        told = ["in the coarse pass"] * ("coarse" in parts)
-        told += [f"in {count(blocks)} of {count(summary.get('blocks'))} blocks"] * bool(blocks)
-        return f": the loss was flat {' and '.join(told)}"
+        where = ["in the coarse pass"] * ("coarse" in parts)
+        where += [f"in {count(blocks)} of {count(summary.get('blocks'))} blocks"] * bool(blocks)
+        return f": the loss was flat {' and '.join(where)}"
     flat, before = summary.get("flat_at"), summary.get("sizes_ended") or []
-    told = [f"of smaller photos after {count(iteration)}" for iteration in before] + (
+    where = [f"of smaller photos after {count(iteration)}" for iteration in before] + (
         [f"after {count(flat)}"] if flat else []
     )
-    return f": the loss was flat {', '.join(told)}" if told else ""
+    return f": the loss was flat {', '.join(where)}" if where else ""
 
 
 def _blocks(inputs: ReportInputs) -> str:
