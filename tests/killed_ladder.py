@@ -1,7 +1,7 @@
 """Runs the pipeline of lines/leftovers.py, and kills itself once a stage reports something; a program for
 test_ladder_kills.py.
 
-Arguments: photos, out, what has to be told ("" to live), threads.
+Arguments: photos, out, the event to die at ("" for none), threads.
 """
 
 import os

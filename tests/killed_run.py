@@ -1,4 +1,4 @@
-"""Runs the pipeline like the command does, and kills itself in the middle of a stage; a program for test_line.py.
+"""Runs the pipeline as the command does, and kills itself in the middle of a stage; a program for test_line.py.
 
 Arguments: photos, out, the stage to die in, "alone" or "group", then --set assignments.
 """
@@ -18,7 +18,7 @@ from splatpipe.stages.options import LineConfig
 
 def main(photos: str, out: str, stage: str, how: str, *assignments: str) -> None:
     def die(event: Event) -> None:
-        # The runner commits an artifact only after the stage's last event: dying in a progress event is dying within.
+        # The runner commits an artifact only after the stage's last event: a progress event is within the stage.
         if event.stage == stage and event.kind == "progress" and event.data["done"] > 0:
             if how == "group":
                 os.killpg(os.getpgid(0), signal.SIGKILL)

@@ -30,7 +30,7 @@ import tiny_scene
 
 TURN = rotation_from_vector(np.array([0.25, -0.2, 0.1]))  # of the wall, in the model's frame: seen at a slant
 WORLD_FROM_MODEL = Similarity(12.5, rotation_from_vector(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
-RENDERED = 6e-3  # metres, of a pixel's 0.089: the screen filter draws what is seen at a slant a little nearer
+RENDERED = 6e-3  # metres; a pixel is 0.089. The screen filter makes slanted surfaces appear a little nearer
 
 
 def wall() -> Gaussians:
@@ -46,7 +46,7 @@ def wall() -> Gaussians:
 
 
 def cameras() -> list[Camera]:
-    """The tiny scene's, with eight times the pixels a side: the wall's Gaussians are some pixels wide."""
+    """The tiny scene's cameras with eight times the pixels per side: the wall's Gaussians are some pixels wide."""
     return [camera.scaled(8 * camera.width, 8 * camera.height) for camera in tiny_scene.cameras()]
 
 
@@ -115,7 +115,7 @@ def test_georefs_findings_on_each_point_are_kept(parts: dict[str, Path]) -> None
 
 
 def test_the_offset_of_a_misplaced_splat_is_reported(parts: dict[str, Path]) -> None:
-    """Surveyed points beside the wall: the residuals are the negative of it."""
+    """Surveyed points beside the wall: the residuals are the negative offset."""
     off = (0.3, -0.2, 0.5)
     rewrite(parts["georef.control"], control(cameras(), points_on_the_wall(), off))
     table = measured(parts)["splat"]["tables"]["all"]

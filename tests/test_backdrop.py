@@ -91,9 +91,9 @@ def test_initial_points_include_all_of_the_inside_and_an_even_sample_of_the_rest
     assert set(range(100, 400)) <= set(rows.tolist())
     others = np.setdiff1d(rows, np.arange(100, 400))
     assert len(others) == backdrop_limit(300) == 150
-    assert np.diff(np.searchsorted(np.flatnonzero(~inside), others)).max() <= 5  # 700 of which every 4.7th is taken
+    assert np.diff(np.searchsorted(np.flatnonzero(~inside), others)).max() <= 5  # of 700, every 4.7th is taken
     np.testing.assert_array_equal(coarse_start(np.ones(7, np.bool_)), np.arange(7))
-    assert len(coarse_start(np.zeros(70, np.bool_))) == 5  # no inside, and a backdrop all the same
+    assert len(coarse_start(np.zeros(70, np.bool_))) == 5  # no inside, but still a backdrop
 
 
 def test_a_backdrop_leaves_the_inside_two_thirds_of_the_cap() -> None:
@@ -137,7 +137,7 @@ def test_density_control_outside_keeps_to_the_backdrops_share(monkeypatch: pytes
             state.control_density(plan, iteration)
             inside = AREA.contains(state.gaussians.means.detach().double().numpy())
             outside = int((~inside).sum())
-            # What the inside's clones and halves add on the other side of the line goes at the next step.
+            # Clones and halves of the inside that fall outside are removed at the next step.
             assert outside <= backdrop_limit(int(inside.sum()), 400) + 0.05 * len(inside)
     before = int(AREA.contains(start.means.double().numpy()).sum())
     assert int(inside.sum()) > 2.5 * before and len(state.gaussians) <= 400

@@ -111,7 +111,7 @@ def test_a_failed_capture_stops_no_other_and_finished_ones_are_not_touched(tmp_p
 
 
 def descendants(process: int) -> dict[int, str]:
-    """Command lines of all that came from a process, by their numbers."""
+    """Command lines of a process's descendants, by process ID."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -137,7 +137,7 @@ def alive(processes: dict[int, str]) -> list[str]:
 
 
 def worker_of(running: subprocess.Popen[str], out: Path, but: int = 0) -> int:
-    """Waits until the stage features runs; the number of the process that runs it."""
+    """Wait until the stage features runs; return the ID of its process."""
 
     def found() -> int:
         assert running.poll() is None

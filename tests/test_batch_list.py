@@ -87,7 +87,7 @@ def test_a_list_gives_each_capture_its_options_and_paths_from_its_own_folder(
     assert {"train": {"time_budget_s": 5400.0}} in again.tables
     control = {section: values for table in surveyed.tables for section, values in table.items()}["georef"]["control"]
     assert Path(control) == listed.parent / "points.txt"
-    assert wrong.trouble is not None and "soon" in wrong.trouble.message  # fails alone, when its turn comes
+    assert wrong.trouble is not None and "soon" in wrong.trouble.message  # only this one fails, once it runs
 
 
 @pytest.mark.parametrize(

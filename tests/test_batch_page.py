@@ -31,7 +31,7 @@ def words(watched: object) -> str:
 
 
 def full_batch(folder: Path) -> BatchState:
-    """A capture in each state, one of them with all that a card can have."""
+    """A capture in each state, one of them with everything that a card can show."""
     whole = folder / "church"
     whole.mkdir()
     for name in ("report.html", "viewer.html"):
@@ -205,7 +205,7 @@ def test_two_hundred_captures_stay_a_small_page(tmp_path: Path, open_page: Calla
     ]
     path = tmp_path / "batch.html"
     write_page(batch(*captures), path)
-    assert path.stat().st_size < 12_000_000  # of pure noise; of photos a third
+    assert path.stat().st_size < 12_000_000  # for pure noise; photos take a third
     watched = open_page(path.as_uri(), width=390, height=844, touch=True)
     assert (watched.requests, watched.errors) == ([], [])
     assert watched.page.locator(".capture img").count() == 200

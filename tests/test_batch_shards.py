@@ -38,7 +38,7 @@ def captures(folder: Path) -> Path:
 
 
 def batch(listed: Path, out: Path, *more: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """The whole program on the line of `sharded`."""
+    """The whole program with the pipeline of `sharded`."""
     path = os.pathsep.join([str(LINES / "sharded_site"), str(LINES), os.environ.get("PYTHONPATH", "")])
     words = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "batch", str(listed), str(out), *more]
     return subprocess.run(
@@ -66,7 +66,7 @@ def test_captures_run_in_shards_and_a_killed_shard_costs_only_its_own_job(tmp_pa
     changed = batch(listed, out, "--until", "sum", "--set", "sum.offset=1", "--dry-run")
     counts = dict(line.split() for line in changed.stderr.splitlines() if len(line.split()) == 2 and "sum" in line)
     assert counts["sum_shard"] == "3" and counts["sum"] == "2"
-    # A shard's command takes the options that lie in its OUT: a job before it leaves them there, though all is valid.
+    # A shard's command reads the options in its OUT: a job before it writes them, even if everything is valid.
     listed.write_text('[[capture]]\nphotos = "south"\n')
     assert batch(listed, out, "--until", "sum", "--set", "sum.offset=1").returncode == 0
     totals = sorted(json.loads(path.read_text())["total"] for path in out.glob("south/stages/sum-*/total.json"))
@@ -103,7 +103,7 @@ def test_shards_have_their_own_share_of_a_stages_resources(tmp_path: Path) -> No
     (house,) = call.plan().captures
     assert [each.stage for each in call.jobs(house)] == ["divide", "sum", "show"]
     call.write_shards(house.key, {"sum": [job("sum.1", 100.0), job("sum.2", 150.0)]})
-    call.write_shards(house.key, {"sum": [job("sum.1", 1.0)]})  # what is known stays
+    call.write_shards(house.key, {"sum": [job("sum.1", 1.0)]})  # known values are kept
     assert [(each.stage, each.seconds) for each in call.jobs(house)] == [
         ("divide", 60.0), ("sum.1", 100.0), ("sum.2", 150.0), ("sum", 50.0), ("show", 60.0),
     ]  # fmt: skip

@@ -67,7 +67,7 @@ def test_forecasts_follow_lengths_windows_and_limits(preset: str) -> None:
     each = [CaptureWork.of(size, config, REFERENCE, 2) for size in (small, large)]
     assert all(work.iterations >= 20 * work.size.photos and work.window <= 0.53 for work in each)
     few, many = (forecast(size, config)["train"] for size in (small, large))
-    decoded = 3 * 0.25e6 * (1000 - 50)  # bytes of the photos that are more, at less than any preset's size
+    decoded = 3 * 0.25e6 * (1000 - 50)  # bytes of the additional photos, at less than any preset's size
     assert many.cpu_seconds > few.cpu_seconds and many.scratch_bytes > few.scratch_bytes + decoded
     limited = resolve(LineConfig, [load_preset(preset), {"train": {"max_memory_bytes": 800_000_000}}])
     assert CaptureWork.of(small, limited, REFERENCE, 2).window < each[0].window

@@ -145,11 +145,11 @@ def test_outside_a_boundary_a_block_stays_coarse(site: SiteParts, undisturbed: P
 
 
 class Kill(BaseException):
-    """Stands for a kill."""
+    """Stands in for a kill."""
 
 
 def step_with(patch: pytest.MonkeyPatch, look: Callable[[TrainState, TrainingPhoto], None]) -> None:
-    """Let ``look`` see each iteration before it begins."""
+    """Call ``look`` before each iteration."""
     step = loop.iterate
 
     def looking(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
@@ -199,7 +199,7 @@ def test_windows_that_show_the_cell_are_each_used_as_often_as_without_blocks(sit
         assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2
         assert {view for view, *_ in times} == set(range(len(plan.train_views)))
         looked.append({(plan.train_views[view], level, window) for view, level, window in times})
-    # Cameras look along the line between the cells: the left cell is in the left of the picture, about.
+    # Cameras look along the line between the cells: the left cell is roughly in the left of the image.
     first, second = looked
     assert max(window.left for _, level, window in first if level == 0) < 0.75 * tiny_scene.WIDTH
     assert min(window.right for _, level, window in second if level == 0) > 0.25 * tiny_scene.WIDTH
@@ -297,7 +297,7 @@ def test_pixels_that_count_are_near_the_cell_or_have_no_depth(site: SiteParts) -
         far = distances > MARGINS * PARTITION.margin * 2**0.5
         assert found[near].all() and not found[cv2.erode(far.astype(np.uint8), beside) > 0].any()
         assert 0.1 < found.mean() < 1.0
-        # Thin things that the depth has not: only what is beside a point counts.
+        # Thin objects missing from the depth: only pixels near a point count.
         lost = counted_samples(enclosed, 0, replace(sight, depth=np.full_like(depth, 500.0)), points.xyz)
         observed = sight.of_points(points.xyz)
         inside = CELLS[0].contains(PARTITION.plan.places(observed.places))

@@ -77,7 +77,7 @@ def test_plan_for_any_up_direction_is_a_rotation(up: tuple[float, float, float])
     assert np.allclose(plan.up, np.array(up) / np.linalg.norm(up), atol=1e-15)
     points = np.random.default_rng(1).normal(size=(50, 3))
     assert np.allclose(plan.points(plan.places(points), plan.heights(points)), points, atol=1e-14)
-    assert plan.places(points)[7].tobytes() == plan.places(points[7:8])[0].tobytes()  # wherever a point stands
+    assert plan.places(points)[7].tobytes() == plan.places(points[7:8])[0].tobytes()  # wherever a point is
 
 
 def test_line_of_a_plan_knows_its_sides() -> None:
@@ -252,7 +252,7 @@ def test_a_building_hides_the_ground_behind_it(coarse: Gaussians, sparse: Float6
     views = block_views(partition, sight, sparse, building_site.quarters)
     assert [photo.photo for photo in views[0].photos] == [0] and views[1].photos == ()
     _, pixels, _ = before.in_view(np.array([[10.0, y1 + 3.0, 0.0]]))
-    assert len(pixels) == 1  # though it lies in its picture
+    assert len(pixels) == 1  # although it is inside its image
 
 
 def test_without_a_coarse_model_points_determine_visibility(
@@ -456,7 +456,7 @@ def test_blocks_are_as_few_as_memory_allows() -> None:
 
 
 def test_demo_is_divided_assigned_to_photos_and_merged(demo_run: Path) -> None:
-    """The demo's own sparse model and coarse depths: four blocks of alike work that see their cells."""
+    """The demo's own sparse model and coarse depths: four blocks of similar work that see their cells."""
     dataset = next((demo_run / "stages").glob("undistort-*")) / "dataset"
     (ply,) = (demo_run / "stages").glob("train-*/*.ply")
     coarse = read_splat(ply)

@@ -55,7 +55,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def prepared(dataset: Path, every: int) -> Path:
-    """The folder of a dataset, with what else comes before blocks."""
+    """A dataset's folder with the other inputs of `blocks`."""
     folder = dataset.parent
     parts = {"undistort.dataset": dataset, **tiny_scene.split_part(dataset, every)}
     parts["split.views"].rename(folder / "split.json")
@@ -114,7 +114,7 @@ def test_a_cap_that_does_not_fit_is_kept_and_the_scene_is_divided(limit: int) ->
 def test_the_coarse_pass_has_the_cap_of_the_whole_or_what_the_limit_holds(limit: int) -> None:
     found = divided(SITE, limit)
     room = limit - (found.memory_bytes - found.need.memory_bytes)  # the libraries are in no need
-    assert found.need.trained < found.coarse_cap < found.cap  # more than a block trains: nothing lies frozen around it
+    assert found.need.trained < found.coarse_cap < found.cap  # more than a block trains: it has no frozen surroundings
     taken = [need_of_blocks(1, found.coarse_cap + n, found.window_pixels, SITE.sh_degree).memory_bytes for n in (0, 2)]
     assert taken[0] <= room < taken[1]
     assert divided(SITE, 0, least=4).coarse_cap == divided(SITE, 8_000_000_000, least=4).coarse_cap == SITE.cap
@@ -130,7 +130,7 @@ def test_few_photos_have_few_blocks_and_a_cap_that_these_hold() -> None:
     few = divided(replace(SITE, photos=5 * PHOTOS_A_BLOCK), 1_000_000_000)
     assert few.blocks == 5 and 0 < few.cap < SITE.cap and few.memory_bytes <= 1_000_000_000
     assert divided(replace(SITE, photos=PHOTOS_A_BLOCK), 1_000_000_000).is_whole
-    assert divided(SITE, 500_000_000).is_whole  # which says itself that it is too little
+    assert divided(SITE, 500_000_000).is_whole  # training itself reports that it is too little
 
 
 def test_a_requested_limit_takes_precedence_over_the_machines() -> None:
@@ -219,7 +219,7 @@ def test_blocks_model_the_sky_and_exclude_moving_objects(tmp_path: Path) -> None
 def test_any_order_any_threads_and_a_kill_in_a_block_give_the_same_bits(
     scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
-    """Blocks of two processes, the last one first, each killed with -9 in its training, made again on two threads."""
+    """Blocks of two processes, the last one first, each killed with -9 during training and restarted on two threads."""
     block_line.make(scene, tmp_path, {**OPTIONS, "blocks": {"least": 0}}, until="blocks")
     block_line.make(scene, tmp_path, OPTIONS, until="blocks")
     for shard in reversed(SHARDS):
@@ -234,7 +234,7 @@ def test_any_order_any_threads_and_a_kill_in_a_block_give_the_same_bits(
 
 
 class Kill(BaseException):
-    """Stands for a kill."""
+    """Stands in for a kill."""
 
 
 def test_a_finished_coarse_pass_is_not_repeated(

@@ -144,7 +144,7 @@ CASES: dict[str, Any] = {
 def test_all_forms_and_reference_systems_give_the_same_area(tmp_path: Path, case: str) -> None:
     area, notes = laid(tmp_path, CASES[case])
     for ring, wanted in zip(area.polygons[0], (OUTLINE, HOLE), strict=True):
-        np.testing.assert_allclose(ring, wanted, atol=0.002)  # the demo's own geodesy, another way of PROJ's
+        np.testing.assert_allclose(ring, wanted, atol=0.002)  # the demo's own geodesy, independent of PROJ
     assert not notes.warnings and "320 m²" in notes.notes[0]
 
 

@@ -237,7 +237,7 @@ def test_every_photo_is_seen_often_enough_before_photos_grow() -> None:
 
 @pytest.mark.parametrize("seconds", [5.0, 15.0, 60.0])
 def test_dense_points_reduce_neither_photo_size_nor_iterations(seconds: float) -> None:
-    """They are what a plan drops first, so it need not have room for them: only the forecast counts those that stay."""
+    """A plan drops them first, so it need not reserve room for them: only the forecast counts those that are kept."""
     bare, dense = choose(task_of(seconds)), choose(replace(task_of(seconds), dense=50_000))
     assert dense.options.max_megapixels == bare.options.max_megapixels
     assert dense.options.iterations >= 0.9 * bare.options.iterations
@@ -292,7 +292,7 @@ def test_a_budget_spent_before_training_gives_a_minimal_training_and_one_warning
 
 
 def trained(scene: Path, out: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch) -> tiny_scene.Recorder:
-    """Train by a plan that was made before: measuring again would fail the test."""
+    """Train by an existing plan: measuring again would fail the test."""
     out.mkdir(exist_ok=True)
     if not (out / "plan.json").exists():
         (out / "plan.json").write_text(plan.to_json())
@@ -313,7 +313,7 @@ def plan(scene: Path, tmp_path: Path) -> TrainingPlan:
 
 
 class Kill(BaseException):
-    """Stands for a kill."""
+    """Stands in for a kill."""
 
 
 def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
@@ -381,7 +381,7 @@ def test_photos_are_trained_on_at_the_planned_size_and_measured_at_the_datasets(
 
 def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused(scene: Path, tmp_path: Path) -> None:
     count = len(read_splat(scene / "init.ply"))
-    return_free_heap()  # of the tests before, which the plan would not count
+    return_free_heap()  # memory of earlier tests, which the plan would not count
     config = tiny_scene.plain(iterations=10, max_memory_bytes=resident_bytes() + FIXED_BYTES // 2)
     with pytest.raises(MachineError, match="GB already") as raised:
         train.run(config, make_inputs(scene), tmp_path, tiny_scene.Recorder())

@@ -33,7 +33,7 @@ from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
 UP = np.array([0.48, -0.64, 0.6])
-TILT = rotation_to_up(UP).T  # world from the frame in which the tests think: z up
+TILT = rotation_to_up(UP).T  # world from the frame that the tests use, z up
 FPS, SECONDS = 25, 10.0
 FRAMES = round(FPS * SECONDS)
 
@@ -133,7 +133,7 @@ def test_outlying_photos_are_left_out() -> None:
     cameras = ring(20)
     far = photo((300.0, 40.0, 8.0), (0, 0, 3))
     away = photo((20.0, 0.0, 8.0), (90.0, 0.0, 30.0))  # sees nothing of the house
-    near = photo((0.5, 0.0, 7.0), (0, 0, 3))  # on the roof: left out of the way, from which it leads aside
+    near = photo((0.5, 0.0, 7.0), (0, 0, 3))  # on the roof: left out of the path, since it would be a detour
     found, _ = followed_photos(capture([*cameras[:10], far, away, near, *cameras[10:]]))
     assert found.tolist() == [*range(10), *range(12, 23)]
     route = film([*cameras[:10], far, away, near, *cameras[10:]])
@@ -142,7 +142,7 @@ def test_outlying_photos_are_left_out() -> None:
 
 
 def test_a_film_goes_round_the_house_and_not_through_it() -> None:
-    """Names alternate between the two sides, so that every straight way from name to name leads through the house."""
+    """Names alternate between the two sides, so that straight lines from one name to the next go through the house."""
     one = [photo((x, -12.0, 5.0), (x, 0, 3)) for x in np.linspace(-8, 8, 9)]
     other = [photo((x, 12.0, 5.0), (x, 0, 3)) for x in np.linspace(8, -8, 9)]
     mixed = [camera for pair in zip(one, other, strict=True) for camera in pair]

@@ -38,7 +38,7 @@ def test_a_real_capture_becomes_a_splat(
 
 @pytest.mark.timeout(600)
 def test_a_phones_wrong_focal_length_does_not_cost_the_cameras(captures: Path, tmp_path: Path) -> None:
-    """Incremental mapping places 4 of these 29 photos: what they state of their lens is 26 % off."""
+    """Incremental mapping places 4 of these 29 photos: the focal length that they state is 26 % off."""
     splatpipe("run", captures / "lund" / "photos", tmp_path / "out", "--preset", "preview", "--until", "sparse")
     [summary] = (tmp_path / "out" / "stages").glob("sparse-*/models.json")
     found = json.loads(summary.read_text())

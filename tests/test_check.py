@@ -53,7 +53,7 @@ def ring(folder: Path, leave_out: tuple[int, ...] = ()) -> Path:
 
 
 def changed(path: Path, change: Picture) -> None:
-    """Save a photo anew with other pixels and the same metadata."""
+    """Save a photo again with other pixels and the same metadata."""
     with Image.open(path) as picture:
         pixels = change(np.asarray(picture.convert("RGB"), np.float32))
         kept = {"exif": picture.getexif().tobytes(), "xmp": picture.info["xmp"]}
@@ -76,7 +76,7 @@ def gps_of(path: Path) -> dict[int, object]:
 
 
 def with_exif(path: Path, gps: dict[int, object] | None = None, model: str = "") -> None:
-    """Another position or camera, in EXIF; XMP goes, which has both, too."""
+    """Another position or camera, in EXIF; XMP, which states both as well, is removed."""
     with Image.open(path) as picture:
         exif, pixels = picture.getexif(), picture.copy()
     if gps is not None:
@@ -128,7 +128,7 @@ def test_faults_of_single_photos_are_found_and_name_them(tmp_path: Path) -> None
 
 
 def lines(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places and times of a flight to and fro, 10 m a photo, 25 m between lines, 2 s a photo and 5 s a turn."""
+    """Positions and times of a flight back and forth: 10 m and 2 s per photo, 25 m between lines, 5 s per turn."""
     places, times, now = [], [], 0.0
     for row in range(rows):
         way = range(columns) if row % 2 == 0 else reversed(range(columns))

@@ -27,7 +27,7 @@ Points = Float64[np.ndarray, "n 3"]
 def made_of(
     points: Points, scale: float | tuple[float, float, float], colour: float, opacity: float = 0.95
 ) -> Gaussians:
-    """Gaussians at points, unturned."""
+    """Gaussians at points, not rotated."""
     found = Gaussians.empty(len(points), 0)
     found.means[:] = torch.from_numpy(points).float()
     found.log_scales[:] = torch.log(torch.tensor(scale if isinstance(scale, tuple) else (scale,) * 3))

@@ -29,7 +29,7 @@ LOOKS = STEPS_BETWEEN * SCHEDULE.density.every
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wall of points at z = 1.5 alone, seen by all cameras."""
+    """Only a wall of points at z = 1.5, seen by all cameras."""
     folder = tmp_path_factory.mktemp("wall")
     tiny_scene.write_dataset(folder)
     generator = np.random.default_rng(1)

@@ -28,7 +28,7 @@ def camera(x: float, turned: float = 0.0) -> Camera:
 
 
 def true_depth(view: Camera, box: bool = False) -> np.ndarray:
-    """Depth of a wall at z = 10, with a board of two units at z = 5 before it."""
+    """Depth of a wall at z = 10, with a board of two units at z = 5 in front of it."""
     rows, columns = np.mgrid[: view.height, : view.width]
     rays = np.stack(((columns + 0.5 - view.cx) / view.fx, (rows + 0.5 - view.cy) / view.fy, np.ones(rows.shape)), 2)
     directions = rays @ view.cam_from_world[:3, :3]
@@ -46,7 +46,7 @@ LEFT, RIGHT = camera(-0.5), camera(0.5)
 
 def test_true_depths_agree_wherever_both_views_see() -> None:
     found = depth_differences(LEFT, true_depth(LEFT), RIGHT, true_depth(RIGHT))
-    # A pixel is 10 / 80 wide there, and what the left sees up to 8 of them from its border the right does not.
+    # A pixel is 10 / 80 wide there, and the right view lacks what the left sees within 8 of them from its border.
     assert found.size == (HEIGHT // SAMPLE_EVERY) * ((WIDTH - 8) // SAMPLE_EVERY)
     assert np.abs(found).max() < 1e-6
 

@@ -36,7 +36,7 @@ def commands() -> list[list[str]]:
 
 @pytest.mark.parametrize("command", commands(), ids=" ".join)
 def test_the_examples_call_splatpipe_with_valid_options(tmp_path: Path, command: list[str]) -> None:
-    """Not one is refused for how it is called, though the container's folders are not here."""
+    """None is refused for its arguments, although the container's folders do not exist here."""
     here = [word.replace("/", f"{tmp_path}/", 1) if word.startswith("/") else word for word in command]
     started = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *here]
     done = subprocess.run(started, capture_output=True, text=True, check=False)
@@ -73,7 +73,7 @@ def test_the_slurm_job_forwards_the_signal_waits_for_the_end_and_is_requeued_unl
     monkeypatch.setenv("TOLD_SLURM", str(told_slurm))
     process = slurm(tmp_path, capture_path(), out, "--preset", "preview")
     wait_until(lambda: (out / "events.jsonl").exists() or process.poll() is not None, "the run")
-    process.send_signal(number)  # Slurm's B: the shell alone
+    process.send_signal(number)  # Slurm's B: the shell only
     _, told = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 143, told
     assert "Finished work is kept" in told, told

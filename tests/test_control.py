@@ -44,7 +44,7 @@ CONSUMER, RTK = ("gps", (3.0, 5.0)), ("rtk", (0.02, 0.03))
 
 @dataclass
 class Notes:
-    """A reporter that remembers."""
+    """A reporter that records."""
 
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -116,7 +116,7 @@ def checks(*names: str) -> str:
 
 def independent_rmse(result: Result, names: tuple[str, ...]) -> tuple[float, float]:
     """Horizontal and vertical RMSE of points by other means: linear triangulation of the marks with the model's
-    cameras as they lie in the frame, taken to the truth's frame by PROJ, against the truth's coordinates."""
+    cameras as placed in the frame, transformed to the truth's frame by PROJ, against the truth's coordinates."""
     frame = load_frame(result.out / "frame.json")
     model = pycolmap.Reconstruction(result.out / "sparse" / "0")
     by_name = {image.name: image for image in model.images.values()}
@@ -168,7 +168,7 @@ def test_five_control_points_make_the_check_points_right_whatever_the_datum_of_g
 def test_figures_are_those_computed_independently_from_the_truth(
     tmp_path: Path, whole: pycolmap.Reconstruction
 ) -> None:
-    """To 1 %, or a tenth of a millimetre: the linear triangulation weighs marks otherwise."""
+    """To 1 %, or a tenth of a millimetre: the linear triangulation weights marks differently."""
     result = georef(tmp_path, whole, gcp_list(rows(tuple(POINTS))), check_points=checks(*OTHERS))
     horizontal, vertical = independent_rmse(result, OTHERS)
     assert result.table("check")["rmse_horizontal_m"] == pytest.approx(horizontal, rel=0.01, abs=2e-4)
@@ -259,7 +259,7 @@ def test_blunder_that_doming_hides_is_found_by_the_adjustment(tmp_path: Path) ->
 
 
 def flat_nadir() -> pycolmap.Reconstruction:
-    """The nadir strips over ground without relief: a longer lens from higher up makes the same photos."""
+    """The nadir strips over ground without relief: a longer lens at a greater height gives the same photos."""
     return adjusted(true_model(NADIR, flat=True))
 
 
@@ -271,7 +271,7 @@ def test_posterior_shows_which_photos_determine_their_focal_length(whole: pycolm
 
 
 def test_undetermined_focal_length_is_held_near_the_metadata(tmp_path: Path) -> None:
-    """Control on the flat ground does not tell it either; the metadata say 853 pixels, the model 10 % more."""
+    """Control on the flat ground does not determine it either; the metadata state 853 pixels, the model 10 % more."""
     flat = adjusted(true_model(NADIR, flat=True), LENS[0] * 1.1, LENS[3])
     ground = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08")
     result = georef(tmp_path, flat, gcp_list(rows(ground, NADIR)), check_points="none")
@@ -424,7 +424,7 @@ def test_point_seen_once_is_named(tmp_path: Path, whole: pycolmap.Reconstruction
 
 
 def test_control_without_heights_controls_horizontally(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
-    """Without positions, how the cameras are held levels the model; with them, heights are theirs."""
+    """Without positions, the cameras' usual attitude levels the model; with them, heights are the positions'."""
     flat = [replace(row, place=(*row.place[:2], 0.0)) for row in rows(GROUND_AND_ROOF)]
     alone = georef(tmp_path / "alone", whole, gcp_list(flat), None)
     assert any("0.0 is treated as unknown" in note for note in alone.told.notes)

@@ -170,7 +170,7 @@ change = st.tuples(
 @settings(max_examples=60, deadline=None)
 @given(st.booleans(), st.lists(change, max_size=12))
 def test_any_changes_leave_a_file_that_reads_back_accordingly(as_csv: bool, changes: list) -> None:
-    """Against the plainest model of it: a dictionary."""
+    """Compared with the simplest model: a dictionary."""
     text = ControlText.begin(Path("marks"), "EPSG:32633", as_csv, find)
     wanted: dict[tuple[str, str], object] = {}
     places = {name: point(name, float(number + 1)) for number, name in enumerate(["P1", "P 2", "point 1"])}

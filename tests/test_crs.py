@@ -29,7 +29,7 @@ from splatpipe.pipeline.survey.georeference import georeference, scene_box
 from splatpipe.pipeline.survey.world import in_crs, open_world
 
 MILLIMETRE = 1e-3
-HALLSTATT = Origin(47.8412, 13.5127, 512.0)  # where the demo's house stands
+HALLSTATT = Origin(47.8412, 13.5127, 512.0)  # where the demo's house is
 BOX = np.array([[-1000.0, -1000.0, -30.0], [1000.0, 1000.0, 60.0]])
 # One UTM on WGS 84, one Gauss-Krüger on another datum and northing first, one conic, one of a neighbouring zone.
 CRSS = ["EPSG:32633", "EPSG:31255", "EPSG:3034", "EPSG:25832"]
@@ -75,7 +75,7 @@ def test_a_crs_is_read_in_every_form_including_its_own_output(text: str, stated:
         "EPSG:999999",
         "EPSG:32633\x00",
         "EPSG:３２６３３",
-        "EPSG:6360",  # heights alone
+        "EPSG:6360",  # heights only
         "EPSG:4978",  # earth-centred
         "EPSG:5555+7837",  # has heights
         "EPSG:25832+5336",  # a depth
@@ -263,7 +263,7 @@ def test_a_missing_grid_is_replaced_with_a_note_if_the_user_accepts_that() -> No
 
 
 def test_a_modern_datum_without_an_operation_is_wgs84_only_if_the_user_accepts_that() -> None:
-    """CGCS2000 has none in EPSG; MGI's, beside its area of use, is hundreds of metres off and stays refused."""
+    """CGCS2000 has none in EPSG; MGI's, outside its area of use, is hundreds of metres off and still refused."""
     wuhan = frame("EPSG:4547", origin=Origin(30.5, 114.3, 30.0))
     with pytest.raises(SplatpipeError, match="has no transformation") as raised:
         open_world(wuhan)
@@ -279,7 +279,7 @@ def test_a_modern_datum_without_an_operation_is_wgs84_only_if_the_user_accepts_t
 
 
 def test_heights_use_the_geoid_grid_if_it_is_present(tmp_path: Path) -> None:
-    """A made-up EGM96: 40 m at 47° N, falling by 2 m to the degree northwards."""
+    """An invented EGM96 grid: 40 m at 47° N, decreasing northwards by 2 m per degree."""
     rows, columns = 721, 1440
     latitudes = -90.0 + 0.25 * np.arange(rows)
     undulations = np.repeat((40.0 - 2.0 * (latitudes - 47.0)).astype(">f4")[:, None], columns, axis=1)
@@ -293,7 +293,7 @@ def test_heights_use_the_geoid_grid_if_it_is_present(tmp_path: Path) -> None:
         told = georeference(frame("EPSG:32633+5773", "EPSG:5773"), BOX)["ecef_from_local"]
         lifted = (np.array(told["matrix"])[:3, 3] - HALLSTATT.ecef_from_enu()[:3, 3]) @ HALLSTATT.ecef_from_enu()[:3, 2]
         assert not told["approximate"] and lifted == pytest.approx(raised[1], abs=1e-4)
-        assert 0.005 < told["largest_error_m"] < 0.05  # the slope, 2 m to 111 km, at 1.4 km; and 7 mm of scale
+        assert 0.005 < told["largest_error_m"] < 0.05  # the slope, 2 m per 111 km, at 1.4 km; and 7 mm of scale
         world = open_world(frame("EPSG:4979", "EPSG:5773"))  # orthometric within, ellipsoidal without
         local = far_points()
         np.testing.assert_allclose(world.local_from_crs(world.crs_from_local(local)), local, atol=1e-6)

@@ -42,11 +42,11 @@ def device() -> Iterator[torch.device]:
     yield torch.device("cuda", torch.cuda.current_device())
     torch.cuda.set_per_process_memory_fraction(1.0)
     torch.cuda.empty_cache()
-    cuda._on_cuda.cache_clear()  # with what its frames have taught it
+    cuda._on_cuda.cache_clear()  # with the forecast from its earlier frames
 
 
 def scene(count: int = COUNT) -> Gaussians:
-    """A cloud of small and large ones before the camera, some behind it, thousands over each other."""
+    """Small and large Gaussians in front of the camera, some behind it, thousands overlapping."""
     generator = torch.Generator().manual_seed(11)
     model = Gaussians.empty(count, 3)
     model.means = torch.randn(count, 3, generator=generator) * torch.tensor([2.0, 1.5, 2.5]) + torch.tensor([0, 0, 5.0])
@@ -126,7 +126,7 @@ def test_pictures_losses_and_gradients_are_the_cpus(device: torch.device, depth:
 def test_steps_are_the_cpus(device: torch.device) -> None:
     here, there, start = stepped(CPU), stepped(device), scene().tensors()
     for name, expected in here.items():
-        # Adam's first steps go by a gradient's sign: where that is rounding, the two may go apart by all their steps.
+        # Adam's first steps follow a gradient's sign: where rounding decides it, the two may diverge by all steps.
         apart = (there[name] - expected).abs() > 1e-2 * (expected - start[name]).abs() + 1e-6
         assert apart.float().mean() < 2e-3, name
 
@@ -147,7 +147,7 @@ def test_chunks_do_not_change_a_bit(device: torch.device, most_pairs: int) -> No
     kernels = cuda.kernels_of(device)
     assert kernels is not None
     kernels.forecast.most_pairs = most_pairs
-    for _ in range(2):  # not foreseen at first, so that one block does the rest; then foreseen
+    for _ in range(2):  # not forecast at first, so that one block does the rest; then forecast
         assert digest(everything(scene(), device, depth=False)) == expected
         torch.cuda.synchronize(device)
 
@@ -160,7 +160,7 @@ def test_short_memory_leads_to_smaller_chunks_with_the_same_bits(device: torch.d
         torch.cuda.synchronize(device)
         before = torch.cuda.memory_allocated(device)
         torch.cuda.reset_peak_memory_stats(device)
-        rasterizer.render(model, view, options)  # with the room that the first one asked for
+        rasterizer.render(model, view, options)  # with the capacity that the first one requested
         wanted = torch.cuda.max_memory_allocated(device) - before
         kernels = cuda.kernels_of(device)
         assert kernels is not None

@@ -31,7 +31,7 @@ assert KEY[2] == SPLIT_POSITION
 
 
 def ending() -> RenderCase:
-    """Pixels end behind a few of many; equal depths; a grid of 3 x 2 tiles with parts of tiles."""
+    """Pixels saturate behind a few of many Gaussians; equal depths; a grid of 3 x 2 tiles with parts of tiles."""
     scene = random_scene(3, 220, 1, size=-0.8)
     scene.opacity_logits += 2.5
     scene.means[:, 2] = (scene.means[:, 2] * 4).round() / 4
@@ -110,7 +110,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 def test_sources_without_a_fault_pass_every_check(found: list[str]) -> None:
-    """Nor do they do what is undefined, as a load that is not aligned, which no GPU forgives: it ends the process."""
+    """Nor is their behaviour undefined: an unaligned load, an error on every GPU, would end the process."""
     assert found[0] == ""
 
 

@@ -70,7 +70,7 @@ def place(request: pytest.FixtureRequest) -> Iterator[DeviceSetup]:
         scene = random_scene(1, n=50_000, size=-4.0)
         yield DeviceSetup(None, torch.device("cuda", 0), scene, random_camera(1, 801, 499))
     else:
-        with use_kernels(None):  # what a test puts there is gone after it
+        with use_kernels(None):  # what a test puts there is removed afterwards
             yield DeviceSetup(
                 kernels_on_cpu(), torch.device("cpu"), random_scene(1, n=200, size=-2.0), random_camera(1)
             )

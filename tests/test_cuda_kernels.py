@@ -65,7 +65,7 @@ def in_one_tile() -> RenderCase:
 
 
 def opaque() -> RenderCase:
-    """Pixels end early, behind a few of many."""
+    """Pixels saturate early, behind a few of many Gaussians."""
     scene = random_scene(3, 500, 0, size=-0.8)
     scene.opacity_logits += 3.0
     return case_of(scene, random_camera(3, 40, 33), background=(1.0, 1.0, 1.0))
@@ -101,7 +101,7 @@ CASES: dict[str, Callable[[], RenderCase]] = {
 
 @functools.cache
 def settled(library: CudaLibrary, name: str) -> tuple[RenderCase, RenderOutcome, RenderOutcome]:
-    """A case, what the harness makes of it, and the definition; nothing comes back where a rounding decides."""
+    """A case with the results of harness and definition; gradients are zero where a rounding decides."""
     case = CASES[name]()
     ours, exact = run(library, case), exact_outcome(case)
     flips = flipped(ours, exact)

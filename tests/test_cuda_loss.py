@@ -54,12 +54,12 @@ def any_order(kernels: Kernels, request: pytest.FixtureRequest) -> None:
 
 
 def untouched(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Memory in which it shows if it is read before it is written, or not written."""
+    """Memory that reveals reads before writes, and missing writes."""
     return torch.full(shape, torch.nan, dtype=dtype)
 
 
 def memory_of(size: int) -> tuple[ctypes.c_void_p, ctypes.c_int64, Tensor]:
-    """Aligned memory with a guard behind it, and what keeps it."""
+    """Aligned memory with a guard behind it, and its owner."""
     whole = torch.full((size + 512,), 0xFF, dtype=torch.uint8)
     skip = -whole.data_ptr() % 256
     return ctypes.c_void_p(whole.data_ptr() + skip), ctypes.c_int64(size), whole

@@ -288,7 +288,7 @@ def test_a_larger_device_holds_more_pairs_at_a_time_within_limits() -> None:
 def test_a_memory_limit_acts_like_a_smaller_device_while_it_lasts(kernels):
     kernels.forecast.most_pairs = most_pairs_of(24 << 30)
     with use_kernels(kernels):
-        for limit_bytes, least in ((0, 24 << 30), (8 << 30, 8 << 30), (141 << 30, 24 << 30)):  # what is less stays
+        for limit_bytes, least in ((0, 24 << 30), (8 << 30, 8 << 30), (141 << 30, 24 << 30)):  # a smaller limit is kept
             with pytest.raises(MachineError), cpu().memory_limit(limit_bytes):
                 assert kernels.forecast.most_pairs == most_pairs_of(least)
                 raise MachineError("It fails.")
@@ -316,7 +316,7 @@ def test_forecast_never_waits(kernels, monkeypatch):
 
 
 class ShortOfMemory(CudaKernels):
-    """Kernels on a device that has no more than some bytes at a time."""
+    """Kernels on a device that never has more than some bytes free."""
 
     most_bytes = 1 << 40
 
@@ -333,7 +333,7 @@ def test_short_memory_makes_chunks_smaller_and_then_is_reported():
         kernels.forecast = Forecast()
         assert kernels.forecast.room(FrameSize(60, 20)).capacity > 200
         kernels.most_bytes = kernels.frame_bytes(shot_of(CAMERA, OPTIONS, 16), 60, 200)
-        with pytest.raises(torch.OutOfMemoryError):  # a training answers that itself, to tell it
+        with pytest.raises(torch.OutOfMemoryError):  # training handles that itself, in order to report it
             render(scene.clone().requires_grad_(), CAMERA, OPTIONS, buffers=GradientBuffers())
         assert kernels.forecast.most_pairs == Forecast().most_pairs
         assert torch.equal(render(scene, CAMERA, OPTIONS).colour, expected)
@@ -342,13 +342,13 @@ def test_short_memory_makes_chunks_smaller_and_then_is_reported():
         with pytest.raises(MachineError, match="60 Gaussians"):
             render(scene, CAMERA, OPTIONS)
         assert kernels.forecast.most_pairs == 60
-        with pytest.raises(torch.OutOfMemoryError):  # the training answers it
+        with pytest.raises(torch.OutOfMemoryError):  # training handles it
             render(scene.requires_grad_(), CAMERA, OPTIONS, buffers=GradientBuffers())
         assert not kernels.forecast.shrink()
 
 
 class ShortOnce(CudaKernels):
-    """Kernels on a device that once has no memory for the way back, the second of a frame's two pieces."""
+    """Kernels on a device that once has no memory for the backward pass, the second of a frame's two allocations."""
 
     pieces = 0
 

@@ -83,7 +83,7 @@ class StepResult:
 
 
 def put(memory: Memory, name: str, values: np.ndarray, unaligned: bool) -> np.ndarray:
-    """A copy on the device; unaligned, one float behind where vectors may begin."""
+    """A copy on the device; if unaligned, one float past an aligned address."""
     room = memory.empty(name, (values.size + 1,))
     copy = (room[1:] if unaligned else room[:-1]).reshape(values.shape)
     copy[...] = values

@@ -55,7 +55,7 @@ def device() -> Iterator[Device]:
     torch.cuda.set_sync_debug_mode("default")
     torch.cuda.set_per_process_memory_fraction(1.0)
     torch.cuda.empty_cache()
-    cuda._on_cuda.cache_clear()  # with what its frames have taught it
+    cuda._on_cuda.cache_clear()  # with the forecast from its earlier frames
 
 
 def views() -> list[View]:

@@ -75,7 +75,7 @@ def on(device: Device, kernels: CudaKernels | None = None) -> Iterator[None]:
 def trained(
     scene: Path, out: Path, config: TrainConfig, device: Device = ON_CUDA, kernels: CudaKernels | None = None
 ) -> tuple[dict[str, object], tiny_scene.Recorder]:
-    """A training's summary and what it told."""
+    """A training's summary and its messages."""
     out.mkdir(exist_ok=True)
     recorder = tiny_scene.Recorder()
     with on(device, kernels):
@@ -85,7 +85,7 @@ def trained(
 
 @pytest.fixture(scope="module")
 def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A training with everything, undisturbed."""
+    """A training with every technique, uninterrupted."""
     out = tmp_path_factory.mktemp("whole")
     _, recorder = trained(scene, out, ALL)
     assert not recorder.warnings and len(read_splat(out / "model.ply")) > 200
@@ -135,7 +135,7 @@ def test_it_has_the_same_bits_in_any_order_of_threads(scene: Path, whole: Path, 
 
 
 class Kill(BaseException):
-    """Stands for a kill: nothing of the trainer catches it."""
+    """Stands in for a kill: nothing of the trainer catches it."""
 
 
 @contextmanager
@@ -202,7 +202,7 @@ def test_an_iteration_reads_nothing_from_the_device(monkeypatch: pytest.MonkeyPa
                 note(function.__name__)
             masks = arguments[1] if function.__name__.startswith("index") else ()
             if any(isinstance(mask, Tensor) and mask.dtype == torch.bool for mask in masks):
-                note(function.__name__)  # looks how many are true
+                note(function.__name__)  # counts how many are true
             return function(*arguments, **(named or {}))
 
     for name in ("tolist", "numpy", "cpu"):

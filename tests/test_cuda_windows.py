@@ -59,7 +59,7 @@ def test_windows_on_cuda_give_the_cpus_results(views: list[View], tmp_path: Path
     start = tiny_scene.true_model().tensors()
     for name, expected in theirs[0].items():
         if name.startswith(("robust.", "distortion.")):
-            continue  # what is not there yet is not finite
+            continue  # values that are not there yet are not finite
         before = start.get(name, torch.zeros_like(expected)).double()
         moved = torch.linalg.vector_norm(expected.double() - before)
         assert torch.linalg.vector_norm(ours[0][name].double() - expected) <= STEP_SHARE * moved, name

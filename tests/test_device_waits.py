@@ -1,7 +1,7 @@
 """Techniques on a device neither wait for it nor mix its tensors with the CPU's.
 
-Shown on torch's meta device, whose tensors have no values: who asks for one, or for the number of those that are
-wanted, fails, as does who adds a tensor of the CPU's.
+Shown on torch's meta device, whose tensors have no values: asking for one, or for the number of those that are
+wanted, fails, as does adding a tensor of the CPU's.
 """
 
 import sys

@@ -145,9 +145,7 @@ def test_a_splat_is_moved_to_the_given_coordinates():
     there = edited(scene, *steps)
     means = there.gaussians.means.double().numpy() - scene.gaussians.means.double().numpy()
     expected = world.local_from_crs(target[None])[0] - [0.5, 0.25, -0.125]
-    np.testing.assert_allclose(
-        means, np.broadcast_to(expected, means.shape), atol=5e-5
-    )  # east is another direction there, by 8 µrad
+    np.testing.assert_allclose(means, np.broadcast_to(expected, means.shape), atol=5e-5)  # east differs there by 8 µrad
     level = edited(scene, ("move_to", f"{target[0]},{target[1]}"))
     np.testing.assert_allclose(level.gaussians.means.median(0)[0][2], scene.gaussians.means.median(0)[0][2], atol=0.01)
 

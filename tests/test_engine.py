@@ -367,7 +367,7 @@ def test_events_are_logged_as_json_lines(numbers: Path, out: Path) -> None:
 
 
 def test_how_a_run_and_its_stages_ended_is_in_the_events(numbers: Path, out: Path) -> None:
-    """A good end, a bad one, a death: with exit code, memory, time and the artifact's key."""
+    """Success, failure and death: with exit code, memory, time and the artifact's key."""
 
     def last(kind: str) -> dict[str, object]:
         events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]

@@ -164,7 +164,7 @@ def test_header_says_where_the_origin_is(exported: Path, tmp_path: Path) -> None
 
 
 def test_georef_json_places_the_exported_cameras(exported: Path) -> None:
-    """A camera's place by georef.json is where its own path through PROJ leads; a shrunk scene in a known CRS."""
+    """A camera's position by georef.json agrees with its exact path through PROJ; a shrunken scene in a known CRS."""
     told = json.loads((exported / "georef.json").read_text())
     assert told["crs"]["id"] == "EPSG:32634" and told["ecef_from_local"]["approximate"]
     positions = np.array([entry["position"] for entry in json.loads((exported / "cameras.json").read_text())])

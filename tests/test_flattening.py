@@ -46,7 +46,7 @@ def picture(depth: torch.Tensor, alpha: float = 0.9) -> Render:
 
 
 def plane(across: float, down: float) -> torch.Tensor:
-    """Depths of a plane about 10 before the camera, by how its inverse depth grows over a pixel."""
+    """Depths of a plane about 10 in front of the camera, by the change of its inverse depth per pixel."""
     x, y = torch.meshgrid(torch.arange(24.0), torch.arange(16.0), indexing="xy")
     return (1.0 / (0.1 + across * x + down * y)).double()
 

@@ -60,19 +60,19 @@ def test_shared_errors_are_estimated_and_the_shape_is_exact(step_m: float) -> No
     shared = SharedErrors(group, np.array([[3.0, 3.0, 5.0], [3.0, 3.0, 1e4]]))
     fit = robust_similarity(Correspondences(source, target, np.full((40, 3), 1.0), shared), 10.0)
     assert fit.inliers.all()
-    pull = 1e-9 + 1e-3 * step_m  # the sigmas of shared errors draw a step to zero by their share
+    pull = 1e-9 + 1e-3 * step_m  # the sigmas of shared errors pull a step towards zero by their share
     np.testing.assert_allclose(fit.offsets[1] - fit.offsets[0], [0.3 * step_m, 0.0, step_m], atol=pull)
     np.testing.assert_allclose(fit.similarity.rotation, TRUTH.rotation, atol=pull / 50.0)
     assert fit.similarity.scale == pytest.approx(TRUTH.scale, rel=pull / 50.0)
     np.testing.assert_allclose(fit.residuals, 0.0, atol=pull)
-    # Height: the first flight's, since nothing binds the second. Across: the mean, since both are bound alike.
+    # Height: the first flight's, since nothing constrains the second. Across: the mean of two equally constrained ones.
     centre = fit.similarity.apply(source).mean(axis=0) - TRUTH.apply(source).mean(axis=0)
     assert centre[2] == pytest.approx(0.0, abs=1e-3 + 0.01 * step_m)
     assert centre[0] == pytest.approx(0.15 * step_m, abs=1e-3 + 0.01 * step_m)
 
 
 def test_accuracy_with_shared_errors_agrees_with_repeated_fits() -> None:
-    """The stated sigma of the scale against the scatter of 25 fits, shared errors drawn anew in each."""
+    """The stated sigma of the scale against the scatter of 25 fits, shared errors drawn again in each."""
     rng = np.random.default_rng(8)
     source = rng.uniform(-3, 3, (30, 3))
     source[15:] += [6.0, 0.0, 0.0]
@@ -85,7 +85,7 @@ def test_accuracy_with_shared_errors_agrees_with_repeated_fits() -> None:
         fit = robust_similarity(points, 10.0)
         scales.append(fit.similarity.scale / TRUTH.scale - 1.0)
         stated.append(fit.sigma_scale)
-    assert np.std(scales) == pytest.approx(np.median(stated), rel=0.4)  # 25 fits tell a sigma to 14 %
+    assert np.std(scales) == pytest.approx(np.median(stated), rel=0.4)  # 25 fits determine a sigma to 14 %
 
 
 def two_flights(step: tuple[float, float, float], sigma: tuple[float, float] = (0.3, 0.5)) -> Survey:

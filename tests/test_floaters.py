@@ -103,7 +103,7 @@ def test_haze_that_is_a_surface_for_one_view_alone_is_a_disagreement(dataset: Pa
 
 
 def test_depth_of_an_antialiased_model_is_that_of_the_surface_however_fine_its_gaussians_are() -> None:
-    """Gaussians of a quarter of a pixel, one a pixel, before a wall: a sixth of the pixel's area, all of its ray."""
+    """Gaussians of a quarter of a pixel, one per pixel, before a wall: a sixth of the pixel's area, all of its ray."""
     camera = Camera("photo", 40, 30, 100.0, 100.0, 20.0, 15.0, np.eye(4))
     x, y = np.meshgrid(np.arange(40) + 0.5 - 20.0, np.arange(30) + 0.5 - 15.0)
     fine = blob(np.stack((x.ravel(), y.ravel(), np.full(x.size, 100.0)), axis=1) * 0.03, 0.25 * 0.03, 0.95)
@@ -136,7 +136,7 @@ def test_figures_do_not_depend_on_the_size_beyond_half_a_megapixel(dataset: Path
 
 
 def test_floater_that_passes_trainings_own_rule_is_still_reported(dataset: Path) -> None:
-    """Right before a held-out camera, where no other one looks: training's photos have no say there."""
+    """Directly in front of a held-out camera, where no other one looks: training photos do not count there."""
     centre = cameras()[3].centre()
     floater = blob(centre[None] + (0.0, 0.0, 0.5), 0.1, 0.9)
     model = Gaussians.concat([wall(), floater])
@@ -148,7 +148,7 @@ def test_floater_that_passes_trainings_own_rule_is_still_reported(dataset: Path)
     assert clean["mean"] == 0.0 and clean["points"] > 500
     assert veiled["mean"] > VEIL and (veiled["worst_photo"], veiled["photos"]) == ("photo_3.png", 1)
     seen = measure_floaters(model, cameras(), {"photo_0.png"}, dataset, OPTIONS)["veil"]
-    assert seen["mean"] == 0.0  # it hangs before nothing that this one sees
+    assert seen["mean"] == 0.0  # it covers nothing that this one sees
 
 
 def test_light_absorbed_by_a_veil_is_that_of_its_gaussian(dataset: Path) -> None:
@@ -165,7 +165,7 @@ def test_light_absorbed_by_a_veil_is_that_of_its_gaussian(dataset: Path) -> None
 
 
 def test_veil_excludes_what_is_nearer_than_the_near_plane(dataset: Path) -> None:
-    """Half a unit before a held-out camera: a plane beyond hides it from every picture, and from training."""
+    """Half a unit from a held-out camera: a near plane beyond it hides it from every image, and from training."""
     floater = blob(cameras()[3].centre()[None] + (0.0, 0.0, 0.5), 0.1, 0.98)
     model = Gaussians.concat([wall(), floater])
     near, far = (
@@ -184,4 +184,4 @@ def test_if_no_photo_is_held_out_training_photos_are_used(dataset: Path) -> None
     assert (of_all["worst"], of_all["worst_photo"]) == (of_one["worst"], "photo_3.png")
     assert (
         of_one["mean"] / 4 <= of_all["mean"] < of_one["mean"] / 2
-    )  # it hangs before one of four, and at another's edge
+    )  # it is in front of one of four, and at another's edge

@@ -148,7 +148,7 @@ def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> 
     few, more, full, longer = (needs[f"train.{number}"] for number in (1, 2, 3, 4))
     assert few.memory_bytes < more.memory_bytes < full.memory_bytes <= limit
     assert more.memory_bytes - few.memory_bytes == pytest.approx(10_000 * 1.25**4 * bytes_per_gaussian(3), rel=0.01)
-    assert full.memory_bytes > 0.8 * work.blocks.division.memory_bytes - 240_000_000  # the bound is of more libraries
+    assert full.memory_bytes > 0.8 * work.blocks.division.memory_bytes - 240_000_000  # the bound counts more libraries
     assert 1.9 * few.cpu_seconds < longer.cpu_seconds + BEGINNING_S and longer.scratch_bytes > few.scratch_bytes + 10**8
     assert few.disk_bytes < more.disk_bytes and needs["train"].memory_bytes == full.memory_bytes
     assert needs["train"].cpu_seconds == pytest.approx(sum(need.cpu_seconds for need in (few, more, full, longer)))

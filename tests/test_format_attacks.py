@@ -89,7 +89,7 @@ def test_damage_gets_past_check_sums(kind):
 
 
 def test_bombs_unpack_to_their_declared_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1 << 26)  # photos take the limit away for the whole process
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1 << 26)  # reading photos removes the limit for the whole process
     packed, crc = container_layers.deflated_zeros()
     unpack, total, found = zlib.decompressobj(-15), 0, 0
     rest = packed

@@ -273,7 +273,7 @@ def test_up_below_a_swaying_kite_is_normal_to_the_ground() -> None:
 def test_photos_along_a_facade_are_not_taken_for_a_survey() -> None:
     centres = np.stack([np.linspace(-15, 15, 12), np.full(12, -20.0), np.full(12, 1.7)], axis=1)
     cameras = [look(np.array([0.01 * i, 1.0, 0.1]), np.array([0.0, 0.0, 1.0])) for i in range(12)]
-    assert estimate(cameras, centres) < 8.0  # all tilted up by 6°, and nothing shows it
+    assert estimate(cameras, centres) < 8.0  # all tilted up by 6°, and nothing reveals it
 
 
 def test_gimbal_angles_place_the_camera() -> None:

@@ -55,7 +55,7 @@ def gaussians_at(places: list[tuple[float, float, float]], size: float = 0.01) -
 
 
 def free_space_views(gaussians: Gaussians, space: FreeSpace) -> torch.Tensor:
-    """Photos that see through each Gaussian; all of them where it is right before a camera."""
+    """Photos that see through each Gaussian; all of them where it is directly in front of a camera."""
     counts = range(1, len(space.photos) + 1)
     return sum((near_or_free(gaussians, space, views).long() for views in counts), torch.zeros(len(gaussians)).long())
 
@@ -74,7 +74,7 @@ def test_share_of_opacity_is_that_of_the_gaussians_in_front_of_the_wall(space: F
 
 
 def test_every_photo_that_sees_through_a_gaussian_counts_once(space: FreeSpace) -> None:
-    # At depth 5 a picture is 6 wide: x of 3.9 is in the last camera's alone, 2.5 in those of the last two.
+    # At depth 5 an image is 6 wide: x = 3.9 is only in the last camera's, 2.5 in those of the last two.
     places = [(0.0, 0.0, 5.0), (2.5, 0.0, 5.0), (3.7, 0.0, 5.0), (4.5, 0.0, 5.0)]
     assert free_space_views(gaussians_at(places), space).tolist() == [3, 2, 1, 0]
     assert near_or_free(gaussians_at(places), space).tolist() == [True, True, False, False]
@@ -93,7 +93,7 @@ def test_only_the_extent_along_the_view_may_reach_the_surface(space: FreeSpace) 
 
 
 def test_directly_in_front_of_a_camera_one_photo_is_enough() -> None:
-    # Two units are a fifth of the wall's depth; so near, the others' pictures do not reach.
+    # Two units are a fifth of the wall's depth; the other cameras' images show nothing so near.
     space = space_of(CAMERAS, wall())
     places = [(-1.0, 0.0, 1.0), (-1.0, 0.0, -1.0), (-1.5, 0.0, 0.5)]
     assert near_or_free(gaussians_at(places), space, views=1).tolist() == [True, False, False]

@@ -30,7 +30,7 @@ DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])  # camera
 
 @dataclass
 class Notes:
-    """A reporter that remembers."""
+    """A reporter that records."""
 
     warnings: list[str] = field(default_factory=list)
 
@@ -46,7 +46,7 @@ class Notes:
 
 @dataclass
 class Survey:
-    """Cameras in the world, what their photos state of it, and coded targets in it by their numbers."""
+    """Cameras in the world, the positions that their photos state, and coded targets by number."""
 
     centres: np.ndarray
     cam_from_world: np.ndarray
@@ -108,7 +108,7 @@ GROUND = np.random.default_rng(1).uniform(-10, 70, (300, 3)) * [1.0, 1.0, 0.001]
 
 
 def finds(scene: Survey) -> list[TargetFind]:
-    """The targets in all photos that show them, good to a tenth of a pixel."""
+    """The targets in all photos that show them, accurate to a tenth of a pixel."""
     rng = np.random.default_rng(2)
     found = []
     for name, pose, centre in zip(scene.names, scene.cam_from_world, scene.centres, strict=True):
@@ -121,7 +121,7 @@ def finds(scene: Survey) -> list[TargetFind]:
 
 
 def ingested(folder: Path, positions: list[dict[str, object]], names: list[str]) -> dict[str, Path]:
-    """The parts that ingest would leave."""
+    """The parts that ingest would write."""
     (folder / "positions.json").write_text(json.dumps({"positions": positions, "orientations": {}}))
     (folder / "cameras.json").write_text('{"cameras": [{"focal_px": 2300.0, "width": 4000, "has_prior": true}]}')
     save_photo_list(PhotoList(tuple(Photo(name, "0" * 64, 4000, 3000, 0) for name in names)), folder)
@@ -225,7 +225,7 @@ def test_models_that_call_the_photos_otherwise_get_their_positions(tmp_path: Pat
 
 def test_line_of_cameras_is_levelled_by_the_cameras(tmp_path: Path) -> None:
     centres = np.stack([np.arange(12) * 9.0, np.arange(12) * 2.0, np.full(12, 40.0)], axis=1)
-    scene = survey(centres[:, [1, 0, 2]], (0.5, 1.0))  # flown along the pictures' height, as drones do
+    scene = survey(centres[:, [1, 0, 2]], (0.5, 1.0))  # flown along the images' height, as drones do
     frame, _, warnings = georef(scene, tmp_path)
     assert frame.kind == "enu"
     assert "rotation" in frame.note

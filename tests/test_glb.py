@@ -1,4 +1,4 @@
-"""GLB: our files, parsed strictly by the glTF specification; others' files, in all permitted forms; hostile files."""
+"""GLB: our files, parsed strictly by the glTF specification; third-party files in all forms; hostile files."""
 
 import io
 import struct
@@ -197,7 +197,7 @@ def test_third_party_files_are_read_whatever_their_layout(tmp_path: Path):
     scene = read(tmp_path, foreign())
     assert scene.facts == SceneFacts("y up")
     found = scene.gaussians
-    # turned a quarter about z, twice as large, moved by 10 along x
+    # a quarter turn about z, scaled by two, moved by 10 along x
     np.testing.assert_allclose(found.means.numpy(), [[10.0, 2.0, 0.0], [6.0, 0.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(torch.exp(found.log_scales).numpy(), [[2.0, 0.0, 0.0], [0.4, 2.0, 2.0]], atol=1e-6)
     half = 0.5**0.5

@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 IMPORTING = ("demo", "benchmarks", "tests")
-PATHS = ("tests/scenes", "tests/harness", "tests/lines", "tests/versions", "benchmarks")  # where plain names lie
+PATHS = ("tests/scenes", "tests/harness", "tests/lines", "tests/versions", "benchmarks")  # where plain names are found
 
 
 def file_of(module: str, importer: Path) -> Path | None:

@@ -42,7 +42,7 @@ JPEG_ERROR = 12  # grey values, of a smooth picture at quality 95
 
 @dataclass
 class Notes:
-    """A reporter that remembers."""
+    """A reporter that records."""
 
     warnings: list[str] = field(default_factory=list)
 
@@ -259,7 +259,7 @@ def test_transparent_pixels_are_masked(folder: Path) -> None:
 
 
 def bad_files(folder: Path) -> dict[str, str]:
-    """Writes files that pretend to be photos; returns a word of each one's reason."""
+    """Write files that pretend to be photos; return a word of each one's reason."""
     good = (folder / "a.jpg").read_bytes()
     png = io.BytesIO()
     Image.fromarray(picture(9)).save(png, "PNG")
@@ -361,7 +361,7 @@ def test_photo_replaced_unnoticed_is_refused_by_the_stage_that_reads_it(folder: 
     assert runner.outcome.ran == ["ingest"] and runner.outcome.failed == "features"
     with open_session(request, lambda event: None) as again:
         again.walk(until="ingest")
-    assert again.outcome.ran == ["ingest"]  # size and times are as before, and it is found to be another all the same
+    assert again.outcome.ran == ["ingest"]  # size and times are unchanged, and the replacement is detected nevertheless
 
 
 def test_duplicates_are_left_out(folder: Path) -> None:

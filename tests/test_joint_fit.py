@@ -46,7 +46,7 @@ def test_control_determines_the_frame_and_the_flight_gets_its_offset() -> None:
 
 
 def test_stated_standard_deviations_are_those_of_many_fits() -> None:
-    """Monte Carlo: 200 draws tell a standard deviation to 5 %; here 20 %."""
+    """Monte Carlo: 200 draws determine a standard deviation to 5 %; the tolerance is 20 %."""
     points, priors = observed()
     exact = TRUTH.apply(points.source) + np.where(points.is_control[:, None], 0.0, OFFSET)
     place = TRUTH.inverse().apply(np.array([[5.0, 8.0, 2.0], [-15.0, 3.0, 9.0]]))

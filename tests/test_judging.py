@@ -39,7 +39,7 @@ def test_a_few_pairs_that_only_look_alike_do_not_make_a_true_model_bad(ring: Rin
 
 
 def test_large_photos_whose_keypoints_were_found_in_reduced_ones_are_judged_alike(ring: Ring) -> None:
-    """Seven times the size, seven times the noise: 3.5 pixels are what half a pixel is in a photo of 1,200."""
+    """Seven times the size, seven times the noise: 3.5 pixels correspond to half a pixel in a photo of 1,200."""
     model = model_of(ring)
     lens = pycolmap.Camera(model.cameras[1].todict())
     for camera in (model.cameras[1], lens):
@@ -52,7 +52,7 @@ def test_large_photos_whose_keypoints_were_found_in_reduced_ones_are_judged_alik
 
 
 def test_a_model_whose_halves_disagree_is_bad(ring: Ring) -> None:
-    half = range(13, 25)  # turned and grown about the first of its cameras, as an incremental mapper's joint does
+    half = range(13, 25)  # rotated and scaled about the first of its cameras, like an incremental mapper's joint
     bent = model_of(ring, moved(ring, half, ring.centre(13), turn_up(8.0), 1.15))
     found = judge(bent, ring.verified, TRUSTED)
     assert (found.level, found.reasons[0].kind, found.reasons[0].level) == ("bad", "bent", "bad")
@@ -92,7 +92,7 @@ def test_a_focal_length_of_few_photos_does_not_affect_the_verdict_on_the_others(
         places = ring.verified.keypoints[number].astype(np.float64)
         image = pycolmap.Image(ring.verified.names[number], places, camera_of[number], number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    second.params = [0.3 * FOCAL, *second.params[1:]]  # what the metadata state of it is another lens
+    second.params = [0.3 * FOCAL, *second.params[1:]]  # the metadata describe another lens
     graph = replace(ring.verified, camera_of=camera_of, cameras={1: stated, 2: second})
     assert judge(model, graph, [TRUSTED[0], ROUGH[0]]).level == level
 

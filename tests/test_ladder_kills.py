@@ -53,7 +53,7 @@ def prepare(folder: Path) -> None:
 
 
 def weaken(folder: Path) -> None:
-    """Leave one photo, the last, but a few keypoints."""
+    """Leave one photo, the last, only a few keypoints."""
     with pycolmap.Database.open(folder / "database.db") as database:
         keypoints = database.read_keypoints(WEAK)
         kind = pycolmap.FeatureExtractorType.SIFT

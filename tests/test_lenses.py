@@ -57,7 +57,7 @@ def test_a_simple_lens_stays_simple_and_bit_identical(seed: int) -> None:
 
 
 def test_flat_ground_from_one_height_keeps_its_lens_unless_one_is_stated() -> None:
-    """There a longer lens from higher up makes the same photos, and a false distortion a dome of the ground."""
+    """There a longer lens at a greater height gives the same photos, and a false distortion a dome."""
     scene = make_scene([make_lens("FULL_OPENCV", BROWN)], strips(24, np.random.default_rng(1)), 1, flat=True)
     found, rows = calibrate(scene.model, scene.verified, {}, "auto")
     assert found is scene.model and rows[0]["freed"] == [] and not rows[0]["focal_told"]

@@ -37,13 +37,13 @@ def training(demo_run: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.
 
 
 def hold(process: subprocess.Popen[bytes], how: signal.Signals = signal.SIGSTOP) -> None:
-    """Stop a run with all its processes where it is, or let it go on: what is seen meanwhile is of that very moment."""
+    """Suspend a run with all its processes, or resume it: what is seen meanwhile is of exactly that moment."""
     if process.poll() is None:
         os.killpg(process.pid, how)
 
 
 def wait(page: Page, until: Callable[[Any], bool]) -> Any:
-    """The page's state, as soon as it is as wanted."""
+    """The page's state, as soon as it is as expected."""
 
     def state() -> Any:
         told = page.evaluate("splatpipe.live.state()")
@@ -99,7 +99,7 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         choose(page, 12)
         far = shown(page, "photo")
         assert far.shape == photo.shape
-        choose(page, 1)  # its number begins the other's
+        choose(page, 1)  # its number is a prefix of the other's
         page.keyboard.press("ArrowRight")
         wait_for_picture(page, SHOWS, 2)
         assert not np.array_equal(shown(page, "photo"), far)

@@ -29,7 +29,7 @@ from splatpipe.stages.line import LINE
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-CARD = Device("cuda", torch.device("cpu"))  # stands for one: the CPU renders on it
+CARD = Device("cuda", torch.device("cpu"))  # stands in for a card: the CPU renders on it
 WHOLE = 8 << 30
 
 
@@ -136,8 +136,8 @@ def test_for_a_scene_in_blocks_the_coarse_model_and_then_a_blocks_is_shown(tmp_p
     found = newest(opened)
     assert found is not None and (found.kind, found.path, found.block) == ("checkpoint", checkpoint, 0)
     checkpoint.unlink()
-    assert (found := newest(opened)) is not None and found.kind == "initial"  # nobody says that the model is whole
-    written(blocks / "coarse.json")  # what comes now, cutting the site, takes a while
+    assert (found := newest(opened)) is not None and found.kind == "initial"  # nothing says that the model is complete
+    written(blocks / "coarse.json")  # dividing the site, which comes next, takes a while
     assert (found := newest(opened)) is not None
     assert (found.kind, found.path, found.rendering) == ("coarse", model, blocks / "coarse" / "rendering.json")
     coarse = left("blocks", "coarse", blocks / "coarse", "2" * 64)

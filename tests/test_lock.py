@@ -35,7 +35,7 @@ with locked(Path(sys.argv[1])):
 
 @pytest.fixture
 def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An OUT's folder, and silence that is soon long enough."""
+    """An OUT's folder; silence expires a signature soon."""
     monkeypatch.setattr(engine_lock, "PATIENCE_S", 0.2)
     monkeypatch.setattr(engine_lock, "SILENCE_S", 1.5)
     monkeypatch.setattr(engine_lock, "BEAT_S", 0.1)
@@ -125,7 +125,7 @@ def test_the_message_says_how_to_break_a_dead_machines_lock_kept_by_a_server(out
             pass
         assert str(path) in refused.value.hint
         path.unlink()
-        with locked(out) as hold:  # as the hint says; who lives after all sees it, and ends
+        with locked(out) as hold:  # as the hint says; a holder that is alive after all notices it, and ends
             hold.confirm()
         assert process.poll() is None
 
@@ -263,7 +263,7 @@ def test_a_shard_on_another_machine_excludes_the_same_shard_and_a_whole_run(out:
                 over.set()
 
         with locked(out, wait=True, notify=notify):
-            assert over.is_set() and (out / "stages" / name).read_bytes() == b""  # who died there holds up nobody else
+            assert over.is_set() and (out / "stages" / name).read_bytes() == b""  # a dead process blocks nobody else
 
 
 def test_no_shard_is_made_while_another_machine_holds_the_whole_out(out: Path) -> None:
@@ -277,7 +277,7 @@ def test_no_shard_is_made_while_another_machine_holds_the_whole_out(out: Path) -
 def test_a_shard_yields_to_a_run_elsewhere_that_signs_simultaneously(
     out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run signs after the look at its file and before the shard's own signature can be seen there."""
+    """The run signs after its file was checked and before the shard's own signature is visible there."""
     take = engine_lock._lock_and_sign
 
     def overtaken(path: Path, *how: object, **more: bool) -> object:

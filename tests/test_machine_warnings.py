@@ -17,7 +17,7 @@ WINDOWS_DRIVE = (
 
 
 def told(root: Path, place: str, *, mounted: str = "", kernel: str = "6.8.0-45-generic\n", gb: int = 64) -> list[str]:
-    """The warnings on a system of these texts."""
+    """The warnings on a system with these kernel texts."""
     texts = {
         "proc/self/mountinfo": ROOT + mounted,
         "proc/sys/kernel/osrelease": kernel,

@@ -48,7 +48,7 @@ def test_cameras_are_accurate_despite_wrong_matches_and_focal_length(
     assert [model.num_reg_images() for model in mapped] == [PHOTOS]
     camera = mapped[0].cameras[1]
     assert camera.mean_focal_length() == pytest.approx(FOCAL_PX, rel=0.005)
-    # Without a wrong match and from the truth, noise alone leaves some; wrong ones that hide among two views add to it.
+    # Without wrong matches, starting at the truth, noise leaves some; wrong ones that only two views see add to it.
     assert error_gsd(mapped[0], flight) < 2.0 * error_gsd(oracle(flight), flight)
 
 

@@ -67,7 +67,7 @@ def gps_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def marking(gps_run: Path) -> Iterator[tuple[Served, Path]]:
-    """The server with the control file that it writes, which begins as none."""
+    """The server with the control file that it writes, which does not exist at first."""
     file = gps_run.parent / "photos of a house" / "gcp_list.txt"
     file.unlink(missing_ok=True)
     config = (gps_run / "config.toml").read_bytes()
@@ -90,7 +90,7 @@ def opened(open_page: Callable, server: Served, *size: object) -> Any:
 
 
 def click(page: Page, pixel: list[float]) -> None:
-    """Click where the photo has a pixel; where that is out of sight, after a look at the whole photo."""
+    """Click on a photo's pixel; if it is out of view, after zooming out to the whole photo."""
     if not in_sight(page, page.evaluate("(at) => splatpipe.mark.screenAt(at)", pixel)):
         page.keyboard.press("f")
         page.wait_for_timeout(50)
@@ -114,7 +114,7 @@ def test_twelve_points_marked_in_the_browser_georeference_the_demo(
 ) -> None:
     """As a surveyor does it: click and Enter, X where the point cannot be seen; then the command that the page names.
 
-    The bars are those of the georeferencing: check points within a ground pixel, and one and a half in height.
+    The limits are those of the georeferencing: check points within a ground pixel, and one and a half in height.
     """
     server, file = marking
     watched = opened(open_page, server, 1000, 640)
@@ -215,7 +215,7 @@ def test_keys_move_remove_hide_and_take_back(marking: tuple[Served, Path], open_
 
 
 def test_a_click_before_the_photo_is_loaded_marks_nothing(marking: tuple[Served, Path], open_page: Callable) -> None:
-    """Else what is seen in one photo would be marked in the next."""
+    """Otherwise a point seen in one photo would be marked in the next."""
     server, file = marking
     page = opened(open_page, server).page
     page.evaluate("splatpipe.mark.goTo('P16', 'DJI_0034.JPG')")
@@ -477,7 +477,7 @@ def test_detected_targets_are_shown_moved_and_rejected_in_the_browser(found_run:
         assert "found" in (chosen.get_attribute("class") or "") and "detected" in (chosen.get_attribute("title") or "")
         assert "were detected" in (page.locator("#list li", has_text="P16").get_attribute("title") or "")
         assert "found in" in page.locator("#about").inner_text()
-        page.keyboard.press("Enter")  # agreed to: nothing is written
+        page.keyboard.press("Enter")  # accepted: nothing is written
         state(page)
         assert file.read_text() == begun
         page.evaluate(f"splatpipe.mark.goTo('P16', '{photo}')")
@@ -487,7 +487,7 @@ def test_detected_targets_are_shown_moved_and_rejected_in_the_browser(found_run:
         assert list(marks_in(file)) == [("P16", photo)]
         assert marks_in(file)["P16", photo] == pytest.approx((pixel[0] + 2.0, pixel[1]), abs=0.3)
         assert "marked" in (chosen.get_attribute("class") or "")
-        page.keyboard.press("u")  # both moves at once: as it was found
+        page.keyboard.press("u")  # both moves at once: as it was detected
         state(page)
         assert marks_in(file) == {} and "found" in (chosen.get_attribute("class") or "")
         page.keyboard.press("Delete")

@@ -111,7 +111,7 @@ def test_psnr_after_colour_fit_fits_each_half_on_the_other(size):
 
 
 def test_colour_fit_is_independent_of_the_pixels_that_it_is_scored_on():
-    """A map fitted on all pixels matches noise to noise a little; halves that share nothing cannot."""
+    """A map fitted to all pixels fits some of the noise; separate halves cannot."""
     generator = torch.Generator().manual_seed(3)
     render, photo = (torch.rand(32, 32, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     spread = photo.reshape(-1, 3).std(dim=0, correction=0).square().mean()
@@ -119,7 +119,7 @@ def test_colour_fit_is_independent_of_the_pixels_that_it_is_scored_on():
 
 
 def test_vignetting_does_not_affect_the_colour_fit():
-    """Both halves have as much of the corners: the fit is as good as one on everything."""
+    """Both halves contain the same share of the corners: the fit is as good as one to all pixels."""
     y, x = np.mgrid[:300, :400]
     fall = 1 - 0.5 * ((x - 200) ** 2 + (y - 150) ** 2) / 250**2
     photo = image(300, 400) * torch.from_numpy(fall)[..., None]

@@ -19,7 +19,7 @@ from surveyed import HEIGHT, LENS, TRUTH, WIDTH, true_model
 
 
 class Notes:
-    """A reporter that remembers."""
+    """A reporter that records."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []

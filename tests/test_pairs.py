@@ -78,7 +78,7 @@ def test_views_of_opposite_walls_are_no_neighbours() -> None:
         if (i < 36) == (j < 36):
             assert float(photos.directions[i] @ photos.directions[j]) > math.cos(math.radians(31))
     across = [pair for pair in select_pairs(photos, "spatial", 6, never) if (pair[0] < 36) != (pair[1] < 36)]
-    assert len(across) <= 2  # only what makes the graph one piece
+    assert len(across) <= 2  # only those that connect the graph
 
 
 def test_distant_groups_are_joined_by_the_nearest_photos() -> None:

@@ -25,7 +25,7 @@ def test_the_nearest_remaining_photo_comes_next() -> None:
 
 
 def test_brighter_is_distinguished_from_moved() -> None:
-    """A wall with a pattern at a distance of 10: the next frame sees it from a metre beside."""
+    """A wall with a pattern at a distance of 10: the next frame sees it from a metre to the side."""
     frames = []
     for x, brighter in ((0.0, 0), (1.0, 0), (1.0, 12)):
         columns, rows = np.meshgrid(np.arange(120) + 0.5 + 10.0 * x, np.arange(90) + 0.5)

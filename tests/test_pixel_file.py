@@ -18,7 +18,7 @@ CAMERA = photo_camera("photo", (0.0, 0.0, 20.0), (0.0, 0.0, 0.0))
 
 
 def photos(decoded: Counter[int]) -> tuple[list[PhotoSource], list[np.ndarray]]:
-    """Three that tell when they are decoded; the last one is larger than its pinhole."""
+    """Three photos whose decodings are counted; the last one is larger than its pinhole."""
     random = np.random.default_rng(1)
     lens = DistortionGrid(301, 199, 120.0, np.zeros((3, 3, 2)))
     pixels = [random.integers(0, 256, (h, w, 3)).astype(np.uint8) for h, w in ((180, 240), (180, 240), (199, 301))]

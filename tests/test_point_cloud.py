@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 
 from hills import IDENTITY, box, hill_grid, placed
 
-HALF_STEP_M = 0.0005 + 2e-4  # of a millimetre, and the grid's way to the CRS
+HALF_STEP_M = 0.0005 + 2e-4  # of a millimetre, and the grid's transformation to the CRS
 NORMAL_DEG = 0.5  # of three signed bytes
 
 

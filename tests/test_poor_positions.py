@@ -110,7 +110,7 @@ def test_gross_errors_are_reported_among_noisy_positions() -> None:
 
 
 def test_correlated_errors_are_reported_and_accounted_for() -> None:
-    """Errors that each position carries on from the one before: the mean of forty is hardly better than one."""
+    """Errors that are correlated from one position to the next: the mean of forty is hardly better than one."""
     rng, error = np.random.default_rng(1), np.zeros((40, 3))
     error[0] = rng.normal(size=3)
     for k in range(1, 40):

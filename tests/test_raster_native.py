@@ -140,7 +140,7 @@ def test_magnitudes_do_not_cancel_and_change_no_other_gradient() -> None:
 
 def test_contributing_pairs_are_those_of_the_reference() -> None:
     scene = random_scene(11, 60, 0)
-    scene.opacity_logits += 3.0  # so that pixels end
+    scene.opacity_logits += 3.0  # so that pixels saturate
     camera, options = random_camera(11), RenderOptions(0, near=0.2)
     frame = _native.Frame()
     tensors = [torch.empty(camera.height, camera.width, 3), torch.empty(camera.height, camera.width), None]

@@ -114,7 +114,7 @@ def test_gaussians_behind_the_near_plane_or_outside_are_not_visible() -> None:
 
 
 def test_gaussians_that_reach_the_cameras_plane_are_not_visible() -> None:
-    sizes = (1.49, 1.51)  # its plane is two deviations away
+    sizes = (1.49, 1.51)  # its plane is two standard deviations away
     ahead = [gaussian([0, 0, 3.0], size, 0.5, [1.0, 1.0, 1.0]) for size in sizes]
     aside = [gaussian([12.0, 0, 3.0], size, 0.5, [1.0, 1.0, 1.0]) for size in sizes]
     assert draw(Gaussians.concat([*ahead, *aside]), camera()).visible.tolist() == [True, False, False, False]

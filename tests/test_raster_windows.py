@@ -124,7 +124,7 @@ def test_variants_of_a_window_match_the_whole(change):
 
 
 def test_windows_of_a_window_match_the_whole():
-    """A cut of a cut knows the whole, not what it was cut from."""
+    """A window of a window refers to the whole, not to the window that it was cut from."""
     camera = random_camera(4, *SIZE)
     at_once, in_two = camera.cut(21, 17, 33, 18), camera.cut(10, 10, 50, 40).cut(11, 7, 33, 18)
     weights = {name: weight[17:35, 21:54] for name, weight in upstream_of(PARTS["middle"]).items()}
@@ -135,7 +135,7 @@ def test_windows_of_a_window_match_the_whole():
 
 @pytest.mark.parametrize("backend", ["reference", "native", "cuda"])
 def test_the_scene_would_reveal_limits_of_the_window_itself(cuda, backend):
-    """The scene has what it takes: with the part's own frustum, as of a small photo, the picture is another."""
+    """The scene suits these tests: with the window's own frustum, as of a small photo, the image would differ."""
     part = random_camera(4, *SIZE).cut(*PARTS["middle"])
     alone = Camera(part.name, part.width, part.height, part.fx, part.fy, part.cx, part.cy, part.cam_from_world)
     dtype = torch.float64 if backend == "reference" else torch.float32

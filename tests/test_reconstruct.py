@@ -46,7 +46,7 @@ def far_off(ring: Ring, model: pycolmap.Reconstruction) -> float:
 
 
 def answers(found: MappingResult) -> list[tuple[object, ...]]:
-    """All bits of an answer but the time that it took."""
+    """All bits of a result except the time that it took."""
     rows = [tuple((key, str(row[key])) for key in sorted(row) if key != "cpu_s") for row in found.tried]
     poses = [found.model.images[number].cam_from_world().matrix().tobytes() for number in found.model.reg_image_ids()]
     return [*rows, tuple(poses), tuple(found.model.cameras[1].params)]
@@ -54,7 +54,7 @@ def answers(found: MappingResult) -> list[tuple[object, ...]]:
 
 @pytest.fixture(scope="module")
 def weak(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ring, MappingInput]:
-    """Forty matches a pair: too few for incremental mapping to begin with, enough for all photos at once."""
+    """Forty matches per pair: too few for incremental mapping to begin with, enough for all photos at once."""
     ring = make_ring(most=45)
     return ring, capture_of(ring, tmp_path_factory.mktemp("weak") / "capture")
 

@@ -232,7 +232,7 @@ def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_
 def test_a_run_that_failed_in_sparse_has_a_truthful_report(tmp_path: Path, open_page: Callable[..., object]) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
-    for name in ("DJI_0001.JPG", "DJI_0011.JPG", "DJI_0021.JPG", "DJI_0031.JPG"):  # a quarter around the house apart
+    for name in ("DJI_0001.JPG", "DJI_0011.JPG", "DJI_0021.JPG", "DJI_0031.JPG"):  # a quarter turn apart
         shutil.copy(capture_path() / name, photos)
     out = tmp_path / "out"
     done = splatpipe("run", photos, out, *sets(*QUICK), "--json")
@@ -314,7 +314,7 @@ def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Call
 )
 def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, part: str) -> None:
     path = read_report_inputs(copy_of_run).part(part)
-    path.write_text("[" + " " * (path.stat().st_size - 2) + "]")  # as long as it was, and something else
+    path.write_text("[" + " " * (path.stat().st_size - 2) + "]")  # of the same length, with other content
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert page.count("This part could not be read") == 1
     assert "Processing</h2>" in page
@@ -413,7 +413,7 @@ def test_scale_bars_are_reported_one_by_one(copy_of_run: Path) -> None:
     assert facts["P3 to P9"].endswith("one of its targets was not found")
     assert unit_of(inputs) == "metres"
     finding = next(finding for finding in judge(inputs).findings if "metric but not georeferenced" in finding.text)
-    assert finding.level == "doubt"  # one bar, which no other proves
+    assert finding.level == "doubt"  # one bar, which no other confirms
 
 
 def test_bad_cameras_are_the_headline_of_page_and_console(

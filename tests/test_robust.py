@@ -34,8 +34,8 @@ from splatpipe.stages import initialize, train
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 
-SCALE = 2  # of the tiny photos: cells of four pixels shall average something
-HELD_OUT = (1, 3, 5)  # between the others: a test of what was learnt, not of how far it goes on
+SCALE = 2  # of the tiny photos: so that cells of four pixels average something
+HELD_OUT = (1, 3, 5)  # between the others: a test of what was learnt, not of extrapolation
 CARS = {2: (20, 30, 40, 60), 4: (60, 90, 85, 125)}  # top, left, bottom, right in a photo, pixels
 YELLOW = (0.9, 0.86, 0.12)
 
@@ -117,7 +117,7 @@ def test_a_device_that_processes_all_cells_leaves_out_the_same(
 
 
 def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(robust: RobustMask) -> None:
-    """The model lacks a thing that all photos show: it has to be learnt."""
+    """The model lacks an object that all photos show: it has to be learnt."""
     for _ in range(2):
         for camera in cameras():
             rendered, missing = true_render(camera), true_photo(camera)
@@ -202,7 +202,7 @@ def test_a_repeated_visit_counts_once(robust: RobustMask) -> None:
     for number, colour in enumerate((true_photo(camera), painted(true_photo(camera), CARS[2]))):
         before = {name: tensor.clone() for name, tensor in robust.to_arrays().items()}
         robust.settings(plain, model, camera, now)
-        robust.begin_again()  # memory was short before the photo was looked at
+        robust.begin_again()  # memory ran out before the photo was processed
         assert all(torch.equal(tensor, before[name]) for name, tensor in robust.to_arrays().items()), number
         looked(robust, camera, colour)
         assert not torch.equal(robust.scores, before["scores"]), number

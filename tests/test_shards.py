@@ -81,7 +81,7 @@ def make_shard(request: Request, number: int) -> Outcome:
 
 
 def alone(numbers: Path, out: Path, shard: str, *more: str, **options: object) -> subprocess.Popen[str]:
-    """A process that makes a shard, or with an empty name walks the line."""
+    """A process that makes a shard, or with an empty name runs the pipeline."""
     words = [sys.executable, "-c", ALONE, str(numbers), str(out), shard, json.dumps(options), *more]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
@@ -110,7 +110,7 @@ def test_a_run_makes_the_shards_and_merges_them_and_a_second_one_reuses_them(num
 
 
 def test_shards_of_many_processes_each_killed_once_have_the_bits_of_a_single_run(numbers: Path, tmp_path: Path) -> None:
-    """Each is killed with -9 between its two numbers, made again in another order, all three at once; then joined."""
+    """Each is killed with -9 between its two numbers, restarted in another order, all three at once; then merged."""
     one, many = tmp_path / "one", tmp_path / "many"
     slow = {"sum": {"step_s": 0.4}}
     walk(request_of(numbers, one, **slow))
@@ -224,7 +224,7 @@ def test_one_stage_alone_merges_existing_shards_and_a_rerun_makes_all_again(numb
 def test_a_damaged_shard_is_made_again_when_it_is_needed(numbers: Path, out: Path) -> None:
     first, _ = walk(request_of(numbers, out))
     (first.artifacts["sum.3"].folder / "sum.txt").unlink()
-    assert walk(request_of(numbers, out))[0].ran == []  # what it was joined to is whole
+    assert walk(request_of(numbers, out))[0].ran == []  # the merged result is intact
     shutil.rmtree(first.artifacts["sum"].folder)
     assert walk(request_of(numbers, out))[0].ran == ["sum.3", "sum"]
 
@@ -283,7 +283,7 @@ def test_manifests_state_what_shards_took_and_their_forecast(numbers: Path, out:
 def test_an_error_of_the_machines_or_the_inputs_stops_the_run_at_once(
     numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another shard would meet the same full disk; only what dies or fails by itself costs itself."""
+    """Another shard would meet the same full disk; only a failure of its own affects a shard alone."""
     monkeypatch.setenv(sharded.FAIL_VARIABLE, "1")
     with pytest.raises(StageError, match="out of order"):
         walk(request_of(numbers, out))

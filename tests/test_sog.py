@@ -186,7 +186,7 @@ def test_a_third_party_file_is_y_down_without_georeference(tmp_path: Path) -> No
 
 
 def test_pictures_as_png_and_a_codebook_that_begins_with_null_are_read(tmp_path: Path) -> None:
-    """Both are in files of others: the specification allows the first, old programs wrote the second."""
+    """Both occur in third-party files: the specification allows the first, old programs wrote the second."""
     images = encode_sog(some_gaussians(60, 1))
     files = {"meta.json": b""}
     for name, data in images.images.items():

@@ -53,7 +53,7 @@ def test_a_split_that_leaves_nothing_or_names_unknown_photos_is_refused(
 
 
 def test_no_stage_borrows_what_the_split_decides() -> None:
-    """All who ask read its part, after it."""
+    """All stages that need it read its part, and run after it."""
     order = [stage.name for stage in LINE]
     readers = [stage.name for stage in LINE if "split.views" in stage.reads]
     assert readers == ["initialize", "blocks", "train", "clean", "evaluate", "splat_depths"]

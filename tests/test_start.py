@@ -24,7 +24,7 @@ SPARSE, SWEPT = 40, 100
 
 
 def numbered() -> InitialGaussians:
-    """A start whose means tell the rows."""
+    """Initial Gaussians whose means identify their rows."""
     gaussians = tiny_scene.true_model(SPARSE + SWEPT)
     gaussians.means = torch.arange(3.0 * len(gaussians)).view(-1, 3)
     return InitialGaussians(gaussians, SPARSE)

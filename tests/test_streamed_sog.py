@@ -19,7 +19,7 @@ FACTS = SceneFacts("z up", metres=True, place=SplatOrigin(47.8, 13.5, 515.0, crs
 
 @pytest.fixture(scope="module")
 def wall() -> Scene:
-    """Two walls of unlike size, so that their branches are of unlike height."""
+    """Two walls of different size, so that their branches differ in height."""
     generator = torch.Generator().manual_seed(6)
     made = Gaussians.empty(900, 1)
     made.means = 10.0 * torch.rand(900, 3, generator=generator) * torch.tensor([1.0, 0.1, 1.0])

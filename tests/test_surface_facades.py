@@ -37,7 +37,7 @@ from house_site import EAVES_M, RIDGE_M, ROOF, WALLS, ExactDepths, depths_of, ph
 
 PIXEL_M = 0.04
 FRAME = Frame("enu", Similarity.identity(), Origin(47.83, 13.51, 512.0), "ellipsoidal", crs="EPSG:32633")
-WALLS_OF_THE_HOUSE = {  # left and right end, seen from before it; top
+WALLS_OF_THE_HOUSE = {  # left and right end, seen from the front; top
     "south": ((-4.0, -3.0), (4.0, -3.0), EAVES_M),
     "north": ((4.0, 3.0), (-4.0, 3.0), EAVES_M),
     "east": ((4.0, -3.0), (4.0, 3.0), RIDGE_M),
@@ -106,7 +106,7 @@ def places_of(elevation: Elevation) -> np.ndarray:
 def panel(
     left: tuple[float, float], right: tuple[float, float], low: float, high: float, seed: int = 0, spread: float = 0.01
 ) -> Facets:
-    """Facets of a wall, 0.2 m apart, three on each place."""
+    """Facets of a wall, 0.2 m apart, three at each place."""
     random = np.random.default_rng(seed)
     along = np.subtract(right, left)
     length = float(np.hypot(*along))

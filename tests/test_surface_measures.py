@@ -47,7 +47,7 @@ def test_a_model_that_is_too_high_has_that_bias_normal_to_its_slopes() -> None:
 
 
 def test_a_shift_by_half_a_cell_affects_only_slopes() -> None:
-    """Away from steps the ground is as good; a slope is off by what it rises on the way, both slopes oppositely."""
+    """Away from steps the ground is unaffected; a slope is off by its rise, the two in opposite directions."""
     heights = house()[0]
     shifted = 0.5 * (heights + np.roll(heights, 1, axis=1))
     assert judged(shifted, where=~on_roof())["p95"] == 0.0
@@ -184,7 +184,7 @@ def test_a_roof_that_is_smeared_or_gone_is_lost() -> None:
 
 
 def test_a_torn_edge_is_caught() -> None:
-    """Every fourth stretch of 8 rows is 4 px aside."""
+    """Every fourth stretch of 8 rows is shifted by 4 px."""
     picture, other = roof_picture()[0], roof_picture(4.0)[0]
     torn = np.where((np.arange(300) // 8 % 4 == 0)[:, None, None], other, picture)
     assert edges_of(torn)["p95"] > 3.0 and edges_of(torn)["median"] <= 1.0

@@ -52,7 +52,7 @@ def truth(surface: Triangles) -> SceneTruth:
 
 
 def grid_of(cell: float) -> Raster:
-    """An empty one of the demo's CRS that holds all that was flown over, on whole cells."""
+    """An empty grid in the demo's CRS that covers everything flown over, on whole cells."""
     world = open_world(true_frame(CRS))
     (west, north), (east, south) = world.crs_from_local(np.array([[-25.0, 25.0, 0.0], [25.0, -25.0, 0.0]]))[:, :2]
     left, top = np.floor(west / cell), np.ceil(north / cell)
@@ -89,7 +89,7 @@ def test_reliefs_are_where_parallel_rays_hit(surface: Triangles) -> None:
 
 
 def test_a_relief_knows_its_slopes() -> None:
-    """A plane of slope 1 over a grid of half metres, and a sliver that nothing is seen of."""
+    """A plane of slope 1 over a grid of half metres, and an invisible sliver."""
     plane = np.array([[[0, 0, 0], [8, 0, 4.0], [0, 8, 0]], [[1, 1, 9], [1, 1, 9], [2, 2, 9.0]]], np.float64)
     found = relief(plane, 4, 4, 0.5)
     np.testing.assert_allclose(found.height[0], [0.25, 0.75, 1.25, 1.75])
@@ -235,7 +235,7 @@ def test_clouds_and_meshes_are_judged_on_both_sides(monkeypatch: pytest.MonkeyPa
 
 
 def test_targets_are_located() -> None:
-    """Painted at eight times the size, 18 px wide, off the middle of a pixel; shown aside, told so; gone, missing."""
+    """Painted at eight times the size, 18 px wide, off a pixel's centre: in place, displaced, missing."""
     y, x = (np.mgrid[:1280, :1280] + 0.5) / 8.0
     place = np.array([80.375, 79.625])
     u, v = x - place[0], y - place[1]
@@ -249,7 +249,7 @@ def test_targets_are_located() -> None:
 
 
 def test_the_true_image_is_aligned_with_the_products_pixels(perfect: tuple[Raster, TruthGrid], tmp_path: Path) -> None:
-    """Return an image whose colours encode their position, east and south."""
+    """On an image whose colours encode their position, east and south."""
     view = top_view(0.1)
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     linear = np.stack([x / view.width, y / view.height, np.full_like(x, 0.5)], axis=-1)

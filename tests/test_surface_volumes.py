@@ -131,7 +131,7 @@ def test_the_uncertainty_is_that_of_many_trials(tmp_path: Path) -> None:
     for nets in zip(*trials, strict=True):
         found = np.array([net.m3 for net in nets])
         told = float(np.median([net.sigma_m3 for net in nets]))
-        assert 0.6 < found.std() / told < 1.5  # the deviation of so few is within 40 % of its own in 99 % of cases
+        assert 0.6 < found.std() / told < 1.5  # the deviation of so few is within 40 % of the true one in 99 % of cases
         assert abs(found.mean() - math.pi * 3.5**2 * 2.0 / 3.0) < 4.0 * told / math.sqrt(TRIALS) + 0.05
 
 

@@ -87,7 +87,7 @@ def local_means(path: Path) -> np.ndarray:
 
 
 def apart(found: np.ndarray, expected: np.ndarray | torch.Tensor) -> float:
-    """Largest distance of one of either from the nearest of the others: files may hold them in any order."""
+    """Largest distance from a point of either set to the nearest of the other: files may hold them in any order."""
     between = np.linalg.norm(found[:, None] - np.asarray(expected, np.float64)[None], axis=2)
     return float(max(between.min(axis=0).max(), between.min(axis=1).max()))
 

@@ -116,11 +116,11 @@ def test_another_folder_gives_the_same_bits_and_another_seed_does_not(
 
 
 class Kill(BaseException):
-    """Stands for a kill: nothing of the trainer catches it."""
+    """Stands in for a kill: nothing of the trainer catches it."""
 
 
 def die_at(monkeypatch: pytest.MonkeyPatch, iteration: int, how: Callable[[], None]) -> None:
-    """Let ``how`` happen in the middle of an iteration, with a checkpoint after every one before."""
+    """Run ``how`` in the middle of an iteration, with a checkpoint after every earlier one."""
     step = loop.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:

@@ -123,7 +123,7 @@ def test_memory_that_runs_out_while_rows_are_moved_is_not_handled_as_a_shortage(
 
     values, rows = torch.randn(40, 48, generator=torch.Generator().manual_seed(3)), torch.arange(40).flip(0)
     tensor = values.clone().as_subclass(Tight)
-    with pytest.raises(MachineError, match="40 Gaussians") as failure:  # which no part of a training answers
+    with pytest.raises(MachineError, match="40 Gaussians") as failure:  # which no part of training handles
         taken_in_place(tensor, rows)
     assert not isinstance(failure.value, torch.OutOfMemoryError)
     assert torch.equal(tensor.as_subclass(Tensor)[:, :16], values[rows, :16])  # two of six times

@@ -145,7 +145,7 @@ def test_constant_sky_is_learnt_in_a_few_steps_and_only_from_pixels_of_the_sky()
     with torch.no_grad():
         learnt = sky.panorama.behind(camera, (0.0, 0.0, 0.0))
     assert float((learnt - photo)[:24].abs().mean()) < 0.02
-    assert float(learnt[-10:].mean()) > 0.4  # the dark wall below did not get into it
+    assert float(learnt[-10:].mean()) > 0.4  # the dark wall below did not affect it
 
 
 def test_a_sky_trained_elsewhere_is_rendered_and_unchanged() -> None:
@@ -234,7 +234,7 @@ def test_training_clears_the_sky_of_gaussians_and_held_out_photos_gain(scene: Pa
 
 
 class Kill(BaseException):
-    """Stands for a kill."""
+    """Stands in for a kill."""
 
 
 @pytest.mark.parametrize("when", [2, 25])

@@ -88,7 +88,7 @@ def test_training_on_windows_approaches_the_truth_in_a_photo_it_never_saw(scene:
 
 
 class Kill(BaseException):
-    """Stands for a kill: nothing of the trainer catches it."""
+    """Stands in for a kill: nothing of the trainer catches it."""
 
 
 def test_killed_training_on_windows_ends_with_the_same_bits_on_any_number_of_threads(

@@ -21,7 +21,7 @@ MADE = ("*.so", "__pycache__", "dist", "node_modules", record.RECORD)
 
 
 def copy_sources(target: Path, *besides: str) -> Path:
-    """Copy the sources but for what is built, and ``besides``; record them."""
+    """Copy the sources except build products and ``besides``; record them."""
     for folder in ("pipeline", "stages", "configs", "demo"):
         shutil.copytree(ROOT / folder, target / folder, ignore=shutil.ignore_patterns(*MADE, *besides))
     record.write(target, record.present(target))

@@ -37,7 +37,7 @@ def home(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (out / "cameras.json").unlink()
     (out / "cameras.json").symlink_to(home / "secret.txt")
     (out / "sparse.glb").unlink()
-    (out / "sparse.glb").symlink_to("splat.ply")  # even to what is given itself
+    (out / "sparse.glb").symlink_to("splat.ply")  # even to a deliverable
     # What a stage delivers as a folder names files below it; here the folder of that name in OUT is a link.
     sky = next((out / "stages").glob("export-*")) / "sky" / "deep"
     sky.mkdir(parents=True)
@@ -396,7 +396,7 @@ def test_a_file_behind_a_link_or_a_pipe_is_not_found(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "out" / "pipe")
     (tmp_path / "link").symlink_to("out")
     out = tmp_path / "out"
-    for folder in (out, tmp_path / "link"):  # the folder itself is the user's word
+    for folder in (out, tmp_path / "link"):  # the folder itself is the user's choice
         file = open_inside(folder, "real/file")
         os.close(file.descriptor)
         assert file.size == 1
