@@ -107,7 +107,7 @@ def _last_loss(out: Path) -> float | None:
 
 @contextlib.contextmanager
 def work_folder(wanted: Path | None) -> Iterator[Path]:
-    """Yield the work folder, locked for this process; a new temporary one if none is wanted.
+    """Yield the work folder, locked for this process; a new temporary one if none is given.
 
     Raises:
         UsageError: if another process uses the folder.

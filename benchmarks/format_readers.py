@@ -1,6 +1,6 @@
 """Read our files with third-party programs: ``format_readers.py OUT``, one line per check.
 
-Splat files are written afresh from the run's splat; COLMAP's folder and LAZ are those of ``splatpipe export OUT
+Splat files are written again from the run's splat; COLMAP's folder and LAZ are those of ``splatpipe export OUT
 --format colmap,laz``. Readers: splat-transform, gltf-validator, three and spark in headless Chromium, pycolmap, laspy,
 pyproj (CesiumJS: `cesium_tiles.py`). Set up once: npm ci --prefix benchmarks/readers.
 """

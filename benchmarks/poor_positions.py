@@ -1,6 +1,6 @@
 """Georeference the demo's cameras with poor positions: ``poor_positions.py [--run OUT] [--seeds 50]``.
 
-The true positions with errors of a known kind, drawn anew for each seed, go through georef as photo positions with a
+The true positions with errors of a known kind, drawn again for each seed, go through georef as photo positions with a
 stated accuracy of 3 m (5 m in height); the resulting frame is compared with the truth. For offset (of the cameras'
 centroid), north, up (angle between the two verticals) and scale: in how many of the georeferenced seeds the truth lies
 within the stated 95 % interval, and the median of the stated standard deviations over the RMS error. Frames whose scale

@@ -68,7 +68,7 @@ class TripFolder:
     Attributes:
         folder: Folder for files; splat-transform's output is reused for the same splat.
         others: Third-party programs.
-        slow: Formats that splat-transform is not asked to write.
+        slow: Formats that splat-transform does not write, to save time.
     """
 
     folder: Path

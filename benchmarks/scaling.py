@@ -64,7 +64,7 @@ COLUMNS = {
     "to linear": "ratio_to_linear:.2f",
     "peak MB": "peak_bytes:MB",
 }
-CALIBRATED = 0.02  # tolerance, relative to the wanted pairs per pixel
+CALIBRATED = 0.02  # tolerance, relative to the target pairs per pixel
 CALIBRATIONS = 8  # iterations at most: the blur prevents a million Gaussians from covering less of a small image
 LONGEST_STEP = 1.5
 MEMORY_START = 0.9  # of the cap: density control then grows to it

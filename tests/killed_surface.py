@@ -1,6 +1,6 @@
 """Writes a product and dies halfway, by a signal or a full disk; a program for test_surface_kills.py.
 
-Arguments: the folder. Every product is tried in a process of its own, in both ways; what became of it goes to stdout.
+Arguments: the folder. Every product is tried in a process of its own, in both ways; the outcome is printed to stdout.
 """
 
 import os

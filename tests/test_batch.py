@@ -281,7 +281,7 @@ def test_the_workflow_has_a_rule_for_each_stage_that_runs_with_its_resources(tmp
         "rule train_shard:",
         "rule train:",
     ]
-    assert text.count("gpu=1") == 2 and "0002-barn" not in text  # without blocks the whole is trained in the last one
+    assert text.count("gpu=1") == 2 and "0002-barn" not in text  # without blocks the last one trains everything
     assert '"train": [2, 900, 21, 50]' in text
     assert "gpu" not in workflow_text(call, call.plan(), LINE)
 

@@ -252,7 +252,7 @@ def test_unreadable_images_affect_nothing_else(tmp_path: Path) -> None:
     page = batch_page(batch(CaptureState("x", "done", picture="photos/a.jpg")), tmp_path)
     assert "no picture</p>" in page and "data:image" not in page
     whole = sorted(capture_path().glob("*.JPG"))[0].read_bytes()
-    (photos / "c.jpg").write_bytes(whole[: len(whole) // 2])  # the half that is there is shown
+    (photos / "c.jpg").write_bytes(whole[: len(whole) // 2])  # the existing half is shown
     page = batch_page(batch(CaptureState("x", "done", picture="photos/c.jpg")), tmp_path)
     code = page.split("data:image/jpeg;base64,")[1].split('"')[0]
     with Image.open(io.BytesIO(base64.b64decode(code))) as picture:

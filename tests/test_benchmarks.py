@@ -85,7 +85,7 @@ def test_contributing_pairs_are_those_of_the_definition(dataset: Path, opacity_l
     for camera in tiny_scene.cameras()[::4]:
         counted = measure.contributing_pairs(gaussians, camera, plan, 1)
         expected = pairs_by_definition(gaussians, camera, RenderOptions(0, near=plan.near))
-        # float32 puts a few alphas on the other side of 1/255, and a few pixels end a Gaussian earlier or later.
+        # In float32 a few alphas are on the other side of 1/255, and a few pixels saturate a Gaussian earlier or later.
         assert expected > 5000 and abs(counted - expected) <= 2e-3 * expected
 
 

@@ -282,7 +282,7 @@ def test_pixels_that_count_are_near_the_cell_or_have_no_depth(site: SiteParts) -
     end = 999.0
     around = ((-end, -end, x0, end), (x1, -end, end, end), (x0, -end, x1, y0), (x0, y1, x1, end))
     cells = (CELLS[0], *(Cell((left, low), (right, high)) for left, low, right, high in around))
-    enclosed = replace(PARTITION, cells=cells)  # whose first cell does not reach outward
+    enclosed = replace(PARTITION, cells=cells)  # whose first cell is not an outer one
     for sight in sights_of(site):
         assert sight.depth is not None
         rows, columns = np.indices(sight.depth.shape).reshape(2, -1)

@@ -96,7 +96,7 @@ def test_cells_share_points_and_pixels(
     assert len(partition.cells) == cells
     found = shares(work, partition)
     assert np.allclose(found.sum(axis=1), 1.0)
-    # Two measures, one cut: neither is shared exactly. Points and pixels of this site differ by a third in places.
+    # Two measures, one cut: neither is divided exactly. Points and pixels of this site differ by a third in places.
     assert found.max() <= 1.35 / cells and found.min() >= 0.65 / cells
     assert math.isclose(partition.margin, 0.1 * math.sqrt(sum(cell.area for cell in partition.cells) / cells))
 
@@ -210,7 +210,7 @@ def test_a_blocks_photos_show_all_of_its_cell(seen: list[PhotoCoverage], sparse:
             assert photo.windows.any() and photo.pixels == int(photo.windows.sum()) * 80 * 60
         names = {seen[photo.photo].camera.name for photo in view.photos}
         others = [k for k in range(len(seen)) if seen[k].camera.name not in names]
-        for number in others:  # nothing that a photo shows of the cell is lost with it
+        for number in others:  # no part of the cell that a photo shows is lost
             samples = seen[number].samples(sparse)
             shown = samples.weights[partition.owners(samples.places) == block].sum()
             assert shown <= 0.08 * seen[number].pixels
@@ -380,7 +380,7 @@ def test_merge_takes_each_gaussian_once_in_any_order(
     trained = {}
     for block in range(4):
         part = coarse.select(torch.from_numpy(partition.trained_by(block, means)))
-        part.sh = part.sh + 0.01 * (block + 1)  # each block learns something else, also of its margin
+        part.sh = part.sh + 0.01 * (block + 1)  # each block has learned different values, also in its margin
         trained[block] = part
     whole = merged(partition, trained)
     assert len(whole) == len(coarse)

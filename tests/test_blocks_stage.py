@@ -113,7 +113,7 @@ def test_a_cap_that_does_not_fit_is_kept_and_the_scene_is_divided(limit: int) ->
 @pytest.mark.parametrize("limit", [1_000_000_000, 1_500_000_000, 2_000_000_000])
 def test_the_coarse_pass_has_the_cap_of_the_whole_or_what_the_limit_holds(limit: int) -> None:
     found = divided(SITE, limit)
-    room = limit - (found.memory_bytes - found.need.memory_bytes)  # the libraries are in no need
+    room = limit - (found.memory_bytes - found.need.memory_bytes)  # ``need`` does not include the libraries
     assert found.need.trained < found.coarse_cap < found.cap  # more than a block trains: it has no frozen surroundings
     taken = [need_of_blocks(1, found.coarse_cap + n, found.window_pixels, SITE.sh_degree).memory_bytes for n in (0, 2)]
     assert taken[0] <= room < taken[1]
@@ -211,7 +211,7 @@ def test_blocks_model_the_sky_and_exclude_moving_objects(tmp_path: Path) -> None
     for view in load_views(folder / "dataset"):
         photo, sky = skies.trace(view.camera)
         shown = rasterizer.render(model, view.camera, rasterizer.RenderOptions(0))
-        assert float(shown.alpha[torch.from_numpy(sky)].mean()) < 0.05  # no block has put Gaussians there
+        assert float(shown.alpha[torch.from_numpy(sky)].mean()) < 0.05  # no block has added Gaussians there
         behind = panorama.behind(view.camera, (0.0, 0.0, 0.0)).numpy()
         assert np.abs(behind - photo.pixels / 255.0)[sky].mean() < 0.03
 

@@ -145,7 +145,7 @@ def test_the_map_marks_gaps_orphans_doubts_and_control_where_they_are(
     assert drawn.locator(".gap").count() == 1 and drawn.locator(".gap-number").text_content() == "1"
     far = drawn.locator(".control.poor title")
     assert "P03" in str(far.text_content()) and "outside it" in str(far.text_content())
-    assert 0.0 < preflight.control[0].position_m[0] < frame.metres  # what lies far out does not shrink the rest
+    assert 0.0 < preflight.control[0].position_m[0] < frame.metres  # outliers do not shrink the rest
     assert drawn.locator("text", has_text="P0").count() == 3
     pairs = watched.page.locator(".layer-pairs")
     expect(pairs).to_be_visible()
@@ -216,7 +216,7 @@ def test_hostile_names_stay_text_and_open_nothing(
     assert watched.page.evaluate("document.documentElement.scrollWidth") <= width
     assert watched.page.title().startswith("This capture cannot") and watched.page.locator("script").count() == 0
     assert words(watched).count('document.title = "taken"') >= 5
-    assert watched.page.locator("img").count() == 0  # what lies outside the folder is not read
+    assert watched.page.locator("img").count() == 0  # files outside the folder are not read
     text = path.read_text(encoding="utf-8")
     assert "\u202e" not in text and "\u2066" not in text
 
@@ -288,7 +288,7 @@ def test_names_on_the_map_do_not_cover_each_other() -> None:
     labels = Labels()
     assert labels.room(100, 100, "P01", "start") == "everywhere"
     assert labels.room(110, 105, "P02", "start") == ""
-    assert labels.room(100, 145, "P03", "start") == "wide"  # where letters are larger there is none
+    assert labels.room(100, 145, "P03", "start") == "wide"  # with larger letters there is no room
     assert labels.room(100, 300, "P04", "end") == "everywhere"
 
 

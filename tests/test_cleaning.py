@@ -133,7 +133,7 @@ def test_large_haze_in_front_of_everything_is_found() -> None:
 
 def test_gaussians_that_no_photo_sees_are_removed_unless_attached_to_the_scene() -> None:
     inside = made_of(np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9]]), 0.02, 0.5)  # far below
-    behind = made_of(np.array([[0.0, 0.0, -0.03]]), 0.05, 0.5)  # under the box, on its floor's ground
+    behind = made_of(np.array([[0.0, 0.0, -0.03]]), 0.05, 0.5)  # under the box, in contact with the ground
     cleaned = clean_scene(Gaussians.concat([scene(), inside, behind]), photos(pictures=False))
     assert cleaned.keep[-3:].tolist() == [False, False, True]
     assert cleaned.removed["seen by none"] == 2

@@ -208,7 +208,7 @@ def test_a_false_header_is_an_error(tmp_path: Path, true: bytes, lie: bytes) -> 
     data = (tmp_path / "a.ply").read_bytes()
     assert true in data
     (tmp_path / "a.ply").write_bytes(data.replace(true, lie, 1))
-    if lie == b"element hs":  # an element that nobody knows is left alone
+    if lie == b"element hs":  # an unknown element is ignored
         assert compressed_ply.read(tmp_path / "a.ply").gaussians.sh_degree == 0
         return
     with pytest.raises(SplatpipeError):

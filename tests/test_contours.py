@@ -55,7 +55,7 @@ def test_lines_lie_at_their_heights_and_not_where_there_is_no_data(tmp_path: Pat
     assert {line.height for line in found.lines} >= {103.5, 104.0, 105.0, 109.0}
     for contour in found.lines:
         x, y = in_metres(grid, contour.line)
-        steepest = 1.2  # of the hill, its slope times half a cell of tolerance and of cells themselves
+        steepest = 1.2  # the hill's slope, times half a cell each for tolerance and for cells
         assert np.abs(hill(x, y) - contour.height).max() < steepest * grid.cell
         assert not ((np.abs(x - 8.0) < 1.9) & (np.abs(y) < 1.9)).any()
         assert contour.is_index == (round(contour.height / 0.5) % 5 == 0)

@@ -121,7 +121,7 @@ class Answer:
     ended_by: Tensor  # rank, or the number of Gaussians
     sums: dict[str, Tensor] = field(default_factory=dict)
     clear: Tensor = field(default_factory=lambda: torch.empty(0))  # where no rounding decides anything
-    clamped: int = 0  # pairs of a pixel and a Gaussian whose alpha was cut
+    clamped: int = 0  # pairs of a pixel and a Gaussian whose alpha was capped
 
 
 @cache
@@ -337,7 +337,7 @@ def test_gradients_that_are_not_given_are_zero(kernels):
     for given in ("colour", "alpha", "depth_sum", "depth_square_sum"):
         zeros = {name: each * (1.0 if name == given else 0.0) for name, each in gradients.items()}
         expected, _ = blend(kernels, scene, zeros, Blend(True, True))
-        # One of depth's must be there: without, the kernels are those that have no gradient of depth.
+        # One of depth must be given: without it, the kernels without depth gradients are used.
         kept = {name: each for name, each in zeros.items() if name in (given, "depth_sum")}
         ours, _ = blend(kernels, scene, kept, Blend(True, True))
         assert_same_bits(ours, expected)

@@ -116,7 +116,7 @@ def test_pictures_losses_and_gradients_are_the_cpus(device: torch.device, depth:
     assert metrics.psnr(there.pop("colour"), here.pop("colour")) > LEAST_DB
     assert (there.pop("alpha") - here.pop("alpha")).square().mean() < 10 ** (-LEAST_DB / 10)
     seen_by_one = here.pop("visible") != there.pop("visible")
-    assert seen_by_one.float().mean() < 1e-4  # ellipses that touch the picture's edge
+    assert seen_by_one.float().mean() < 1e-4  # ellipses that touch the image's edge
     assert set(here) == set(there)
     for name, expected in here.items():
         assert torch.isfinite(there[name]).all(), name

@@ -212,9 +212,9 @@ def test_each_tile_lists_what_touches_it_from_near_to_far(library: CudaLibrary, 
         xs, ys = pixel_centres(case, tile)
         u, v = a * (xs[None, None, :] - x) + b * (ys[None, :, None] - y), c * (ys[None, :, None] - y)
         must = np.flatnonzero((u**2 + v**2).min((1, 2)) < reach - 1e-4)
-        assert np.isin(must, listed).all()  # all with a pixel that they count in
+        assert np.isin(must, listed).all()  # all that contribute to a pixel
         least = least_distance2(records[listed], (xs[0], xs[-1]), (ys[0], ys[-1]))
-        assert (least <= reach[listed] + 1e-4).all()  # none that stays outside
+        assert (least <= reach[listed] + 1e-4).all()  # none that does not reach the tile
 
 
 def pixel_centres(case: RenderCase, tile: int) -> tuple[np.ndarray, np.ndarray]:
@@ -243,7 +243,7 @@ def test_hostile_numbers_are_skipped_and_do_not_affect_the_others(library: CudaL
     scene = random_scene(2, 60, 1)
     hostile = torch.zeros(len(scene), dtype=torch.bool)
     for row, tensor in enumerate(scene.tensors().values()):
-        if (row, value) not in ((1, -3e38), (3, 3e38)):  # no extent at all, or quite opaque: nothing is wrong there
+        if (row, value) not in ((1, -3e38), (3, 3e38)):  # no extent, or full opacity: both are valid
             tensor.view(len(scene), -1)[5 + 7 * row, -1] = value
             hostile[5 + 7 * row] = True
     case, spared = (case_of(each, random_camera(2)) for each in (scene, scene.select(~hostile)))

@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from on_cpu import kernels_on_cpu, library_on_cpu
 from random_scene import random_camera, random_scene
 
-# Two float32 computations of the same sums in another order; between the backends 2e-6 was the most that was seen.
+# Two float32 computations of the same sums in another order; between the backends the largest seen was 2e-6.
 GRADIENT_RTOL = 1e-5
 # A step is the rate times a quotient of moments, and Adam divides by small ones: what differs in the tenth place of a
 # gradient near zero differs in the third of its first step.

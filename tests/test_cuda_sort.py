@@ -148,7 +148,7 @@ def test_plan_puts_whole_tiles_into_chunks(library, any_order, tiles, most, capa
 
 
 def test_plan_of_more_pairs_than_32_bits_can_count(library):
-    counts = np.full(32_400, 2_600_000)  # a picture of 3840 x 2160 that 2.6 million Gaussians cover, each all of it
+    counts = np.full(32_400, 2_600_000)  # an image of 3840 x 2160, each of 2.6 million Gaussians covering all of it
     plan = planned(library, counts, 1 << 28)
     assert plan.facts[0] == 32_400 * 2_600_000 > 1 << 36
     assert plan.tile_begin[-1] == plan.facts[0]

@@ -105,7 +105,7 @@ def fused_step(library: CudaLibrary, case: RenderCase, how: StepSettings) -> Ste
     step.beta1, step.beta2, step.epsilon, step.step = *BETAS, EPSILON, STEPS_BEFORE + 1
     step.sparse, step.log_scale_min, step.log_scale_max = int(how.sparse), *LIMITS
     step.logit_gain, step.skipped = pointer(how.gain), pointer(skipped)
-    if how.gain is not None:  # what is trained is not what was rendered
+    if how.gain is not None:  # the trained rows are not the rendered ones
         rendered = frame.at.put("logits", case.rows["opacity_logits"])
         step.logits = pointer(rendered)
         values["opacity_logits"] -= 1.0

@@ -35,7 +35,7 @@ OPTIONS = TrainConfig(
 )
 FEW = OPTIONS.model_copy(
     update={"robust": 0.0, "distortion_weight": 0.0}
-)  # these two may look at the device now and then
+)  # these two may read from the device now and then
 MEGABYTE = 1 << 20
 
 
@@ -119,7 +119,7 @@ def test_an_iteration_waits_for_nothing(device: Device) -> None:
     iterate(training, plan, given[0])  # what is loaded and allocated once
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
-    for photo in given[1:4]:  # density control comes after the fifth
+    for photo in given[1:4]:  # density control follows the fifth
         iterate(training, plan, photo)
     assert training.iteration == 4
 

@@ -178,7 +178,7 @@ def test_resuming_on_another_device_is_reported(scene: Path, tmp_path: Path) -> 
         assert "sm_80" in recorder.warnings[0] and summary["device"] == other.name
 
 
-ASKED_OF_THE_CPU = {  # numbers that are the host's: learning rates, and what arrived from the device long ago
+ASKED_OF_THE_CPU = {  # numbers on the host: learning rates, and values that arrived from the device long ago
     "optim.py:_step_fused",
     "optim.py:_is_fused",
     "cuda_forecast.py:facts",
@@ -240,7 +240,7 @@ def test_short_memory_makes_chunks_then_the_model_smaller_and_then_is_reported(
     most = read_splat(whole / "model.ply")
     shot = shot_of(tiny_scene.cameras()[0], RenderOptions(3, depth=False), 16)
 
-    # Chunks: as many Gaussians, the same bits.
+    # Smaller chunks: the same number of Gaussians, the same bits.
     kernels = ShortOfMemory(library_on_cpu(), torch.device("cpu"))
     kernels.most_bytes = kernels.back_bytes(shot, len(most), 2 * len(most))
     _, recorder = trained(scene, tmp_path / "chunks", ALL, kernels=kernels)
@@ -252,7 +252,7 @@ def test_short_memory_makes_chunks_then_the_model_smaller_and_then_is_reported(
     assert 1 <= len(recorder.warnings) <= 2  # once an iteration, however often something was halved
     assert all("smaller parts" in warning for warning in recorder.warnings)
 
-    # Then fewer Gaussians, and no more of them.
+    # Then fewer Gaussians, and no further growth.
     kernels.most_bytes = kernels.back_bytes(shot, 200, 200)
     fewer, recorder = trained(scene, tmp_path / "fewer", ALL, kernels=kernels)
     assert any("most opaque" in warning for warning in recorder.warnings)
@@ -371,7 +371,7 @@ def test_a_checkpoint_too_large_for_the_device_is_not_called_broken(
     plan = make_small_plan(ALL)
     begun = TrainState.begin(tiny_scene.true_model(), plan, Techniques())
     monkeypatch.setattr(state.Adam, "load_state_dict", no_room)
-    with pytest.raises(torch.OutOfMemoryError):  # "broken" would have it trained from the start again
+    with pytest.raises(torch.OutOfMemoryError):  # "broken" would restart training from the beginning
         TrainState.restore(begun.checkpoint("any"), plan, Techniques())
 
 

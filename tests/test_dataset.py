@@ -161,7 +161,7 @@ def test_a_hostile_model_is_refused_and_never_more_than_its_bytes_are_read(tmp_p
             load_points_and_tracks(tmp_path)
     for start in range(8, len(sound) - 7):
         path.write_bytes(sound[:start] + huge + sound[start + 8 :])
-        with contextlib.suppress(StageError):  # a claim that does not fit; elsewhere it is a number like any other
+        with contextlib.suppress(StageError):  # an impossible count; elsewhere it is an ordinary number
             load_points_and_tracks(tmp_path)
 
 

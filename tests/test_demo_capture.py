@@ -157,7 +157,7 @@ def test_gimbal_angles_agree_with_the_cameras() -> None:
         about_forward, _ = cv2.Rodrigues(np.array([0, 0, roll]))
         world_from_cam = about_up @ level @ about_right @ about_forward
         between = world_from_cam @ cam_from_world()[entry["name"]][:3, :3]
-        assert np.rad2deg(np.linalg.norm(cv2.Rodrigues(between)[0])) < 1.2  # the gimbal's own error is 0.2 an axis
+        assert np.rad2deg(np.linalg.norm(cv2.Rodrigues(between)[0])) < 1.2  # the gimbal's own error is 0.2 per axis
 
 
 def test_gps_errors_have_the_stated_size_and_no_bias() -> None:

@@ -23,7 +23,7 @@ SCHEDULE = resolve_schedule(TrainConfig()).density
 
 
 def scene(count: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
-    """Overlapping Gaussians before the camera, of degree 0."""
+    """Overlapping Gaussians in front of the camera, of degree 0."""
     generator = torch.Generator().manual_seed(seed)
     gaussians = Gaussians.empty(count, 0, dtype)
     spread = torch.tensor([1.0, 0.8, 1.0], dtype=dtype)

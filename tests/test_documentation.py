@@ -38,7 +38,7 @@ QUICK = (
     "status",
     "report",
 )  # seconds each on a run that has hardly begun
-SOURCES = (ROOT, ROOT / "pipeline", ROOT / "pipeline/raster")  # what paths in the pages count from
+SOURCES = (ROOT, ROOT / "pipeline", ROOT / "pipeline/raster")  # the folders that paths in the pages are relative to
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 ENDINGS = ("csv", "json", "tif", "glb", "ply", "webm", "py", "toml", "laz", "md", "txt", "html", "geojson", "dxf")
 

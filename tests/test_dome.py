@@ -33,7 +33,7 @@ def scene_around(centre: np.ndarray, reach: float) -> Gaussians:
     offset = torch.randn(1000, 3, generator=torch.Generator().manual_seed(1))
     offset = reach * offset / torch.linalg.vector_norm(offset, dim=1, keepdim=True)
     scene.means = torch.from_numpy(centre).float() + offset
-    scene.means[0] = 1e6  # one lies anywhere
+    scene.means[0] = 1e6  # a distant outlier
     return scene
 
 

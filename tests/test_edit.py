@@ -79,9 +79,6 @@ def same(first: Gaussians, second: Gaussians) -> bool:
     return all(torch.equal(tensor, getattr(second, name)) for name, tensor in first.tensors().items())
 
 
-# ------------------------------------------------------------------------------------------------------------- motions
-
-
 @pytest.mark.parametrize("axes", ["z up", "y down"])
 def test_rotated_by_37_degrees_it_looks_the_same_from_cameras_rotated_with_it(axes):
     scene = Scene(true_model(), SceneFacts(axes))
@@ -171,9 +168,6 @@ def test_moved_far_away_it_is_upright_in_a_new_local_frame():
 def test_without_georeference_it_is_not_moved_beyond_float32_precision():
     with pytest.raises(SplatpipeError, match="32-bit"):
         edited(Scene(true_model(), SceneFacts()), ("move", "500000,5800000,0"))
-
-
-# --------------------------------------------------------------------------------------------------------------- crops
 
 
 def test_a_box_crop_keeps_its_contents_bit_identical_and_a_cut_keeps_the_rest():
@@ -283,9 +277,6 @@ def test_a_polygon_of_many_vertices_cuts_like_the_circle_it_is(tmp_path: Path):
     assert same(edited(scene, ("crop_polygon", path), local=True).gaussians, scene.gaussians.select(inside))
 
 
-# --------------------------------------------------------------------------------------------------------------- merges
-
-
 def test_two_halves_merge_to_the_whole(tmp_path: Path):
     scene = Scene(true_model(), PLACED)
     right = edited(scene, ("crop_box", "0,-9,9,9"), local=True)
@@ -352,9 +343,6 @@ def test_without_georeference_only_splats_in_one_frame_are_merged(tmp_path: Path
     assert len(merged.gaussians) == 2 * len(true_model())
 
 
-# ------------------------------------------------------------------------------------------------------------- cleaning
-
-
 def test_cleaning_uses_cameras_moved_with_the_splat():
     scene = Scene(true_model(), SceneFacts("y down"))
     scene.gaussians.opacity_logits[::10] = -8.0  # what nobody sees
@@ -388,9 +376,6 @@ def test_held_out_photos_are_not_used_for_cleaning(run_folder: Path):
     assert len(open_source(run_folder / "splat.ply").trained_on()) == 9
 
 
-# ------------------------------------------------------------------------------------------------------ sizes, records
-
-
 def test_it_is_reduced_to_a_count_or_a_size_in_bytes(tmp_path: Path):
     scene = Scene(true_model(600), SceneFacts())
     assert len(edited(scene, ("reduce", "200")).gaussians) == 200
@@ -415,9 +400,6 @@ def test_a_record_keeps_the_newest_edits_and_counts_the_others():
     long = with_edits(SceneFacts(), [{"step": "crop", "polygon": "x" * 20_000}] * 6)
     assert long.edits[0]["count"] + len(long.edits) - 1 == 6
     long.record()
-
-
-# -------------------------------------------------------------------------------------------------- what people write
 
 
 @pytest.mark.parametrize(
@@ -480,9 +462,6 @@ def test_options_are_read_in_order_and_may_be_repeated():
         steps_in_order([*order, "scale_from"], options)
     with pytest.raises(UsageError, match="too many"):
         parse_steps([("rotate", "1")] * 101, OUTPUT, False)
-
-
-# ---------------------------------------------------------------------------------------------------------- the command
 
 
 def splatpipe_edit(*arguments: object) -> dict[str, Any]:
@@ -594,9 +573,6 @@ def test_a_model_folder_is_written_completely_and_never_into_a_nonempty_folder(t
     with pytest.raises(UsageError, match="is a folder"):
         edit_splat(task, Recorder())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "model", "model.edits.json"]
-
-
-# ------------------------------------------------------------------------------------------------------------ pictures
 
 
 def test_a_photo_that_shows_it_is_used_or_else_an_oblique_view(run_folder: Path):

@@ -458,7 +458,7 @@ def test_a_disabled_stage_reads_nothing_and_waits_for_nothing(numbers: Path, out
     assert walk(off)[0].ran == ["read", "add", "tell"]
     assert (out / "telling.txt").read_text() == "nothing of 0 parts 21"
     changed = request_of(numbers, out, count={"enabled": False}, add={"offset": 1})
-    assert walk(changed)[0].ran == ["add", "tell"]  # another parity, which nobody counts
+    assert walk(changed)[0].ran == ["add", "tell"]  # another parity, which no stage counts
 
 
 def test_matching_artifacts_are_found_without_configuration_and_source(numbers: Path, out: Path) -> None:

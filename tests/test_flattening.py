@@ -165,7 +165,7 @@ def test_copy_is_flatter_and_the_same_for_any_threads_and_after_a_kill(
     model = flatten(trained(parts), Machine("cpu", 1), once, tiny_scene.Recorder())
     before = read_splat(parts["clean.model"])
     assert len(model) == len(before)
-    # A tenth of the shipped length takes off a tenth.
+    # A tenth of the shipped length reduces it by a tenth.
     assert spread_of(model, parts["undistort.dataset"]) < 0.95 * spread_of(before, parts["undistort.dataset"])
     real = loop.iterate
 

@@ -83,7 +83,7 @@ def test_planted_floater_is_found_with_the_light_that_it_absorbs(dataset: Path) 
     assert figures["free_space_gaussians"] == 1
     assert figures["free_space_opacity"] == pytest.approx(0.98 / (0.98 + 0.9 * len(places())), abs=1e-6)
     assert figures["depth_disagreement"]["share_above_5_percent"] == 0.0  # all see it in the same place
-    # Light that an isotropic Gaussian stops: 2 π σ² × opacity, σ² in pixels and with the screen filter's 0.3.
+    # Light that an isotropic Gaussian absorbs: 2 π σ² × opacity, σ² in pixels and with the screen filter's 0.3.
     stopped = 2.0 * np.pi * ((0.08 * 130.0 / 2.0) ** 2 + 0.3) * 0.98
     assert figures["free_space_rendered"] == pytest.approx(stopped / (144 * 108), rel=0.05)
 

@@ -72,7 +72,7 @@ def test_an_unnamed_frame_is_found(scene):
 
 def test_floaters_are_planted_in_front_of_surfaces_and_visible(scene):
     model = scene.gaussians
-    wall = Gaussians.empty(1200, 3)  # behind all: every ray ends
+    wall = Gaussians.empty(1200, 3)  # behind everything: every ray ends there
     wall.means = torch.rand(1200, 3, generator=torch.Generator().manual_seed(2)) * torch.tensor([8.0, 6.0, 0.05])
     wall.means += torch.tensor([-4.0, -3.0, 1.6])
     wall.log_scales = torch.full((1200, 3), math.log(0.15))

@@ -23,7 +23,7 @@ from splatpipe.pipeline.geometry.upright import (
 from splatpipe.pipeline.survey.frames import Frame, load_frame, save_frame
 from splatpipe.pipeline.survey.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
 
-EXACT = 1e-12  # float64, a handful of products of numbers near one
+EXACT = 1e-12  # float64, a few products of numbers near one
 
 
 def random_similarity(seed: int) -> Similarity:

@@ -223,4 +223,4 @@ def test_gdal_leaves_pyproj_and_the_environment_alone(tmp_path: Path) -> None:
     write_hill(path, hill_grid())
     assert state() == before
     with pytest.raises(rasterio.errors.EnvError):
-        rasterio.env.getenv()  # no setting of ours outlives the writing
+        rasterio.env.getenv()  # none of our settings remains after writing

@@ -540,7 +540,7 @@ def test_masks_beside_images_are_found_without_a_model(folder: Path) -> None:
     result = ingest(folder)
     assert_left_half(result.mask("images/c.jpg"))
     assert_left_half(result.mask("a.jpg"))
-    assert result.mask("images/a.jpg") is None  # it is the other's
+    assert result.mask("images/a.jpg") is None  # the mask belongs to the other photo
     assert not any("mask" in warning for warning in result.warnings)
 
 

@@ -87,7 +87,7 @@ def thin(folder: Path) -> None:
             database.delete_two_view_geometry(i, j)
             if (i, j) in TIES:
                 rows = np.asarray(geometry.inlier_matches)
-                # Those that are sure to have a point, in the models that the photos are of.
+                # Those most certain to have a point in the photos' models.
                 sure = [min(seen[n, row] for n, row in ((i, a), (j, b)) if n != FAINT) for a, b in rows.tolist()]
                 geometry.inlier_matches = rows[np.argsort(-np.array(sure), kind="stable")[: TIES[i, j]]]
                 database.write_two_view_geometry(i, j, geometry)

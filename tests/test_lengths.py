@@ -62,7 +62,7 @@ def test_few_photos_take_the_minimum_and_more_take_proportionally_more() -> None
     totals = {photos: sum(count for _, count in lengths(footage_of(photos, 4.0), 7000)) for photos in PHOTOS}
     assert 7000 <= totals[11] < 7600 and list(totals.values()) == sorted(totals.values())
     assert totals[1000] == 2 * totals[500]
-    # What 50 photos are looked at in all: no more than 1.4 times what 7,000 iterations at 0.5 megapixels were.
+    # The pixels trained on for 50 photos: at most 1.4 times those of 7,000 iterations at 0.5 megapixels.
     footage = footage_of(50, 4.0)
     pixels = sum(
         count * footage.pixels(TrainingSize(level, footage.window_at(level))) for level, count in lengths(footage, 7000)

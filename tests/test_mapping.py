@@ -86,12 +86,12 @@ def test_the_best_keypoints_are_spread_and_bring_their_partners() -> None:
     side = np.arange(40) + 0.5
     places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2).astype(np.float32)
     matches = {(1, 2): np.stack([np.arange(1600), np.arange(1600)[::-1]], axis=1).astype(np.uint32)}
-    matches[1, 3] = matches[1, 2][700:720]  # these are verified twice: in the middle, and first of their cells
+    matches[1, 3] = matches[1, 2][700:720]  # these are verified twice: in the middle, and the first in their cells
     chosen = best_keypoints(ViewGraph({}, {}, {}, {1: places, 2: places, 3: places}, matches), 128)
     cells = np.bincount((places[chosen[1]] // 5).astype(int) @ [1, 8], minlength=64)
     assert cells.min() == 2
     assert chosen[1][700:720].all()
-    assert chosen[1].sum() < 200  # of 1600; more than were asked for, since photo 2 has cells of its own
+    assert chosen[1].sum() < 200  # of 1600; more than requested, since photo 2 has its own cells
     with_partner = chosen[2][::-1] >= chosen[1]
     with_partner[700:720] = True  # photo 3 brought some of these in
     assert with_partner.all()

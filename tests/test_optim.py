@@ -233,6 +233,6 @@ def test_moments_are_loaded_one_after_the_other() -> None:
     given = {name: tensor.as_subclass(Watched) for name, tensor in state.items()} | {"step": torch.tensor(3)}
     old = [weakref.ref(tensor) for moments in (optimizer.mean, optimizer.square) for tensor in moments.values()]
     optimizer.load_state_dict(given)
-    assert found == list(range(1, len(old) + 1))  # each is gone before its successor comes
+    assert found == list(range(1, len(old) + 1))  # each is freed before its successor is loaded
     assert all(torch.equal(tensor, state[name]) for name, tensor in optimizer.state_dict().items() if tensor.ndim)
     assert optimizer.step_count == 3

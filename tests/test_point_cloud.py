@@ -86,7 +86,7 @@ def test_crs_is_wkt_that_proj_reads(tmp_path: Path, frame: Frame, codes: list[st
     assert header.global_encoding.wkt
     texts = {vlr.record_id: vlr for vlr in header.vlrs if vlr.user_id in ("LASF_Projection", "LASF_Spec")}
     crs = pyproj.CRS.from_wkt(texts[2112].string)
-    assert texts[2112].string.startswith(("COMPD_CS", "PROJCS", "LOCAL_CS"))  # WKT of 2001, which LAS asks for
+    assert texts[2112].string.startswith(("COMPD_CS", "PROJCS", "LOCAL_CS"))  # WKT of 2001, which LAS requires
     parts = crs.sub_crs_list if crs.is_compound else [crs]
     assert [(part.to_authority() or (None, None))[1] for part in parts] == codes
     assert texts[3].record_data == f"Heights: {about}".encode() + b"\0"

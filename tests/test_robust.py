@@ -124,7 +124,7 @@ def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(rob
             missing[20:88, 20:124] = torch.tensor(YELLOW)
             photo = robust.look(TrainingPhoto(camera, missing, None), rendered, rendered.colour)
         robust.end_epoch(0.5)
-        robust.threshold.clamp_(max=LEAST_RESIDUAL)  # however many stand out
+        robust.threshold.clamp_(max=LEAST_RESIDUAL)  # however many are above it
     assert bool((robust.scores[3] > LEAST_RESIDUAL).any())
     assert photo.mask is None or float((~photo.mask).float().mean()) < 0.02
 

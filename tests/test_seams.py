@@ -76,7 +76,7 @@ def test_no_alarm_without_a_seam(splat: Gaussians, coarse: Gaussians, cameras: l
 def test_gap_is_found(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:
     torn = gap(splat, PLAN, BORDERS[0], 10.0 * PIXEL)
     assert "gap" in found(torn, coarse, BORDERS[0], cameras)
-    assert found(torn, coarse, BORDERS[1], cameras) == {}  # which crosses it: there it is one place of many
+    assert found(torn, coarse, BORDERS[1], cameras) == {}  # which crosses it: there it is a single place
 
 
 def test_doubled_surface_is_found(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:

@@ -92,7 +92,7 @@ def statuses(request: Request) -> dict[str, StageStatus]:
 
 
 def digests(out: Path) -> dict[str, object]:
-    """Every part of every artifact, by its folder: which has the key."""
+    """Digests of every part of every artifact, by its folder, whose name has the key."""
     manifests = {path.parent.name: json.loads(path.read_text()) for path in out.glob("stages/*-*/manifest.json")}
     return {
         name: {part: told["digest"] for part, told in manifest["parts"].items()} for name, manifest in manifests.items()
@@ -236,7 +236,7 @@ def test_clean_keeps_the_shards_in_use(numbers: Path, out: Path) -> None:
     make_shard(request, 2)
     line, store = status_of(request)
     removed, _ = store.remove_stale(entry for status in line_status(line, store) for entry in status.to_keep)
-    assert removed == 1 + 6 + 1 + 1  # the other division, its shards, what they were joined to, what that showed
+    assert removed == 1 + 6 + 1 + 1  # the other division, its shards, their merged result, and what was shown of it
     assert walk(request)[0].ran == ["sum.1", "sum.3", "sum", "show"]
 
 

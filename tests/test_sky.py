@@ -32,7 +32,7 @@ def test_sky_is_found_however_the_photo_is_rolled(
 def test_sky_above_a_camera_that_looks_at_the_zenith_is_found() -> None:
     photo, truth = skies.trace(skies.look(pitch_deg=80.0))
     assert truth.all()
-    photo.pixels[-30:] = 40  # an eave; a picture of sky alone has nothing to outshine
+    photo.pixels[-30:] = 40  # an eave: in an image of sky alone nothing is darker than the sky
     mask = found(photo, skies.points_on())
     assert mask[:-34].all() and not mask[-30:].any()
 
@@ -217,5 +217,5 @@ def test_bright_strip_that_is_narrow_at_the_top_is_not_sky() -> None:
     photo, _ = skies.trace(skies.look(), (tower,))
     photo.pixels[:200, 100:125] = (228, 230, 232)  # a white column on a dark wall, no point on either
     assert not found(photo, np.zeros((0, 3))).any()
-    photo.pixels[:60] = (228, 230, 232)  # as wide as the picture, it might be one: only points tell
+    photo.pixels[:60] = (228, 230, 232)  # as wide as the image, it might be sky: only points decide
     assert found(photo, np.zeros((0, 3)))[:50].all()

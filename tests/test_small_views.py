@@ -45,7 +45,7 @@ def test_a_large_jpeg_is_decoded_small_and_shows_the_same(tmp_path: Path, megapi
     assert read_small(view.image_path, size, (camera.width, camera.height))[0] == factor
     assert camera == expected_camera and pixels.shape == expected.shape
     assert counts is not None and np.array_equal(counts, expected_counts)
-    # Rounding of what was decoded small, and what of its frequencies its blocks' own filter lets through.
+    # Rounding of the small decode, and the frequencies that the blocks' own filter lets through.
     difference = pixels.astype(float) - expected
     assert np.abs(difference).mean() < 1.5 and np.abs(difference).max() < 12.0
 

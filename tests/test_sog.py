@@ -137,9 +137,6 @@ def test_values_that_are_not_finite_are_never_written() -> None:
         encode_sog(gaussians)
 
 
-# ---- our reader ----
-
-
 def test_our_reader_agrees_with_the_specification(tmp_path: Path) -> None:
     write(tmp_path / "a.sog", Scene(some_gaussians(400), SceneFacts("y down")))
     table = decode(rows_of_file(tmp_path / "a.sog"))

@@ -48,7 +48,7 @@ def plain_album() -> OrthoInput:
 
 
 def levels(album: OrthoInput) -> PhotoGains:
-    """Levelled at places on the surface."""
+    """Exposures equalised at places on the surface."""
     centres, up = HEIGHTS.centres(WHOLE)[1::3, 1::3], album.surface.height[1::3, 1::3]
     places = np.concatenate([centres, up[..., None].astype(np.float64)], axis=-1).reshape(-1, 3)
     return exposure_levels(album.sources, places[np.isfinite(places[:, 2])], 2 * HEIGHTS.cell_m, threads=1)

@@ -215,7 +215,7 @@ def test_the_orthophoto_covers_all_that_the_surface_model_does(
 ) -> None:
     monkeypatch.setattr(ortho_file, "TILE", 32)
     covered = np.zeros_like(site().covered)
-    covered[len(covered) // 2, 0] = True  # enough photos see but a corner, as far as samples tell
+    covered[len(covered) // 2, 0] = True  # by samples, enough photos see only a corner
     (tmp_path / "dsm.tif").write_bytes((made / "dsm.tif").read_bytes())
     surface = run_surface(FRAME, photos(), HOUSE)
     make_ortho(

@@ -213,7 +213,7 @@ def test_photos_see_what_is_not_occluded() -> None:
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
     assert photos_that_see(places, up, sights).tolist() == [9, 9, 0, 0]
     level = np.tile([1.0, 0.0, 0.0], (4, 1))
-    assert photos_that_see(places, level, sights)[0] == 6  # three stand straight above: seen as a line
+    assert photos_that_see(places, level, sights)[0] == 6  # three are straight above: seen as a line
 
 
 def test_clouds_and_meshes_are_judged_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:

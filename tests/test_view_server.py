@@ -199,7 +199,7 @@ def test_invalid_paths_are_refused(served: Served, raw: bytes) -> None:
     ],
 )
 def test_a_host_that_is_not_this_machine_is_refused(served: Served, host: str | None) -> None:
-    """A name of somebody else's that resolves to 127.0.0.1 is DNS rebinding."""
+    """A foreign name that resolves to 127.0.0.1 is DNS rebinding."""
     for path in ("/", "/splat.ply", "/api/live"):
         assert refused(served.ask(path, host=host))
 

@@ -178,7 +178,7 @@ def test_a_click_on_a_frustum_moves_the_camera_into_it(demo_run: Path, view: Ope
     page.evaluate("() => splatpipe.complete()")
     places = page.evaluate("() => splatpipe.facts.cameras.map((c) => splatpipe.project(c.centre))")
     found = None
-    for place in places:  # a frustum's picture lies beside its centre: look for one around each
+    for place in places:  # a frustum's image is beside its centre: search around each
         for right, down in ((0, 12), (12, 0), (-12, 0), (0, -12)):
             page.mouse.move(place["x"] + right, place["y"] + down)
             if page.locator("#tip").is_visible():

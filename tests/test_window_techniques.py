@@ -44,7 +44,7 @@ LATE = resolve_schedule(TrainConfig(iterations=100)).at(60)  # every technique t
 
 
 def gaussians(count: int = 400) -> Gaussians:
-    """Blobs before the camera, from the ground to the sky."""
+    """Blobs in front of the camera, from the ground to the sky."""
     drawn = torch.Generator().manual_seed(3)
     found = Gaussians.empty(count, 0)
     pixels = torch.rand(count, 2, generator=drawn).double().numpy() * [CAMERA.width, CAMERA.height]

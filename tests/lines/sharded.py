@@ -13,7 +13,7 @@ from arithmetic import READ, ReadConfig
 from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shards, Stage, StageConfig, Summary
 
-KILL_VARIABLE = "SHARDED_KILL"  # names the shard whose process dies of SIGKILL half-way
+KILL_VARIABLE = "SHARDED_KILL"  # names the shard whose process dies of SIGKILL halfway
 FAIL_VARIABLE = "SHARDED_FAIL"  # names the shard that raises
 
 
