@@ -49,7 +49,7 @@ def row(variant: str, capture: str, seed: int, **values: float) -> dict[str, Any
     return {"variant": variant, "capture": capture, "seed": seed, **values}
 
 
-def test_runs_what_is_new_and_nothing_else(dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_only_new_trainings_run(dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     work = tmp_path / "work"
     smooth = ("--only", "smooth", "--variant", "smooth=train.antialias=true")
     code, first = ablate(dataset, work, *smooth, "--seeds", "2")

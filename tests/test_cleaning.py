@@ -165,7 +165,7 @@ def test_nothing_is_removed_from_few_or_no_gaussians() -> None:
         assert clean_scene(few).keep.all()
 
 
-def test_what_is_not_finite_is_refused() -> None:
+def test_values_that_are_not_finite_are_refused() -> None:
     broken = scene().clone()
     broken.means[3, 0] = float("nan")
     with pytest.raises(ValueError, match="not finite"):

@@ -178,7 +178,7 @@ def test_dxf_in_feet_says_so(tmp_path: Path) -> None:
     assert header[header.index("$INSUNITS") + 2] == "21"
 
 
-def test_frame_without_a_place_has_a_dxf_and_no_longitudes(tmp_path: Path) -> None:
+def test_frame_without_georeference_has_a_dxf_and_no_longitudes(tmp_path: Path) -> None:
     grid = make_grid(Frame("arbitrary", IDENTITY, metres=True), box(20.0, 15.0), 0.1)
     found = traced(tmp_path / "dsm.tif", grid)
     write_dxf(tmp_path / "contours.dxf", found, grid.crs)

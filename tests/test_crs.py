@@ -346,7 +346,7 @@ def test_utm_zones_hemispheres_and_poles() -> None:
         np.testing.assert_allclose(world.local_from_crs(world.crs_from_local(local)), local, atol=1e-6)
 
 
-def test_axis_order_is_east_first_whatever_the_crs_says() -> None:
+def test_axis_order_is_east_first_whatever_the_crs_prescribes() -> None:
     """Gauss-Krüger states northing first, geographic CRSs latitude first."""
     for text in ("EPSG:31255", "EPSG:4326", "EPSG:32633"):
         world = open_world(frame(text))
@@ -373,7 +373,7 @@ def test_an_operation_is_named_with_its_accuracy() -> None:
     assert np.isfinite(back).all()
 
 
-def test_scene_box_leaves_out_what_lies_kilometres_away() -> None:
+def test_scene_box_excludes_points_kilometres_away() -> None:
     points = np.concatenate([np.random.default_rng(1).uniform(-10, 10, (1000, 3)), [[5000.0, 0.0, 0.0], [np.nan] * 3]])
     box = scene_box(points, np.array([[0.0, 0.0, 40.0]]))
     assert box[1, 0] < 11.0 and box[1, 2] == 40.0

@@ -322,7 +322,7 @@ def test_blending_and_its_gradients_are_the_definitions(kernels, name, depth, ma
 
 
 @pytest.mark.parametrize("how", [Blend(True, True, 1, 2), Blend(True, True, 2, 1), Blend(True, True, 1000, 7)])
-def test_chunks_and_blocks_leave_the_same_bits(kernels, how):
+def test_chunks_and_blocks_give_the_same_bits(kernels, how):
     scene = SCENES["odd size"]()
     _, gradients = blend_exactly("odd size", True)
     expected, _ = blend(kernels, scene, gradients, Blend(True, True))

@@ -126,7 +126,7 @@ def test_frame_and_every_gradient_are_those_of_the_cpus_kernels(library: CudaLib
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("order", [(REVERSE, 0), (SHUFFLED, 1)], ids=["reverse", "shuffled"])
-def test_order_of_threads_and_blocks_leaves_the_same_bits(
+def test_order_of_threads_and_blocks_gives_the_same_bits(
     library: CudaLibrary, as_it_was: ctypes.CDLL, name: str, order: tuple[int, int]
 ) -> None:
     case, ours, _ = settled(library, name)
@@ -135,7 +135,7 @@ def test_order_of_threads_and_blocks_leaves_the_same_bits(
 
 
 @pytest.mark.parametrize("multiprocessors", [1, 40])
-def test_size_of_the_device_leaves_the_same_bits(
+def test_size_of_the_device_gives_the_same_bits(
     library: CudaLibrary, as_it_was: ctypes.CDLL, multiprocessors: int
 ) -> None:
     case, ours, _ = settled(library, "thousands")
@@ -144,7 +144,7 @@ def test_size_of_the_device_leaves_the_same_bits(
 
 
 @pytest.mark.parametrize("name", ["pixels that end", "long", "one tile with everything", "magnitudes, no depth"])
-def test_chunks_and_passes_leave_the_same_bits(library: CudaLibrary, name: str) -> None:
+def test_chunks_and_passes_give_the_same_bits(library: CudaLibrary, name: str) -> None:
     case, ours, _ = settled(library, name)
     pairs, least = ours.facts[0], case.count
     chunks = set()

@@ -309,7 +309,7 @@ def test_inputs_changed_while_a_stage_reads_them_give_no_artifact(numbers: Path,
     assert walk(request_of(numbers, out))[0].artifacts["add"].summary == {"total": 21}
 
 
-def test_survey_says_why(numbers: Path, out: Path) -> None:
+def test_status_states_the_reasons(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     statuses = list(line_status(*status_of(request_of(numbers, out, add={"offset": 5}))))
     assert [(status.stage.name, status.state) for status in statuses] == [
@@ -418,7 +418,7 @@ def test_hostile_names_do_no_harm(numbers: Path, out: Path) -> None:
     assert walk(request_of(numbers, out))[0].ran == []
 
 
-def test_a_refused_stage_leaves_the_configuration_as_it_was(numbers: Path, out: Path) -> None:
+def test_a_refused_stage_does_not_change_the_configuration(numbers: Path, out: Path) -> None:
     walk(request_of(numbers, out))
     changed = request_of(numbers, out, add={"offset": 1})
     with pytest.raises(UsageError), open_session(changed, lambda event: None) as runner:

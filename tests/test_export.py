@@ -154,7 +154,7 @@ def test_positions_and_sizes_are_in_the_world_frame(inputs: Inputs, exported: Pa
     np.testing.assert_allclose(vertex["opacity"], before.opacity_logits.numpy())
 
 
-def test_header_says_where_the_origin_is(exported: Path, tmp_path: Path) -> None:
+def test_header_states_the_origin(exported: Path, tmp_path: Path) -> None:
     comments = PlyData.read(str(exported / "splat.ply")).comments
     assert any("east north up, metres" in comment for comment in comments)
     assert any("52.2" in comment and "20.9" in comment and "110.5" in comment for comment in comments)

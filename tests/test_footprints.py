@@ -88,7 +88,7 @@ def test_photos_without_metadata_overlap_with_none() -> None:
     assert shares and all(3 not in pair for pair in shares)
 
 
-def test_strips_are_matched_with_what_overlaps_and_nothing_else() -> None:
+def test_strips_are_matched_with_overlapping_photos_only() -> None:
     grid = np.array([[12.0 * x, 16.0 * y, 40.0] for y in range(3) for x in range(6)])
     these = layout_of(nadir(grid))
     assert choose_pairing(these, 30) == "spatial"

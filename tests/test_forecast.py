@@ -87,7 +87,7 @@ def test_more_and_larger_photos_cost_more() -> None:
     assert without["matches"].cpu_seconds > 2 * forecast(SIZE, config)["matches"].cpu_seconds
 
 
-def test_threads_divide_what_they_can_and_cost_memory() -> None:
+def test_threads_divide_parallel_work_and_cost_memory() -> None:
     one, four = (forecast(SIZE, configured("standard"), threads) for threads in (1, 4))
     assert one["train"].cpu_seconds == four["train"].cpu_seconds
     assert one["features"].memory_bytes < four["features"].memory_bytes

@@ -196,7 +196,7 @@ def test_result_is_the_same_in_another_frame_and_by_parts(space: FreeSpace, monk
     assert torch.equal(free_space_views(model, space), here)
 
 
-def test_gaussians_on_a_device_are_judged_alike(space: FreeSpace) -> None:
+def test_gaussians_on_a_device_are_judged_equally(space: FreeSpace) -> None:
     generator = torch.Generator().manual_seed(3)
     model = gaussians_at([(0.0, 0.0, 1.0)] * 4000, 0.05)
     model.means = torch.rand(4000, 3, generator=generator) * torch.tensor([14.0, 10.0, 16.0]) - torch.tensor(

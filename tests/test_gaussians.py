@@ -47,7 +47,7 @@ def test_quaternion_product_composes_rotations():
     torch.testing.assert_close(rotation_of(multiply_quats(a, b)), rotation_of(a) @ rotation_of(b))
 
 
-def test_change_of_frame_moves_means_covariances_and_colours_alike():
+def test_change_of_frame_transforms_means_covariances_and_colours():
     gaussians = random_gaussians(6)
     rotation, shift, scale = rotation_of(torch.randn(4, dtype=torch.float64)), torch.randn(3, dtype=torch.float64), 2.5
     moved = gaussians.transformed(scale, rotation, shift)

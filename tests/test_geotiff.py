@@ -118,7 +118,7 @@ def test_crs_in_feet_has_heights_in_feet(tmp_path: Path) -> None:
         assert "NAVD88 height (ftUS)" in raster.crs.to_wkt() and raster.res == (1.64, 1.64)
 
 
-def test_frame_without_a_place_has_a_crs_of_its_own_and_no_other(tmp_path: Path) -> None:
+def test_frame_without_georeference_has_a_local_crs(tmp_path: Path) -> None:
     grid = make_grid(Frame("arbitrary", IDENTITY, metres=True), box(3.0, 2.0), 0.01)
     path = tmp_path / "dsm.tif"
     write_hill(path, grid, hole=False)

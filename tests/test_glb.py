@@ -55,7 +55,7 @@ def written(tmp_path: Path) -> bytes:
     return (tmp_path / "splat.glb").read_bytes()
 
 
-def test_one_gaussian_is_stored_as_the_specification_says(tmp_path: Path):
+def test_one_gaussian_is_stored_as_specified(tmp_path: Path):
     one = some_gaussians(1)
     one.means = torch.tensor([[1.0, 2.0, 3.0]])  # east, north, up
     one.quats = torch.tensor([[2.0, 0.0, 0.0, 0.0]])  # upright, not of unit length
@@ -89,7 +89,7 @@ def test_positions_state_their_exact_bounds(written: bytes):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_round_trip_keeps_every_figure_and_what_is_known(tmp_path: Path, degree: int):
+def test_a_round_trip_keeps_every_value_and_the_metadata(tmp_path: Path, degree: int):
     scene = Scene(some_gaussians(70, degree), FACTS)
     glb.write(tmp_path / "a.glb", scene)
     read = glb.read(tmp_path / "a.glb")

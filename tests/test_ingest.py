@@ -193,7 +193,7 @@ def test_deep_photos_that_use_their_range_keep_their_brightness(folder: Path) ->
     assert result.photos["p.png"].converted == "converted/p.png.png"
 
 
-def test_photos_of_few_bits_are_scaled_alike(folder: Path) -> None:
+def test_photos_of_few_bits_are_scaled_equally(folder: Path) -> None:
     """12 bits in a 16-bit file, as thermal and machine-vision cameras write: one scale for all photos of the camera."""
     Image.fromarray(deep(5, 4.0, 7000.0)[..., 0]).save(folder / "cold.png")
     Image.fromarray(deep(5, 4.0, 7500.0)[..., 0]).save(folder / "warm.png")
@@ -570,7 +570,7 @@ def test_both_masks_of_a_photo_are_kept_apart_and_a_black_sky_mask_means_no_sky(
     assert not any("mask" in warning for warning in result.warnings)
 
 
-def test_masks_beside_the_photos_belong_to_what_a_run_depends_on(folder: Path) -> None:
+def test_a_run_depends_on_masks_beside_the_photos(folder: Path) -> None:
     for name in ("masks", "sky_masks"):
         (folder.parent / name).mkdir()
         half_black(WIDTH, HEIGHT).save(folder.parent / name / "a.png")
@@ -834,7 +834,7 @@ DRONE = Exif(make="DJI", model="FC330", focal_mm=3.61, focal_35mm=20.0, width=40
         (Exif(focal_mm=5000.0, focal_plane_px_per_mm=1e5), {}, (2000, 1500), "guess", 2400.0),
     ],
 )
-def test_focal_length_is_taken_in_the_order_of_trust(
+def test_focal_length_is_taken_from_the_most_trusted_source(
     exif: Exif, xmp: dict[str, str], size: tuple[int, int], source: str, focal: float
 ) -> None:
     found = focal_prior(exif, xmp, *size)

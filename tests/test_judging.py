@@ -38,7 +38,7 @@ def test_a_few_pairs_that_only_look_alike_do_not_make_a_true_model_bad(ring: Rin
     assert (found.level, found.contradicted) == ("good", 4)
 
 
-def test_large_photos_whose_keypoints_were_found_in_reduced_ones_are_judged_alike(ring: Ring) -> None:
+def test_large_photos_whose_keypoints_were_found_in_reduced_ones_are_judged_equally(ring: Ring) -> None:
     """Seven times the size, seven times the noise: 3.5 pixels correspond to half a pixel in a photo of 1,200."""
     model = model_of(ring)
     lens = pycolmap.Camera(model.cameras[1].todict())

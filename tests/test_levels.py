@@ -63,7 +63,7 @@ def test_the_same_gaussians_give_the_same_bits() -> None:
         )
 
 
-def test_a_sky_far_away_leaves_the_wall_its_small_boxes() -> None:
+def test_a_distant_sky_does_not_enlarge_the_walls_boxes() -> None:
     wall, sky = a_wall(1000), a_wall(200)
     generator = torch.Generator().manual_seed(4)
     sky.means = 1000.0 * torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1)

@@ -46,7 +46,7 @@ def grouped(*photos: CheckedPhoto) -> tuple[list[CameraGroup], list[list[str]]]:
     return groups, [[name for name, number in index.items() if number == k] for k in range(len(groups))]
 
 
-def test_a_zooms_steps_share_a_camera_as_long_as_they_are_alike() -> None:
+def test_similar_zoom_steps_share_a_camera() -> None:
     """Most at 5 mm, their neighbours within 1 % with them; 20 mm and its neighbour; 11 mm between them is separate."""
     steps = [5.0, 5.0, 5.0, 4.97, 5.04, 20.0, 20.0, 20.15, 11.0]
     _, names = grouped(*(photo(f"{k}.jpg", focal_mm=step) for k, step in enumerate(steps)))

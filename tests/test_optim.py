@@ -197,7 +197,7 @@ def test_state_of_other_parameters_is_refused():
         optimizer.load_state_dict(state)
 
 
-def test_what_cannot_be_stepped_in_place_is_refused():
+def test_parameters_that_cannot_be_stepped_in_place_are_refused():
     tensors = parameters(6)
     set_gradients(tensors, 0)
     optimizer = Adam(tensors)

@@ -17,7 +17,7 @@ def test_a_codebook_of_evenly_spread_numbers_is_even() -> None:
     assert np.abs(errors).max() <= 1.05 / 256
 
 
-def test_a_codebook_of_normal_numbers_is_as_good_as_the_theory_says() -> None:
+def test_a_codebook_of_normal_numbers_is_as_good_as_the_theory_predicts() -> None:
     """Panter and Dite: √3 π / 2 over the square of the number of levels, of the variance."""
     values = np.random.default_rng(1).normal(size=200_000).astype(np.float32)
     errors = fit_codebook(values)[nearest_codes(values, fit_codebook(values))] - values

@@ -52,7 +52,7 @@ def test_a_split_that_leaves_nothing_or_names_unknown_photos_is_refused(
     assert raised.value.hint and not (tmp_path / "split.json").exists()
 
 
-def test_no_stage_borrows_what_the_split_decides() -> None:
+def test_no_stage_borrows_the_splits_options() -> None:
     """All stages that need it read its part, and run after it."""
     order = [stage.name for stage in LINE]
     readers = [stage.name for stage in LINE if "split.views" in stage.reads]

@@ -175,7 +175,7 @@ def test_the_same_gaussians_give_the_same_bytes_and_zero_give_a_valid_file() -> 
     assert head["flags"] == 0
 
 
-def test_what_is_not_finite_is_refused() -> None:
+def test_values_that_are_not_finite_are_refused() -> None:
     made = some_gaussians()
     made.means[3, 1] = float("nan")
     with pytest.raises(ValueError, match="finite"):

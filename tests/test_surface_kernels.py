@@ -126,7 +126,7 @@ def test_the_robust_mean_is_tukeys() -> None:
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_sight_is_what_its_definition_says(number: int) -> None:
+def test_sight_agrees_with_its_definition(number: int) -> None:
     found, points = maps()[number], places()
     place = place_in(found.camera, *points)
     row, column = (np.where(place.inside, at, 0.0).astype(np.int64) for at in (place.row, place.column))

@@ -200,7 +200,7 @@ def test_without_georeference_there_are_cad_contours_and_no_geojson(made: Path) 
     assert not (made / "contours.geojson").exists()
 
 
-def test_the_orthophoto_lies_on_the_surface_model(made: Path) -> None:
+def test_the_orthophoto_is_aligned_with_the_surface_model(made: Path) -> None:
     bands, east, north = centres(made / "ortho.tif")
     assert (bands[3] > 0).sum() * (CELL_M / 2) ** 2 == pytest.approx(95.04, rel=0.01)
     off = ((np.arange(4) + 0.5) / 4 - 0.5) * CELL_M / 2

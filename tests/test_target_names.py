@@ -90,7 +90,7 @@ def test_a_quadrant_without_a_point_gets_no_name() -> None:
     assert set(marks.pixels()) <= set(known) and marks.refused["targets where no point is"] >= 2
 
 
-def test_a_coded_target_that_lies_elsewhere_than_its_point_is_refused() -> None:
+def test_a_coded_target_away_from_its_point_is_rejected() -> None:
     """The boards of two points were swapped in the field."""
     number = {1: 6, 6: 1}
     swapped = [replace(find, number=number.get(find.number or 0, find.number)) for find in finds(kind="5x5_250")]

@@ -97,7 +97,7 @@ def run(
 
 @pytest.mark.parametrize("model_scale", [1.0, 0.5])
 @pytest.mark.parametrize("model", CAMERAS)
-def test_pixels_are_where_the_pinhole_camera_says(model: str, model_scale: float, tmp_path: Path) -> None:
+def test_pixels_are_where_the_pinhole_camera_projects_them(model: str, model_scale: float, tmp_path: Path) -> None:
     """Also where the model was made from photos of half the size."""
     photo = blobs(make_camera(model))
     names = ["a.png", "sub/b b.png"]
