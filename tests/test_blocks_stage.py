@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.app.report import learning
+from splatpipe.pipeline.app.report import training
 from splatpipe.pipeline.engine.errors import StageError, UsageError
 from splatpipe.pipeline.engine.lock import locked_shard
 from splatpipe.pipeline.engine.stage import Inputs, Machine
@@ -368,5 +368,5 @@ def test_the_reason_for_fewer_iterations_of_blocks_is_reported(tmp_path: Path) -
         "1": {"flat_at": 80},
         "3": {"flat_at": 50, "sizes_ended": [30]},
     }
-    assert learning._why_earlier(told) == ": the loss was flat in the coarse pass and in 2 of 3 blocks"
+    assert training._why_earlier(told) == ": the loss was flat in the coarse pass and in 2 of 3 blocks"
     assert "flat" not in assembly._told(replace(given, summaries={}), {"curve": []}, 100)

@@ -16,7 +16,7 @@ import pytest
 
 from splatpipe import pipeline, stages
 from splatpipe.pipeline.app.command_summary import for_the_user
-from splatpipe.pipeline.app.console import RunConsole, say, show_error
+from splatpipe.pipeline.app.console import RunConsole, print_line, show_error
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, MachineError, SplatpipeError
@@ -221,7 +221,7 @@ def test_the_log_has_no_colours_whatever_the_terminal(
 
 def test_no_name_sends_colours_or_commands_to_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
     hostile = "\x1b[31mred\x1b]0;title\x07\x9b2J[bold]\ttab"
-    say(hostile)
+    print_line(hostile)
     show_error(MachineError(hostile, hostile))
     console = RunConsole()
     console(Event("warning", "train", {"message": hostile, "hint": hostile}))
