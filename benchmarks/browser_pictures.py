@@ -30,7 +30,7 @@ SPARK_TYPES = {"ply": "ply", "compressed-ply": "ply", "spz": "spz", "spz2": "spz
 
 class _Quiet(SimpleHTTPRequestHandler):
     def log_message(self, *_: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @contextmanager

@@ -72,7 +72,7 @@ class Files(SimpleHTTPRequestHandler):
         return str(self.roots[first] / rest) if first in self.roots and ".." not in rest else "/nothing"
 
     def log_message(self, *arguments: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 def main() -> None:

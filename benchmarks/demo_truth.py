@@ -169,7 +169,7 @@ def photos_at(run: OpenedRun, names: Sequence[str], factor: float) -> dict[str, 
 
 
 def measure_scales(run: OpenedRun, others: dict[str, OpenedRun], names: Sequence[str], folder: Path) -> list[Row]:
-    """A row a size: the model's figures, and those of the one that was trained for it, on the same pictures."""
+    """Return a row per size: the model's figures, and those of the one trained for that size, on the same images."""
     trained = run.camera(next(view for view in run.views if view.camera.name in names))
     rows = []
     for size, factor in SIZES.items():
@@ -197,7 +197,7 @@ def _measured(run: OpenedRun, camera: Camera, photo: Pixels) -> dict[str, float 
 
 
 def same_frame(run: OpenedRun, other: OpenedRun) -> OpenedRun:
-    """The other run, if its cameras are those of the first.
+    """Return the other run, if its cameras are those of the first.
 
     Raises:
         UsageError: if they are not.

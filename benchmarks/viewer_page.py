@@ -97,7 +97,7 @@ def measure(page: Page, path: Path) -> None:
 
 
 def tell(what: str, page: Page, ask: Callable[[int], object]) -> None:
-    """Ask many times, with pauses, and print the response times."""
+    """Send many requests, with pauses, and print the response times."""
     times = []
     for i in range(QUESTIONS):
         began = time.perf_counter()

@@ -120,7 +120,7 @@ class PageVisit:
 
     Args:
         browser: A fresh browser.
-        size: Window size, e.g. ``390x844``; a narrow one stands for a phone.
+        size: Window size, e.g. ``390x844``; a narrow one emulates a phone.
         options: The command's options.
     """
 
@@ -201,7 +201,7 @@ class QuietHandler(SimpleHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def log_message(self, *_: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @contextmanager

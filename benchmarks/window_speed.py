@@ -1,7 +1,7 @@
 """Compare an iteration on a window with one on a whole photo of the same size: ``window_speed.py --data DATASET``.
 
 The same scene with the same Gaussians is trained by training's own code, with exposures and the sky, on photos of
-several sizes in turn, one iteration of each after the other, so that other load on the machine affects all alike.
+several sizes in turn, one iteration of each after the other, so that other load on the machine affects all equally.
 Photos of the first size are whole; those of the others are seen in windows of at most that size, each window of each
 photo equally often. Time is that of all compute threads, including the one that reads windows. Photos are decoded
 beforehand.
