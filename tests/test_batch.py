@@ -17,6 +17,7 @@ from types import SimpleNamespace
 import pytest
 
 from splatpipe.demo import capture_path
+from splatpipe.pipeline.app.batch.attempts import NO_MESSAGE, AttemptLog, AttemptResult
 from splatpipe.pipeline.app.batch.capture_list import read_captures
 from splatpipe.pipeline.app.batch.driver import STOPPED_NOTICE_S, Driver, Notifications, fresh_call
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
@@ -25,7 +26,6 @@ from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
 from splatpipe.pipeline.app.batch.snakemake_process import open_profile, snakemake_command
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
-from splatpipe.pipeline.app.batch.tries import NO_WORD, TryLog, TryResult
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED, StopSignal
@@ -197,9 +197,9 @@ def call_of(out: Path, *captures: PlannedCapture, retries: int = 1) -> Call:
     return call
 
 
-BAD = TryResult(EXIT_STAGE, "The stage train died.", "See the log.")
-HOPELESS = TryResult(EXIT_INPUT, "No two photos overlap.", "Fly again.", final=True)
-FULL = TryResult(EXIT_MACHINE, "The disk is full.", "Make room.")
+BAD = AttemptResult(EXIT_STAGE, "The stage train died.", "See the log.")
+PERMANENT = AttemptResult(EXIT_INPUT, "No two photos overlap.", "Fly again.", final=True)
+FULL = AttemptResult(EXIT_MACHINE, "The disk is full.", "Make room.")
 
 
 @pytest.mark.parametrize(
@@ -207,29 +207,29 @@ FULL = TryResult(EXIT_MACHINE, "The disk is full.", "Make room.")
     [
         ([], False, ("waiting", "ingest", 0.0, 0, "")),
         ([], True, ("stopped", "ingest", 0.0, 0, "It was stopped with the batch.")),
-        ([("ingest", TryResult(0))], False, ("waiting", "train", 0.25, 0, "")),
-        ([("ingest", TryResult(0)), ("train", None)], False, ("running", "train", 0.25, 1, "")),
-        ([("ingest", TryResult(0)), ("train", BAD)], False, ("waiting", "train", 0.25, 1, "")),
+        ([("ingest", AttemptResult(0))], False, ("waiting", "train", 0.25, 0, "")),
+        ([("ingest", AttemptResult(0)), ("train", None)], False, ("running", "train", 0.25, 1, "")),
+        ([("ingest", AttemptResult(0)), ("train", BAD)], False, ("waiting", "train", 0.25, 1, "")),
         (
-            [("ingest", TryResult(0)), ("train", BAD), ("train", FULL)],
+            [("ingest", AttemptResult(0)), ("train", BAD), ("train", FULL)],
             False,
             ("failed", "train", 0.25, 2, FULL.message),
         ),
-        ([("ingest", HOPELESS)], False, ("failed", "ingest", 0.0, 1, HOPELESS.message)),
-        ([("ingest", TryResult(0)), ("train", BAD), ("train", TryResult(0))], True, ("done", "", 1.0, 2, "")),
+        ([("ingest", PERMANENT)], False, ("failed", "ingest", 0.0, 1, PERMANENT.message)),
+        ([("ingest", AttemptResult(0)), ("train", BAD), ("train", AttemptResult(0))], True, ("done", "", 1.0, 2, "")),
     ],
 )
 def test_a_captures_state_follows_from_its_attempts_alone(
-    tmp_path: Path, tries: Sequence[tuple[str, TryResult | None]], ended: bool, expected: tuple[object, ...]
+    tmp_path: Path, tries: Sequence[tuple[str, AttemptResult | None]], ended: bool, expected: tuple[object, ...]
 ) -> None:
     call = call_of(tmp_path, planned("house", "ingest", "train"))
-    log = TryLog(call.tries_file("0001-house"))
+    log = AttemptLog(call.attempts_file("0001-house"))
     for stage, ending in tries:
         log.begin(stage)
         if ending is not None:
             log.end(ending)
     if tries:
-        with call.tries_file("0001-house").open("ab") as file:
+        with call.attempts_file("0001-house").open("ab") as file:
             file.write(b'{"ended": {"exit_c')  # as after a power cut
     if ended:
         call.write_end(time.time(), 0, "")
@@ -240,13 +240,13 @@ def test_a_captures_state_follows_from_its_attempts_alone(
 
 def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
     call = call_of(tmp_path, planned("house", "ingest", "train"), retries=0)
-    log = TryLog(call.tries_file("0001-house"))
+    log = AttemptLog(call.attempts_file("0001-house"))
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     begun = log.begin("ingest")
-    call.tries_file("0001-house").write_text(json.dumps({"begun": {**vars(begun), "process": process.pid}}) + "\n")
+    call.attempts_file("0001-house").write_text(json.dumps({"begun": {**vars(begun), "process": process.pid}}) + "\n")
     (house,) = BatchMonitor(call).state().captures
-    assert (house.state, house.reason) == ("failed", NO_WORD)
+    assert (house.state, house.reason) == ("failed", NO_MESSAGE)
 
 
 def run_job(call: Call, stage: str) -> int:
@@ -268,7 +268,7 @@ def test_a_job_without_disk_space_is_not_started_and_a_hopeless_one_is_not_repea
 
 def call_warnings(call: Call, capture: PlannedCapture) -> tuple[str, ...]:
     """Before anything has run."""
-    call.tries_file(capture.key).unlink()
+    call.attempts_file(capture.key).unlink()
     return BatchMonitor(call).state().warnings
 
 

@@ -62,8 +62,8 @@ def test_one_card_per_capture_fits_the_screen_and_requests_nothing(
     cards = watched.page.locator(".capture")
     assert cards.locator("h2").all_inner_texts() == ["lund", "seneca", "field", "church", "roof", "copr"]
     said = words(watched)
-    assert "Running: 2 of 6 captures finished, 1 failed" in said and "About 1.7 h to go" in said
-    assert "81.00 GB are free on the disk; what is still to run takes about 9.00 GB" in said
+    assert "Running: 2 of 6 captures finished, 1 failed" in said and "About 1.7 h left" in said
+    assert "81.00 GB are free on the disk; the remaining stages need about 9.00 GB" in said
     assert "Only 3 of 29 photos could be placed. Add overlap." in said and "Mind the disk." in said
     assert "Running in matches 23 %, about 1.5 h left" in said
     assert watched.page.locator("progress").get_attribute("value") == "23"
@@ -192,7 +192,7 @@ def test_a_reason_of_many_lines_is_shortened_to_its_first(tmp_path: Path) -> Non
 def test_finished_with_doubts_is_stated_in_the_headline(tmp_path: Path) -> None:
     captures = (CaptureState("a", "done", level="good"), CaptureState("b", "done", level="doubt"))
     page = batch_page(batch(*captures, ended_s=time.time(), exit_code=0), tmp_path)
-    assert "<h2>All 2 captures succeeded; 1 to look at</h2>" in page
+    assert "<h2>All 2 captures succeeded; 1 to check</h2>" in page
 
 
 def test_two_hundred_captures_stay_a_small_page(tmp_path: Path, open_page: Callable) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from splatpipe.pipeline.app.batch.attempts import Attempt, AttemptLog, AttemptResult, read_attempts, spent_s
 from splatpipe.pipeline.app.batch.driver import fresh_call
 from splatpipe.pipeline.app.batch.job import command_of
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
 from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
-from splatpipe.pipeline.app.batch.tries import Try, TryLog, TryResult, read_tries, spent_s
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.engine.errors import EXIT_STAGE
 
@@ -24,7 +24,7 @@ import sharded  # noqa: E402
 
 NORTH, SOUTH = (3, 14, 15, 92), (2, 71)
 TOTALS = {name: sum(number**2 for number in numbers) for name, numbers in (("north", NORTH), ("south", SOUTH))}
-BAD = TryResult(EXIT_STAGE, "The stage sum.2 died.", "See the log.")
+BAD = AttemptResult(EXIT_STAGE, "The stage sum.2 died.", "See the log.")
 
 
 def captures(folder: Path) -> Path:
@@ -57,7 +57,7 @@ def test_captures_run_in_shards_and_a_killed_shard_costs_only_its_own_job(tmp_pa
     sums = {path.parts[-4]: json.loads(path.read_text())["total"] for path in out.glob("*/stages/sum-*/total.json")}
     assert sums == TOTALS
     tries = {
-        name: [each.stage for each in read_tries(Call(out / ".batch" / "call").tries_files(f"000{at}-{name}"))]
+        name: [each.stage for each in read_attempts(Call(out / ".batch" / "call").attempts_files(f"000{at}-{name}"))]
         for at, name in enumerate(TOTALS, 1)
     }
     assert sorted(tries["north"]) == ["divide", "read", "sum", "sum.1", "sum.2", "sum.2", "sum.2"]
@@ -114,22 +114,22 @@ def test_shards_have_their_own_share_of_a_stages_resources(tmp_path: Path) -> No
     [
         ((), False, ("waiting", "sum.1", 0.125)),
         ((("sum.2", None),), False, ("running", "sum.2", 0.125)),
-        ((("sum.1", TryResult(0)), ("sum.2", BAD)), False, ("waiting", "sum.2", 0.375)),
+        ((("sum.1", AttemptResult(0)), ("sum.2", BAD)), False, ("waiting", "sum.2", 0.375)),
         ((("sum.2", BAD), ("sum.2", BAD)), False, ("waiting", "sum.1", 0.125)),
         ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", None)), False, ("running", "sum.1", 0.125)),
-        ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", TryResult(0))), False, ("failed", "sum.2", 0.375)),
+        ((("sum.2", BAD), ("sum.2", BAD), ("sum.1", AttemptResult(0))), False, ("failed", "sum.2", 0.375)),
         ((("sum.2", BAD), ("sum.2", BAD)), True, ("failed", "sum.2", 0.125)),
         ((("sum.2", BAD),), True, ("stopped", "sum.1", 0.125)),
-        ((("sum.1", TryResult(0)), ("sum.2", TryResult(0))), False, ("waiting", "sum", 0.625)),
+        ((("sum.1", AttemptResult(0)), ("sum.2", AttemptResult(0))), False, ("waiting", "sum", 0.625)),
     ],
 )
 def test_the_state_of_concurrent_shards_is_that_of_the_most_active(
-    tmp_path: Path, tries: Sequence[tuple[str, TryResult | None]], ended: bool, expected: tuple[object, ...]
+    tmp_path: Path, tries: Sequence[tuple[str, AttemptResult | None]], ended: bool, expected: tuple[object, ...]
 ) -> None:
     call = call_of(tmp_path)
     call.write_shards("0001-house", {"sum": [job("sum.1"), job("sum.2")]})
-    for stage, ending in (("divide", TryResult(0)), *tries):
-        log = TryLog(call.tries_file("0001-house", stage))
+    for stage, ending in (("divide", AttemptResult(0)), *tries):
+        log = AttemptLog(call.attempts_file("0001-house", stage))
         log.begin(stage)
         if ending is not None:
             log.end(ending)
@@ -143,4 +143,4 @@ def test_the_state_of_concurrent_shards_is_that_of_the_most_active(
 
 def test_time_of_concurrent_shards_counts_once() -> None:
     spans = ((0.0, 10.0), (12.0, 20.0), (13.0, 15.0), (14.0, 26.0), (30.0, None))
-    assert spent_s([Try("sum.1", began, "here", 1, ended) for began, ended in reversed(spans)]) == 24.0
+    assert spent_s([Attempt("sum.1", began, "here", 1, ended) for began, ended in reversed(spans)]) == 24.0

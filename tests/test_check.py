@@ -16,7 +16,7 @@ from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.cli_runs import overrides
 from splatpipe.pipeline.app.preflight.examination import examine_capture
 from splatpipe.pipeline.app.preflight.findings import Finding, Preflight, as_json
-from splatpipe.pipeline.app.preflight.intake import take_in
+from splatpipe.pipeline.app.preflight.intake import read_capture
 from splatpipe.pipeline.app.preflight.places import control_findings
 from splatpipe.pipeline.engine.config import load_preset
 from splatpipe.pipeline.engine.events import EventReporter
@@ -236,7 +236,7 @@ def test_points_that_no_photo_can_show_are_reported(
     photos = ring(tmp_path / "photos", leave_out=tuple(number for number in RING if number not in (1, 6, 11)))
     config = overrides(None, [], None).resolve(load_preset("preview"))
     source = open_source(photos, tmp_path / "out", LINE, config)
-    intake, _ = take_in(source, config, 1, EventReporter("check", lambda _event: None))
+    intake, _ = read_capture(source, config, 1, EventReporter("check", lambda _event: None))
     stated = intake.positions.positions  # around the house, which all of them show
     latitude, longitude = np.mean([(each.latitude, each.longitude) for each in stated], axis=0)
     rows = [f"P{k},{latitude + step / 111_195.0:.8f},{longitude:.8f}" for k, step in enumerate(north_m)]

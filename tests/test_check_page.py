@@ -15,7 +15,7 @@ from playwright.sync_api import expect
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.preflight.coverage import CELLS, STEPS, covered, shades
-from splatpipe.pipeline.app.preflight.finding_pictures import MOST_A_FINDING, MOST_PICTURES, finding_pictures
+from splatpipe.pipeline.app.preflight.finding_pictures import MAX_PER_FINDING, MAX_PICTURES, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import (
     ControlPlace,
     Finding,
@@ -29,7 +29,7 @@ from splatpipe.pipeline.app.preflight.findings import (
     worst_first,
 )
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, frame_of
-from splatpipe.pipeline.app.preflight.overlap_map import MOST_PAIRS, Labels
+from splatpipe.pipeline.app.preflight.overlap_map import MAX_PAIRS, Labels
 from splatpipe.pipeline.app.preflight.page import check_page, write_page
 
 WIDTHS = ((1440, 900), (390, 844))
@@ -234,7 +234,7 @@ def test_images_are_few_and_a_truncated_photo_shows_what_there_is(
     write_page(grid(tmp_path, demo_names, findings=tuple(findings)), path)
     watched = open_page(path.as_uri())
     figures = [told.locator("img").count() for told in watched.page.locator("article.finding-card").all()]
-    assert figures[:2] == [1, MOST_A_FINDING] and sum(figures) == MOST_PICTURES
+    assert figures[:2] == [1, MAX_PER_FINDING] and sum(figures) == MAX_PICTURES
     assert (
         watched.page.locator("article.finding-card").nth(2).locator("details bdi").all_text_contents()
         == demo_names[:12]
@@ -263,7 +263,7 @@ def test_two_thousand_photos_stay_a_page_that_opens(tmp_path: Path, open_page: C
     assert watched.page.evaluate("document.documentElement.scrollWidth") <= 390
     assert watched.page.locator(".drawn .photo").count() == 2000
     drawn = "".join(path.get_attribute("d") or "" for path in watched.page.locator(".drawn .pair").all())
-    assert drawn.count("M") == MOST_PAIRS
+    assert drawn.count("M") == MAX_PAIRS
     ends = {end for line in drawn.split("M")[1:] for end in line.split("L")}
     assert len(ends) == 2000  # no photo loses all its lines
 

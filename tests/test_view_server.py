@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.app.view.files import NotThereError, open_inside, wanted_range
-from splatpipe.pipeline.app.view.log import MOST_POINTS, Curve, RunLog
+from splatpipe.pipeline.app.view.files import FileNotServedError, open_inside, parse_range
+from splatpipe.pipeline.app.view.log import MAX_POINTS, Curve, RunLog
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from served import Answer, Served, linked_copy, serving
@@ -412,19 +412,19 @@ def test_a_file_behind_a_link_or_a_pipe_is_not_found(tmp_path: Path) -> None:
         "/etc/passwd",
         "real/file/x",
     ):
-        with pytest.raises(NotThereError):
+        with pytest.raises(FileNotServedError):
             open_inside(out, path)
-    with pytest.raises(NotThereError):
+    with pytest.raises(FileNotServedError):
         open_inside(out, "real/file\0")
 
 
 def test_ranges_are_parsed_as_in_http() -> None:
-    assert wanted_range(None, 10) is None and wanted_range("bytes=3-1", 10) is None
-    assert wanted_range("bytes=3-", 10) == (3, 10) and wanted_range("bytes=-3", 10) == (7, 10)
-    assert wanted_range("bytes=0-99", 10) == (0, 10)
+    assert parse_range(None, 10) is None and parse_range("bytes=3-1", 10) is None
+    assert parse_range("bytes=3-", 10) == (3, 10) and parse_range("bytes=-3", 10) == (7, 10)
+    assert parse_range("bytes=0-99", 10) == (0, 10)
     for asked, size in (("bytes=10-", 10), ("bytes=-0", 10), ("bytes=0-", 0), ("bytes=-5", 0)):
         with pytest.raises(IndexError):
-            wanted_range(asked, size)
+            parse_range(asked, size)
 
 
 def test_a_garbage_log_is_ignored(tmp_path: Path) -> None:
@@ -453,7 +453,7 @@ def test_a_curve_stays_short_however_long_it_is_watched() -> None:
     curve = Curve()
     for step in range(50_000):
         curve.add(step, float(step))
-    assert len(curve.points) <= MOST_POINTS
+    assert len(curve.points) <= MAX_POINTS
     steps = [step for step, _ in curve.points]
     assert steps == sorted(steps) and steps[0] < 100 and steps[-1] > 49_900
     curve.add(100, 0.0)  # a run that went on from an earlier checkpoint

@@ -112,13 +112,20 @@ def _uses_gpu(device: str, profile: Profile) -> bool:
 
 def _run(captures: Path, out: Path, settings: Settings, profile: Profile, command: str) -> BatchState:
     from splatpipe.pipeline.app.batch.capture_list import read_captures
-    from splatpipe.pipeline.app.batch.driver import Driver, Notifications, fresh_call, hold, summary, with_unlisted
+    from splatpipe.pipeline.app.batch.driver import (
+        Driver,
+        Notifications,
+        fresh_call,
+        lock_folder,
+        summary,
+        with_unlisted,
+    )
     from splatpipe.pipeline.app.batch.planning import make_plan
     from splatpipe.pipeline.app.batch.publication import PAGE_FILE
     from splatpipe.pipeline.app.console import print_line
 
     listed = read_captures(captures, out)
-    with hold(out.resolve()) as lock:
+    with lock_folder(out.resolve()) as lock:
         call = fresh_call(out)
         call.write_plan(with_unlisted(make_plan(listed, call, settings)))
         state = Driver(call, profile, Notifications(print_line, command)).run(lock)

@@ -24,7 +24,7 @@ PART_VARIABLE = "SPLATPIPE_PART"  # set if further commands run more stages at o
 STOP_S = 4.0  # after Ctrl-C the report is limited to this: the command promises to end within five seconds
 
 NOTICE_S = 4.7  # and the notification gets what is left of this,
-LEAST_NOTICE_S = 0.5  # but at least this
+MIN_NOTICE_S = 0.5  # but at least this
 
 
 class CommandSummary:
@@ -76,7 +76,7 @@ class CommandSummary:
         limit_s = TIME_LIMIT_S
         if isinstance(error, StopSignal | KeyboardInterrupt):
             state = "stopped"
-            limit_s = max(LEAST_NOTICE_S, getattr(error, "at_s", time.monotonic()) + NOTICE_S - time.monotonic())
+            limit_s = max(MIN_NOTICE_S, getattr(error, "at_s", time.monotonic()) + NOTICE_S - time.monotonic())
         out = self._out.resolve()
         trouble = notify(command, state, out.name, self._report_path and self._report_path.resolve(), out, limit_s)
         if trouble:

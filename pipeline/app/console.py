@@ -33,7 +33,7 @@ from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 PLAIN_INTERVAL_S = 10.0  # between progress lines in a log file
 PLAIN_WIDTH = 120  # columns of a table in a log file
-LEAST_OFFSET_M = 0.01  # of a flight's positions; smaller offsets are not shown
+MIN_OFFSET_M = 0.01  # of a flight's positions; smaller offsets are not shown
 POINTS_SHOWN = 40  # more are only in metrics.json
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 MARKS = {"good": ("✓", "green"), "doubt": ("!", "yellow"), "bad": ("✗", "red")}
@@ -326,7 +326,7 @@ def _offsets(flights: Iterable[Mapping[str, JSON]]) -> list[str]:
     return [
         f"Positions of flight {number}: common offset east {east:+.3f}, north {north:+.3f}, up {up:+.3f} m."
         for number, east, north, up in offsets
-        if max(abs(east), abs(north), abs(up)) >= LEAST_OFFSET_M
+        if max(abs(east), abs(north), abs(up)) >= MIN_OFFSET_M
     ]
 
 

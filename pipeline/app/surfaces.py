@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.surface.surface_file import SurfaceFile
     from splatpipe.pipeline.survey.frames import Frame
 
-MOST_SECTIONS = 100
+MAX_SECTIONS = 100
 UNFINISHED = ".sections.making"
 SECTION_FILE = re.compile(r"section-\d+(_points)?\.(csv|dxf|png)")
 SECTION_PLACES = 2000  # most points in a section's trace: more than a chart has pixels
@@ -61,8 +61,8 @@ class MeasurementRequest:
         Raises:
             UsageError: if a section is not a line or has no length, the base is invalid, or there is no such file.
         """
-        if len(sections) > MOST_SECTIONS:
-            raise UsageError(f"{len(sections)} sections are too many.", hint=f"At most {MOST_SECTIONS} at a time.")
+        if len(sections) > MAX_SECTIONS:
+            raise UsageError(f"{len(sections)} sections are too many.", hint=f"At most {MAX_SECTIONS} at a time.")
         height = _number(base)
         if height is None and base not in ("rim", "lowest"):
             raise UsageError(f'There is no base "{base[:40]}".', hint="Choose rim, lowest, or a height.")

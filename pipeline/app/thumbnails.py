@@ -14,8 +14,8 @@ from markupsafe import Markup
 from PIL import Image, ImageOps
 
 FORMATS = ("JPEG", "PNG", "TIFF")  # as ingest accepts; an MPO opens as JPEG
-MOST_BYTES = 512 << 20  # of a file
-MOST_PIXELS = 300_000_000  # of a photo that cannot be reduced while decoding: about a gigabyte of memory
+MAX_BYTES = 512 << 20  # of a file
+MAX_PIXELS = 300_000_000  # of a photo that cannot be reduced while decoding: about a gigabyte of memory
 END_OF_JPEG = b"\xff\xd9"
 QUALITY = 76
 TURNS = {  # by EXIF orientation
@@ -27,7 +27,7 @@ TURNS = {  # by EXIF orientation
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-MOST_KEPT = 1024  # thumbnails cached for a page that is written repeatedly
+MAX_CACHED = 1024  # thumbnails cached for a page that is written repeatedly
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,12 @@ def _file_stamp(path: Path) -> tuple[int, int] | None:
         status = path.stat()
     except (OSError, ValueError):
         return None
-    if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:  # reading a pipe would block
+    if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:  # reading a pipe would block
         return None
     return status.st_mtime_ns, status.st_size
 
 
-@lru_cache(maxsize=MOST_KEPT)
+@lru_cache(maxsize=MAX_CACHED)
 def _thumbnail(path: Path, side: int, orientation: int, _stamp: tuple[int, int]) -> Thumbnail | None:
     """The thumbnail of the file as it was at that stamp."""
     opened = _read(path, side)
@@ -113,7 +113,7 @@ def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
                 with Image.open(io.BytesIO(data + more), formats=FORMATS) as image:
                     if side is not None:
                         image.draft("RGB", (2 * side, 2 * side))
-                    if image.width * image.height > MOST_PIXELS:
+                    if image.width * image.height > MAX_PIXELS:
                         return None
                     image.load()
                     return ImageOps.exif_transpose(image).convert("RGB"), not more

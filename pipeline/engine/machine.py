@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-MOST_CHARACTERS = 1 << 20  # read of a kernel file: a machine with thousands of mounts needs less
+MAX_CHARACTERS = 1 << 20  # read of a kernel file: a machine with thousands of mounts needs less
 UNLIMITED_BYTES = 1 << 60  # more than any machine has: cgroup version 1 expresses "no limit" by a number this large
 # File systems that belong to one machine, so that its own locks suffice.
 LOCAL_DISKS = ("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "ntfs3", "vfat", "exfat")
@@ -198,5 +198,5 @@ def _plain(name: str) -> str:
 def _text(path: Path) -> str:
     """The beginning of a file; empty if it cannot be read."""
     with suppress(OSError), path.open(encoding="utf-8", errors="surrogateescape") as file:
-        return file.read(MOST_CHARACTERS)
+        return file.read(MAX_CHARACTERS)
     return ""

@@ -110,32 +110,32 @@ def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
     try:
         if path.stat().st_size > MAX_LIST_BYTES:
             raise UsageError(f"{name} is too large.", hint=TOML_HINT)
-        told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a number with thousands of digits
         raise UsageError(f"{name} is not valid TOML: {error}.", hint=TOML_HINT) from error
     except OSError as error:
         raise UsageError(f"{name} cannot be read: {error.strerror}.", hint="Check its permissions.") from error
-    captures = told.pop("capture", [])
+    captures = table.pop("capture", [])
     if not isinstance(captures, list) or not all(isinstance(each, Mapping) for each in captures):
         raise UsageError(f"{name} has no tables [[capture]].", hint=TOML_HINT)
-    for_all = _known(told, name, ("preset", "config", "time_budget", "max_memory", "set"))
-    own = [_known(each, f"Capture {at} of {path.name}", KEYS) for at, each in enumerate(captures, 1)]
+    for_all = _validated(table, name, ("preset", "config", "time_budget", "max_memory", "set"))
+    own = [_validated(each, f"Capture {at} of {path.name}", KEYS) for at, each in enumerate(captures, 1)]
     return [{**for_all, **each, "set": [*for_all.get("set", []), *each.get("set", [])]} for each in own]
 
 
-def _known(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[str, JSON]:
+def _validated(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[str, JSON]:
     """Validate a table's keys and value types."""
-    taken = dict(table)
-    for key, value in taken.items():
+    result = dict(table)
+    for key, value in result.items():
         if key not in keys:
             raise UsageError(f'{where}: there is no "{key}" here.', hint=f"Known are {', '.join(keys)}.")
         if key == "set" and isinstance(value, str):
-            taken[key] = [value]
+            result[key] = [value]
         elif key == "set" and not (isinstance(value, list) and all(isinstance(text, str) for text in value)):
             raise UsageError(f"{where}: set is not a list of strings.", hint='Write set = ["train.iterations=3000"].')
         elif key != "set" and not isinstance(value, str):
             raise UsageError(f"{where}: {key} is not a string.", hint=f'Write {key} = "…".')
-    return taken
+    return result
 
 
 def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]]:
@@ -164,32 +164,32 @@ def _of_csv(path: Path) -> Iterator[tuple[Mapping[str, JSON], Mapping[str, str]]
         )
 
 
-def _entry(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> ListedCapture:
+def _entry(entry: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> ListedCapture:
     """Build a capture from its row or table; paths are relative to the list's folder."""
-    if not told.get("photos"):
+    if not entry.get("photos"):
         raise UsageError("A capture in the list has no photos.", hint="Set photos to its folder.")
     try:
-        photos = _below(folder, str(told["photos"]))
+        photos = _below(folder, str(entry["photos"]))
     except SplatpipeError as error:
         raise UsageError(error.message, hint=error.hint) from error
-    name = str(told.get("name") or photos.resolve().name)
-    preset = str(told.get("preset", ""))
+    name = str(entry.get("name") or photos.resolve().name)
+    preset = str(entry.get("preset", ""))
     try:
-        return ListedCapture(name, photos, preset, tuple(_tables(told, folder, options)))
+        return ListedCapture(name, photos, preset, tuple(_tables(entry, folder, options)))
     except SplatpipeError as error:
         return ListedCapture(name, photos, preset, trouble=error)
 
 
-def _tables(told: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> Iterator[Table]:
-    if told.get("config"):
-        table = load_file(_below(folder, str(told["config"])))
+def _tables(entry: Mapping[str, JSON], folder: Path, options: Mapping[str, str]) -> Iterator[Table]:
+    if entry.get("config"):
+        table = load_file(_below(folder, str(entry["config"])))
         table.pop("photos", None), table.pop("splatpipe", None)
         yield with_files_from(folder, table)
-    if told.get("time_budget"):
-        yield {"train": {"time_budget_s": parse_duration(str(told["time_budget"]), "time_budget")}}
-    if told.get("max_memory"):
-        yield {"train": {"max_memory_bytes": parse_bytes(str(told["max_memory"]), "max_memory")}}
-    assignments = [*told.get("set", []), *(f"{name}={value}" for name, value in options.items())]
+    if entry.get("time_budget"):
+        yield {"train": {"time_budget_s": parse_duration(str(entry["time_budget"]), "time_budget")}}
+    if entry.get("max_memory"):
+        yield {"train": {"max_memory_bytes": parse_bytes(str(entry["max_memory"]), "max_memory")}}
+    assignments = [*entry.get("set", []), *(f"{name}={value}" for name, value in options.items())]
     yield with_files_from(folder, merge(parse_set(text, LineConfig) for text in assignments))
 
 
@@ -212,12 +212,12 @@ def _below(folder: Path, text: str) -> Path:
 def with_files_from(folder: Path, table: Table) -> Table:
     """Make the file paths in options absolute; relative ones are relative to the given folder."""
     files = {(stage.name, option) for stage in LINE for option in stage.files}
-    taken = merge([table])
+    result = merge([table])
     for section, option in files:
-        value = taken.get(section, {}).get(option) if isinstance(taken.get(section), Mapping) else None
+        value = result.get(section, {}).get(option) if isinstance(result.get(section), Mapping) else None
         if isinstance(value, str) and value not in ("auto", "none"):
-            taken = merge([taken, {section: {option: str(_below(folder, value))}}])
-    return taken
+            result = merge([result, {section: {option: str(_below(folder, value))}}])
+    return result
 
 
 def _check_places(captures: Sequence[ListedCapture], out: Path) -> None:

@@ -18,13 +18,13 @@ from splatpipe.pipeline.app.batch.publication import PAGE_FILE, publish
 from splatpipe.pipeline.app.batch.snakemake_process import (
     Profile,
     end_group,
-    last_words,
+    last_error_line,
     require_snakemake,
     snakemake_command,
     snakemake_environment,
     start_snakemake,
 )
-from splatpipe.pipeline.app.batch.state import RENEWED_EVERY_S, BatchState, CaptureState
+from splatpipe.pipeline.app.batch.state import UPDATE_INTERVAL_S, BatchState, CaptureState
 from splatpipe.pipeline.app.batch.workflow import write_workflow
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, notify
 from splatpipe.pipeline.app.report import REPORT_FILE
@@ -38,7 +38,7 @@ from splatpipe.stages.line import LINE
 
 POLL_S = 1.0
 STOPPED_NOTICE_S = 1.5  # after a signal: the jobs may have taken eight seconds to end, and Docker kills after ten
-CHANGED_EVERY_S = 5.0  # between progress updates; a capture's change of state is reported at once
+CHANGE_INTERVAL_S = 5.0  # between progress updates; a capture's change of state is reported at once
 LOCK_PATIENCE_S = 15.0  # a killed call's guard ends its jobs within this time
 NAMES_FILE = "captures.json"  # below BATCH_FOLDER: every capture that was ever listed
 ENDS = {"done": "done", "failed": "failed", "stopped": "stopped"}
@@ -57,7 +57,7 @@ def check_folder(out: Path) -> None:
 
 
 @contextmanager
-def hold(out: Path) -> Iterator[int]:
+def lock_folder(out: Path) -> Iterator[int]:
     """Lock a batch's folder; two concurrent calls would report different states.
 
     Yields:
@@ -99,9 +99,9 @@ def with_unlisted(plan: BatchPlan) -> BatchPlan:
     with suppress(OSError, ValueError):
         known = json.loads(path.read_text(encoding="utf-8"))
     names = [capture.name for capture in plan.captures]
-    gone = [str(name) for name in known if name not in names and (Path(plan.out) / str(name) / "stages").is_dir()]
-    write_durably(path, json.dumps([*names, *gone]))
-    return replace(plan, unlisted=tuple(gone))
+    unlisted = [str(name) for name in known if name not in names and (Path(plan.out) / str(name) / "stages").is_dir()]
+    write_durably(path, json.dumps([*names, *unlisted]))
+    return replace(plan, unlisted=tuple(unlisted))
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,11 @@ class Notifications:
     """Where changes are reported besides the files.
 
     Attributes:
-        say: Prints a line on the terminal.
+        print_line: Prints a line on the terminal.
         command: The command of ``--notify``; empty for none.
     """
 
-    say: Callable[[str], None]
+    print_line: Callable[[str], None]
     command: str = ""
 
 
@@ -129,7 +129,7 @@ class Driver:
     def __init__(self, call: Call, profile: Profile, notifications: Notifications) -> None:
         self._call, self._profile, self._notifications = call, profile, notifications
         self._plan = call.plan()
-        self._account = BatchMonitor(call)
+        self._monitor = BatchMonitor(call)
         self._before: dict[str, CaptureState] = {}
         self._published_s = 0.0
         self._last: BatchState | None = None
@@ -150,11 +150,11 @@ class Driver:
             StopSignal: if stopped by a signal, once all jobs have ended.
         """
         try:
-            self._tell(self._account.state())
+            self._report(self._monitor.state())
             if any(capture.jobs for capture in self._plan.captures):
                 self._work(lock)
             self._call.write_end(time.time(), None, "")
-            succeeded = self._account.state().all_succeeded
+            succeeded = self._monitor.state().all_succeeded
             return self._finish(0 if succeeded else EXIT_INPUT, "")
         except BaseException as error:
             if isinstance(error, StopSignal | KeyboardInterrupt):
@@ -165,46 +165,50 @@ class Driver:
     def _finish(self, code: int, message: str) -> BatchState:
         with suppress(OSError):  # on a full disk
             self._call.write_end(time.time(), code, message)
-        state = self._account.state()
-        self._tell(state)
+        state = self._monitor.state()
+        self._report(state)
         self._notify("stopped" if code > 128 else "done" if code == 0 else "failed", state.name, PAGE_FILE)
         return state
 
     def _work(self, lock: int) -> None:
         require_snakemake()
         write_workflow(self._call, self._plan, LINE)
-        with _guarded(self._call, lock) as say:
+        with _guarded(self._call, lock) as send:
             process = start_snakemake(self._call, self._plan, self._profile)
-            say({"group": process.pid, "local": self._profile.local})
+            send({"group": process.pid, "local": self._profile.local})
             try:
                 while process.poll() is None:
-                    self._tell(self._account.state())
+                    self._report(self._monitor.state())
                     time.sleep(POLL_S)
             except BaseException:
-                self._notifications.say("Stopping the batch: running jobs are asked to stop and keep their progress.")
-                end_group(self._call, process.pid, local=self._profile.local, gone=lambda: process.poll() is not None)
+                self._notifications.print_line(
+                    "Stopping the batch: running jobs are asked to stop and keep their progress."
+                )
+                end_group(
+                    self._call, process.pid, local=self._profile.local, has_ended=lambda: process.poll() is not None
+                )
                 process.wait()
                 raise
         self._check(process.returncode)
 
     def _check(self, code: int) -> None:
         """Raise an error if Snakemake failed and no capture's failure explains it."""
-        state = self._account.state()
+        state = self._monitor.state()
         if code == 0 or any(capture.state == "failed" for capture in state.captures):
             over = all(capture.state in ("done", "reused", "failed") for capture in state.captures)
             if over or code == 0:
                 return
-        raise WorkflowError(code, last_words(self._call), self._call.snakemake_log)
+        raise WorkflowError(code, last_error_line(self._call), self._call.snakemake_log)
 
-    def _tell(self, state: BatchState) -> None:
+    def _report(self, state: BatchState) -> None:
         """Report changes: on the terminal and by notification at once, in the files periodically."""
-        changed = [capture for capture in state.captures if _moved(self._before.get(capture.name), capture)]
+        changed = [capture for capture in state.captures if _has_changed(self._before.get(capture.name), capture)]
         for capture in changed:
             if capture.state != "waiting":
-                self._notifications.say(_line(capture))
+                self._notifications.print_line(_change_text(capture))
         waited_s = time.time() - self._published_s
         other = self._last is None or replace(state, as_of_s=0.0) != replace(self._last, as_of_s=0.0)
-        if changed or not state.at_work or waited_s >= (CHANGED_EVERY_S if other else RENEWED_EVERY_S):
+        if changed or not state.at_work or waited_s >= (CHANGE_INTERVAL_S if other else UPDATE_INTERVAL_S):
             self._publish(state)
         for capture in changed if self._notice_s == TIME_LIMIT_S else ():  # after a signal, only for the batch
             before = self._before.get(capture.name)
@@ -220,7 +224,7 @@ class Driver:
         except (OSError, MachineError) as error:
             if str(error) != self._unwritten:
                 self._unwritten = str(error)
-                self._notifications.say(f"Cannot write the status of the batch: {error}")
+                self._notifications.print_line(f"Cannot write the status of the batch: {error}")
         self._published_s, self._last = time.time(), state
 
     def _notify(self, state: str, name: str, page: str) -> None:
@@ -230,7 +234,7 @@ class Driver:
         report = path if path.is_file() else None
         trouble = notify(self._notifications.command, state, name, report, self._call.out, self._notice_s)  # type: ignore[arg-type]
         if trouble:
-            self._notifications.say(trouble)
+            self._notifications.print_line(trouble)
 
 
 class WorkflowError(MachineError):
@@ -238,10 +242,10 @@ class WorkflowError(MachineError):
 
     exit_code = EXIT_STAGE
 
-    def __init__(self, code: int, said: str, log: Path) -> None:
+    def __init__(self, code: int, last_line: str, log: Path) -> None:
         super().__init__(
-            f"Snakemake ended with exit code {code} before the batch had finished. {said}".strip(),
-            hint=f"Its log has the details: {log}. Repeat the command to go on.",
+            f"Snakemake ended with exit code {code} before the batch had finished. {last_line}".strip(),
+            hint=f"Its log has the details: {log}. Repeat the command to resume.",
         )
 
 
@@ -263,15 +267,15 @@ def _guarded(call: Call, lock: int) -> Iterator[Callable[[JSON], None]]:
     assert guard.stdin is not None
     pipe = guard.stdin
 
-    def say(told: JSON) -> None:
+    def send(message: JSON) -> None:
         with suppress(BrokenPipeError):  # the guard was killed: the batch continues without it
-            pipe.write(json.dumps(told).encode() + b"\n")
+            pipe.write(json.dumps(message).encode() + b"\n")
             pipe.flush()
 
     try:
-        yield say
+        yield send
     finally:
-        say({"done": True})
+        send({"done": True})
         with suppress(BrokenPipeError):
             pipe.close()
         guard.wait()
@@ -305,17 +309,17 @@ def planned_line(capture: PlannedCapture) -> str:
     return f"{capture.name}: {stages} ({roughly(sum(job.seconds for job in capture.jobs))} forecast)"
 
 
-def _moved(before: CaptureState | None, now: CaptureState) -> bool:
+def _has_changed(before: CaptureState | None, now: CaptureState) -> bool:
     return before is None or (before.state, before.stage, before.tries) != (now.state, now.stage, now.tries)
 
 
-def _line(capture: CaptureState) -> str:
+def _change_text(capture: CaptureState) -> str:
     """A capture's change of state in one line."""
     where = f" {capture.stage}" if capture.stage and capture.state != "failed" else ""
-    again = f" (try {capture.tries})" if capture.tries > 1 else ""
+    again = f" (attempt {capture.tries})" if capture.tries > 1 else ""
     why = " ".join(filter(None, [f"in {capture.stage}:" if capture.stage else "", capture.reason, capture.hint]))
-    told = {"failed": why, "stopped": "", "done": capture.verdict, "reused": capture.verdict}.get(capture.state, "")
-    return f"{capture.name}: {capture.state}{where}{again}{'. ' if told else ''}{told}"
+    detail = {"failed": why, "stopped": "", "done": capture.verdict, "reused": capture.verdict}.get(capture.state, "")
+    return f"{capture.name}: {capture.state}{where}{again}{'. ' if detail else ''}{detail}"
 
 
 def summary(states: Sequence[CaptureState]) -> str:

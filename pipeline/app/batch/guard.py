@@ -27,20 +27,20 @@ def main() -> None:
     call = Call(Path(sys.argv[1]))
     group, local = 0, True
     for line in sys.stdin:
-        told = json.loads(line)
-        if told.get("done"):
+        message = json.loads(line)
+        if message.get("done"):
             return
-        group, local = int(told["group"]), bool(told["local"])
+        group, local = int(message["group"]), bool(message["local"])
     _clean_up(call, group, local)
 
 
 def _clean_up(call: Call, group: int, local: bool) -> None:
     from splatpipe.pipeline.app.batch.monitor import BatchMonitor
     from splatpipe.pipeline.app.batch.publication import publish
-    from splatpipe.pipeline.app.batch.snakemake_process import end_group, group_gone
+    from splatpipe.pipeline.app.batch.snakemake_process import end_group, group_has_ended
 
     if group:
-        end_group(call, group, local=local, gone=lambda: group_gone(group))
+        end_group(call, group, local=local, has_ended=lambda: group_has_ended(group))
     with suppress(OSError):
         call.write_end(time.time(), None, KILLED)
         publish(BatchMonitor(call).state(), call.out)

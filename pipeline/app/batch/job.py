@@ -19,9 +19,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 
+from splatpipe.pipeline.app.batch.attempts import PERMANENT_FAILURES, AttemptLog, AttemptResult, read_attempts, spent_s
 from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
-from splatpipe.pipeline.app.batch.shards import counts_shards, tell_shards
-from splatpipe.pipeline.app.batch.tries import HOPELESS, TryLog, TryResult, read_tries, spent_s
+from splatpipe.pipeline.app.batch.shards import counts_shards, store_shard_jobs
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
 from splatpipe.pipeline.app.command_summary import PART_VARIABLE
 from splatpipe.pipeline.app.report.run_history import read_history
@@ -44,56 +44,56 @@ def main() -> None:
         sys.exit(EXIT_TERMINATED)
     plan = call.plan()
     capture = plan.capture(key)
-    log = TryLog(call.tries_file(key, stage))
+    log = AttemptLog(call.attempts_file(key, stage))
     before = [each for each in log.read() if each.stage == stage]
     if before and before[-1].final:
         sys.exit(before[-1].exit_code)
     job = next(job for job in call.jobs(capture) if job.stage == stage)
     log.begin(stage)
-    ending = _lacking(Path(plan.out), job) or _run(call, plan, capture, job, threads)
+    ending = _disk_shortage(Path(plan.out), job) or _run(call, plan, capture, job, threads)
     log.end(ending)
     if ending.exit_code:
         sys.exit(ending.exit_code)
     if counts_shards(stage, LINE):
-        tell_shards(call, key, threads)
+        store_shard_jobs(call, key, threads)
     marker.parent.mkdir(parents=True, exist_ok=True)
     marker.touch()
 
 
-def _lacking(out: Path, job: StageJob) -> TryResult | None:
+def _disk_shortage(out: Path, job: StageJob) -> AttemptResult | None:
     """The failure if the stage must not start, e.g. for lack of disk space; None if it may."""
     free = shutil.disk_usage(out).free
     if free >= job.disk_bytes + RESERVE_BYTES:
         return None
     needed = (job.disk_bytes + RESERVE_BYTES) / 1e9
-    return TryResult(
+    return AttemptResult(
         EXIT_MACHINE,
         f"The disk has {free / 1e9:.1f} GB free, and the stage {job.stage} needs about {needed:.1f}.",
-        "Make room, then repeat the command: what is finished is kept.",
+        "Make room, then repeat the command: finished work is kept.",
         final=True,
     )
 
 
-def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> TryResult:
+def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> AttemptResult:
     log = call.log(capture.name, job.stage)
     log.parent.mkdir(parents=True, exist_ok=True)
-    spent = spent_s(read_tries(call.tries_files(capture.key)))
+    spent = spent_s(read_attempts(call.attempts_files(capture.key)))
     last = job.stage == capture.jobs[-1].stage
-    with log.open("a", encoding="utf-8") as said:
+    with log.open("a", encoding="utf-8") as log_file:
         process = subprocess.Popen(
             command_of(call, plan, capture, job, threads),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            stderr=said,
+            stderr=log_file,
             env={**os.environ, SPENT_VARIABLE: f"{spent:.3f}", **({} if last else {PART_VARIABLE: "1"})},
             start_new_session=True,
             preexec_fn=end_with_parent,  # noqa: PLW1509 (one thread)
         )
-    _pass_on_signals(process)
-    told, _ = process.communicate()
+    _forward_signals(process)
+    output, _ = process.communicate()
     out = Path(plan.out) / capture.name
     shard = job.stage != stage_name(job.stage)
-    return _ending(process.returncode, told, shard_events(out, job.stage) if shard else out / EVENTS_FILE)
+    return _ending(process.returncode, output, shard_events(out, job.stage) if shard else out / EVENTS_FILE)
 
 
 def command_of(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
@@ -125,40 +125,42 @@ def end_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-def _pass_on_signals(process: subprocess.Popen[bytes]) -> None:
-    passed: list[int] = []
+def _forward_signals(process: subprocess.Popen[bytes]) -> None:
+    forwarded: list[int] = []
 
-    def pass_on(number: int, _frame: FrameType | None) -> None:
-        if not passed:  # a second signal would keep the run from writing its report
-            passed.append(number)
+    def forward(number: int, _frame: FrameType | None) -> None:
+        if not forwarded:  # a second signal would keep the run from writing its report
+            forwarded.append(number)
             process.send_signal(signal.SIGTERM)
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, pass_on)
+        signal.signal(number, forward)
 
 
-def _ending(code: int, told: bytes, events: Path) -> TryResult:
+def _ending(code: int, output: bytes, events: Path) -> AttemptResult:
     if code < 0:
         name = signal.Signals(-code).name
         hint = "See the end of its log; SIGKILL usually means that memory ran out."
-        return TryResult(128 - code, f"The command was killed by {name}.", hint)
+        return AttemptResult(128 - code, f"The command was killed by {name}.", hint)
     if code == 0:
-        return TryResult(0)
-    error = _error(told)
+        return AttemptResult(0)
+    error = _error_of(output)
     message = str(error.get("message", "")) or f"It ended with exit code {code}."
-    return TryResult(code, message, str(error.get("hint", "")), code in HOPELESS and not _may_pass(events))
+    return AttemptResult(
+        code, message, str(error.get("hint", "")), code in PERMANENT_FAILURES and not _may_be_temporary(events)
+    )
 
 
-def _may_pass(events: Path) -> bool:
+def _may_be_temporary(events: Path) -> bool:
     """Whether the failure may be temporary: photos changed or were briefly unavailable, as on a network disk."""
     culprit = read_history(events, running=False).culprit
     return culprit is not None and culprit.state == "failed" and not culprit.lasting
 
 
-def _error(told: bytes) -> Mapping[str, JSON]:
+def _error_of(output: bytes) -> Mapping[str, JSON]:
     """The ``error`` of the JSON object that a command prints last."""
     try:
-        found = json.loads(told.splitlines()[-1])["error"]
+        found = json.loads(output.splitlines()[-1])["error"]
     except (ValueError, KeyError, TypeError, IndexError):
         return {}
     return found if isinstance(found, dict) else {}

@@ -1,4 +1,4 @@
-"""Determines a call's state from the disk alone, so that any process that survives a kill can report it."""
+"""Determines a call's state from the disk alone, so that any surviving process can report it after a kill."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from splatpipe.pipeline.app.batch.attempts import Attempt, read_attempts
 from splatpipe.pipeline.app.batch.pictures import capture_picture
 from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState, Level
-from splatpipe.pipeline.app.batch.tries import Try, read_tries
 from splatpipe.pipeline.app.report import REPORT_FILE
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs, read_report_inputs
 from splatpipe.pipeline.app.report.run_history import read_history
@@ -25,8 +25,9 @@ from splatpipe.pipeline.engine.stage import stage_name
 
 VIEWER_FILE = "viewer.html"
 STOPPED = "It was stopped with the batch."
-LIVELY = ("running", "waiting", "failed", "stopped", "done", "reused")  # of parallel shards' states, the first counts
-GO_ON = "Repeat the command: it goes on from what is finished."
+# Of parallel shards' states, the first of these counts.
+STATE_PRIORITY = ("running", "waiting", "failed", "stopped", "done", "reused")
+RESUME_HINT = "Repeat the command to resume: finished work is reused."
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class BatchMonitor:
             left_s=None if ended or not left_s else self._left_s(left_s),
             free_bytes=free,
             needed_bytes=needed,
-            warnings=(*self._plan.warnings, *_short(free, needed)),
+            warnings=(*self._plan.warnings, *_disk_warning(free, needed)),
             unlisted=self._plan.unlisted,
         )
 
@@ -87,40 +88,40 @@ class BatchMonitor:
             return self._with_facts(failed, planned, ())
         if not planned.jobs:
             return self._with_facts(CaptureState(planned.name, "reused", progress=1.0), planned, ())
-        tries = read_tries(self._call.tries_files(planned.key))
-        return self._with_facts(self._capture_state(planned, tries, ended=ended), planned, tries)
+        attempts = read_attempts(self._call.attempts_files(planned.key))
+        return self._with_facts(self._capture_state(planned, attempts, ended=ended), planned, attempts)
 
-    def _capture_state(self, planned: PlannedCapture, tries: Sequence[Try], *, ended: bool) -> CaptureState:
-        """A capture's state from its jobs' tries; for parallel shards, the first of ``LIVELY``."""
-        done = {each.stage for each in tries if each.succeeded}
+    def _capture_state(self, planned: PlannedCapture, attempts: Sequence[Attempt], *, ended: bool) -> CaptureState:
+        """A capture's state from its jobs' attempts; for parallel shards, the first of ``STATE_PRIORITY``."""
+        done = {each.stage for each in attempts if each.succeeded}
         jobs = self._call.jobs(planned)
         rest = [job for job in jobs if job.stage not in done]
         if jobs[-1].stage in done:
-            most = max(Counter(each.stage for each in tries).values())
-            return CaptureState(planned.name, "done", progress=1.0, tries=most, earlier=_reasons(tries))
+            most = max(Counter(each.stage for each in attempts).values())
+            return CaptureState(planned.name, "done", progress=1.0, tries=most, earlier=_reasons(attempts))
         first = stage_name(rest[0].stage)
         beside = [job for job in rest if job.stage != first and stage_name(job.stage) == first] or rest[:1]
-        each = [self._job(planned, job.stage, tries, ended=ended) for job in beside]
-        told = min(each, key=lambda state: LIVELY.index(state.state))
+        each = [self._job(planned, job.stage, attempts, ended=ended) for job in beside]
+        state = min(each, key=lambda state: STATE_PRIORITY.index(state.state))
         fractions = {state.stage: state.progress for state in each}
         return replace(
-            told,
+            state,
             progress=_progress(planned, jobs, rest, fractions),
-            left_s=None if told.state in ("failed", "stopped") else _left_s(rest, fractions),
+            left_s=None if state.state in ("failed", "stopped") else _left_s(rest, fractions),
         )
 
-    def _job(self, planned: PlannedCapture, stage: str, tries: Sequence[Try], *, ended: bool) -> CaptureState:
+    def _job(self, planned: PlannedCapture, stage: str, attempts: Sequence[Attempt], *, ended: bool) -> CaptureState:
         """The capture's state judged by one job only; ``progress`` is the job's."""
-        own = [each for each in tries if each.stage == stage]
-        told = CaptureState(planned.name, "waiting", stage, tries=len(own), earlier=_reasons(tries))
+        own = [each for each in attempts if each.stage == stage]
+        state = CaptureState(planned.name, "waiting", stage, tries=len(own), earlier=_reasons(attempts))
         if own and own[-1].alive and not ended:
-            return replace(told, state="running", progress=self._fraction(planned, stage))
-        if own and not own[-1].alive and self._is_over(own):
-            earlier = tuple(reason for reason in _reasons(tries) if reason != _reasons(own[-1:])[0])
-            return replace(told, state="failed", reason=own[-1].reason, hint=own[-1].hint, earlier=earlier)
-        return replace(told, state="stopped", reason=STOPPED, hint=GO_ON) if ended else told
+            return replace(state, state="running", progress=self._fraction(planned, stage))
+        if own and not own[-1].alive and self._is_final(own):
+            earlier = tuple(reason for reason in _reasons(attempts) if reason != _reasons(own[-1:])[0])
+            return replace(state, state="failed", reason=own[-1].reason, hint=own[-1].hint, earlier=earlier)
+        return replace(state, state="stopped", reason=STOPPED, hint=RESUME_HINT) if ended else state
 
-    def _is_over(self, own: Sequence[Try]) -> bool:
+    def _is_final(self, own: Sequence[Attempt]) -> bool:
         """Whether a failed stage will not be retried."""
         last = own[-1]
         if self._call.stop_file.exists() and last.exit_code in (None, EXIT_INTERRUPTED, EXIT_TERMINATED):
@@ -139,16 +140,16 @@ class BatchMonitor:
             return min(1.0, max(0.0, float(found.messages.progress["done"]) / float(found.messages.progress["total"])))
         return 0.0
 
-    def _with_facts(self, told: CaptureState, planned: PlannedCapture, tries: Sequence[Try]) -> CaptureState:
-        known = (told.state, told.stage, len(tries), tries[-1].ended_s if tries else None)
+    def _with_facts(self, state: CaptureState, planned: PlannedCapture, attempts: Sequence[Attempt]) -> CaptureState:
+        known = (state.state, state.stage, len(attempts), attempts[-1].ended_s if attempts else None)
         if self._facts.get(planned.key, (None,))[0] != known:
-            self._facts[planned.key] = (known, self._read(planned, told))
+            self._facts[planned.key] = (known, self._read(planned, state))
         facts = self._facts[planned.key][1]
-        under_way = time.time() - tries[-1].began_s if told.state == "running" else 0.0
+        under_way = time.time() - attempts[-1].began_s if state.state == "running" else 0.0
         return replace(
-            told,
-            verdict="" if told.state == "failed" else facts.verdict,  # it would add nothing
-            level="bad" if told.state == "failed" else facts.level,
+            state,
+            verdict="" if state.state == "failed" else facts.verdict,  # it would add nothing
+            level="bad" if state.state == "failed" else facts.level,
             seconds=round(facts.seconds + under_way, 1),
             photos=planned.photo_count,
             figures=facts.figures,
@@ -157,9 +158,9 @@ class BatchMonitor:
             viewer=facts.viewer,
         )
 
-    def _read(self, planned: PlannedCapture, told: CaptureState) -> CaptureFacts:
+    def _read(self, planned: PlannedCapture, state: CaptureState) -> CaptureFacts:
         """The facts from its results folder, with an image."""
-        facts = read_facts(self._call.out, planned.name, told.state in ("done", "reused", "failed"))
+        facts = read_facts(self._call.out, planned.name, state.state in ("done", "reused", "failed"))
         try:
             folder = self._call.out
             picture = capture_picture(folder / planned.name, Path(planned.photos), folder / BATCH_FOLDER / "pictures")
@@ -185,7 +186,7 @@ class BatchMonitor:
         needed = 0
         for planned in self._plan.captures:
             if planned.name not in over:
-                done = {each.stage for each in read_tries(self._call.tries_files(planned.key)) if each.succeeded}
+                done = {each.stage for each in read_attempts(self._call.attempts_files(planned.key)) if each.succeeded}
                 needed += sum(job.disk_bytes for job in planned.jobs if job.stage not in done)
         return needed
 
@@ -196,7 +197,7 @@ def read_facts(out: Path, name: str, judged: bool) -> CaptureFacts:
     Args:
         out: The batch's folder.
         name: The capture's name.
-        judged: Whether to include the verdict, which makes no sense while the run is going on.
+        judged: Whether to include the verdict, which makes no sense while it is running.
     """
     folder = out / name
     facts = CaptureFacts(
@@ -243,9 +244,9 @@ def _figures(inputs: ReportInputs) -> dict[str, float | int]:
     return found
 
 
-def _reasons(tries: Sequence[Try]) -> tuple[str, ...]:
-    """Why tries failed, each with its stage."""
-    return tuple(f"{each.stage}: {each.reason}" for each in tries if each.reason)
+def _reasons(attempts: Sequence[Attempt]) -> tuple[str, ...]:
+    """Why attempts failed, each with its stage."""
+    return tuple(f"{each.stage}: {each.reason}" for each in attempts if each.reason)
 
 
 def _progress(
@@ -267,10 +268,10 @@ def _left_s(rest: Sequence[StageJob], fractions: Mapping[str, float]) -> float:
     return sum(job.seconds * (1.0 - fractions.get(job.stage, 0.0)) for job in rest)
 
 
-def _short(free: int | None, needed: int) -> tuple[str, ...]:
+def _disk_warning(free: int | None, needed: int) -> tuple[str, ...]:
     if free is None or free >= needed:
         return ()
     return (
-        f"The disk has {free / 1e9:.1f} GB free, and what is still to run takes about {needed / 1e9:.1f} GB: "
+        f"The disk has {free / 1e9:.1f} GB free, and the remaining stages need about {needed / 1e9:.1f} GB: "
         "a stage that does not fit will not start.",
     )

@@ -21,7 +21,7 @@ REFRESH_S = 10  # the page's reload interval; the batch rewrites the page somewh
 PICTURE_SIDE = 480  # pixels, of a card on a good display
 SMALL_SIDE = 240  # if there are so many that the page would load slowly
 MANY = 60  # captures
-MOST_LINES = 50  # of a reason; the full text is in the report
+MAX_LINES = 50  # of a reason; the full text is in the report
 GROUPS: Sequence[tuple[State, str]] = (  # those that need attention first
     ("failed", "Failed"),
     ("running", "Running"),
@@ -44,13 +44,13 @@ class Card:
         stage: The current stage in words; empty if there is nothing to show.
         percent: Progress; None if it is not running.
         left: Progress and time left in words; empty if it is not running.
-        facts: Figures in words: photos, time, tries.
+        facts: Figures in words: photos, time, attempts.
         verdict: The report's headline.
         level: The verdict's level.
         reason: First line of why it failed or was stopped.
         more: Further lines of the reason.
         hint: What to do about it.
-        earlier: Why earlier tries failed.
+        earlier: Why earlier attempts failed.
         links: Titles and URLs.
     """
 
@@ -105,11 +105,11 @@ def batch_page(state: BatchState, folder: Path) -> str:
     """
     side = SMALL_SIDE if len(state.captures) > MANY else PICTURE_SIDE
     groups = []
-    for standing, title in GROUPS:
-        those = sorted((it for it in state.captures if it.state == standing), key=lambda it: it.level != "bad")
-        cards = tuple(_card(it, folder, side) for it in those)
+    for name, title in GROUPS:
+        captures = sorted((it for it in state.captures if it.state == name), key=lambda it: it.level != "bad")
+        cards = tuple(_card(it, folder, side) for it in captures)
         if cards:
-            groups.append(Group(standing, title, cards))
+            groups.append(Group(name, title, cards))
     level, headline = _headline(state)
     return page_text(
         TEMPLATES,
@@ -148,7 +148,7 @@ def _headline(state: BatchState) -> tuple[Level, str]:
         doubtful = sum(capture.level in ("doubt", "bad") for capture in state.captures)
         headline = "The capture succeeded" if total == 1 else f"All {total:,} captures succeeded"
         if doubtful:
-            return "doubt", f"{headline}; {doubtful:,} to look at"
+            return "doubt", f"{headline}; {doubtful:,} to check"
         return "good", headline
     if failed:
         return "bad", f"{failed:,} of {plural(total, 'capture')} failed; {finished:,} finished"
@@ -159,16 +159,16 @@ def _text(state: BatchState) -> str:
     """Start time, duration and resources in words."""
     until_s = state.as_of_s if state.ended_s is None else state.ended_s
     poor = sum(capture.level == "bad" and capture.state in FINISHED for capture in state.captures)
-    told = [state.message, f"Of what finished, {poor:,} have poor results." if poor else ""]
-    told += [f"Began {_moment(state.began_s)}."]
+    sentences = [state.message, f"{poor:,} of the finished captures have poor results." if poor else ""]
+    sentences += [f"Began {_moment(state.began_s)}."]
     if state.ended_s is not None:
-        told.append(f"Ended {_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")
+        sentences.append(f"Ended {_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")
     elif state.left_s is not None:
-        told.append(f"About {roughly(state.left_s)} to go, until {_moment(until_s + state.left_s)} (forecast).")
+        sentences.append(f"About {roughly(state.left_s)} left, until {_moment(until_s + state.left_s)} (forecast).")
     if state.free_bytes is not None and (state.at_work or not state.all_succeeded):
-        needed = f"; what is still to run takes about {size(state.needed_bytes)}" if state.needed_bytes else ""
-        told.append(f"{size(state.free_bytes)} are free on the disk{needed}.")
-    return " ".join(filter(None, told))
+        needed = f"; the remaining stages need about {size(state.needed_bytes)}" if state.needed_bytes else ""
+        sentences.append(f"{size(state.free_bytes)} are free on the disk{needed}.")
+    return " ".join(filter(None, sentences))
 
 
 def _card(capture: CaptureState, folder: Path, side: int) -> Card:
@@ -177,7 +177,7 @@ def _card(capture: CaptureState, folder: Path, side: int) -> Card:
     if capture.seconds > 0.0:
         facts.append(duration(capture.seconds))
     if capture.tries > 1:
-        facts.append(f"try {capture.tries}" if running else plural(capture.tries, "try", "tries"))
+        facts.append(f"attempt {capture.tries}" if running else plural(capture.tries, "attempt"))
     percent = round(100 * min(max(capture.progress, 0.0), 1.0))
     left = f"{percent} %"
     if capture.left_s is not None:
@@ -195,7 +195,7 @@ def _card(capture: CaptureState, folder: Path, side: int) -> Card:
         verdict="" if reason else capture.verdict,  # the verdict would repeat the state and the reason
         level=capture.level,
         reason=reason,
-        more=tuple(more[:MOST_LINES]) + ((f"and {len(more) - MOST_LINES:,} more",) if len(more) > MOST_LINES else ()),
+        more=tuple(more[:MAX_LINES]) + ((f"and {len(more) - MAX_LINES:,} more",) if len(more) > MAX_LINES else ()),
         hint=capture.hint,
         earlier=capture.earlier,
         links=tuple(

@@ -17,19 +17,19 @@ from splatpipe.pipeline.photos.photo_list import photo_root
 
 SIDE = 480  # pixels, of a card on a good display
 POOR_DB = 12.0  # PSNR without exposure compensation: a worse render does not show which capture it is
-LOOKED_AT = 5  # photos, spread over the capture: some show little but sky, grass, or the ground before take-off
+CANDIDATES = 5  # photos, spread over the capture: some show little but sky, grass, or the ground before take-off
 
 
-def capture_picture(out: Path, photos: Path, kept: Path) -> Path | None:
+def capture_picture(out: Path, photos: Path, pictures: Path) -> Path | None:
     """Make a small image of a capture from what exists of it now.
 
     Args:
         out: Its results folder, which may not exist yet.
         photos: Its photo folder.
-        kept: The folder for the images of all captures; created if missing.
+        pictures: The folder for the images of all captures; created if missing.
 
     Returns:
-        The image in `kept`, rewritten if a better one is available now. None if there is nothing to show.
+        The image in `pictures`, rewritten if a better one is available now. None if there is nothing to show.
 
     Raises:
         OSError: if it cannot be written.
@@ -38,16 +38,16 @@ def capture_picture(out: Path, photos: Path, kept: Path) -> Path | None:
     if source is None:
         return None
     capture = hashlib.sha256(bytes(out.absolute())).hexdigest()[:16]
-    told = source.stat()
-    stamp = hashlib.sha256(f"{bytes(source)!r} {told.st_mtime_ns} {told.st_size}".encode()).hexdigest()[:16]
-    path = kept / f"{capture}-{stamp}.jpg"
+    status = source.stat()
+    stamp = hashlib.sha256(f"{bytes(source)!r} {status.st_mtime_ns} {status.st_size}".encode()).hexdigest()[:16]
+    path = pictures / f"{capture}-{stamp}.jpg"
     if not path.is_file():
         small = thumbnail(source, SIDE, orientation)
         if small is None:
             return None
-        kept.mkdir(parents=True, exist_ok=True)
+        pictures.mkdir(parents=True, exist_ok=True)
         write_durably(path, lambda file: file.write(base64.b64decode(str(small.picture).partition(",")[2])))
-    for other in kept.glob(f"{capture}-*.jpg"):
+    for other in pictures.glob(f"{capture}-*.jpg"):
         if other != path:
             other.unlink(missing_ok=True)
     return path
@@ -61,7 +61,7 @@ def _render(out: Path) -> tuple[Path, int] | None:
         views: Sequence[Mapping[str, Any]] = inputs.read("evaluate.metrics").get("per_view", [])
         if folder is None or not views:
             return None
-        views = sorted(views, key=_likeness, reverse=True)
+        views = sorted(views, key=_view_psnr, reverse=True)
         renders = [(folder / f"{Path(str(view['file'])).name}.render.png", view) for view in views]
         better = renders[: (len(renders) + 1) // 2]
         good = [(path, view) for path, view in better if path.is_file() and float(view.get("psnr") or 0.0) >= POOR_DB]
@@ -75,7 +75,7 @@ def _render(out: Path) -> tuple[Path, int] | None:
         return None
 
 
-def _likeness(view: Mapping[str, Any]) -> float:
+def _view_psnr(view: Mapping[str, Any]) -> float:
     return float(view.get("psnr_cc") or view.get("psnr") or 0.0)
 
 
@@ -86,6 +86,6 @@ def _photo(photos: Path) -> Path | None:
         every = sorted(path for path in root.rglob("*") if path.suffix.lower().lstrip(".") in PHOTO_SUFFIXES)
     except OSError:
         return None
-    chosen = [every[len(every) * (2 * i + 1) // (2 * LOOKED_AT)] for i in range(LOOKED_AT)] if every else []
+    chosen = [every[len(every) * (2 * i + 1) // (2 * CANDIDATES)] for i in range(CANDIDATES)] if every else []
     seen = ((len(small.picture), path) for path in dict.fromkeys(chosen) if (small := thumbnail(path, SIDE)))
     return max(seen, default=(0, None))[1]

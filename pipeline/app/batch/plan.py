@@ -15,7 +15,7 @@ PLAN_FILE = "plan.json"
 RUNTIME_FACTOR, RUNTIME_MIN = 3.0, 15.0  # a cluster kills jobs at the limit, and extra minutes cost nothing
 MEGABYTE = 10**6
 SHARDS_FOLDER = "shards"  # below a call's folder
-LEAST_S = 1.0  # of a process that only joins
+MIN_S = 1.0  # of a process that only joins
 
 
 @dataclass(frozen=True)
@@ -150,8 +150,8 @@ class Call:
         """The options of a capture."""
         return self.folder / "config" / f"{key}.toml"
 
-    def tries_file(self, key: str, job: str = "") -> Path:
-        """The log of a capture's tries, one JSON object per line; shards, which run in parallel, have their own files.
+    def attempts_file(self, key: str, job: str = "") -> Path:
+        """The log of a capture's attempts, one JSON object per line; shards, which run in parallel, have their own.
 
         Args:
             key: The capture's key.
@@ -159,16 +159,16 @@ class Call:
         """
         return self.folder / "tries" / f"{key}{_shard(job)}.jsonl"
 
-    def tries_files(self, key: str) -> list[Path]:
-        """All tries files of a capture; they may not exist."""
-        return [self.tries_file(key), *sorted(self.tries_file(key).parent.glob(f"{key}.*.jsonl"))]
+    def attempts_files(self, key: str) -> list[Path]:
+        """The files of all attempts of a capture; they may not exist."""
+        return [self.attempts_file(key), *sorted(self.attempts_file(key).parent.glob(f"{key}.*.jsonl"))]
 
     def log(self, name: str, job: str = "") -> Path:
         """The output of a capture's jobs; it outlives the call.
 
         Args:
             name: The capture's name.
-            job: As for ``tries_file``.
+            job: As for ``attempts_file``.
         """
         return self.folder.parent / "logs" / f"{name}{_shard(job)}.log"
 
@@ -178,7 +178,7 @@ class Call:
 
     def write_shards(self, key: str, jobs: Mapping[str, Sequence[StageJob]]) -> None:
         """Store the jobs of shards by stage; those of stages already stored are not changed."""
-        told = {
+        stored = {
             stage: {
                 "jobs": [asdict(job) for job in of_stage],
                 "resources": {job.stage: job.resources for job in of_stage},
@@ -187,43 +187,47 @@ class Call:
         }
         path = self.shards_file(key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, json.dumps({**told, **self._shards(key)}))
+        write_durably(path, json.dumps({**stored, **self._shards(key)}))
 
     def jobs(self, capture: PlannedCapture) -> list[StageJob]:
         """A capture's jobs in order, shards before their stage, which keeps the remaining time."""
-        known = {stage: [StageJob(**job) for job in told["jobs"]] for stage, told in self._shards(capture.key).items()}
+        known = {
+            stage: [StageJob(**job) for job in stored["jobs"]] for stage, stored in self._shards(capture.key).items()
+        }
         found = []
         for job in capture.jobs:
             shards = known.get(job.stage, [])
             rest_s = job.seconds - sum(shard.seconds for shard in shards)
-            found += [*shards, replace(job, seconds=max(LEAST_S, rest_s)) if shards else job]
+            found += [*shards, replace(job, seconds=max(MIN_S, rest_s)) if shards else job]
         return found
 
     def _shards(self, key: str) -> Mapping[str, JSON]:
         try:
-            told: Mapping[str, JSON] = json.loads(self.shards_file(key).read_text(encoding="utf-8"))
+            stored: Mapping[str, JSON] = json.loads(self.shards_file(key).read_text(encoding="utf-8"))
         except FileNotFoundError:
             return {}
-        return told
+        return stored
 
     def write_plan(self, plan: BatchPlan) -> None:
         write_durably(self.folder / PLAN_FILE, json.dumps(asdict(plan), indent=1))
 
     def plan(self) -> BatchPlan:
-        told = json.loads((self.folder / PLAN_FILE).read_text(encoding="utf-8"))
-        return BatchPlan(**{**told, "captures": tuple(_capture(each) for each in told["captures"]), **_tuples(told)})
+        stored = json.loads((self.folder / PLAN_FILE).read_text(encoding="utf-8"))
+        return BatchPlan(
+            **{**stored, "captures": tuple(_capture(each) for each in stored["captures"]), **_tuples(stored)}
+        )
 
     def write_end(self, ended_s: float, exit_code: int | None, message: str) -> None:
-        told = {"ended_s": ended_s, "exit_code": exit_code, "message": message}
-        write_durably(self.end_file, json.dumps(told))
+        stored = {"ended_s": ended_s, "exit_code": exit_code, "message": message}
+        write_durably(self.end_file, json.dumps(stored))
 
     def end(self) -> Mapping[str, JSON]:
         """``ended_s``, ``exit_code`` and ``message``; empty while it is running."""
         try:
-            told: Mapping[str, JSON] = json.loads(self.end_file.read_text(encoding="utf-8"))
+            stored: Mapping[str, JSON] = json.loads(self.end_file.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return {}
-        return told
+        return stored
 
 
 def _shard(job: str) -> str:
@@ -231,9 +235,9 @@ def _shard(job: str) -> str:
     return f".{job}" if job != stage_name(job) else ""
 
 
-def _capture(told: Mapping[str, JSON]) -> PlannedCapture:
-    return PlannedCapture(**{**told, "jobs": tuple(StageJob(**job) for job in told["jobs"])})
+def _capture(stored: Mapping[str, JSON]) -> PlannedCapture:
+    return PlannedCapture(**{**stored, "jobs": tuple(StageJob(**job) for job in stored["jobs"])})
 
 
-def _tuples(told: Mapping[str, JSON]) -> dict[str, tuple[str, ...]]:
-    return {name: tuple(told[name]) for name in ("warnings", "unlisted")}
+def _tuples(stored: Mapping[str, JSON]) -> dict[str, tuple[str, ...]]:
+    return {name: tuple(stored[name]) for name in ("warnings", "unlisted")}

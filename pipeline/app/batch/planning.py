@@ -33,7 +33,7 @@ from splatpipe.stages.forecast import forecast, machine_speed
 
 CLUSTER_THREADS = 8  # of a job on another machine; a profile's set-threads overrides it
 LONGEST_SLUG = 40
-UNTRIED = "Nothing has changed since, so it was not tried again; use --retry-failed to do so."
+NOT_RETRIED = "Nothing has changed since, so it was not retried; use --retry-failed to do so."
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class _CaptureForecast:
+class _CaptureDraft:
     """A capture's plan before threads are divided.
 
     Attributes:
@@ -91,14 +91,15 @@ def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings)
         settings: The command's settings.
     """
     began_s = time.time()
-    outlooks = [
-        _look(capture, f"{at:04d}-{_slug(capture.name)}", call, settings) for at, capture in enumerate(captures, 1)
+    drafts = [
+        _draft_capture(capture, f"{at:04d}-{_slug(capture.name)}", call, settings)
+        for at, capture in enumerate(captures, 1)
     ]
-    threads = settings.threads or _threads(outlooks, local=settings.local)
-    planned = tuple(_with_jobs(outlook, threads) for outlook in outlooks)
-    for outlook in outlooks:
-        if outlook.shards:
-            call.write_shards(outlook.planned.key, shard_jobs(outlook.shards, outlook.forecast_needs(threads), threads))
+    threads = settings.threads or _threads(drafts, local=settings.local)
+    planned = tuple(_with_jobs(draft, threads) for draft in drafts)
+    for draft in drafts:
+        if draft.shards:
+            call.write_shards(draft.planned.key, shard_jobs(draft.shards, draft.forecast_needs(threads), threads))
     return BatchPlan(
         out=str(call.out),
         began_s=began_s,
@@ -115,20 +116,20 @@ def _slug(name: str) -> str:
     return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-")[:LONGEST_SLUG]
 
 
-def _look(capture: ListedCapture, key: str, call: Call, settings: Settings) -> _CaptureForecast:
+def _draft_capture(capture: ListedCapture, key: str, call: Call, settings: Settings) -> _CaptureDraft:
     planned = PlannedCapture(capture.name, key, str(capture.photos), capture.preset or settings.preset)
     try:
         if capture.trouble is not None:
             raise capture.trouble
-        return _outlook(capture, planned, call, settings)
+        return _resolve_capture(capture, planned, call, settings)
     except SplatpipeError as error:
-        return _CaptureForecast(replace(planned, message=error.message, hint=error.hint))
+        return _CaptureDraft(replace(planned, message=error.message, hint=error.hint))
     except OSError as error:
         trouble = MachineError(f"Cannot read {error.filename or capture.photos}: {error.strerror}.", "Check the disk.")
-        return _CaptureForecast(replace(planned, message=trouble.message, hint=trouble.hint))
+        return _CaptureDraft(replace(planned, message=trouble.message, hint=trouble.hint))
 
 
-def _outlook(capture: ListedCapture, planned: PlannedCapture, call: Call, settings: Settings) -> _CaptureForecast:
+def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call, settings: Settings) -> _CaptureDraft:
     tables = (*settings.tables, *capture.tables)
     config = Overrides(tables).resolve(load_preset(planned.preset))
     request = request_of(capture.photos.absolute(), call.out / capture.name, config)
@@ -144,18 +145,18 @@ def _outlook(capture: ListedCapture, planned: PlannedCapture, call: Call, settin
     names = _to_run(request, needed, statuses)
     first = next((each for each in statuses if each.stage.name in names and each.artifact is None), None)
     if first is not None and not settings.retry_failed:
-        planned = _with_kept_failure(planned, first, request.out)
+        planned = _with_previous_failure(planned, first, request.out)
     if names and not planned.message:
-        planned = _with_broken_file(planned, request)
+        planned = _with_input_error(planned, request)
     memory = available_memory_bytes() if settings.local else 0
     forecast_needs = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
     # If the stage that counts the shards has to run, it will determine their number.
     counted = [each for each in statuses if each.stage.name in names] if first else []
     shards = {} if planned.message else missing_shards(counted)
-    return _CaptureForecast(planned, tuple(needed), () if planned.message else names, forecast_needs, shards)
+    return _CaptureDraft(planned, tuple(needed), () if planned.message else names, forecast_needs, shards)
 
 
-def _with_broken_file(planned: PlannedCapture, request: Request) -> PlannedCapture:
+def _with_input_error(planned: PlannedCapture, request: Request) -> PlannedCapture:
     """Detect errors that would end the run before its first stage: such a failure leaves no trace in OUT."""
     try:
         require_readable(request)
@@ -192,22 +193,22 @@ def _to_run(request: Request, needed: Sequence[str], statuses: Sequence[StageSta
     return () if delivered else (needed[-1],)
 
 
-def _with_kept_failure(planned: PlannedCapture, first: StageStatus, out: Path) -> PlannedCapture:
+def _with_previous_failure(planned: PlannedCapture, first: StageStatus, out: Path) -> PlannedCapture:
     """If a stage failed on its input and the input is unchanged, keep that failure and run nothing."""
     for status in (first, *first.shards):
         for path in (out / EVENTS_FILE, shard_events(out, status.stage.name)):
             history = read_history(path, running=is_locked(out))
             culprit = history.culprit
-            alike = history.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
-            if culprit is None or culprit.state != "failed" or not culprit.lasting or not alike:
+            same_version = history.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
+            if culprit is None or culprit.state != "failed" or not culprit.lasting or not same_version:
                 continue
             if (culprit.name, culprit.key) == (status.stage.name, status.key):
-                hint = f"{culprit.hint} {UNTRIED}".strip()
+                hint = f"{culprit.hint} {NOT_RETRIED}".strip()
                 return replace(planned, message=culprit.message, hint=hint, stage=culprit.name)
     return planned
 
 
-def _threads(outlooks: Sequence[_CaptureForecast], *, local: bool) -> int:
+def _threads(drafts: Sequence[_CaptureDraft], *, local: bool) -> int:
     """Threads per job: the machine's threads divided by the captures that can run at once.
 
     Many captures in parallel finish sooner than one after the other with all threads, some of which are always idle.
@@ -215,7 +216,7 @@ def _threads(outlooks: Sequence[_CaptureForecast], *, local: bool) -> int:
     if not local:
         return CLUSTER_THREADS
     cores = available_cores()
-    peaks = [max(_of(outlook, cores, outlook.names).values(), key=_memory) for outlook in outlooks if outlook.names]
+    peaks = [max(_needs_of(draft, cores, draft.names).values(), key=_memory) for draft in drafts if draft.names]
     if not peaks:
         return 1
     room = free_memory_bytes()
@@ -223,17 +224,17 @@ def _threads(outlooks: Sequence[_CaptureForecast], *, local: bool) -> int:
     return max(1, cores // max(1, min(len(peaks), fitting, cores)))
 
 
-def _of(outlook: _CaptureForecast, threads: int, names: Sequence[str]) -> dict[str, Need]:
+def _needs_of(draft: _CaptureDraft, threads: int, names: Sequence[str]) -> dict[str, Need]:
     """The needs of stages; stages without a forecast count as almost nothing."""
-    foreseen = outlook.forecast_needs(threads)
-    return {name: foreseen.get(name, NOTHING) for name in names}
+    needs = draft.forecast_needs(threads)
+    return {name: needs.get(name, NOTHING) for name in names}
 
 
 def _memory(need: Need) -> int:
     return need.memory_bytes
 
 
-def _with_jobs(outlook: _CaptureForecast, threads: int) -> PlannedCapture:
-    needs = _of(outlook, threads, outlook.needed)
-    jobs = tuple(stage_job(name, needs[name], threads) for name in outlook.names)
-    return replace(outlook.planned, jobs=jobs, weights={name: need.seconds(threads) for name, need in needs.items()})
+def _with_jobs(draft: _CaptureDraft, threads: int) -> PlannedCapture:
+    needs = _needs_of(draft, threads, draft.needed)
+    jobs = tuple(stage_job(name, needs[name], threads) for name in draft.names)
+    return replace(draft.planned, jobs=jobs, weights={name: need.seconds(threads) for name, need in needs.items()})

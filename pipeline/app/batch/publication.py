@@ -43,10 +43,10 @@ def table_text(state: BatchState) -> str:
 
 
 def _row(capture: CaptureState, when: str) -> list[str | int | float | None]:
-    told = (capture.name, capture.state, capture.stage, capture.progress, capture.verdict, capture.level)
-    why = (capture.reason, capture.hint, capture.tries, "; ".join(capture.earlier), capture.seconds, capture.photos)
+    identity = (capture.name, capture.state, capture.stage, capture.progress, capture.verdict, capture.level)
+    outcome = (capture.reason, capture.hint, capture.tries, "; ".join(capture.earlier), capture.seconds, capture.photos)
     figures = [capture.figures.get(name) for name in FIGURES]
-    return [_cell(value) for value in (*told, *why, *figures, capture.report, capture.viewer, when)]
+    return [_cell(value) for value in (*identity, *outcome, *figures, capture.report, capture.viewer, when)]
 
 
 def _cell(value: str | int | float | None) -> str | int | float | None:

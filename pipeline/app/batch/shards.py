@@ -57,7 +57,7 @@ def counts_shards(stage: str, line: Sequence[Stage]) -> bool:
     return any(each.shards is not None and stage_name(each.shards.counted_by) == stage for each in line)
 
 
-def tell_shards(call: Call, key: str, threads: int) -> None:
+def store_shard_jobs(call: Call, key: str, threads: int) -> None:
     """Store the jobs of a capture's shards for Snakemake, once the stage that counts them has run.
 
     Args:

@@ -1,4 +1,4 @@
-"""Snakemake as a process: found, started in its own process group, and shut down with everything it started.
+"""Snakemake as a process: located, started in its own process group, and ended with everything it started.
 
     python -m splatpipe.pipeline.app.batch.snakemake_process ARGUMENTS
 
@@ -31,7 +31,7 @@ END_PATIENCE_S = 8.0  # a run ends within five seconds and Docker kills after te
 POLL_S = 0.05
 LOG_TAIL = 4000  # characters of Snakemake's log that are searched for its last message
 PROFILE_FILES = ("config.v9+.yaml", "config.v8+.yaml", "config.yaml")
-SAID = re.compile(r"^(?:[A-Za-z]*(?:Error|Exception)\b.*|.*\berror: .*)", re.MULTILINE)
+ERROR_LINE = re.compile(r"^(?:[A-Za-z]*(?:Error|Exception)\b.*|.*\berror: .*)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Profile:
         found = re.search(r"^executor\s*:\s*[\"']?([\w-]+)", self.text, re.MULTILINE)
         return found is None or found[1] == "local"
 
-    def says(self, option: str) -> bool:
+    def sets(self, option: str) -> bool:
         """Whether the profile sets an option."""
         return re.search(rf"^{re.escape(option)}\s*:", self.text, re.MULTILINE) is not None
 
@@ -92,13 +92,13 @@ def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str
     command += ["--retries", str(plan.retries), "--scheduler", "greedy", "--rerun-triggers", "input"]
     if profile.folder is not None:
         command += ["--profile", str(profile.folder)]
-    if not profile.local and not profile.says("cores"):  # caps the threads of jobs elsewhere
+    if not profile.local and not profile.sets("cores"):  # caps the threads of jobs elsewhere
         command += ["--cores", str(max((job.threads for each in plan.captures for job in each.jobs), default=1))]
     if profile.local:
         memory = free_memory_bytes() // MEGABYTE
         limits = ["gpu=1", *([f"mem_mb={memory}"] if memory else [])]
-        command += [] if profile.says("cores") else ["--cores", str(available_cores())]
-        command += [] if profile.says("resources") else ["--resources", *limits]
+        command += [] if profile.sets("cores") else ["--cores", str(available_cores())]
+        command += [] if profile.sets("resources") else ["--resources", *limits]
     return command
 
 
@@ -124,26 +124,26 @@ def start_snakemake(call: Call, plan: BatchPlan, profile: Profile) -> subprocess
         )
 
 
-def end_group(call: Call, group: int, *, local: bool, gone: Callable[[], bool]) -> None:
+def end_group(call: Call, group: int, *, local: bool, has_ended: Callable[[], bool]) -> None:
     """End a workflow: no job starts, running ones are asked to stop, and those that do not are killed.
 
     Args:
         call: The call.
         group: ID of Snakemake's process group.
         local: Local jobs are signalled directly; Snakemake cancels those elsewhere.
-        gone: Returns whether Snakemake has ended.
+        has_ended: Returns whether Snakemake has ended.
     """
     with suppress(OSError):  # on a full disk the signals must suffice
         call.stop_file.touch()
     deadline = time.monotonic() + END_PATIENCE_S
     with suppress(ProcessLookupError):
         os.killpg(group, signal.SIGTERM if local else signal.SIGINT)
-        while not gone() and time.monotonic() < deadline:
+        while not has_ended() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         os.killpg(group, signal.SIGKILL)
 
 
-def group_gone(group: int) -> bool:
+def group_has_ended(group: int) -> bool:
     """Whether no process of a group is left, for a group whose processes are not our children."""
     try:
         os.killpg(group, 0)
@@ -152,11 +152,11 @@ def group_gone(group: int) -> bool:
     return False
 
 
-def last_words(call: Call) -> str:
+def last_error_line(call: Call) -> str:
     """The last line of Snakemake's log; empty if there is none."""
     with suppress(OSError):
         text = call.snakemake_log.read_text(encoding="utf-8", errors="replace")[-LOG_TAIL:]
-        found = SAID.findall(text) or [line for line in text.splitlines() if line.strip()]
+        found = ERROR_LINE.findall(text) or [line for line in text.splitlines() if line.strip()]
         return str(found[-1]).strip() if found else ""
     return ""
 

@@ -13,7 +13,7 @@ State = Literal["waiting", "running", "done", "reused", "failed", "stopped"]
 Level = Literal["", "good", "doubt", "bad"]
 
 FINISHED: tuple[State, ...] = ("done", "reused")
-RENEWED_EVERY_S = 15.0  # longest interval between updates of a running batch
+UPDATE_INTERVAL_S = 15.0  # longest interval between updates of a running batch
 STALE_S = 60.0  # older means that nobody is working: four missed updates, where a busy machine misses one
 
 
@@ -31,8 +31,8 @@ class CaptureState:
         level: The verdict's level; empty if there is none yet.
         reason: Why it failed or was stopped, in one sentence; else empty.
         hint: What to do about it.
-        tries: Tries of the stage in this batch; once all are done, of the stage with the most.
-        earlier: Why earlier tries failed, with their stages, even if a later one succeeded.
+        tries: Attempts at the stage in this batch; once all are done, of the stage with the most.
+        earlier: Why earlier attempts failed, with their stages, even if a later one succeeded.
         seconds: Total duration of its stages from their manifests, including the current one.
         left_s: Forecast time left once it runs; None if unknown.
         photos: Number of photos; None if not known yet.
@@ -75,7 +75,7 @@ class BatchState:
         message: Why it ended before its captures were finished; else empty.
         left_s: Forecast time left; None if unknown.
         free_bytes: Free space on the disk of the batch's folder.
-        needed_bytes: Forecast disk space of what is still to run.
+        needed_bytes: Forecast disk space of what remains to be run.
         warnings: What to read first in the morning.
         unlisted: Captures of earlier calls that are no longer listed; their results are kept.
     """

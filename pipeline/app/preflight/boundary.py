@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatpipe.pipeline.app.preflight.findings import Finding
-from splatpipe.pipeline.app.preflight.places import LEAST_REACH_M
+from splatpipe.pipeline.app.preflight.places import MIN_REACH_M
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.boundary import placed, placed_area
@@ -50,7 +50,7 @@ def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Positio
         vertices = np.concatenate([ring for polygon in area.polygons for ring in polygon])
         wide = float(np.linalg.norm(np.ptp(cameras[:, :2], axis=0)))
         apart = min(float(np.linalg.norm(vertices - camera, axis=1).min()) for camera in cameras[:, :2])
-        if apart > max(wide, LEAST_REACH_M):  # farther from all photos than the width of the flight
+        if apart > max(wide, MIN_REACH_M):  # farther from all photos than the width of the flight
             placed(drawing, frame, cameras)  # raises an error with its location, unless it surrounds all of them
     except SplatpipeError as error:
         return [Finding("boundary-broken", "error", error.message, error.hint)]

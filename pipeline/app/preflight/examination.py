@@ -24,7 +24,7 @@ from splatpipe.pipeline.app.preflight.findings import (
     PresetForecast,
     worst_first,
 )
-from splatpipe.pipeline.app.preflight.intake import LEAST_PHOTOS, Intake, take_in
+from splatpipe.pipeline.app.preflight.intake import MIN_PHOTOS, Intake, read_capture
 from splatpipe.pipeline.app.preflight.overlap import (
     MatchGraph,
     flight_of,
@@ -98,23 +98,23 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     config = next(iter(configs.values()))
     # No OUT is written: any folder outside the photos will do.
     source = open_source(photos, folder.parent / f"{folder.name}-out", LINE, config)
-    intake, findings = take_in(source, config, threads, report)
-    look = examine_photos(intake, threads, report)
-    control, told = _control(source, config, intake)
-    findings += [*look.findings, *focal_findings(intake), *told]
+    intake, findings = read_capture(source, config, threads, report)
+    examination = examine_photos(intake, threads, report)
+    control, control_problems = _control(source, config, intake)
+    findings += [*examination.findings, *focal_findings(intake), *control_problems]
     if (boundary := source.part_path("source.boundary")).is_file():
         controlled = source.part_path("source.control").is_file()
         findings += boundary_findings(boundary, config.georef, intake.positions.positions, controlled)
     forecasts, machine = forecast_presets(intake, has_control(source), configs, threads)
     return Preflight(
         folder=source.folder,
-        photos=_facts(intake, look),
+        photos=_facts(intake, examination),
         left_out=intake.left_out,
         findings=worst_first(findings),
         origin=origin_of(intake),
-        pairs=tuple(MatchedPair(i, j, count) for (i, j), count in sorted(look.overlap.matches.items())),
-        components=look.overlap.pieces,
-        gaps=look.gaps,
+        pairs=tuple(MatchedPair(i, j, count) for (i, j), count in sorted(examination.overlap.matches.items())),
+        components=examination.overlap.pieces,
+        gaps=examination.gaps,
         control=control,
         forecasts=forecasts,
         machine=machine,
@@ -127,7 +127,7 @@ def examine_photos(intake: Intake, threads: int, report: Reporter) -> PhotoExami
     """Read the photos, match them quickly, and compare their quality where they match."""
     count = len(intake.photos)
     unknown = np.full(count, np.nan)
-    if count < LEAST_PHOTOS:
+    if count < MIN_PHOTOS:
         return PhotoExamination((), NOTHING, (), unknown, unknown, (float("nan"),) * count)
     names = [photo.name for photo in intake.photos]
     glimpses: list[QuickFeatures] = []
@@ -173,13 +173,13 @@ def forecast_presets(
 
     disk = shutil.disk_usage(Path.cwd())
     machine = MachineFacts(available_memory_bytes(), available_cores(), disk.free)
-    if len(intake.photos) < LEAST_PHOTOS:
+    if len(intake.photos) < MIN_PHOTOS:
         return (), machine
     megapixels = float(np.median([photo.width * photo.height for photo in intake.photos])) / 1e6
     shape = float(np.median([min(photo.width / photo.height, photo.height / photo.width) for photo in intake.photos]))
     size = CaptureSize(len(intake.photos), megapixels, bool(intake.layout.located().mean() > 0.5), shape, control)
     speed = machine_speed()
-    told = []
+    forecasts = []
     for preset, config in configs.items():
         work = CaptureWork.of(size, config, REFERENCE, threads, machine.memory_bytes)
         need, blocks = whole(needs_of(work, speed)), work.blocks
@@ -192,7 +192,7 @@ def forecast_presets(
             )
         if disk.free < disk_bytes:
             lacking.append(f"{disk_bytes / 1e9:.1f} GB of disk, of which {disk.free / 1e9:.1f} are free here")
-        told.append(
+        forecasts.append(
             PresetForecast(
                 preset,
                 need.memory_bytes,
@@ -203,12 +203,12 @@ def forecast_presets(
                 1 if blocks is None else blocks.division.blocks,
             )
         )
-    return tuple(told), machine
+    return tuple(forecasts), machine
 
 
-def _facts(intake: Intake, look: PhotoExamination) -> tuple[PhotoFacts, ...]:
+def _facts(intake: Intake, examination: PhotoExamination) -> tuple[PhotoFacts, ...]:
     places = intake.layout.positions_m
-    partners = look.overlap.partners(len(intake.photos))
+    partners = examination.overlap.partners(len(intake.photos))
     return tuple(
         PhotoFacts(
             name=photo.name,
@@ -219,9 +219,9 @@ def _facts(intake: Intake, look: PhotoExamination) -> tuple[PhotoFacts, ...]:
             time=photo.exif.time,
             position_m=_rounded(places[k]),
             footprint_m=footprint(intake.layout.views, k),
-            sharpness=_number(look.sharpness[k]),
-            brightness_ev=_number(look.brighter_ev[k]),
-            mean_level=_number(look.levels[k]),
+            sharpness=_number(examination.sharpness[k]),
+            brightness_ev=_number(examination.brighter_ev[k]),
+            mean_level=_number(examination.levels[k]),
             matched=partners[k],
         )
         for k, photo in enumerate(intake.photos)

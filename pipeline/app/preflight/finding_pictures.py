@@ -15,9 +15,9 @@ from splatpipe.pipeline.photos.photo_list import photo_root
 
 SIDE = 260  # pixels of a thumbnail's longer side
 CUT = (260, 195)  # photo pixels of a crop: blur of a pixel or two is invisible in a thumbnail
-MOST_A_FINDING = 8
-MOST_PICTURES = 40  # on the page: below a megabyte, and a second or two of decoding
-MOST_CUTS = 8  # of these crops, for which a photo is decoded completely
+MAX_PER_FINDING = 8
+MAX_PICTURES = 40  # on the page: below a megabyte, and a second or two of decoding
+MAX_CROPS = 8  # of these crops, for which a photo is decoded completely
 CLOSE = ("blurred",)  # findings whose photos are shown as crops
 EXAMPLES = 3  # of photos that are dull throughout
 SHARP = 0.9  # least relative sharpness of a neighbour shown for comparison
@@ -44,12 +44,12 @@ def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
     """Images for each finding, in order; the worst findings, which come first, have priority within the limits."""
     photos = {photo.name: photo for photo in preflight.photos}
     root = photo_root(preflight.folder)
-    left, cuts = MOST_PICTURES, MOST_CUTS
+    left, cuts = MAX_PICTURES, MAX_CROPS
     every = []
     for finding in preflight.findings:
         pictures: list[FindingPicture] = []
         names = finding.photos or _examples(preflight, finding)
-        for name in names[: min(MOST_A_FINDING, left)]:
+        for name in names[: min(MAX_PER_FINDING, left)]:
             close = finding.code in CLOSE and cuts > 0
             cuts -= close
             pictures.append(_pictured(root, name, finding, photos.get(name), close=close))

@@ -32,7 +32,7 @@ from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
 
-LEAST_PHOTOS = 2  # the number ingest requires
+MIN_PHOTOS = 2  # the number ingest requires
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Intake:
     layout: Layout
 
 
-def take_in(source: RunSource, config: LineConfig, threads: int, report: Reporter) -> tuple[Intake, list[Finding]]:
+def read_capture(source: RunSource, config: LineConfig, threads: int, report: Reporter) -> tuple[Intake, list[Finding]]:
     """Check every photo completely, including its metadata.
 
     Args:
@@ -73,7 +73,7 @@ def take_in(source: RunSource, config: LineConfig, threads: int, report: Reporte
         checked, broken = check_photos(scan, work)
     photos, duplicates = split_duplicates(checked)
     findings = [*_unreadable([*scan.left_out, *broken]), *_duplicates(duplicates)]
-    if len(photos) < LEAST_PHOTOS:
+    if len(photos) < MIN_PHOTOS:
         findings.append(_too_few(len(photos)))
     groups, camera_of = group_cameras(photos)
     findings += [from_doubt(doubt) for doubt in camera_doubts(photos, groups, camera_of)]
@@ -162,16 +162,16 @@ def _unreadable(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
 def _duplicates(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
     if not entries:
         return []
-    told = [f"{printable(entry.name)} {entry.reason}" for entry in entries]
-    more = f"; and {len(told) - 5} more" if len(told) > 5 else ""
+    descriptions = [f"{printable(entry.name)} {entry.reason}" for entry in entries]
+    more = f"; and {len(descriptions) - 5} more" if len(descriptions) > 5 else ""
     # The reason ends with the twin's name, so that both can be found.
     twins = {entry.reason.partition(" as ")[2] for entry in entries}
     names = tuple(sorted({entry.name for entry in entries} | twins))
-    text = f"Duplicate photos: {'; '.join(told[:5])}{more}."
+    text = f"Duplicate photos: {'; '.join(descriptions[:5])}{more}."
     return [Finding("duplicate", "warning", text, "The duplicates are left out; was a card copied twice?", names)]
 
 
 def _too_few(count: int) -> Finding:
-    told = "None of the photos can be used." if count == 0 else "There is only one usable photo."
+    text = "None of the photos can be used." if count == 0 else "There is only one usable photo."
     hint = "A reconstruction needs many overlapping photos of the same scene."
-    return Finding("too-few", "error", told, hint)
+    return Finding("too-few", "error", text, hint)

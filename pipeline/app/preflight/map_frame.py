@@ -12,7 +12,7 @@ WIDTH = 2000  # of the drawing, in its own units: integers are precise enough, a
 NARROWEST, HIGHEST = 0.4, 1.0  # height over width
 MARGIN = 0.06  # of the longer side, around what is shown
 REACH = 0.3  # of the photos' extent: footprints of oblique views and points farther out are cut off
-LEAST_SPAN_M = 10.0  # a capture from one spot still has a map
+MIN_SPAN_M = 10.0  # a capture from one spot still has a map
 SCALE_SHARE = 0.25  # of the width, the most that the scale bar occupies
 
 
@@ -67,7 +67,7 @@ def frame_of(preflight: Preflight) -> MapFrame | None:
     taken = [photo.position_m[:2] for photo in preflight.photos if photo.position_m is not None]
     if not taken:
         return None
-    reach = REACH * max(_span(taken, 0), _span(taken, 1), LEAST_SPAN_M)
+    reach = REACH * max(_span(taken, 0), _span(taken, 1), MIN_SPAN_M)
     shown: list[Place] = [place for photo in preflight.photos for place in photo.footprint_m or ()]
     shown += [place for gap in preflight.gaps for place in gap.outline_m]
     low, high = ([bound(place[axis] for place in taken) for axis in (0, 1)] for bound in (min, max))
@@ -78,7 +78,7 @@ def frame_of(preflight: Preflight) -> MapFrame | None:
         near = [min(max(place[axis], low[axis] - reach), high[axis] + reach) for place in shown]
         low[axis], high[axis] = min([low[axis], *near]), max([high[axis], *near])
     east, north = (high[0] + low[0]) / 2, (high[1] + low[1]) / 2
-    margin = MARGIN * max(high[0] - low[0], high[1] - low[1], LEAST_SPAN_M)
+    margin = MARGIN * max(high[0] - low[0], high[1] - low[1], MIN_SPAN_M)
     wide, tall = high[0] - low[0] + 2 * margin, high[1] - low[1] + 2 * margin
     tall = max(tall, NARROWEST * wide)
     wide = max(wide, tall / HIGHEST)

@@ -31,8 +31,8 @@ NEIGHBOURS = 8  # partners per photo by position or sequence; a run uses 20
 LOOK_ALIKES = 4  # further partners by appearance, since positions may be wrong
 AGAIN = 16  # partners tried for photos without a match
 THIN_PARTNERS = 2.5  # least median number of matched photos: with fewer, a run loses photos
-WELL_TOGETHER = 0.9  # least share of the photos in the largest component; else the capture is fragmented
-LEAST_TOGETHER = 0.2  # least share for a reconstruction
+WELL_CONNECTED = 0.9  # least share of the photos in the largest component; else the capture is fragmented
+MIN_CONNECTED = 0.2  # least share for a reconstruction
 OUTLINE_SHARE = 0.35  # half the width of a gap's outline as a share of its length
 
 
@@ -78,9 +78,9 @@ def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: in
     if pairing != "exhaustive":
         pairs |= nearest(range(count), alike(), LOOK_ALIKES)
     found = match_glimpses(glimpses, pairs, threads)
-    lonely = [k for piece in pieces_of(found, count)[1:] for k in piece]
-    if lonely and pairing != "exhaustive":
-        more = nearest(lonely, alike(), AGAIN) - pairs
+    unmatched = [k for piece in pieces_of(found, count)[1:] for k in piece]
+    if unmatched and pairing != "exhaustive":
+        more = nearest(unmatched, alike(), AGAIN) - pairs
         found |= match_glimpses(glimpses, more, threads)
     report.progress(1, 1, "matching quickly", "rounds")
     return MatchGraph(found, pieces_of(found, count))
@@ -101,7 +101,7 @@ def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]
     pieces = overlap.pieces
     if count < 2:
         return []
-    if len(pieces[0]) < max(2.0, LEAST_TOGETHER * count):
+    if len(pieces[0]) < max(2.0, MIN_CONNECTED * count):
         text = f"Hardly any photos overlap: at most {len(pieces[0])} of {count} are connected."
         hint = "This cannot be reconstructed: photos must overlap by two thirds, be sharp and show texture."
         return [Finding("no-overlap", "error", text, hint)]
@@ -109,13 +109,13 @@ def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]
     alone = tuple(sorted(names[piece[0]] for piece in pieces if len(piece) == 1))
     if alone:
         text = f"Matches no other photo: {some(alone)}." if len(alone) <= count / 10 else ""
-        text = text or f"{len(alone)} of {count} photos match no other one at low resolution."
+        text = text or f"{len(alone)} of {count} photos match no other photo at low resolution."
         hint = "A run will probably fail to place them: take more photos around them, with two thirds overlap."
         findings.append(Finding("orphan", "warning", text, hint, alone if len(alone) <= count / 10 else ()))
     islands = [piece for piece in pieces[1:] if len(piece) > 1]
     if islands:
-        told = "; ".join(some([names[k] for k in piece], 4) for piece in islands[:3])
-        text = f"The photos fall into {len(islands) + 1} groups that do not overlap: {told}"
+        groups = "; ".join(some([names[k] for k in piece], 4) for piece in islands[:3])
+        text = f"The photos fall into {len(islands) + 1} groups that do not overlap: {groups}"
         text += " …" if len(islands) > 3 else ""
         hint = "Take photos between the groups, to connect them."
         findings.append(Finding("pieces", "warning", f"{text}.", hint))

@@ -18,12 +18,12 @@ from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
 from splatpipe.pipeline.app.report.wording import count, length, plural
 
-MOST_PAIRS = 5_000  # lines; if there are more, those of weakly connected photos come first
+MAX_PAIRS = 5_000  # lines; if there are more, those of weakly connected photos come first
 STRENGTHS = ((0, "weak"), (25, "fair"), (80, "strong"))  # least number of matches of each class
 CLEAR_PAIRS = 120  # lines drawn opaque; more of them are fainter, so that what is below shows through
 FAINTEST = 0.25
 MANY = 400  # photos, whose dots are smaller
-MOST_NAMED = 40  # control points with their names on the map
+MAX_NAMED = 40  # control points with their names on the map
 RADIUS, MIDDLE = 880, 1000  # of the ring
 LETTERS = {"wide": 34, "everywhere": 60}  # letter height in the drawing's units: as in the style sheet, and on a phone
 LONGEST_TITLE = 120  # characters of a name in a tooltip
@@ -176,7 +176,7 @@ def _pairs(pairs: Sequence[MatchedPair], places: Mapping[int, tuple[int, int]], 
 def _strongest(pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
     """The pairs to draw, weakest first; if there are too many, each photo's strongest have priority."""
     ranked = sorted(pairs, key=lambda pair: (-pair.matches, pair.first, pair.second))
-    if len(ranked) > MOST_PAIRS:
+    if len(ranked) > MAX_PAIRS:
         held: dict[int, int] = {}
         needed = []  # for each pair, the smaller number of lines so far of its two photos
         for pair in ranked:
@@ -184,7 +184,7 @@ def _strongest(pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
             for photo in (pair.first, pair.second):
                 held[photo] = held.get(photo, 0) + 1
         order = sorted(range(len(ranked)), key=lambda i: (needed[i], i))
-        ranked = [ranked[i] for i in order[:MOST_PAIRS]]
+        ranked = [ranked[i] for i in order[:MAX_PAIRS]]
     return sorted(ranked, key=lambda pair: (pair.matches, pair.first, pair.second))
 
 
@@ -228,7 +228,7 @@ def _control(frame: MapFrame, preflight: Preflight) -> str:
         side = "end" if x > 0.85 * WIDTH else "start"
         away = -30 if side == "end" else 30
         text = _short(name)
-        room = labels.room(x + away, y + 12, text, side) if len(preflight.control) <= MOST_NAMED else ""
+        room = labels.room(x + away, y + 12, text, side) if len(preflight.control) <= MAX_NAMED else ""
         if room:
             spot = f'text-anchor="{side}" x="{x + away}" y="{y + 12}"'
             drawn.append(f'<text class="name {room}" {spot}>{escape(text)}</text>')

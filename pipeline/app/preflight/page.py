@@ -19,9 +19,9 @@ from splatpipe.pipeline.app.report.wording import count, duration, number, plura
 from splatpipe.pipeline.engine.durable import write_durably
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
-MOST_FINDINGS = 200
-MOST_NAMES = 300  # photos listed per finding
-MOST_CONTROL = 500  # rows
+MAX_FINDINGS = 200
+MAX_NAMES = 300  # photos listed per finding
+MAX_CONTROL = 500  # rows
 LEVELS: Mapping[Severity, Literal["note", "doubt", "bad"]] = {"error": "bad", "warning": "doubt", "note": "note"}
 SIGNS = {"bad": "✗", "doubt": "!", "note": "i"}
 
@@ -82,14 +82,14 @@ def check_page(preflight: Preflight) -> str:
         level=level,
         headline=headline,
         text=text,
-        findings=findings[:MOST_FINDINGS],
-        findings_more=max(0, len(findings) - MOST_FINDINGS),
+        findings=findings[:MAX_FINDINGS],
+        findings_more=max(0, len(findings) - MAX_FINDINGS),
         facts=_facts(preflight),
         drawing=overlap_map(preflight, _doubts(preflight)),
         steps=("1", "2", "3–4", "5–9", "10 or more"),
         gaps=[gap.text for gap in preflight.gaps],
-        control=preflight.control[:MOST_CONTROL],
-        control_more=max(0, len(preflight.control) - MOST_CONTROL),
+        control=preflight.control[:MAX_CONTROL],
+        control_more=max(0, len(preflight.control) - MAX_CONTROL),
         forecasts=[
             (_named(it), size(it.memory_bytes), roughly(it.seconds), roughly(it.cpu_seconds), size(it.disk_bytes),
              it.lacking)
@@ -129,7 +129,7 @@ def _named(forecast: PresetForecast) -> str:
 def _card(finding: Finding, pictures: list[FindingPicture]) -> FindingCard:
     level = LEVELS[finding.severity]
     names = [printable(name) for name in finding.photos]
-    return FindingCard(finding, level, SIGNS[level], pictures, names[:MOST_NAMES], max(0, len(names) - MOST_NAMES))
+    return FindingCard(finding, level, SIGNS[level], pictures, names[:MAX_NAMES], max(0, len(names) - MAX_NAMES))
 
 
 def _doubts(preflight: Preflight) -> dict[str, str]:

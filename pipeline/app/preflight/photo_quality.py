@@ -72,16 +72,16 @@ def find_exposures(
         hint = "Lock the exposure during a flight, or leave the photo out."
         code = "overexposed" if step > 0 else "underexposed"
         findings.append(Finding(code, "warning", text, hint, (name,)))
-    told = set(jumps)
+    reported = set(jumps)
     means = [glimpse.brightness.mean_level for glimpse in glimpses]
     whites, blacks = [g.brightness.white for g in glimpses], [g.brightness.black for g in glimpses]
-    findings += _empty(photos, "overexposed", whites, [mean > BRIGHT_LEVEL for mean in means], told)
-    findings += _empty(photos, "underexposed", blacks, [mean < DARK_LEVEL for mean in means], told)
+    findings += _empty(photos, "overexposed", whites, [mean > BRIGHT_LEVEL for mean in means], reported)
+    findings += _empty(photos, "underexposed", blacks, [mean < DARK_LEVEL for mean in means], reported)
     return findings
 
 
 def _empty(
-    photos: Sequence[CheckedPhoto], code: str, shares: Sequence[float], beyond: Sequence[bool], told: set[int]
+    photos: Sequence[CheckedPhoto], code: str, shares: Sequence[float], beyond: Sequence[bool], reported: set[int]
 ) -> list[Finding]:
     """Find mostly white or black photos, except those already reported."""
     level = "white" if code == "overexposed" else "black"
@@ -90,7 +90,7 @@ def _empty(
         text = f"Most photos are {level} over more than half of their pixels."
         return [Finding(code, "warning", text, "Correct the exposure: nothing can be matched in those areas.")]
     clipped = [share > max(CLIPPED, usual + CLIPPED_MORE) for share in shares]
-    found = [k for k in range(len(photos)) if k not in told and (clipped[k] or beyond[k])]
+    found = [k for k in range(len(photos)) if k not in reported and (clipped[k] or beyond[k])]
     if not found:
         return []
     names = tuple(photos[k].name for k in found)
@@ -123,8 +123,8 @@ def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures
             copies[photos[k].name] = photos[j].name
     if not copies:
         return []
-    told = [f"{printable(name)} is {printable(twin)} saved again" for name, twin in list(copies.items())[:5]]
+    descriptions = [f"{printable(name)} is {printable(twin)} saved again" for name, twin in list(copies.items())[:5]]
     more = f"; and {len(copies) - 5} more" if len(copies) > 5 else ""
-    text = f"Duplicate photos: {'; '.join(told)}{more}."
+    text = f"Duplicate photos: {'; '.join(descriptions)}{more}."
     hint = "Leave the copies out: they count twice, and a held-out photo may also be trained on."
     return [Finding("duplicate", "warning", text, hint, tuple(sorted({*copies, *copies.values()})))]

@@ -25,7 +25,7 @@ DOWN_DEG = -75.0  # gimbal pitch: views less steep show walls, which determine t
 ONE_HEIGHT = 0.1  # spread of the heights above take-off relative to their median
 OUTSIDE_SHARE = 0.3  # of the marks outside their photos: they were made in photos of another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
-REACH_SPACINGS, LEAST_REACH_M = 3.0, 60.0  # around photos whose viewing direction is unknown
+REACH_SPACINGS, MIN_REACH_M = 3.0, 60.0  # around photos whose viewing direction is unknown
 
 
 def origin_of(intake: Intake) -> tuple[float, float] | None:
@@ -182,7 +182,7 @@ def _outside(
         text = f"The points of {name} lie {np.median(nearest) / 1000.0:,.1f} km from the photos."
         return [Finding("control-outside", "error", text, "Check the CRS, its zone, and that east comes first.")]
     spacing = float(np.median(tree.query(positions, k=2)[0][:, 1])) if len(positions) > 1 else 0.0
-    reach = max(LEAST_REACH_M, REACH_SPACINGS * spacing)
+    reach = max(MIN_REACH_M, REACH_SPACINGS * spacing)
     off = [
         place.name
         for place, metres in zip(places, nearest.tolist(), strict=True)

@@ -70,27 +70,27 @@ def forecast_text(request: Request) -> str:
     needs = needs_of(work, machine_speed())
     need = whole(needs)
     seconds = sum(each.seconds(threads) for each in needs.values())
-    told = f"{size.photos:,} photos of {size.megapixels:.1f} megapixels take about {roughly(seconds)}, "
-    told += (
+    text = f"{size.photos:,} photos of {size.megapixels:.1f} megapixels take about {roughly(seconds)}, "
+    text += (
         f"{need.memory_bytes / 1e9:.1f} GB of memory and {(need.disk_bytes + need.scratch_bytes) / 1e9:.1f} GB of disk"
     )
     if config.train.time_budget_s:
-        return f"{told}."
+        return f"{text}."
     training = sum(needs[stage].seconds(threads) for stage in ("blocks", "train"))
-    told += f": training {roughly(training)}, {work.iterations:,} iterations"
+    text += f": training {roughly(training)}, {work.iterations:,} iterations"
     if work.blocks is not None:
-        told += f", {blocks_text(work.blocks)}"
+        text += f", {blocks_text(work.blocks)}"
     elif config.train.max_memory_bytes and work.most_gaussians < work.grown:
-        told += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos would support more"
-    return f"{told}."
+        text += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos would support more"
+    return f"{text}."
 
 
 def blocks_text(blocks: BlockWork) -> str:
     """How the scene is divided into blocks, and what a block needs, in words."""
     division = blocks.division
-    told = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians and "
-    told += f"{division.memory_bytes / 1e9:.1f} GB of memory at most"
-    return f"{told}, about {round(blocks.load.trained, -3):,.0f} Gaussians and {blocks.photos:.0f} photos each"
+    text = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians and "
+    text += f"{division.memory_bytes / 1e9:.1f} GB of memory at most"
+    return f"{text}, about {round(blocks.load.trained, -3):,.0f} Gaussians and {blocks.photos:.0f} photos each"
 
 
 def _on_cuda(request: Request) -> bool:

@@ -30,7 +30,7 @@ from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, viewer_rendering, viewer_scene, viewer_splat
 
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a running training
-COARSE_TOLD = "coarse.json"  # in the folder of blocks not laid out yet: the coarse pass is done
+COARSE_SUMMARY = "coarse.json"  # in the folder of blocks not laid out yet: the coarse pass is done
 FROZEN = "frozen.ply"  # beside a block's checkpoint: the fixed Gaussians rendered around it
 COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # of a scene in blocks
 JPEG_QUALITY = 92
@@ -71,66 +71,66 @@ class LoadedModel:
     iteration: int
 
 
-def newest(opened: Contents) -> ModelSource | None:
+def newest(contents: Contents) -> ModelSource | None:
     """The newest model of a training; None before it can begin."""
-    if "train.model" in opened.parts:
-        if "train.rendering" not in opened.parts:  # from an earlier version: its rendering settings are unknown
+    if "train.model" in contents.parts:
+        if "train.rendering" not in contents.parts:  # from an earlier version: its rendering settings are unknown
             return None
-        part = opened.parts.get("clean.model", opened.parts["train.model"])
-        rendering, sky = opened.parts["train.rendering"].path, opened.parts["train.sky"].path
+        part = contents.parts.get("clean.model", contents.parts["train.model"])
+        rendering, sky = contents.parts["train.rendering"].path, contents.parts["train.sky"].path
         return ModelSource(part.path, "model", part.digest[:16], rendering, sky)
-    folder = opened.working.get("train")
-    for at_work, rendering, block in _trainings(opened):
+    folder = contents.working.get("train")
+    for training, rendering, block in _trainings(contents):
         try:
-            facts = (at_work / CHECKPOINT).stat()
+            facts = (training / CHECKPOINT).stat()
             stamp = f"{facts.st_ino:x}-{facts.st_mtime_ns:x}"
             sky = rendering.with_name(COARSE_SKY)
             return ModelSource(
-                at_work / CHECKPOINT, "checkpoint", stamp, rendering, sky if sky.is_file() else None, block
+                training / CHECKPOINT, "checkpoint", stamp, rendering, sky if sky.is_file() else None, block
             )
         except OSError:
             continue
-    coarse = _coarse(opened)
+    coarse = _coarse(contents)
     if coarse is not None:
-        done = {part.path: part.digest[:16] for name, part in opened.parts.items() if name == "blocks.coarse"}
-        stamp = done.get(coarse) or f"{_moved(coarse / COARSE_MODEL):x}"
+        done = {part.path: part.digest[:16] for name, part in contents.parts.items() if name == "blocks.coarse"}
+        stamp = done.get(coarse) or f"{_mtime_ns(coarse / COARSE_MODEL):x}"
         return ModelSource(coarse / COARSE_MODEL, "coarse", stamp, coarse / RENDERING, coarse / COARSE_SKY)
-    if "initialize.splat" in opened.parts:
-        part = opened.parts["initialize.splat"]
+    if "initialize.splat" in contents.parts:
+        part = contents.parts["initialize.splat"]
         begun = folder is not None and (folder / RENDERING).is_file()
         return ModelSource(part.path, "initial", part.digest[:16], folder / RENDERING if folder and begun else None)
     return None
 
 
-def _coarse(opened: Contents) -> Path | None:
+def _coarse(contents: Contents) -> Path | None:
     """The coarse pass's model of a scene in blocks; None without blocks, or before it is done."""
-    part = opened.parts.get("blocks.coarse")
+    part = contents.parts.get("blocks.coarse")
     if part is not None and (part.path / COARSE_MODEL).is_file():
         return part.path
-    folder = opened.working.get("blocks")
-    return folder / "coarse" if folder is not None and (folder / COARSE_TOLD).is_file() else None
+    folder = contents.working.get("blocks")
+    return folder / "coarse" if folder is not None and (folder / COARSE_SUMMARY).is_file() else None
 
 
-def _trainings(opened: Contents) -> list[tuple[Path, Path, int]]:
+def _trainings(contents: Contents) -> list[tuple[Path, Path, int]]:
     """Running trainings: checkpoint, rendering settings, and block number (0 for the whole scene or a coarse pass).
 
     The block updated last comes first.
     """
     found = []
-    if "train" in opened.working:
-        found.append((opened.working["train"], opened.working["train"] / RENDERING, 0))
-    if (coarse := _coarse(opened)) is not None:
-        blocks = [(_moved(folder / CHECKPOINT), name, folder) for name, folder in opened.working.items()]
+    if "train" in contents.working:
+        found.append((contents.working["train"], contents.working["train"] / RENDERING, 0))
+    if (coarse := _coarse(contents)) is not None:
+        blocks = [(_mtime_ns(folder / CHECKPOINT), name, folder) for name, folder in contents.working.items()]
         blocks = [each for each in blocks if each[1].startswith("train.")]
         for _, name, folder in sorted(blocks, reverse=True):
             found.append((folder, coarse / RENDERING, int(name.removeprefix("train."))))
-    if "blocks" in opened.working:
-        folder = opened.working["blocks"] / "coarse"
+    if "blocks" in contents.working:
+        folder = contents.working["blocks"] / "coarse"
         found.append((folder, folder / RENDERING, 0))
     return found
 
 
-def _moved(path: Path) -> int:
+def _mtime_ns(path: Path) -> int:
     try:
         return path.stat().st_mtime_ns
     except OSError:
@@ -150,14 +150,14 @@ def iteration_of(source: ModelSource) -> int | None:
         return None
 
 
-def load(source: ModelSource, opened: Contents) -> LoadedModel:
+def load(source: ModelSource, contents: Contents) -> LoadedModel:
     """Read a model for rendering.
 
     Raises:
         SplatpipeError: if it cannot be read, e.g. if a checkpoint was replaced meanwhile.
     """
     if source.kind == "checkpoint":
-        gaussians, sky = _from_checkpoint(source.path, opened)
+        gaussians, sky = _from_checkpoint(source.path, contents)
         if sky is None and source.sky is not None:
             sky = read_panorama(source.sky)
     else:
@@ -169,32 +169,32 @@ def load(source: ModelSource, opened: Contents) -> LoadedModel:
     return LoadedModel(gaussians, sky, options, megapixels, iteration_of(source) or 0)
 
 
-def views_of(opened: Contents) -> tuple[View, ...]:
+def views_of(contents: Contents) -> tuple[View, ...]:
     """The training and held-out views; empty before they are undistorted."""
-    part = opened.parts.get("undistort.dataset")
+    part = contents.parts.get("undistort.dataset")
     if part is None:
         return ()
     folder = part.path.resolve()  # an OUT from elsewhere may refer to images outside it
     return tuple(view for view in load_views(part.path) if view.image_path.resolve().is_relative_to(folder))
 
 
-def held_out_of(opened: Contents) -> Sequence[str]:
+def held_out_of(contents: Contents) -> Sequence[str]:
     """Names of the held-out photos; empty before they are chosen."""
-    part = opened.parts.get("split.views")
+    part = contents.parts.get("split.views")
     try:
         return () if part is None else load_split(part.path).held_out
     except StageError:
         return ()
 
 
-def device_of(opened: Contents, logged: str) -> str:
+def device_of(contents: Contents, logged: str) -> str:
     """The device that training was given, or that of the run if training is not done.
 
     Args:
-        opened: The run.
+        contents: The run.
         logged: The device of its last run, from its log.
     """
-    done = opened.artifacts.get("train")
+    done = contents.artifacts.get("train")
     machine = None if done is None else done.manifest.get("machine")
     return str(machine.get("device", logged)) if isinstance(machine, Mapping) else logged
 
@@ -214,13 +214,13 @@ def pictures(shown: LoadedModel, view: View, threads: int, device: str = "auto")
     """
     camera, photo, _ = reduced_view(view, min(JUDGED_MEGAPIXELS, shown.megapixels or JUDGED_MEGAPIXELS))
     with same_bits(threads):
-        render = None if device == "cpu" else _on_card(shown, camera)
+        render = None if device == "cpu" else _render_on_gpu(shown, camera)
         if render is None:
-            render = _rendered(shown, camera, cpu())
+            render = _render(shown, camera, cpu())
     return _jpeg(render), _jpeg(photo)
 
 
-def _on_card(shown: LoadedModel, camera: Camera) -> Pixels | None:
+def _render_on_gpu(shown: LoadedModel, camera: Camera) -> Pixels | None:
     """A render by the GPU; None without a GPU or with too little free memory."""
     try:
         device = choose_device("auto")
@@ -229,41 +229,41 @@ def _on_card(shown: LoadedModel, camera: Camera) -> Pixels | None:
         free, whole = torch.cuda.mem_get_info(device.tensors)
         if free - RENDER_BYTES * len(shown.gaussians) < LEFT_SHARE * whole:
             return None
-        return _rendered(shown, camera, device)
+        return _render(shown, camera, device)
     except (torch.OutOfMemoryError, MachineError):
         return None
     finally:
         torch.cuda.empty_cache()  # does nothing if CUDA was not used
 
 
-def _rendered(shown: LoadedModel, camera: Camera, device: Device) -> Pixels:
+def _render(shown: LoadedModel, camera: Camera, device: Device) -> Pixels:
     return render_pixels(placed((shown.gaussians, shown.sky), device), camera, shown.options)
 
 
-def viewer(shown: LoadedModel, source: ModelSource, opened: Contents, name: str) -> tuple[str, bytes]:
+def viewer(shown: LoadedModel, source: ModelSource, contents: Contents, name: str) -> tuple[str, bytes]:
     """The 3D viewer's page of a model, and the splat file ``SPLAT`` that it loads from beside it.
 
     Args:
         shown: The model.
         source: Its source.
-        opened: The run.
+        contents: The run.
         name: The run's name.
 
     Raises:
         SplatpipeError: if the run is not georeferenced yet or cannot be read.
     """
-    if source.rendering is None or not {"georef.frame", "undistort.dataset"} <= set(opened.parts):
+    if source.rendering is None or not {"georef.frame", "undistort.dataset"} <= set(contents.parts):
         raise SplatpipeError("There is nothing to show in 3D yet.")
-    frame = load_frame(opened.parts["georef.frame"].path)
+    frame = load_frame(contents.parts["georef.frame"].path)
     gaussians = in_world(shown.gaussians, frame)
-    look = viewer_rendering(shown.options, shown.sky)
-    dataset, held_out = opened.parts["undistort.dataset"].path, set(held_out_of(opened))
+    rendering = viewer_rendering(shown.options, shown.sky)
+    dataset, held_out = contents.parts["undistort.dataset"].path, set(held_out_of(contents))
     title = f"{name}, iteration {shown.iteration:,}"
-    scene = viewer_scene(dataset, frame, look, held_out, len(gaussians), title)
+    scene = viewer_scene(dataset, frame, rendering, held_out, len(gaussians), title)
     return viewer_page(scene, SPLAT), viewer_splat(gaussians, scene.antialias)
 
 
-def _from_checkpoint(path: Path, opened: Contents) -> tuple[Gaussians, Panorama | None]:
+def _from_checkpoint(path: Path, contents: Contents) -> tuple[Gaussians, Panorama | None]:
     """The Gaussians as rendered, and the sky; only the arrays needed for that are read from the file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -277,9 +277,9 @@ def _from_checkpoint(path: Path, opened: Contents) -> tuple[Gaussians, Panorama 
     if frozen.is_file():
         gaussians = Gaussians.concat([gaussians, read_splat(frozen)])
     sky = None
-    if colours is not None and "georef.frame" in opened.parts:
+    if colours is not None and "georef.frame" in contents.parts:
         # A checkpoint does not store the up direction; the frame's is within a cell of it.
-        up = load_frame(opened.parts["georef.frame"].path).world_from_model.rotation[2]
+        up = load_frame(contents.parts["georef.frame"].path).world_from_model.rotation[2]
         sky = Panorama(np.asarray(up, np.float64), colours)
     return gaussians, sky
 

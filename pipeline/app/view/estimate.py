@@ -34,16 +34,15 @@ from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, SurveyPo
 
 Marks = Mapping[str, Mapping[str, tuple[float, float]]]
 UNKNOWN_HEIGHT_M = 5.0  # of a point without a height, or while the vertical datum is unknown
-LEAST_RADIUS_PX = 6.0
+MIN_RADIUS_PX = 6.0
 SURFACE_RADIUS_M = 8.0  # around a point: its height is taken from the sparse points within
-LEAST_NEAR = 3  # sparse points needed for a height
+MIN_NEAR = 3  # sparse points needed for a height
 RAY_TOLERANCE = 1e-3  # of x/z; beyond it, the lens model has folded a ray outside the image back into it
-BEYOND = np.array(
-    [0.5, 2.0]
-)  # times a photo's nearest and farthest sparse point depths: the range in which a mark's ray is followed
+# Times a photo's nearest and farthest sparse point depths: the range in which a mark's ray is followed.
+BEYOND = np.array([0.5, 2.0])
 LINE_STEPS = 48  # along the ray: lens distortion bends its image
 NEIGHBOURS = 30  # sparse points around a place: in a photo that shows none of them, the place is most likely occluded
-MOST_WITNESSES = 50_000  # sparse points searched for them
+MAX_WITNESSES = 50_000  # sparse points searched for them
 HELPFUL_MARKS = 4  # of a point: further marks add little
 
 
@@ -128,14 +127,16 @@ class Estimator:
         Args:
             marks: Pixel coordinates by point and photo; (0, 0) is the top-left corner of the first pixel.
         """
-        job, told = self._job, WarningCollector()
+        job, collector = self._job, WarningCollector()
         points = [self._locate(k, marks.get(point.name, {})) for k, point in enumerate(job.points)]
         survey = self._survey(points)
         try:
-            fitted = self._fit(survey, told)
+            fitted = self._fit(survey, collector)
         except (NoPlaceError, SplatpipeError) as error:
             if marks_many(points):
-                told.warnings.append(str(error) if isinstance(error, SplatpipeError) else f"No frame yet: {error}.")
+                collector.warnings.append(
+                    str(error) if isinstance(error, SplatpipeError) else f"No frame yet: {error}."
+                )
             fitted = None
         survey = fitted.survey if fitted is not None else survey
         located = [point.found for point in survey.points]
@@ -143,7 +144,9 @@ class Estimator:
         places = np.array([np.full(3, np.nan) if found is None else found.xyz for found in located]).reshape(-1, 3)
         radius, residual = np.zeros(len(points)), np.full((len(points), 3), np.nan)
         if fitted is None:
-            return Estimate(survey, {}, None, False, None, places, radius, by_marks, residual, tuple(told.warnings))
+            return Estimate(
+                survey, {}, None, False, None, places, radius, by_marks, residual, tuple(collector.warnings)
+            )
         site, similarity = fitted.site, fitted.fit.similarity
         known = np.isfinite(site.targets.sigmas)
         residual[by_marks] = np.where(
@@ -155,7 +158,9 @@ class Estimator:
         tables = accuracy_json(survey, site, placed, gsd)["tables"]
         sigmas = self._sigmas(fitted)
         tied = any(point.surveyed.z is not None for point in survey.of_role("control"))
-        return Estimate(survey, tables, sigmas, tied, gsd, places, radius, by_marks, residual, tuple(told.warnings))
+        return Estimate(
+            survey, tables, sigmas, tied, gsd, places, radius, by_marks, residual, tuple(collector.warnings)
+        )
 
     def _locate(self, number: int, marks: Mapping[str, tuple[float, float]]) -> SurveyPoint:
         job, point = self._job, self._job.points[number]
@@ -172,13 +177,13 @@ class Estimator:
         file = ControlFile(job.crs.text, job.points, ())
         return Survey(file, job.crs, job.text.path.name, tuple(with_roles(points, job.config.check_points)))
 
-    def _fit(self, survey: Survey, told: WarningCollector) -> _GeoreferencedSite:
+    def _fit(self, survey: Survey, collector: WarningCollector) -> _GeoreferencedSite:
         job, stations = self._job, self._stations
         site = make_site(survey, self._geodetic, stations, job.frame, job.config)
         start = start_similarity(site, survey, job.model, job.positions, job.frame)
         if not survey.of_role("control"):
             start = (self._lifted(start[0], site), start[1])
-        survey = name_blunders(survey, site, job.model, start, job.config, told)
+        survey = name_blunders(survey, site, job.model, start, job.config, collector)
         observed = observed_in(site, survey, job.model, start[0].scale, job.config.mark_sigma_px)
         fit = fit_jointly(start[0], observed, start[1])
         require_fit(fit, observed, survey)
@@ -192,7 +197,7 @@ class Estimator:
         lifts = []
         for place in site.targets.enu[np.isfinite(site.targets.sigmas[:, 2])]:
             near = np.linalg.norm(cloud[:, :2] - place[:2], axis=1) < SURFACE_RADIUS_M
-            if near.sum() >= LEAST_NEAR:
+            if near.sum() >= MIN_NEAR:
                 lifts.append(place[2] - np.median(cloud[near, 2]))
         lift = float(np.median(lifts)) if lifts else 0.0
         return replace(similarity, translation=similarity.translation + np.array([0.0, 0.0, lift]))
@@ -282,7 +287,7 @@ class Projector:
             true = np.abs(back - seen[ahead, :2] / seen[ahead, 2:]).max(axis=1) < RAY_TOLERANCE
             shown = shown / view.scale
             focal = view.camera.mean_focal_length() / view.scale
-            spread = np.maximum(LEAST_RADIUS_PX, focal * radius_m[ahead] / seen[ahead, 2])
+            spread = np.maximum(MIN_RADIUS_PX, focal * radius_m[ahead] / seen[ahead, 2])
             margin = np.minimum(spread, 0.25 * photo.width)[:, None]
             inside = true & ((shown >= -margin) & (shown <= np.array([photo.width, photo.height]) + margin)).all(axis=1)
             rows = ahead[inside]
@@ -318,7 +323,7 @@ class Projector:
 def _cloud_of(model: SparseModel) -> tuple[Float64[np.ndarray, "k 3"], Bool[np.ndarray, "k m"]]:
     """Sparse points, evenly thinned if there are many, and which photos show each."""
     every = sorted(model.reconstruction.points3D.items())
-    chosen = [point for _, point in every[:: max(1, len(every) // MOST_WITNESSES)]]
+    chosen = [point for _, point in every[:: max(1, len(every) // MAX_WITNESSES)]]
     number = {image: k for k, image in enumerate(model.image_ids)}
     shows = np.zeros((len(chosen), len(model.image_ids)), dtype=bool)
     for row, point in enumerate(chosen):

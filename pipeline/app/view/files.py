@@ -32,7 +32,7 @@ TYPES = {
 }
 
 
-class NotThereError(Exception):
+class FileNotServedError(Exception):
     """A path is not a file inside its folder; the reason is not disclosed."""
 
 
@@ -53,11 +53,11 @@ def open_inside(folder: Path, relative: str) -> OpenFile:
         relative: POSIX path below it.
 
     Raises:
-        NotThereError: if it does not exist, or only outside the folder.
+        FileNotServedError: if it does not exist, or only outside the folder.
     """
     parts = PurePosixPath(relative).parts
     if not parts or any(part in ("..", "/") or "\0" in part for part in parts):
-        raise NotThereError
+        raise FileNotServedError
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK  # does not block on a pipe
     descriptor = -1
     try:
@@ -68,11 +68,11 @@ def open_inside(folder: Path, relative: str) -> OpenFile:
             os.close(above)
         facts = os.fstat(descriptor)
         if not stat.S_ISREG(facts.st_mode):
-            raise NotThereError
-    except (OSError, NotThereError, ValueError) as error:
+            raise FileNotServedError
+    except (OSError, FileNotServedError, ValueError) as error:
         if descriptor >= 0:
             os.close(descriptor)
-        raise NotThereError from error
+        raise FileNotServedError from error
     return OpenFile(descriptor, facts.st_size, f'"{facts.st_ino:x}-{facts.st_size:x}-{facts.st_mtime_ns:x}"')
 
 
@@ -80,12 +80,12 @@ def is_inside(folder: Path, relative: str) -> bool:
     """Whether ``open_inside`` can open it."""
     try:
         os.close(open_inside(folder, relative).descriptor)
-    except NotThereError:
+    except FileNotServedError:
         return False
     return True
 
 
-def wanted_range(header: str | None, size: int) -> tuple[int, int] | None:
+def parse_range(header: str | None, size: int) -> tuple[int, int] | None:
     """Parse a Range header: the first byte and the one after the last; None for the whole file.
 
     Multiple ranges and units other than bytes are answered with the whole file (RFC 9110, 14.2).
@@ -123,14 +123,14 @@ class FileAnswer(Response):
             os.close(self._file.descriptor)
 
     async def _answer(self, request: Request, send: Send) -> None:
-        asked, size, tag = request.headers, self._file.size, self._file.tag
+        headers, size, tag = request.headers, self._file.size, self._file.tag
         self.headers["etag"], self.headers["accept-ranges"] = tag, "bytes"
         begin, end, status = 0, size, 200
-        if tag in [each.strip() for each in asked.get("if-none-match", "").split(",")]:
+        if tag in [each.strip() for each in headers.get("if-none-match", "").split(",")]:
             end, status = 0, 304
-        elif asked.get("if-range", tag) == tag:
+        elif headers.get("if-range", tag) == tag:
             try:
-                found = wanted_range(asked.get("range"), size)
+                found = parse_range(headers.get("range"), size)
             except IndexError:
                 end, status = 0, 416
                 self.headers["content-range"] = f"bytes */{size}"

@@ -120,7 +120,7 @@ def _check_writing(headers: Headers, token: str) -> None:
     if not secrets.compare_digest(headers.get(TOKEN_HEADER, "").encode(), token.encode()):
         raise RefusedError(403, "Only the page of this server may write. Load it again.")
     if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise RefusedError(415, "It takes JSON.")
+        raise RefusedError(415, "The request must be JSON.")
     length = headers.get("content-length", "")
     if not (length.isascii() and length.isdigit()):
         raise RefusedError(411, "Content-Length is required.")
@@ -131,7 +131,7 @@ def _check_writing(headers: Headers, token: str) -> None:
 def _only(headers: Iterable[tuple[bytes, bytes]], name: bytes, title: str) -> str:
     found = [value for key, value in headers if key == name]
     if len(found) != 1:
-        raise RefusedError(400, f"It takes one {title}.")
+        raise RefusedError(400, f"Exactly one {title} header is required.")
     return found[0].decode("latin-1")
 
 

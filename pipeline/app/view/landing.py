@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
-from splatpipe.pipeline.app.view.files import NotThereError, is_inside, open_inside
+from splatpipe.pipeline.app.view.files import FileNotServedError, is_inside, open_inside
 from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
@@ -64,7 +64,7 @@ def _state(log: RunLog, at_work: bool) -> dict[str, str]:
     failed = next((stage for stage in log.stages.values() if stage.state == "failed"), None)
     running = next((stage for stage in log.stages.values() if stage.state == "running"), None)
     if at_work:
-        return {"kind": "running", "text": "At work" + (f": {running.name}." if running else ".")}
+        return {"kind": "running", "text": "Running" + (f": {running.name}." if running else ".")}
     if failed is not None:
         return {"kind": "failed", "text": f"Ended in {failed.name}: {failed.message}"}
     if log.stages and all(stage.state in ("done", "reused") for stage in log.stages.values()):
@@ -113,7 +113,7 @@ def _read_json(run: RunFolder, name: str) -> Mapping[str, JSON]:
         file = open_inside(run.out, name)
         with os.fdopen(file.descriptor, "rb") as stream:
             found = json.loads(stream.read(LARGEST_METRICS))
-    except (NotThereError, ValueError, RecursionError):
+    except (FileNotServedError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -19,8 +19,8 @@ from splatpipe.pipeline.photos.dataset import View
 if TYPE_CHECKING:  # torch takes seconds to load, and marking does not need it
     from splatpipe.pipeline.app.view.checkpoint_render import LoadedModel, ModelSource
 
-LOOK_EVERY_S = 2.0
-MOST_PICTURES = 64  # cached pairs of JPEGs of about 100 kB
+REFRESH_INTERVAL_S = 2.0
+MAX_PICTURES = 64  # cached pairs of JPEGs of about 100 kB
 RENDER_THREADS = 1  # the training needs the others
 CURVES = ("loss", "gaussians")
 
@@ -36,8 +36,8 @@ class Live:
         self._run = run
         self._lock = threading.Lock()
         self._log = RunLog(run.out, EVENTS_FILE)
-        self._opened = Contents()
-        self._looked_s = -LOOK_EVERY_S
+        self._contents = Contents()
+        self._refreshed_s = -REFRESH_INTERVAL_S
         self._renderer = ThreadPoolExecutor(1, "render")  # one at a time
         self._model: tuple[str, LoadedModel] | None = None
         self._viewer: tuple[str, bytes, bytes] | None = None
@@ -54,10 +54,10 @@ class Live:
 
         with self._lock:
             self._log.read()
-            opened, views = self._look()
+            contents, views = self._refresh()
             log = self._log
-            source = checkpoint_render.newest(opened)
-            held_out = set(checkpoint_render.held_out_of(opened))
+            source = checkpoint_render.newest(contents)
+            held_out = set(checkpoint_render.held_out_of(contents))
             model: JSON = None
             if source is not None and views:
                 model = {
@@ -97,8 +97,8 @@ class Live:
         Raises:
             SplatpipeError: if it cannot be made.
         """
-        made = self._renderer.submit(self._make, number).result()
-        return None if made is None else made[0 if what == "render" else 1]
+        jpegs = self._renderer.submit(self._render, number).result()
+        return None if jpegs is None else jpegs[0 if what == "render" else 1]
 
     def viewer(self, what: str) -> bytes | None:
         """The 3D viewer of the latest model: its ``page``, or the ``splat`` that it loads; None if there is none.
@@ -106,62 +106,62 @@ class Live:
         Raises:
             SplatpipeError: if it cannot be made.
         """
-        made = self._renderer.submit(self._make_viewer).result()
-        return None if made is None else made[0 if what == "page" else 1]
+        files = self._renderer.submit(self._make_viewer).result()
+        return None if files is None else files[0 if what == "page" else 1]
 
     def _make_viewer(self) -> tuple[bytes, bytes] | None:
         from splatpipe.pipeline.app.view import checkpoint_render
 
         with self._lock:
-            opened, _ = self._look()
-        source = checkpoint_render.newest(opened)
+            contents, _ = self._refresh()
+        source = checkpoint_render.newest(contents)
         if source is None:
             return None
         if self._viewer is None or self._viewer[0] != source.stamp:
-            page, splat = checkpoint_render.viewer(self._load(source, opened), source, opened, self._run.name)
+            page, splat = checkpoint_render.viewer(self._load(source, contents), source, contents, self._run.name)
             self._viewer = source.stamp, page.encode(), splat
         return self._viewer[1:]
 
-    def _load(self, source: ModelSource, opened: Contents) -> LoadedModel:
+    def _load(self, source: ModelSource, contents: Contents) -> LoadedModel:
         from splatpipe.pipeline.app.view import checkpoint_render
 
         if self._model is None or self._model[0] != source.stamp:
             self._model = None  # two models may not fit in memory
-            self._model = source.stamp, checkpoint_render.load(source, opened)
+            self._model = source.stamp, checkpoint_render.load(source, contents)
         return self._model[1]
 
-    def _make(self, number: int) -> tuple[bytes, bytes] | None:
+    def _render(self, number: int) -> tuple[bytes, bytes] | None:
         from splatpipe.pipeline.app.view import checkpoint_render
 
         with self._lock:
-            opened, views = self._look()
-            device = checkpoint_render.device_of(opened, self._log.device)
-        source = checkpoint_render.newest(opened)
+            contents, views = self._refresh()
+            device = checkpoint_render.device_of(contents, self._log.device)
+        source = checkpoint_render.newest(contents)
         if source is None or not 0 <= number < len(views):
             return None
         if (source.stamp, number) in self._pictures:
             return self._pictures[source.stamp, number]
-        shown = self._load(source, opened)
+        shown = self._load(source, contents)
         if shown.megapixels is None:
             shown = replace(shown, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
-        made = checkpoint_render.pictures(shown, views[number], RENDER_THREADS, device)
-        self._pictures[source.stamp, number] = made
-        while len(self._pictures) > MOST_PICTURES:
+        jpegs = checkpoint_render.pictures(shown, views[number], RENDER_THREADS, device)
+        self._pictures[source.stamp, number] = jpegs
+        while len(self._pictures) > MAX_PICTURES:
             self._pictures.popitem(last=False)
-        return made
+        return jpegs
 
-    def _look(self) -> tuple[Contents, tuple[View, ...]]:
-        """The run's contents and views, at most ``LOOK_EVERY_S`` old; called with the lock held."""
+    def _refresh(self) -> tuple[Contents, tuple[View, ...]]:
+        """The run's contents and views, at most ``REFRESH_INTERVAL_S`` old; called with the lock held."""
         from splatpipe.pipeline.app.view import checkpoint_render
 
-        if time.monotonic() - self._looked_s >= LOOK_EVERY_S:
-            self._opened = contents_of(self._run, self._log)
-            self._looked_s = time.monotonic()
-            part = self._opened.parts.get("undistort.dataset")
+        if time.monotonic() - self._refreshed_s >= REFRESH_INTERVAL_S:
+            self._contents = contents_of(self._run, self._log)
+            self._refreshed_s = time.monotonic()
+            part = self._contents.parts.get("undistort.dataset")
             path = None if part is None else part.path
             if path != self._views[0]:
                 try:
-                    self._views = path, checkpoint_render.views_of(self._opened)
+                    self._views = path, checkpoint_render.views_of(self._contents)
                 except SplatpipeError:
                     self._views = None, ()
-        return self._opened, self._views[1]
+        return self._contents, self._views[1]

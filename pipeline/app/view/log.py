@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatpipe.pipeline.app.view.files import NotThereError, open_inside
+from splatpipe.pipeline.app.view.files import FileNotServedError, open_inside
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import parse_event
 from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
@@ -17,8 +17,8 @@ from splatpipe.stages.options import LineConfig
 
 LONGEST_LINE = 1 << 18
 READ_AT_ONCE = 8 << 20
-MOST_POINTS = 2000  # of a curve: twice the width of a screen
-MOST_NOTES = 200
+MAX_POINTS = 2000  # of a curve: twice the width of a screen
+MAX_NOTES = 200
 RATE_WINDOW_S = 60.0  # for the estimate of the time left: iterations slow down as the model grows
 
 
@@ -94,7 +94,7 @@ class Curve:
         if self.seen % self.stride:
             return
         self.points.append((step, value))
-        if len(self.points) > MOST_POINTS:
+        if len(self.points) > MAX_POINTS:
             self.points = self.points[::2]
             self.stride *= 2
 
@@ -127,7 +127,7 @@ class RunLog:
         """Read what was written since the last call; a replaced or truncated log is read from the start."""
         try:
             file = open_inside(self._out, self._name)
-        except NotThereError:
+        except FileNotServedError:
             return
         try:
             inode = file.tag.partition("-")[0]
@@ -143,11 +143,11 @@ class RunLog:
                 *lines, self._rest = (self._rest + chunk).split(b"\n")
                 self._rest = self._rest[: LONGEST_LINE + 1]
                 for line in lines:
-                    self._take(line)
+                    self._process(line)
         finally:
             os.close(file.descriptor)
 
-    def _take(self, line: bytes) -> None:
+    def _process(self, line: bytes) -> None:
         """Process a line; invalid ones are skipped, since the log is not trusted."""
         if len(line) > LONGEST_LINE:
             return
@@ -175,8 +175,8 @@ class RunLog:
                 self.curves_of = stage
                 self.curves.setdefault(str(data["name"]), Curve()).add(int(step), value)
         elif kind in ("note", "warning"):
-            told = {"kind": kind, "stage": stage, "message": str(data["message"]), "hint": str(data.get("hint", ""))}
-            self.notes = [*self.notes, told][-MOST_NOTES:]
+            note = {"kind": kind, "stage": stage, "message": str(data["message"]), "hint": str(data.get("hint", ""))}
+            self.notes = [*self.notes, note][-MAX_NOTES:]
         elif stage_name(stage) in self.stages:
             if stage not in self.stages:  # a shard that starts
                 known = {**self.stages, stage: StageState(stage)}

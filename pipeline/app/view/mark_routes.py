@@ -71,24 +71,24 @@ class MarkPages:
         return Response(data, media_type=kind, headers=headers)
 
     def _change(self, request: Request) -> Response:
-        asked = _body(request)
-        point, photo = _number(asked, "point", len(self._names)), _number(asked, "photo", len(self._marking.photos))
-        after = _state(asked)
+        body = _body(request)
+        point, photo = _number(body, "point", len(self._names)), _number(body, "photo", len(self._marking.photos))
+        after = _state(body)
         try:
             self._marking.change(
-                self._names[point], self._marking.photos[photo], after, nudge=asked.get("nudge") is True
+                self._names[point], self._marking.photos[photo], after, nudge=body.get("nudge") is True
             )
         except WrongRequestError as error:
             raise HTTPException(400, str(error)) from error
         return self._answer(point)
 
     def _undo(self, request: Request) -> Response:
-        return self._turned(self._marking.undo(), request)
+        return self._answer_change(self._marking.undo(), request)
 
     def _redo(self, request: Request) -> Response:
-        return self._turned(self._marking.redo(), request)
+        return self._answer_change(self._marking.redo(), request)
 
-    def _turned(self, change: Change | None, _request: Request) -> Response:
+    def _answer_change(self, change: Change | None, _request: Request) -> Response:
         if change is None:
             return JSONResponse({"overview": self._marking.overview()})
         return self._answer(self._names.index(change.point), self._marking.photos.index(change.photo))
@@ -108,29 +108,29 @@ def _body(request: Request) -> dict[str, Any]:
     try:
         found = json.loads(request.scope["splatpipe.body"])
     except (ValueError, RecursionError) as error:
-        raise HTTPException(400, "It takes JSON.") from error
+        raise HTTPException(400, "The request must be JSON.") from error
     if not isinstance(found, dict):
-        raise HTTPException(400, "It takes a JSON object.")
+        raise HTTPException(400, "The request must be a JSON object.")
     return found
 
 
-def _number(asked: dict[str, Any], name: str, count: int) -> int:
-    found = asked.get(name)
+def _number(body: dict[str, Any], name: str, count: int) -> int:
+    found = body.get(name)
     if type(found) is not int or not 0 <= found < count:
-        raise HTTPException(400, f"It takes a {name}.")
+        raise HTTPException(400, f"The request must have a valid {name}.")
     return found
 
 
-def _state(asked: dict[str, Any]) -> State:
-    action = asked.get("action")
+def _state(body: dict[str, Any]) -> State:
+    action = body.get("action")
     if action not in ACTIONS:
-        raise HTTPException(400, "It takes an action: mark, unmark or hide.")
+        raise HTTPException(400, "The action must be mark, unmark or hide.")
     if action != "mark":
         return "hidden" if action == "hide" else None
-    x, y = asked.get("x"), asked.get("y")
+    x, y = body.get("x"), body.get("y")
     if type(x) not in (int, float) or type(y) not in (int, float):
-        raise HTTPException(400, "It takes x and y.")
+        raise HTTPException(400, "The request must have x and y.")
     try:
         return float(x), float(y)  # type: ignore[arg-type]
     except OverflowError as error:
-        raise HTTPException(400, "It takes x and y.") from error
+        raise HTTPException(400, "The request must have x and y.") from error

@@ -29,7 +29,7 @@ from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.control_file import SurveyedPoint
 
-MOST_UNDONE = 10_000
+MAX_UNDO = 10_000
 WIDE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing
 HELPFUL_PHOTOS = 20  # of a point, ordered by how much they help; the rest follow by distance
 DIGITS = 2  # decimal places of pixel coordinates in the file
@@ -89,7 +89,7 @@ class Marking:
         """
         after = self._checked(point, photo, after)
         with self._lock:
-            text = self._fresh()
+            text = self._current_text()
             before = self._state(text, point, photo)
             if before == after:
                 return
@@ -98,23 +98,23 @@ class Marking:
             if nudge and last is not None and (last.point, last.photo, last.after) == (point, photo, before):
                 self._done[-1] = replace(last, after=after)
             else:
-                self._done = [*self._done[-MOST_UNDONE:], Change(point, photo, before, after)]
+                self._done = [*self._done[-MAX_UNDO:], Change(point, photo, before, after)]
             self._undone.clear()
 
     def undo(self) -> Change | None:
         """Undo the last change and return it; None if there is none."""
-        return self._turn(self._done, self._undone, back=True)
+        return self._move_change(self._done, self._undone, back=True)
 
     def redo(self) -> Change | None:
         """Redo the last undone change and return it; None if there is none."""
-        return self._turn(self._undone, self._done, back=False)
+        return self._move_change(self._undone, self._done, back=False)
 
-    def _turn(self, source: list[Change], target: list[Change], back: bool) -> Change | None:
+    def _move_change(self, source: list[Change], target: list[Change], back: bool) -> Change | None:
         with self._lock:
             if not source:
                 return None
             change = source[-1]
-            text = self._fresh()
+            text = self._current_text()
             now = self._state(text, change.point, change.photo)
             self._write(text, replace(change, before=now, after=change.before if back else change.after))
             target.append(source.pop())
@@ -133,7 +133,7 @@ class Marking:
             raise WrongRequestError("The position is outside the photo.")
         return x, y
 
-    def _fresh(self) -> ControlText:
+    def _current_text(self) -> ControlText:
         """The file's current content, including changes by others; a deleted file is restored."""
         if self.job.text.path.is_file():
             return ControlText.read(self.job.text.path, NameFinder(self._photos))
@@ -161,11 +161,9 @@ class Marking:
         """All points and the estimates from the marks, for the lists beside the photo."""
         with self._lock:
             revision, estimate, projection = self._estimate()
-            marks, found, hidden = self._text.marks, self._found(), self._text.hidden
+            marks, found, hidden = self._text.marks, self._detections(), self._text.hidden
             can_undo, can_redo = bool(self._done), bool(self._undone)
-        points = [
-            self._told_point(k, estimate, projection, (marks, found), hidden) for k in range(len(self.job.points))
-        ]
+        points = [self._point_row(k, estimate, projection, (marks, found), hidden) for k in range(len(self.job.points))]
         return {
             "revision": revision,
             "file": str(self.job.text.path),
@@ -197,7 +195,7 @@ class Marking:
             raise WrongRequestError("There is no such point.")
         with self._lock:
             revision, estimate, projection = self._estimate()
-            marks, found = self._text.marks.get(name, {}), self._found().get(name, {})
+            marks, found = self._text.marks.get(name, {}), self._detections().get(name, {})
             hidden = self._text.hidden
         number = list(self._points).index(name)
         shown = {s.photo: s for s in estimate.survey.points[number].sightings}
@@ -205,7 +203,7 @@ class Marking:
         lines = self._lines(estimate, number)
         rows = []
         for photo in self._photos:
-            row = self._seen(photo, index.get(photo), number, projection)
+            row = self._photo_row(photo, index.get(photo), number, projection)
             sighting = shown.get(photo)
             off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
             mark = self._shifted(marks[photo]) if photo in marks else found.get(photo)
@@ -232,7 +230,7 @@ class Marking:
         posed = [seen for seen in estimate.survey.points[number].sightings if seen.index is not None]
         return self._projector.line(posed[0]) if len(posed) == 1 else None
 
-    def _found(self) -> dict[str, dict[str, tuple[float, float]]]:
+    def _detections(self) -> dict[str, dict[str, tuple[float, float]]]:
         """Detected targets, except where a person has marked the point or declared it not visible."""
         marks, hidden = self._text.marks, self._text.hidden
         return {
@@ -248,7 +246,7 @@ class Marking:
         shift = self.job.pixel_shift
         return round(pixel[0] + shift, DIGITS), round(pixel[1] + shift, DIGITS)
 
-    def _seen(self, photo: str, index: int | None, number: int, projection: Projection) -> dict[str, Any]:
+    def _photo_row(self, photo: str, index: int | None, number: int, projection: Projection) -> dict[str, Any]:
         """Where a photo shows a point; photos that are close and have it near the centre rank first."""
         row: dict[str, Any] = {"photo": self._photos.index(photo), "name": photo, "predicted": None, "radius_px": None}
         row |= {"doubtful": False, "rank": 0.0, "posed": index is not None}
@@ -267,14 +265,14 @@ class Marking:
     def _estimate(self) -> tuple[int, Estimate, Projection]:
         """Version, estimate and projection for the current marks; called with the lock held."""
         if self._estimated is None or self._estimated[0] != self.revision:
-            marks = {name: dict(pixels) for name, pixels in self._found().items()}
+            marks = {name: dict(pixels) for name, pixels in self._detections().items()}
             for name, seen in self._text.marks.items():
                 marks.setdefault(name, {}).update((photo, self._shifted(pixel)) for photo, pixel in seen.items())
             estimate = self._estimator.estimate(marks)
             self._estimated = self.revision, estimate, self._projector.project(estimate.places, estimate.radius_m)
         return self._estimated
 
-    def _told_point(
+    def _point_row(
         self,
         number: int,
         estimate: Estimate,

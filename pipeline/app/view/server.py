@@ -24,7 +24,7 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, NotThereError, open_inside
+from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, FileNotServedError, open_inside
 from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, Guard
 from splatpipe.pipeline.app.view.landing import fetchable, landing
 from splatpipe.pipeline.app.view.live import Live
@@ -35,9 +35,8 @@ from splatpipe.pipeline.web.measured_page import SITE
 from splatpipe.stages.line import LINE
 
 ADDRESS = "127.0.0.1"
-MARKING_PORT = (
-    8474  # if free: unsent marks in the browser's storage belong to an address, which the next server must have too
-)
+# If free: unsent marks in the browser's storage belong to an address, which the next server must have too.
+MARKING_PORT = 8474
 ASSETS = {
     "landing.css": "text/css",
     "live.css": "text/css",
@@ -83,7 +82,7 @@ def serve(out: Path, options: ViewOptions, print_line: Callable[[str], None]) ->
         SplatpipeError: if there is no run, or nothing to mark.
         MachineError: if the port is taken.
     """
-    bind = _checked(options.bind)
+    bind = _check_address(options.bind)
     run = open_run_folder(out, LINE)
     listening = _listen_for_marks(bind) if options.mark and options.port == 0 else _listen(bind, options.port)
     live, token = Live(run), secrets.token_urlsafe(32)
@@ -92,11 +91,11 @@ def serve(out: Path, options: ViewOptions, print_line: Callable[[str], None]) ->
         routes = [*(_marking(pages, options, print_line) if options.mark else ()), *pages.routes()]
         start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
         start += "mark" if options.mark else "live" if run.is_running else ""
-        _take_signals_back()
+        _restore_signal_handlers()
 
         def ready() -> None:
             if bind != ADDRESS:
-                print_line(f"It listens on {bind}: publish the port to this machine only (-p {ADDRESS}:PORT:PORT).")
+                print_line(f"Listening on {bind}: publish the port to this machine only (-p {ADDRESS}:PORT:PORT).")
             print_line(f"Open {start} (Ctrl-C to stop)")
             if options.open_browser:
                 threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
@@ -123,7 +122,7 @@ class _Server(uvicorn.Server):
         self._ready()
 
 
-def _take_signals_back() -> None:
+def _restore_signal_handlers() -> None:
     """Restore Python's signal handlers: pyceres, once imported, treats SIGTERM as a crash and prints its stack."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.getsignal(number))
@@ -155,7 +154,7 @@ def _settings(app: ASGIApp) -> uvicorn.Config:
     )
 
 
-def _checked(bind: str) -> str:
+def _check_address(bind: str) -> str:
     try:
         return str(ipaddress.IPv4Address(bind))
     except ValueError as error:
@@ -285,7 +284,7 @@ class Pages:
             raise HTTPException(404)
         try:
             file = open_inside(self.run.out, path)
-        except NotThereError as error:
+        except FileNotServedError as error:
             raise HTTPException(404) from error
         kind = TYPES.get(PurePosixPath(path).suffix, "application/octet-stream")
         return FileAnswer(file, kind, OF_SITE if path.startswith(SITE) else OF_RUN)

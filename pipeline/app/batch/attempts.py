@@ -1,4 +1,4 @@
-"""The log of a capture's jobs: one line when a try starts and one when it ends."""
+"""The log of a capture's jobs: one line when an attempt starts and one when it ends."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pathlib import Path
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_USAGE
 from splatpipe.pipeline.engine.stage import JSON
 
-HOPELESS = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options would fail again: not retried
-NO_WORD = "It ended without an error message: its process was killed, usually by the system for lack of memory."
+PERMANENT_FAILURES = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options would fail again: not retried
+NO_MESSAGE = "It ended without an error message: its process was killed, usually by the system for lack of memory."
 
 
 @dataclass(frozen=True)
-class TryResult:
-    """The outcome of a try; the fields are those of ``Try``."""
+class AttemptResult:
+    """The outcome of an attempt; the fields are those of ``Attempt``."""
 
     exit_code: int
     message: str = ""
@@ -28,8 +28,8 @@ class TryResult:
 
 
 @dataclass(frozen=True)
-class Try:
-    """One try to run a stage.
+class Attempt:
+    """One attempt to run a stage.
 
     Attributes:
         stage: The stage's name.
@@ -77,26 +77,26 @@ class Try:
         """Why it failed, in one or two sentences; empty while it is running or if it succeeded."""
         if self.succeeded or self.alive:
             return ""
-        return self.message or NO_WORD
+        return self.message or NO_MESSAGE
 
 
-def spent_s(tries: Iterable[Try]) -> float:
-    """Seconds during which any of these tries was running, counted once; tries without a recorded end count as 0."""
+def spent_s(attempts: Iterable[Attempt]) -> float:
+    """Seconds during which any of these attempts was running, counted once; one without a recorded end counts as 0."""
     spent, until_s = 0.0, 0.0
-    for each in sorted(tries, key=lambda each: each.began_s):
+    for each in sorted(attempts, key=lambda each: each.began_s):
         ended_s = each.ended_s or each.began_s
         spent += max(0.0, ended_s - max(each.began_s, until_s))
         until_s = max(until_s, ended_s)
     return spent
 
 
-def read_tries(paths: Iterable[Path]) -> list[Try]:
-    """The tries of several files, in order of their start."""
-    return sorted((each for path in paths for each in TryLog(path).read()), key=lambda each: each.began_s)
+def read_attempts(paths: Iterable[Path]) -> list[Attempt]:
+    """The attempts of several files, in order of their start."""
+    return sorted((each for path in paths for each in AttemptLog(path).read()), key=lambda each: each.began_s)
 
 
-class TryLog:
-    """The tries of those jobs of a capture that run one at a time.
+class AttemptLog:
+    """The attempts of those jobs of a capture that run one at a time.
 
     Args:
         path: The log file.
@@ -105,39 +105,39 @@ class TryLog:
     def __init__(self, path: Path) -> None:
         self._path = path
 
-    def begin(self, stage: str) -> Try:
+    def begin(self, stage: str) -> Attempt:
         """Record that a stage starts here and now."""
-        begun = Try(stage, time.time(), socket.gethostname(), os.getpid())
+        begun = Attempt(stage, time.time(), socket.gethostname(), os.getpid())
         self._append({"begun": asdict(begun)})
         return begun
 
-    def end(self, ending: TryResult) -> None:
-        """Record the outcome of the last try."""
+    def end(self, ending: AttemptResult) -> None:
+        """Record the outcome of the last attempt."""
         self._append({"ended": {"ended_s": time.time(), **asdict(ending)}})
 
-    def read(self) -> list[Try]:
-        """All tries in order; malformed lines, e.g. after a power cut, are skipped."""
+    def read(self) -> list[Attempt]:
+        """All attempts in order; malformed lines, e.g. after a power cut, are skipped."""
         try:
             lines = self._path.read_bytes().splitlines()
         except FileNotFoundError:
             return []
-        tries: list[Try] = []
+        attempts: list[Attempt] = []
         for line in lines:
             try:
-                told = json.loads(line)
-                if "begun" in told:
-                    tries.append(Try(**told["begun"]))
-                elif tries:
-                    tries[-1] = Try(**{**asdict(tries[-1]), **told["ended"]})
+                record = json.loads(line)
+                if "begun" in record:
+                    attempts.append(Attempt(**record["begun"]))
+                elif attempts:
+                    attempts[-1] = Attempt(**{**asdict(attempts[-1]), **record["ended"]})
             except (ValueError, TypeError, KeyError):
                 continue
-        return tries
+        return attempts
 
-    def _append(self, told: Mapping[str, JSON]) -> None:
+    def _append(self, record: Mapping[str, JSON]) -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
         try:
-            os.write(descriptor, json.dumps(told).encode() + b"\n")
+            os.write(descriptor, json.dumps(record).encode() + b"\n")
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
