@@ -30,7 +30,7 @@ from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCach
 GSD_M = 0.028  # of the original photos, at the house
 HALF_M = 9.0  # half the side of the part
 RELIEF = HeightRange(-2.0, 14.0)
-HELD_BYTES = 1 << 30
+CACHE_BYTES = 1 << 30
 EVERY = 5  # spacing, in cells of the surface model, of the places where exposures are compared
 FIGURES = {"what": "what:", "cells": "cells:,", "CPU s": "cpu:.2f", "s a million": "million:.1f", "known": "known:.4f"}
 Result = TypeVar("Result")
@@ -51,7 +51,7 @@ def timed(make: Callable[[], Result]) -> tuple[Result, float]:
 def heights_of(sources: list[DepthSource], lattice: Lattice) -> HeightField:
     """Compute the surface model."""
     height = np.full((lattice.height, lattice.width), np.nan, np.float32)
-    capture = HeightInput(sources, lattice, RELIEF, LruCache(HELD_BYTES))
+    capture = HeightInput(sources, lattice, RELIEF, LruCache(CACHE_BYTES))
     for part in surface_heights(capture, list(lattice.tiles(HEIGHTS_TILE)), threads=1):
         height[part.tile.slices] = part.height
     return HeightField(lattice, height)
@@ -63,7 +63,7 @@ def coloured(photos: list[PhotoSource], surface: HeightField, lattice: Lattice) 
     places = np.concatenate([centres, surface.height[..., None].astype(np.float64)], axis=-1)
     places = places[::EVERY, ::EVERY].reshape(-1, 3)
     levels = exposure_levels(photos, places[np.isfinite(places[:, 2])], 2.0 * lattice.cell_m, threads=1)
-    album = OrthoInput(photos, surface, lattice, RELIEF, levels, LruCache(HELD_BYTES), LruCache(HELD_BYTES))
+    album = OrthoInput(photos, surface, lattice, RELIEF, levels, LruCache(CACHE_BYTES), LruCache(CACHE_BYTES))
     tiles = list(lattice.tiles(TILE))
     known = sum(int(part.known.sum()) for part in orthophotos(album, tiles, threads=1))
     return known / (lattice.width * lattice.height)

@@ -22,7 +22,7 @@ from splatpipe.pipeline.surface import elevation as elevation_module
 from splatpipe.pipeline.surface.elevation import Elevation, ElevationPhotos, draw_elevation, wall_sheet
 from splatpipe.pipeline.surface.facades import FacadesTask, make_facades
 from splatpipe.pipeline.surface.facets import Facets, facets_of, upright_facets
-from splatpipe.pipeline.surface.holes import filled
+from splatpipe.pipeline.surface.holes import fill_holes
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
 from splatpipe.pipeline.surface.openings import outlines, projections, recesses
 from splatpipe.pipeline.surface.photo_gains import PhotoGains
@@ -100,7 +100,9 @@ def places_of(elevation: Elevation) -> np.ndarray:
     """Local places of all cells, as the depth has them; nan where there is none."""
     lattice = elevation.sheet.lattice
     centres = lattice.centres(next(lattice.tiles(4096)))
-    return elevation.sheet.local(np.concatenate([centres, elevation.depth[..., None].astype(np.float64)], axis=-1))
+    return elevation.sheet.local_from_sheet(
+        np.concatenate([centres, elevation.depth[..., None].astype(np.float64)], axis=-1)
+    )
 
 
 def panel(
@@ -220,8 +222,8 @@ def test_the_raster_extends_from_corner_to_corner() -> None:
     assert np.ptp(corners[:2, 2]) < 1e-9
     assert corners[0, 2] > corners[2, 2]
     sheet = south().sheet
-    assert np.allclose(sheet.local(sheet.place(corners)), corners)
-    assert sheet.place(np.array([0.0, -13.0, 2.0]))[2] == pytest.approx(10.0, abs=0.1)  # towards the viewer
+    assert np.allclose(sheet.local_from_sheet(sheet.sheet_from_local(corners)), corners)
+    assert sheet.sheet_from_local(np.array([0.0, -13.0, 2.0]))[2] == pytest.approx(10.0, abs=0.1)  # towards the viewer
 
 
 def test_threads_change_no_bit_of_an_elevation() -> None:
@@ -236,18 +238,18 @@ def test_specks_are_removed_and_edges_kept() -> None:
     depth[300:, :3] = np.nan
     speck = depth.copy()
     speck[100, 10], speck[256, 30], speck[0, 0] = 0.3, 0.1, -0.2
-    assert np.array_equal(elevation_module.without_specks(speck), depth, equal_nan=True)
-    assert np.array_equal(elevation_module.without_specks(depth), depth, equal_nan=True)
+    assert np.array_equal(elevation_module.remove_specks(speck), depth, equal_nan=True)
+    assert np.array_equal(elevation_module.remove_specks(depth), depth, equal_nan=True)
 
 
 def test_a_hole_beside_a_window_is_filled_with_the_wall() -> None:
     depth = np.zeros((40, 60))
     depth[:, :20] = -0.16
     depth[18:22, 20:30] = np.nan
-    upright, new = filled(depth, 0.028, 16, upright=True)
+    upright, new = fill_holes(depth, 0.028, 16, upright=True)
     assert new.sum() == 40
     assert np.abs(upright[18:22, 22:30]).max() < 1e-9
-    assert filled(depth, 0.028, 16)[0][20, 22] == -0.16  # what lies behind an edge is hidden, seen from above
+    assert fill_holes(depth, 0.028, 16)[0][20, 22] == -0.16  # what lies behind an edge is hidden, seen from above
 
 
 def test_an_elevation_of_too_many_pixels_is_refused() -> None:

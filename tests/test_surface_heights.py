@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.surface.heights import HeightInput, Heights, surface_heights, tile_heights
-from splatpipe.pipeline.surface.holes import filled
+from splatpipe.pipeline.surface.holes import fill_holes
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sheet import Sheet
 from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, photos_seeing
@@ -135,13 +135,13 @@ def test_a_turned_sheet_gives_the_same_surface() -> None:
     turn[:2, :2] = [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]
     turn[:3, 3] = [0.5, -0.2, -2.0]
     sheet = Sheet(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), HeightRange(-3.0, 6.0))
-    sources = [sheet.moved_depths(DepthSource(found.camera, lambda found=found: found)) for found in exact()]
+    sources = [sheet.transform_depths(DepthSource(found.camera, lambda found=found: found)) for found in exact()]
     made = tile_heights(HeightInput(sources, sheet.lattice, sheet.relief, LruCache(1 << 30)), Tile(0, 0, 50, 60))
     places = np.concatenate([sheet.lattice.centres(made.tile), made.height[..., None]], axis=-1)
-    east, north, up = np.moveaxis(sheet.local(places), -1, 0)
+    east, north, up = np.moveaxis(sheet.local_from_sheet(places), -1, 0)
     clear = edge_distance(east, north) > 2 * CELL_M
     assert np.abs(up - true_height(east, north))[clear].max() < 0.2 * PIXEL_M  # on the round tree
-    assert np.allclose(sheet.place(sheet.local(places)), places, equal_nan=True)
+    assert np.allclose(sheet.sheet_from_local(sheet.local_from_sheet(places)), places, equal_nan=True)
 
 
 def test_places_that_only_two_photos_see_have_no_height() -> None:
@@ -194,7 +194,7 @@ def test_a_hole_at_a_wall_is_filled_with_ground_and_a_wide_one_is_left() -> None
     height[:, :5] = 3.0
     height[3:6, 5] = np.nan
     height[:, 12:24] = np.nan
-    result, new = filled(height, 0.1, 4)
+    result, new = fill_holes(height, 0.1, 4)
     assert new[4, 5]
     assert result[4, 5] == 0.0
     assert np.isnan(result[:, 16:20]).all()
@@ -224,7 +224,7 @@ def test_a_lattice_without_cells_is_refused(arguments: tuple[float, float, float
 
 
 def test_a_cache_keeps_within_its_limit() -> None:
-    shelf: LruCache[str] = LruCache(25)
+    cache: LruCache[str] = LruCache(25)
     loads: list[str] = []
 
     def load(name: str) -> tuple[str, int]:
@@ -232,7 +232,7 @@ def test_a_cache_keeps_within_its_limit() -> None:
         return name, 10
 
     for name in "abcab":
-        assert shelf.get(name, lambda name=name: load(name)) == name
+        assert cache.get(name, lambda name=name: load(name)) == name
     assert loads == ["a", "b", "c", "a", "b"]
-    assert shelf.get("b", lambda: load("b")) == "b"
+    assert cache.get("b", lambda: load("b")) == "b"
     assert len(loads) == 5

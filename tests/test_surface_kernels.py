@@ -12,9 +12,15 @@ import pytest
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, DistortionGrid, PhotoSource, rated, sampled
-from splatpipe.pipeline.surface.point_visibility import Points, place_in, sight
+from splatpipe.pipeline.surface.mosaic import MARGIN, compose_mosaic, keep_best
+from splatpipe.pipeline.surface.photo_samples import (
+    PLAIN_TONE,
+    DistortionGrid,
+    PhotoSource,
+    rate_points,
+    sample_colours,
+)
+from splatpipe.pipeline.surface.point_visibility import Points, classify_points, project_points
 from splatpipe.pipeline.surface.sources import HeightRange, PhotoWindow, PosedDepthMap, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.votes import HeightVotes
@@ -58,17 +64,17 @@ def everything() -> list[np.ndarray]:
     """Return the results of all kernels."""
     made, points = votes(), places()
     layers = made.layers()
-    fit = made.fitted(layers[0].height)
+    fit = made.fit(layers[0].height)
     found = [part for layer in layers for part in (layer.height, layer.count, layer.cover)]
     found += [fit.height, fit.sigma, fit.photos]
     offers = []
     for camera, depths in zip(cameras()[::3], maps(), strict=True):
-        said = sight(depths, points, 0.05).said
-        cost, seen = rated(camera, points, 0.1, said)
+        flags = classify_points(depths, points, 0.05).flags
+        cost, seen = rate_points(camera, points, 0.1, flags)
         source = PhotoSource(camera, lambda: np.zeros((0, 0, 3), np.uint8), None)
-        offers.append((seen, cost, sampled(source, photo_of(camera, 1), points, seen, 0.1, PLAIN_TONE)))
+        offers.append((seen, cost, sample_colours(source, photo_of(camera, 1), points, seen, 0.1, PLAIN_TONE)))
     stacked = [np.stack(column) for column in zip(*offers, strict=True)]
-    mosaic = composed(*(part.copy() for part in stacked), parity=1)
+    mosaic = compose_mosaic(*(part.copy() for part in stacked), parity=1)
     best = stacked[0].copy()
     return [*found, mosaic.label, mosaic.colour, keep_best(best, stacked[1]), best, *stacked]
 
@@ -114,32 +120,32 @@ def test_heights_are_those_of_the_planes_through_pixels() -> None:
 def test_the_robust_mean_is_tukeys() -> None:
     made = votes()
     start = made.layers()[0].height
-    fit = made.fitted(start)
-    again = made.fitted(fit.height)  # six rounds rather than three
+    fit = made.fit(start)
+    again = made.fit(fit.height)  # six rounds rather than three
     known = np.isfinite(fit.height)
     assert known.mean() > 0.9
     assert np.abs(again.height - fit.height)[known].max() < 0.01
     assert np.median(np.abs(again.height - fit.height)[known]) < 1e-5
     assert np.array_equal(np.isnan(fit.sigma), ~known)
     assert not fit.photos[~known].any()
-    assert np.isnan(made.fitted(np.full_like(start, np.nan)).height).all()
+    assert np.isnan(made.fit(np.full_like(start, np.nan)).height).all()
 
 
 @pytest.mark.parametrize("number", range(3))
 def test_sight_agrees_with_its_definition(number: int) -> None:
     found, points = maps()[number], places()
-    place = place_in(found.camera, *points)
+    place = project_points(found.camera, *points)
     row, column = (np.where(place.inside, at, 0.0).astype(np.int64) for at in (place.row, place.column))
     near = found.depth[row, column].astype(np.float64)
     least = np.asarray(cv2.erode(found.depth, np.ones((3, 3), np.uint8)))[row, column].astype(np.float64)
     limit = np.maximum(3.0 * place.depth / found.camera.fx / np.maximum(place.sine, 0.2), 0.02)
     seen = place.inside & (near > 0.0) & (np.abs(near - place.depth) <= limit)
-    view = sight(found, points, 0.02)
+    view = classify_points(found, points, 0.02)
     assert np.array_equal(view.seen, seen)
     assert np.array_equal(view.through, place.inside & (least > 0.0) & (least - place.depth > limit) & ~seen)
     assert np.array_equal(view.mixed, seen & (least > 0.0) & (least < place.depth - limit))
     assert np.array_equal(view.unknown, place.inside & (near <= 0.0))
-    assert np.array_equal(sight(found, points, 0.02, place.sine).said, view.said)
+    assert np.array_equal(classify_points(found, points, 0.02, place.sine).flags, view.flags)
     assert seen.any() and view.unknown.any()
 
 
@@ -147,10 +153,10 @@ def test_colours_are_opencvs_cubic() -> None:
     camera, points = cameras()[4], places()
     pixels = np.random.default_rng(1).integers(0, 256, (180, 240, 3)).astype(np.uint8)
     source = PhotoSource(camera, lambda: pixels, None)
-    place = place_in(camera, *points)
+    place = project_points(camera, *points)
     column, row = (np.nan_to_num(at - 0.5).astype(np.float32) for at in (place.column, place.row))
     expected = cv2.remap(pixels.astype(np.float32), column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    found = sampled(source, pixels, points, place.inside, 0.1, PLAIN_TONE)
+    found = sample_colours(source, pixels, points, place.inside, 0.1, PLAIN_TONE)
     off = np.abs(found - np.clip(expected, 0, 255))[place.inside]
     assert off.mean() < 2.0  # OpenCV rounds places to a 32nd of a pixel
     assert np.percentile(off, 99) < 6.0
@@ -159,15 +165,17 @@ def test_colours_are_opencvs_cubic() -> None:
 
 def test_cells_away_from_the_rim_do_not_depend_on_it() -> None:
     offers = everything_at_best()[-3:]
-    whole = composed(*(part.copy() for part in offers), parity=0)
-    part = composed(*(part[:, 5:, 7:].copy() for part in offers), parity=0)
+    whole = compose_mosaic(*(part.copy() for part in offers), parity=0)
+    part = compose_mosaic(*(part[:, 5:, 7:].copy() for part in offers), parity=0)
     inner = np.s_[5 + MARGIN : -MARGIN, 7 + MARGIN : -MARGIN]
     assert np.array_equal(whole.label[inner], part.label[MARGIN:-MARGIN, MARGIN:-MARGIN])
     assert np.array_equal(whole.colour[inner], part.colour[MARGIN:-MARGIN, MARGIN:-MARGIN])
 
 
 def test_no_photos_are_no_colours() -> None:
-    made = composed(np.zeros((0, 4, 5), bool), np.zeros((0, 4, 5), np.uint16), np.zeros((0, 4, 5, 3), np.uint8), 0)
+    made = compose_mosaic(
+        np.zeros((0, 4, 5), bool), np.zeros((0, 4, 5), np.uint16), np.zeros((0, 4, 5, 3), np.uint8), 0
+    )
     assert (made.label == -1).all()
     assert not made.colour.any()
 
@@ -218,22 +226,22 @@ def test_hostile_depths_are_no_heights() -> None:
 
 
 def _said(depth: np.ndarray) -> np.ndarray:
-    points, said = places(), np.empty(TILE.height * TILE.width, np.uint8)
-    _native.look(depth, native_camera(cameras()[4]), points, None, 0.0, said)
-    return said
+    points, flags = places(), np.empty(TILE.height * TILE.width, np.uint8)
+    _native.look(depth, native_camera(cameras()[4]), points, None, 0.0, flags)
+    return flags
 
 
 def test_photos_that_do_not_fit_are_refused() -> None:
     camera, points = native_camera(cameras()[4]), places()
     size = points[0].shape
-    pixels, said, cost = np.zeros((180, 240, 3), np.uint8), np.zeros(size, np.uint8), np.zeros(size, np.uint16)
+    pixels, flags, cost = np.zeros((180, 240, 3), np.uint8), np.zeros(size, np.uint8), np.zeros(size, np.uint16)
     depth, colour = np.ones((180, 240), np.float32), np.zeros((*size, 3), np.uint8)
-    refused(_native.look, depth[1:], camera, points, None, 0.0, said)
-    refused(_native.look, depth, camera, points, None, 0.0, said[1:])
-    refused(_native.look, depth, camera, points, np.zeros(3), 0.0, said)
-    refused(_native.look, depth, camera, (points[0][1:], *points[1:]), None, 0.0, said)
-    refused(_native.rate, camera, points, 0.0, said, cost, said)
-    refused(_native.rate, camera, points, 0.1, said, cost[1:], said)
+    refused(_native.look, depth[1:], camera, points, None, 0.0, flags)
+    refused(_native.look, depth, camera, points, None, 0.0, flags[1:])
+    refused(_native.look, depth, camera, points, np.zeros(3), 0.0, flags)
+    refused(_native.look, depth, camera, (points[0][1:], *points[1:]), None, 0.0, flags)
+    refused(_native.rate, camera, points, 0.0, flags, cost, flags)
+    refused(_native.rate, camera, points, 0.1, flags, cost[1:], flags)
     nodes = np.zeros((3, 3, 2))
     for photo in (
         (pixels[1:], PLAIN_TONE, camera, None),
@@ -242,9 +250,9 @@ def test_photos_that_do_not_fit_are_refused() -> None:
         (pixels, PLAIN_TONE, camera, (8.0, nodes[:1])),
         (pixels[:0], PLAIN_TONE, camera, (8.0, nodes)),
     ):
-        refused(_native.sample_photo, photo, points, 0.1, said, colour)
-    refused(_native.sample_photo, (pixels, PLAIN_TONE, camera, None), points, 0.1, said, colour[1:])
-    refused(_native.sample_photo, (pixels, PLAIN_TONE, camera, None), points, np.nan, said, colour)
+        refused(_native.sample_photo, photo, points, 0.1, flags, colour)
+    refused(_native.sample_photo, (pixels, PLAIN_TONE, camera, None), points, 0.1, flags, colour[1:])
+    refused(_native.sample_photo, (pixels, PLAIN_TONE, camera, None), points, np.nan, flags, colour)
     seen, many = np.zeros((2, 6, 7), np.uint8), np.zeros((2, 6, 7), np.uint16)
     colours, label, counts = np.zeros((2, 6, 7, 3), np.uint8), np.zeros((6, 7), np.int16), np.zeros((6, 7), np.uint8)
     refused(_native.keep_best, seen, many[:1], 8, counts)
@@ -262,5 +270,5 @@ def test_a_lens_that_leads_beyond_the_photo_ends_at_its_rim() -> None:
     pixels = np.full((50, 40, 3), 77, np.uint8)
     for nodes in (np.full((3, 3, 2), 1e9), np.full((3, 3, 2), -np.inf), np.full((3, 3, 2), np.nan)):
         source = PhotoSource(camera, lambda: pixels, None, DistortionGrid(40, 50, 100.0, nodes))
-        seen = place_in(camera, *points).inside
-        assert (sampled(source, pixels, points, seen, 0.1, PLAIN_TONE)[seen] == 77).all()
+        seen = project_points(camera, *points).inside
+        assert (sample_colours(source, pixels, points, seen, 0.1, PLAIN_TONE)[seen] == 77).all()

@@ -19,7 +19,7 @@ from splatpipe.pipeline.surface.blocks import SIDE, blocks_of, keys_of, surface_
 from splatpipe.pipeline.surface.mesh_files import write_mesh
 from splatpipe.pipeline.surface.photo_set import PhotoSet
 from splatpipe.pipeline.surface.point_colours import photo_set
-from splatpipe.pipeline.surface.surface_mesh import MeshTask, decimated, make_mesh, vertex_colours
+from splatpipe.pipeline.surface.surface_mesh import MeshTask, decimate, make_mesh, vertex_colours
 from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, in_order, without_crumbs
 from splatpipe.pipeline.survey.frames import Frame, Origin
 
@@ -161,7 +161,7 @@ def test_glb_has_16_bit_linear_colours_and_is_unlit(tmp_path: Path) -> None:
 
 def test_few_triangles_are_unchanged() -> None:
     mesh = sheet(0.0, 3)
-    assert decimated(mesh, 18) is mesh
+    assert decimate(mesh, 18) is mesh
 
 
 def test_the_complete_mesh_or_how_to_install_open3d(tmp_path: Path) -> None:

@@ -14,10 +14,10 @@ from splatpipe.pipeline.surface import mosaic
 from splatpipe.pipeline.surface.exposures import exposure_levels
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.orthophoto import SPREAD, OrthoInput, Orthophoto, orthophotos, tile_orthophoto
+from splatpipe.pipeline.surface.orthophoto import EXTENDED_CELLS, OrthoInput, Orthophoto, orthophotos, tile_orthophoto
 from splatpipe.pipeline.surface.photo_gains import GAMMA, OFFSET, PhotoGains
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, DistortionGrid, PhotoSource, sampled, tone_curve
-from splatpipe.pipeline.surface.point_visibility import contiguous, place_in
+from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, DistortionGrid, PhotoSource, sample_colours, tone_curve
+from splatpipe.pipeline.surface.point_visibility import contiguous, project_points
 from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 
@@ -121,9 +121,9 @@ def test_dark_corners_are_equalised() -> None:
     assert np.abs(middle[[0, 1, 3]]).max() < 0.1
     east, north = np.moveaxis(HEIGHTS.centres(WHOLE), -1, 0)
     points = contiguous((east, north, true_height(east, north)))
-    seen = place_in(plain.sources[0].camera, *points).inside & np.isfinite(points[2])
+    seen = project_points(plain.sources[0].camera, *points).inside & np.isfinite(points[2])
     shown = [
-        np.log(told.sampled(0, (source, source.load()), points, seen, HEIGHTS.cell_m)[seen] + OFFSET)
+        np.log(told.sample(0, (source, source.load()), points, seen, HEIGHTS.cell_m)[seen] + OFFSET)
         for told, source in ((levels(plain), plain.sources[0]), (found, sources[0]), (plain.levels, sources[0]))
     ]
     levelled, dark = (np.subtract(*np.quantile(each - shown[0], [0.95, 0.05])) for each in shown[1:])
@@ -165,9 +165,9 @@ def test_far_from_visible_cells_there_is_no_colour() -> None:
     known[:, 0] = True
     colour = np.full((60, 60, 3), 9, np.uint8)
     colour[~known] = 0
-    result, reached = mosaic.spread(colour, known, np.ones_like(known), SPREAD)
-    assert reached[:, : SPREAD + 1].all()
-    assert not reached[:, SPREAD + 1 :].any()
+    result, reached = mosaic.extend_colours(colour, known, np.ones_like(known), EXTENDED_CELLS)
+    assert reached[:, : EXTENDED_CELLS + 1].all()
+    assert not reached[:, EXTENDED_CELLS + 1 :].any()
     assert (result[reached] == 9).all()
 
 
@@ -212,12 +212,12 @@ def test_a_finer_photo_is_softened_and_an_equal_one_is_not() -> None:
     source = PhotoSource(Camera("photo", 64, 64, 100.0, 100.0, 32.0, 32.0, down), lambda: pixels, None)  # 1 m a pixel
     row, column = np.mgrid[4:12, 4:12] + 0.5
     seen = np.ones((8, 8), np.bool_)
-    same = sampled(source, pixels, (column - 32.0, 32.0 - row, np.zeros((8, 8))), seen, 1.0, PLAIN_TONE)
+    same = sample_colours(source, pixels, (column - 32.0, 32.0 - row, np.zeros((8, 8))), seen, 1.0, PLAIN_TONE)
     assert np.array_equal(same[..., 0], board[4:12, 4:12])
     coarse = (4.0 * column - 32.0, 32.0 - 4.0 * row, np.zeros((8, 8)))
-    assert np.ptp(sampled(source, pixels, coarse, seen, 4.0, PLAIN_TONE)) <= 1
+    assert np.ptp(sample_colours(source, pixels, coarse, seen, 4.0, PLAIN_TONE)) <= 1
     seen[2] = False
-    assert not sampled(source, pixels, coarse, seen, 4.0, PLAIN_TONE)[2].any()
+    assert not sample_colours(source, pixels, coarse, seen, 4.0, PLAIN_TONE)[2].any()
 
 
 def test_a_seam_runs_where_two_photos_look_alike() -> None:
@@ -226,7 +226,7 @@ def test_a_seam_runs_where_two_photos_look_alike() -> None:
     cost = np.full((2, 40, 60), 300, np.uint16)
     cost[0] += np.arange(60, dtype=np.uint16) * 2  # the first is better on the left, the second on the right
     cost[1] += (59 - np.arange(60, dtype=np.uint16)) * 2
-    label = mosaic.composed(np.ones(cost.shape, np.bool_), cost, colour, parity=0).label
+    label = mosaic.compose_mosaic(np.ones(cost.shape, np.bool_), cost, colour, parity=0).label
     crossings = np.flatnonzero(label[20, 1:] != label[20, :-1])
     assert crossings.size == 1
     assert (colour[0, 20, crossings[0]] == colour[1, 20, crossings[0]]).all()
@@ -237,7 +237,7 @@ def test_objects_in_one_of_five_photos_are_not_shown() -> None:
     colour[3, 20:40, 20:40] = 240  # a car that had driven on; elsewhere this photo is the best
     cost = np.full((5, 60, 60), 300, np.uint16)
     cost[3] = 100
-    made = mosaic.composed(np.ones(cost.shape, np.bool_), cost, colour, parity=1)
+    made = mosaic.compose_mosaic(np.ones(cost.shape, np.bool_), cost, colour, parity=1)
     assert (made.colour[22:38, 22:38] == 90).all()  # colours mix around the seam
     assert (made.label[28:32, 2:4] == 3).all()
 
@@ -246,7 +246,7 @@ def test_of_many_photos_the_best_are_kept() -> None:
     random = np.random.default_rng(0)
     seen, cost = random.random((20, 30, 40)) < 0.7, random.integers(0, 50, (20, 30, 40)).astype(np.uint16)
     count, costs = seen.sum(axis=0), np.where(seen, cost, 9999)
-    limit = np.sort(costs, axis=0)[mosaic.KEPT - 1]
+    limit = np.sort(costs, axis=0)[mosaic.MAX_CANDIDATES - 1]
     kept = seen.copy()
     assert np.array_equal(mosaic.keep_best(kept, cost), count)
     assert np.array_equal(kept, seen & (cost <= limit))  # more than so many only where costs are the same

@@ -259,12 +259,12 @@ def test_sheets_of_a_grid_agree_where_they_meet() -> None:
     for sheet in grid_sheets(grid, low, high, side=25):
         plane, part = sheet.sheet, sheet.part
         moved = HeightInput(
-            [plane.moved_depths(source) for source in sources()], plane.lattice, plane.relief, LruCache(1 << 30)
+            [plane.transform_depths(source) for source in sources()], plane.lattice, plane.relief, LruCache(1 << 30)
         )
         found = tile_heights(moved, Tile(0, 0, part.height, part.width))
         heights = sheet.heights(found.tile, found.height)
         whole[part.row : part.row + part.height, part.column : part.column + part.width] = heights
-        back = sheet.over(grid, part, heights)
+        back = sheet.heights_over(grid, part, heights)
         assert np.allclose(back, found.height, atol=1e-4, equal_nan=True)
         lattice = sheet.lattice_of(grid, part)
         assert (lattice.width, lattice.height) == (plane.lattice.width, plane.lattice.height)

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.photo_set import PhotoSet, place_of
+from splatpipe.pipeline.surface.photo_set import PhotoSet, unproject_pixels
 from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, PosedDepthMap
 
 SIDE = 8  # voxels per side of a block: a surface fills smaller blocks better than open3d's default of 16
 BAND = 3.0  # truncation distance on either side of the surface, in voxels
 MIN_PHOTOS = 2  # photos that have to see a surface in a block: each of their depths is already confirmed by others
-EVERY = 3  # one pixel in this many is used per axis: blocks are wider
-MIN_GROWTH = 1.05  # of voxels that were too small
+PIXEL_STEP = 3  # one pixel in this many is used per axis: blocks are wider
+MIN_GROWTH = 1.05  # factor by which voxels that were too small grow
 BITS = 21  # of a block's number along an axis: two million
 
 Keys = Int64[np.ndarray, " n"]
@@ -28,15 +28,15 @@ def depths_in(box: Box, found: PosedDepthMap) -> Float32[np.ndarray, "h w"]:
     """A photo's confirmed depths inside a box; 0 elsewhere."""
     sure = (found.confidence >= MIN_CONFIRMED) & (found.depth > 0.0)
     row, column = np.nonzero(sure)
-    xyz = _places(found, row, column)
+    xyz = _positions(found, row, column)
     inside = ((xyz >= box[0][:, None]) & (xyz < box[1][:, None])).all(axis=0)
     depth = np.zeros_like(found.depth)
     depth[row[inside], column[inside]] = found.depth[row[inside], column[inside]]
     return depth
 
 
-def _places(found: PosedDepthMap, row: np.ndarray, column: np.ndarray) -> Float64[np.ndarray, "3 n"]:
-    return place_of(found.camera, row, column, 1.0 / found.depth[row, column].astype(np.float64))
+def _positions(found: PosedDepthMap, row: np.ndarray, column: np.ndarray) -> Float64[np.ndarray, "3 n"]:
+    return unproject_pixels(found.camera, row, column, 1.0 / found.depth[row, column].astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,8 @@ def surface_blocks(photos: PhotoSet, box: Box, voxel_m: float, most: int, thread
     """
     while True:
         keys, seen = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        look = partial(_seen_keys, photos, box, voxel_m)
-        for found in ordered_map(look, photos.with_depths(), threads):
+        find_keys = partial(_keys_of_photo, photos, box, voxel_m)
+        for found in ordered_map(find_keys, photos.with_depths(), threads):
             every = np.concatenate([keys, found])
             count = np.concatenate([seen, np.ones(len(found), np.int64)])
             keys, place = np.unique(every, return_inverse=True)
@@ -79,18 +79,18 @@ def surface_blocks(photos: PhotoSet, box: Box, voxel_m: float, most: int, thread
         kept = keys[seen >= MIN_PHOTOS]
         if len(kept) <= most:
             return Blocks(box[0], voxel_m, blocks_of(kept))
-        voxel_m *= max(MIN_GROWTH, float(np.sqrt(len(kept) / most)))  # blocks of a surface go with its area
+        voxel_m *= max(MIN_GROWTH, float(np.sqrt(len(kept) / most)))  # the number of blocks is proportional to the area
 
 
-def _seen_keys(photos: PhotoSet, box: Box, voxel_m: float, number: int) -> Keys:
+def _keys_of_photo(photos: PhotoSet, box: Box, voxel_m: float, number: int) -> Keys:
     return visible_blocks(box, voxel_m, photos.depth_map(number))
 
 
 def visible_blocks(box: Box, voxel_m: float, found: PosedDepthMap) -> Keys:
     """Keys of the blocks in which a photo sees a surface, or the band around it, in order."""
     depth = depths_in(box, found)
-    row, column = np.nonzero(depth[::EVERY, ::EVERY])
-    xyz = (_places(found, row * EVERY, column * EVERY) - box[0][:, None]) / voxel_m
+    row, column = np.nonzero(depth[::PIXEL_STEP, ::PIXEL_STEP])
+    xyz = (_positions(found, row * PIXEL_STEP, column * PIXEL_STEP) - box[0][:, None]) / voxel_m
     corners = [
         keys_of(np.floor((xyz + BAND * np.array(signs)[:, None]) / SIDE).astype(np.int64))
         for signs in product((-1.0, 1.0), repeat=3)

@@ -24,13 +24,13 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.surface.geotiff import gdal
 
 INDEX_EVERY = 5  # every fifth contour is drawn bold, as on maps
-CELLS_AN_INTERVAL = 6.0  # 95 % of heights are within 3 cells: half an interval, as map standards ask of contours
-MAX_AUTO_LEVELS = 100  # over the relief, with an interval chosen here
+CELLS_PER_INTERVAL = 6.0  # 95 % of heights are within 3 cells: half an interval, as map standards require
+MAX_AUTO_LEVELS = 100  # over the relief, with an automatic interval
 MAX_LEVELS = 10_000  # with a given interval
 MAX_VERTICES = 3_000_000  # 300 MB until they are written
 WINDOW = 1024  # cells
-TOLERANCE_CELLS = 0.3  # of simplified lines: less than half a cell, which is what a height's place means
-MIN_LOOP_CELLS = 12.0  # around: a loop of less is a single cell's noise
+TOLERANCE_CELLS = 0.3  # of simplified lines: less than half a cell, the uncertainty of where a height applies
+MIN_LOOP_CELLS = 12.0  # length of a closed line: shorter ones are noise of single cells
 SAME_PLACE_CELLS = 1e-6  # two windows round the same crossing differently
 
 Line = Float64[np.ndarray, "n 2"]
@@ -73,7 +73,7 @@ def neat_interval(cell: float, relief: float) -> float:
         cell: Cell size, in the heights' unit.
         relief: Difference between the highest and the lowest height.
     """
-    least = max(CELLS_AN_INTERVAL * cell, relief / MAX_AUTO_LEVELS)
+    least = max(CELLS_PER_INTERVAL * cell, relief / MAX_AUTO_LEVELS)
     power = 10.0 ** math.floor(math.log10(least))
     return next(float(f"{step * power:.1g}") for step in (1, 2, 5, 10) if step * power >= least * (1.0 - 1e-9))
 
@@ -96,11 +96,11 @@ def trace_contours(dsm: Path, interval: float | None = None) -> Contours:
             raise SplatpipeError(
                 f"Contours every {interval:g} over {high - low:g} cannot be drawn.", "Choose another interval."
             )
-        joints = _Joints()
+        joiner = _LineJoiner()
         for window in _windows(raster):
             for level, line in _pieces(raster, window, interval):
-                joints.add(level, line)
-        found = joints.lines()
+                joiner.add(level, line)
+        found = joiner.lines()
         return Contours(interval, tuple(_contour(level, line, interval, raster.transform) for level, line in found))
 
 
@@ -140,12 +140,12 @@ def _pieces(raster: Any, window: Window, interval: float) -> Iterator[tuple[int,
     least, most = math.ceil(float(heights.min()) / interval), math.floor(float(heights.max()) / interval)
     for level in range(least, most + 1):
         for line in generator.lines(level * interval):
-            simple = _simplified(np.asarray(line, np.float64), np.array([window.col_off, window.row_off], np.float64))
+            simple = _simplify(np.asarray(line, np.float64), np.array([window.col_off, window.row_off], np.float64))
             if len(simple) > 1:
                 yield level, simple
 
 
-def _simplified(line: Line, corner: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "k 2"]:
+def _simplify(line: Line, corner: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "k 2"]:
     """Simplify by Douglas-Peucker; float32 from the window's corner is exact to 1e-4 cells, and ends stay unchanged."""
     closed = bool((line[0] == line[-1]).all())
     near = (line[:-1] if closed else line) - corner
@@ -165,7 +165,7 @@ class _Chain:
 _Place = tuple[int, int, int]  # level, and where in steps of SAME_PLACE_CELLS
 
 
-class _Joints:
+class _LineJoiner:
     """Joins pieces into lines: a piece continues one that ends where it begins."""
 
     def __init__(self) -> None:
@@ -189,16 +189,16 @@ class _Joints:
         if begin == end:
             self._whole.append((level, piece))
             return
-        chain = _taken(self._end, begin)
+        chain = _pop_chain(self._end, begin)
         if chain is None:
             chain = _Chain(level)
             self._begin.setdefault(begin, []).append(chain)
         chain.parts.append(piece)
-        after = _taken(self._begin, end)
+        after = _pop_chain(self._begin, end)
         if after is None:
             self._end.setdefault(end, []).append(chain)
         elif after is chain:
-            self._whole.append((level, _joined(chain)))
+            self._whole.append((level, _concatenate(chain)))
         else:
             self._join(chain, after)
 
@@ -210,12 +210,12 @@ class _Joints:
 
     def lines(self) -> list[tuple[int, Line]]:
         """All lines with their levels, without the smallest loops; in an order that is independent of the windows."""
-        opened = [(chain.level, _joined(chain)) for chains in self._begin.values() for chain in chains]
+        opened = [(chain.level, _concatenate(chain)) for chains in self._begin.values() for chain in chains]
         lines = [found for found in self._whole + opened if not _is_noise(found[1])]
         return sorted(lines, key=lambda found: (found[0], *found[1].min(axis=0), *found[1].max(axis=0)))
 
 
-def _taken(chains: dict[_Place, list[_Chain]], place: _Place) -> _Chain | None:
+def _pop_chain(chains: dict[_Place, list[_Chain]], place: _Place) -> _Chain | None:
     waiting = chains.get(place)
     if not waiting:
         return None
@@ -229,7 +229,7 @@ def _place(level: int, point: Float64[np.ndarray, " 2"]) -> _Place:
     return level, round(float(point[0]) / SAME_PLACE_CELLS), round(float(point[1]) / SAME_PLACE_CELLS)
 
 
-def _joined(chain: _Chain) -> Line:
+def _concatenate(chain: _Chain) -> Line:
     return np.concatenate([chain.parts[0], *(part[1:] for part in list(chain.parts)[1:])])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
-from splatpipe.pipeline.surface.fusion import FusedPoints, finest_of_cubes, fused, joined
+from splatpipe.pipeline.surface.fusion import FusedPoints, concatenate_clouds, finest_of_cubes, fuse_depths
 from splatpipe.pipeline.surface.grid import make_grid
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_set import PhotoSet
@@ -75,7 +75,7 @@ def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict
             chunk = _part(task, photos, (lattice, relief), part)
             save_arrays(path, **vars(chunk))
         report.progress(done + 1, len(parts), "dense cloud", "parts")
-    count = write_cloud(out / "cloud.laz", _kept(work, len(parts)), CloudFrame.of_grid(grid), UNDATED)
+    count = write_cloud(out / "cloud.laz", _load_chunks(work, len(parts)), CloudFrame.of_grid(grid), UNDATED)
     return {"points": count, "spacing_m": task.spacing_m, "crs": grid.crs.horizontal.name}
 
 
@@ -99,7 +99,7 @@ def _tiles(task: CloudTask, lattice: Lattice, part: Tile) -> list[Tile]:
 def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, HeightRange], part: Tile) -> CloudChunk:
     """The cloud of a part of the plan."""
     tiles = _tiles(task, space[0], part)
-    points = joined(list(ordered_map(partial(tile_cloud, photos, *space), tiles, task.threads)))
+    points = concatenate_clouds(list(ordered_map(partial(tile_cloud, photos, *space), tiles, task.threads)))
     if task.surface.area is not None:
         points = points.select(task.surface.area.contains(points.pieces.xyz.T))
     colours, known = point_colours(photos, points.pieces, task.spacing_m, task.threads)
@@ -111,11 +111,11 @@ def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, HeightRange],
 def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: HeightRange, tile: Tile) -> FusedPoints:
     """The points of one tile, by cell and height: at most one for each cube of cell size."""
     wide = tile.grown(MARGIN)
-    points = fused(photos.parts_in(lattice, wide, relief), lattice, wide, relief)
+    points = fuse_depths(photos.parts_in(lattice, wide, relief), lattice, wide, relief)
     return points.select(finest_of_cubes(points.pieces.xyz, points.footprint, lattice, tile))
 
 
-def _kept(work: Path, count: int) -> Iterator[CloudChunk]:
+def _load_chunks(work: Path, count: int) -> Iterator[CloudChunk]:
     for number in range(count):
         with np.load(work / f"{number:06d}.npz", allow_pickle=False) as kept:
             yield CloudChunk(**kept)

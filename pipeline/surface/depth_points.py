@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_set import DepthPart, SurfacePieces, dot, look_at, place_of, turned
+from splatpipe.pipeline.surface.photo_set import DepthPart, SurfacePieces, dot, rotate, unproject_pixels, view_pieces
 from splatpipe.pipeline.surface.sources import HeightRange
 from splatpipe.pipeline.surface.tiles import Tile
 
-SAME_PX = 10.0  # depths that bend by more than so many pixels' widths are not one surface
-REACHES = (3, 1)  # pixels on either side that a normal is taken from: nearer ones say little but noise
+SAME_PX = 10.0  # depths that bend by more than this many pixel widths are not one surface
+REACHES = (3, 1)  # distances in pixels at which the slope for a normal is measured: at the shorter one, noise dominates
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,20 +45,20 @@ def depth_points(part: DepthPart, lattice: Lattice, tile: Tile, relief: HeightRa
         relief: Height range; points outside of it are dropped.
     """
     row, column = np.nonzero(part.depth > 0.0)
-    xyz = place_of(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64))
+    xyz = unproject_pixels(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64))
     inside = (lattice.cells(tile, xyz[0], xyz[1]) >= 0) & (xyz[2] >= relief.low_m) & (xyz[2] < relief.high_m)
     row, column, xyz = row[inside], column[inside], xyz[:, inside]
-    normal, known = picture_normals(part, row, column, REACHES[0])
+    normal, known = pixel_normals(part, row, column, REACHES[0])
     for reach in REACHES[1:]:
         rest = np.flatnonzero(~known)
-        normal[:, rest], known[rest] = picture_normals(part, row[rest], column[rest], reach)
+        normal[:, rest], known[rest] = pixel_normals(part, row[rest], column[rest], reach)
     pieces = SurfacePieces(xyz, normal)
-    footprint = look_at(part.camera, pieces).footprint
+    footprint = view_pieces(part.camera, pieces).footprint
     seen = np.flatnonzero(known & np.isfinite(footprint))
     return DepthPoints(part.number, pieces.select(seen), footprint[seen])
 
 
-def picture_normals(
+def pixel_normals(
     part: DepthPart, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], reach: int
 ) -> tuple[Float64[np.ndarray, "3 n"], Bool[np.ndarray, " n"]]:
     """Normals of pixels from the depths on all four sides, and whether these lie on one surface.
@@ -101,5 +101,5 @@ def _normal(
     camera = part.camera
     x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
     across, down = slopes[0] * camera.fx, slopes[1] * camera.fy
-    away = np.stack(turned(camera.cam_from_world[:3, :3].T, across, down, inverse - across * x - down * y))
+    away = np.stack(rotate(camera.cam_from_world[:3, :3].T, across, down, inverse - across * x - down * y))
     return np.asarray(-away / np.maximum(np.sqrt(dot(away, away)), 1e-30))

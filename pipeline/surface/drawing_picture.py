@@ -11,7 +11,7 @@ from splatpipe.pipeline.surface.drawing import Drawing
 from splatpipe.pipeline.surface.drawing_files import LAYERS, MARGIN_MM
 from splatpipe.pipeline.surface.whole_file import whole_file
 
-DOTS_AN_INCH = 150  # of paper: a page fills a screen
+DOTS_PER_INCH = 150  # of paper: a page fills a screen
 MM_AN_INCH, POINTS_A_MM = 25.4, 72.0 / 25.4
 LETTER = 1.4  # a font's size over its capitals' height
 DOT_MM = 0.6  # of a point
@@ -30,7 +30,7 @@ def write_png_drawing(path: Path, drawing: Drawing) -> None:
     low = low - (TEXT_ROOM_MM + MARGIN_MM) * mm
     high = high + MARGIN_MM * mm
     width, height = ((high - low) / mm).clip(MIN_MM, MAX_MM) / MM_AN_INCH
-    figure = Figure(figsize=(width, height), dpi=DOTS_AN_INCH)
+    figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_xlim(low[0], high[0])

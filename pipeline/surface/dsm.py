@@ -25,7 +25,7 @@ from splatpipe.pipeline.surface.site_extent import SiteExtent
 from splatpipe.pipeline.surface.sources import LruCache
 from splatpipe.pipeline.surface.tiles import Tile
 
-HELD_BYTES = 512 << 20  # limit for depths in memory
+CACHE_BYTES = 512 << 20  # limit for depths in memory
 MILLIMETRES = 1000.0
 MAX_MILLIMETRES = np.iinfo(np.uint16).max
 
@@ -73,11 +73,11 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
     """
     grid = make_grid(task.surface.frame, task.site.box, task.cell_m)
     sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
-    making = SheetWork(sheets, partial(_seen, task.site), task.surface.area, TILE, work, report, "surface model")
+    making = SheetWork(sheets, partial(_is_seen, task.site), task.surface.area, TILE, work, report, "surface model")
 
     def heights(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
-        sources = [sheet.sheet.moved_depths(source) for source in task.surface.depths]
-        capture = HeightInput(sources, sheet.sheet.lattice, sheet.sheet.relief, LruCache(HELD_BYTES))
+        sources = [sheet.sheet.transform_depths(source) for source in task.surface.depths]
+        capture = HeightInput(sources, sheet.sheet.lattice, sheet.sheet.relief, LruCache(CACHE_BYTES))
         for part in surface_heights(capture, tiles, task.threads):
             sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))
             confidence = np.stack([part.photos, np.minimum(sigma, MAX_MILLIMETRES)], axis=-1).astype(np.uint16)
@@ -103,10 +103,10 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
     }
 
 
-def _seen(site: SiteExtent, sheet: GridSheet, tile: Tile) -> bool:
+def _is_seen(site: SiteExtent, sheet: GridSheet, tile: Tile) -> bool:
     """Whether enough photos see any part of a tile."""
     corners = sheet.sheet.lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
-    local = sheet.sheet.local(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
+    local = sheet.sheet.local_from_sheet(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
     return site.sees(np.stack([local.min(axis=0), local.max(axis=0)]))
 
 

@@ -1,8 +1,8 @@
 """Elevations of walls: orthographic views, with the distance of each point in front of or behind the wall's plane.
 
 A wall is a vertical sheet. The surface model over it, with the surface nearest to the viewer as the topmost, gives the
-depths, and the orthophoto the colours. Objects in front of the wall beyond the height range are left out, and never
-smeared over it: areas that they hide are coloured from photos that see past them, or not at all.
+depths, and the orthophoto the colours. Objects in front of the wall beyond the height range are left out, and not
+projected onto it: areas that they hide are coloured from photos that see past them, or not at all.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from splatpipe.pipeline.surface.sheet import Sheet
 from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PosedDepthMap
 from splatpipe.pipeline.surface.walls import Wall
 
-BEHIND_M, BEFORE_M = 0.6, 0.6  # what belongs to a wall: reveals and doors, sills and cornices; balconies do not
+BEHIND_M, BEFORE_M = 0.6, 0.6  # extent of a wall's details: reveals and doors, sills and cornices, but not balconies
 MAX_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
-STRIP = 256  # rows that are softened at a time
-SHELF_BYTES = 256 << 20  # of photos, and as many of depths
+STRIP = 256  # rows that are filtered at a time
+CACHE_BYTES = 256 << 20  # of photos, and as many of depths
 
 Progress = Callable[[int, int], None]
 
@@ -57,7 +57,9 @@ class Elevation:
         lattice = self.sheet.lattice
         left, top = lattice.east_m, lattice.north_m
         right, bottom = left + lattice.width * lattice.cell_m, top - lattice.height * lattice.cell_m
-        return self.sheet.local(np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]]))
+        return self.sheet.local_from_sheet(
+            np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]])
+        )
 
 
 def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
@@ -115,21 +117,21 @@ def draw_elevation(wall: Wall, cell_m: float, photos: ElevationPhotos, progress:
     sheet = wall_sheet(wall, cell_m)
     depths_tiles, colour_tiles = (list(sheet.lattice.tiles(side)) for side in (HEIGHTS_TILE, TILE))
     total = len(depths_tiles) + len(colour_tiles)
-    sources, levels = _before(sheet, photos)
+    sources, levels = _photos_in_front(sheet, photos)
     shape = sheet.lattice.height, sheet.lattice.width
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     colour = np.zeros((*shape, 4), np.uint8)
-    shelf: LruCache[PosedDepthMap] = LruCache(SHELF_BYTES)
+    cache: LruCache[PosedDepthMap] = LruCache(CACHE_BYTES)
     known = [source.depths for source in sources if source.depths is not None]
-    capture = HeightInput(known, sheet.lattice, sheet.relief, shelf, upright=True)
+    capture = HeightInput(known, sheet.lattice, sheet.relief, cache, upright=True)
     for done, part in enumerate(surface_heights(capture, depths_tiles, photos.threads), 1):
         cut = part.tile.slices
         depth[cut], sigma[cut] = part.height, part.sigma
         progress(done, total)
-    depth = without_specks(depth)
+    depth = remove_specks(depth)
     surface = HeightField(sheet.lattice, depth)
     album = OrthoInput(
-        sources, surface, sheet.lattice, sheet.relief, levels, LruCache(SHELF_BYTES), LruCache(SHELF_BYTES)
+        sources, surface, sheet.lattice, sheet.relief, levels, LruCache(CACHE_BYTES), LruCache(CACHE_BYTES)
     )
     for done, drawn in enumerate(orthophotos(album, colour_tiles, photos.threads), len(depths_tiles) + 1):
         cut = drawn.tile.slices
@@ -139,7 +141,7 @@ def draw_elevation(wall: Wall, cell_m: float, photos: ElevationPhotos, progress:
     return Elevation(wall, sheet, depth, sigma, colour)
 
 
-def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def remove_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Median filter over known neighbours, which keeps edges and removes errors of single cells."""
     result = np.empty_like(depth)
     wide = np.pad(depth, 1, constant_values=np.nan)
@@ -153,9 +155,11 @@ def without_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h 
     return result
 
 
-def _before(sheet: Sheet, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
+def _photos_in_front(sheet: Sheet, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
     """Photos in front of a wall, in its sheet's frame, with their exposure gains."""
     rows = [
-        row for row, source in enumerate(photos.sources) if sheet.place(source.camera.centre())[2] > sheet.relief.high_m
+        row
+        for row, source in enumerate(photos.sources)
+        if sheet.sheet_from_local(source.camera.centre())[2] > sheet.relief.high_m
     ]
-    return [sheet.moved_photo(photos.sources[row]) for row in rows], photos.levels.of(rows)
+    return [sheet.transform_photo(photos.sources[row]) for row in rows], photos.levels.of(rows)

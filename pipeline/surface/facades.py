@@ -25,12 +25,12 @@ from splatpipe.pipeline.surface.elevation_files import (
     write_facades,
     write_picture,
 )
-from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_levels
+from splatpipe.pipeline.surface.exposures import COMPARED_POINTS, exposure_levels
 from splatpipe.pipeline.surface.facets import Facets, upright_facets
 from splatpipe.pipeline.surface.grid import DIGITS
 from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
 from splatpipe.pipeline.surface.run_sources import RunSurface
-from splatpipe.pipeline.surface.walls import Wall, find_walls, named, stated_wall
+from splatpipe.pipeline.surface.walls import Wall, find_walls, name_walls, stated_wall
 from splatpipe.pipeline.surface.whole_file import write_whole_text
 
 LIST = "facades.json"
@@ -84,7 +84,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         report.warning("No walls were found.", "Add photos that face them, or give walls by their end points.")
         write_facades(out / LIST, [], crs)
         return []
-    places = facets.places[:: max(1, len(facets) // COMPARED_AT)]
+    places = facets.places[:: max(1, len(facets) // COMPARED_POINTS)]
     photos = ElevationPhotos(sources, exposure_levels(sources, places, 2.0 * pixel_m, task.threads), task.threads)
     facts = []
     for number, wall in enumerate(walls):
@@ -105,7 +105,7 @@ def _within(walls: Sequence[Wall], area: PlanArea | None) -> list[Wall]:
     if area is None or not walls:
         return list(walls)
     middles = np.array([[*((wall.left + wall.right) / 2.0), wall.low_m] for wall in walls])
-    return named([wall for wall, inside in zip(walls, area.contains(middles), strict=True) if inside])
+    return name_walls([wall for wall, inside in zip(walls, area.contains(middles), strict=True) if inside])
 
 
 def parse_lines(text: str) -> list[Line]:
@@ -152,7 +152,7 @@ def stated_walls(lines: Sequence[Line], facets: Facets, crs: MapCrs) -> list[Wal
                 "Give its left end first, as seen from in front of it, in the run's CRS.",
             )
         walls.append(wall)
-    return named(walls)
+    return name_walls(walls)
 
 
 def _write(folder: Path, elevation: Elevation, crs: MapCrs) -> None:

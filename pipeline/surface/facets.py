@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, DepthSource, PosedDepthMap
 
-BLOCKS_A_PHOTO = 20_000  # blocks of pixels, each fitted with a plane: 20 cm of a wall in photos with a GSD of 3 cm
+BLOCKS_PER_PHOTO = 20_000  # blocks of pixels, each fitted with a plane: 20 cm of a wall in photos with a GSD of 3 cm
 MIN_BLOCK = 6  # pixels per side: a smaller block's slope is noise
 MIN_SHARE = 0.6  # of a block's pixels that count
 ROUGH_PX = 3.0  # pixel widths by which a block's depths may scatter about its plane: more means two surfaces
@@ -54,13 +54,13 @@ def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
         sources: Depths of photos, always in the same order.
         threads: Photos in parallel.
     """
-    share = max(1, math.ceil(len(sources) * BLOCKS_A_PHOTO / 4 / MAX_FACETS))  # a quarter stands, at most
+    share = max(1, math.ceil(len(sources) * BLOCKS_PER_PHOTO / 4 / MAX_FACETS))  # at most a quarter are vertical
 
-    def thinned(source: DepthSource) -> Facets:
+    def load_facets(source: DepthSource) -> Facets:
         found = facets_of(source.load())
         return found.select(np.arange(0, len(found), share))
 
-    every = _joined(list(ordered_map(thinned, sources, threads)))
+    every = _concatenate(list(ordered_map(load_facets, sources, threads)))
     return every.select(every.pixels_m <= COARSEST * np.median(every.pixels_m)) if len(every) else every
 
 
@@ -70,10 +70,10 @@ def facets_of(found: PosedDepthMap) -> Facets:
     Inverse depth is linear in a plane's pixels: w = n · (x, y, 1) for the plane n · X = 1.
     """
     camera = found.camera
-    side = max(MIN_BLOCK, round(math.sqrt(camera.width * camera.height / BLOCKS_A_PHOTO)))
+    side = max(MIN_BLOCK, round(math.sqrt(camera.width * camera.height / BLOCKS_PER_PHOTO)))
     strip = max(1, STRIP_PIXELS // (side * camera.width)) * side
     parts = [_strip_facets(found, top, strip, side) for top in range(0, camera.height - side + 1, strip)]
-    return _joined(parts)
+    return _concatenate(parts)
 
 
 def _strip_facets(found: PosedDepthMap, top: int, rows: int, side: int) -> Facets:
@@ -95,10 +95,10 @@ def _strip_facets(found: PosedDepthMap, top: int, rows: int, side: int) -> Facet
     w = (middle * normal).sum(axis=1)
     rough = np.sqrt((weight * misfit).sum(axis=1) / total)
     good = (w > 0.0) & (rough * camera.fx <= ROUGH_PX * w)
-    return _standing(camera, middle[good], normal[good], side)
+    return _upright_only(camera, middle[good], normal[good], side)
 
 
-def _joined(parts: Sequence[Facets]) -> Facets:
+def _concatenate(parts: Sequence[Facets]) -> Facets:
     every = [Facets(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0)), *parts]
     fields = ("places", "facing", "areas", "pixels_m")
     return Facets(*(np.concatenate([getattr(part, name) for part in every]) for name in fields))
@@ -123,7 +123,7 @@ def _planes(
     return np.column_stack([slope, mean - (slope * middle[:, :2]).sum(axis=1)])
 
 
-def _standing(
+def _upright_only(
     camera: Camera,
     rays: Float64[np.ndarray, "n 3"],
     normals: Float64[np.ndarray, "n 3"],

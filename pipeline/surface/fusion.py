@@ -13,9 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatpipe.pipeline.surface.depth_points import REACHES, DepthPoints, depth_points, picture_normals
+from splatpipe.pipeline.surface.depth_points import REACHES, DepthPoints, depth_points, pixel_normals
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_set import DepthPart, SurfacePieces, SurfaceView, dot, look_at, place_of
+from splatpipe.pipeline.surface.photo_set import (
+    DepthPart,
+    SurfacePieces,
+    SurfaceView,
+    dot,
+    unproject_pixels,
+    view_pieces,
+)
 from splatpipe.pipeline.surface.sources import HeightRange
 from splatpipe.pipeline.surface.tiles import Tile
 
@@ -24,7 +31,7 @@ MIN_PHOTOS = 3  # photos that have to see a point, including its own
 REACH = 2.5  # standard deviations from the mean within which a photo counts (Tukey's biweight; Beaton and Tukey 1974)
 SIGMA_PX = 0.7  # standard deviation of a depth, in pixel footprints on the surface
 ROUNDS = 3  # of the robust mean
-STALE = 0.3  # share of discarded points at which the arrays are compacted
+COMPACT_SHARE = 0.3  # of discarded points, at which the arrays are compacted
 BATCH = 1 << 14  # points at a time: takes 16 bytes per point and photo
 MOST = np.iinfo(np.uint8).max
 
@@ -51,7 +58,7 @@ class FusedPoints:
         return FusedPoints(self.pieces.select(rows), self.footprint[rows], self.confidence[rows])
 
 
-def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: HeightRange) -> FusedPoints:
+def fuse_depths(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: HeightRange) -> FusedPoints:
     """Fuse the depths in a tile, photo by photo; points may lie slightly outside of the tile.
 
     Args:
@@ -61,9 +68,9 @@ def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: Heig
         relief: Height range; points outside of it are noise.
     """
     if not parts:
-        return joined([])
+        return concatenate_clouds([])
     nearest = _by_distance(parts, lattice, tile)
-    finest = [_finest(depth_points(part, lattice, tile, relief), nearest) for part in parts]
+    finest = [_drop_coarser(depth_points(part, lattice, tile, relief), nearest) for part in parts]
     xyz = np.concatenate([each.pieces.xyz for each in finest], axis=1)
     footprint = np.concatenate([each.footprint for each in finest])
     kept = np.zeros(len(footprint), np.bool_)
@@ -73,8 +80,8 @@ def fused(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile, relief: Heig
     for points, some in zip(finest, np.split(kept, ends[:-1]), strict=True):
         points = points.select(some)
         starts = range(0, len(points.footprint), BATCH)
-        found += [_agreed(points.select(np.s_[start : start + BATCH]), parts) for start in starts]
-    return joined(found)
+        found += [_average_positions(points.select(np.s_[start : start + BATCH]), parts) for start in starts]
+    return concatenate_clouds(found)
 
 
 def finest_of_cubes(
@@ -92,7 +99,7 @@ def finest_of_cubes(
     return kept[order[first]]
 
 
-def joined(found: Sequence[FusedPoints]) -> FusedPoints:
+def concatenate_clouds(found: Sequence[FusedPoints]) -> FusedPoints:
     """Concatenate clouds."""
     none = FusedPoints(SurfacePieces(np.zeros((3, 0)), np.zeros((3, 0))), np.zeros(0), np.zeros(0, np.uint8))
     every = [none, *found]
@@ -108,7 +115,7 @@ def _by_distance(parts: Sequence[DepthPart], lattice: Lattice, tile: Tile) -> li
     return [parts[k] for k in np.argsort(away, kind="stable")]
 
 
-def _finest(points: DepthPoints, others: Sequence[DepthPart]) -> DepthPoints:
+def _drop_coarser(points: DepthPoints, others: Sequence[DepthPart]) -> DepthPoints:
     """Points that no other photo sees more finely."""
     lost = np.zeros(len(points.footprint), np.bool_)
     for other in others:
@@ -116,21 +123,21 @@ def _finest(points: DepthPoints, others: Sequence[DepthPart]) -> DepthPoints:
             break
         if other.number == points.number:
             continue
-        if lost.mean() > STALE:
+        if lost.mean() > COMPACT_SHARE:
             points, lost = points.select(~lost), np.zeros(int((~lost).sum()), np.bool_)
-        look = look_at(other.camera, points.pieces)
-        asked = np.flatnonzero((look.footprint < FINER * points.footprint) & ~lost)
-        sight = look.sight(other, asked)
-        lost[asked] = sight.seen & ~sight.mixed
+        view = view_pieces(other.camera, points.pieces)
+        candidates = np.flatnonzero((view.footprint < FINER * points.footprint) & ~lost)
+        visibility = view.classify(other, candidates)
+        lost[candidates] = visibility.seen & ~visibility.mixed
     return points.select(~lost)
 
 
 @dataclass(frozen=True, eq=False)
-class _Opinion:
-    """Where other photos place the points; one row per photo that sees any.
+class _OtherPositions:
+    """Positions of the points according to other photos; one row per photo that sees any.
 
     Attributes:
-        offset: From a point to the photo's position of it, metres: (photos, 3, n).
+        offset: From a point to its position in the photo's depths, metres: (photos, 3, n).
         weight: Weight of the photo; 0 where it does not see the point.
     """
 
@@ -138,24 +145,24 @@ class _Opinion:
     weight: Float32[np.ndarray, "m n"]
 
 
-def _agreed(points: DepthPoints, parts: Sequence[DepthPart]) -> FusedPoints:
+def _average_positions(points: DepthPoints, parts: Sequence[DepthPart]) -> FusedPoints:
     """Points moved to the average of the photos that see them, without those that few see or many see through."""
-    opinion, normal, balance = _heard(points, parts)
-    count = 1 + (opinion.weight > 0.0).sum(axis=0)
+    others, normal, balance = _other_positions(points, parts)
+    count = 1 + (others.weight > 0.0).sum(axis=0)
     kept = np.flatnonzero((count >= MIN_PHOTOS) & (balance > 0))
     normal = normal[:, kept]
     normal = normal / np.maximum(np.sqrt(dot(normal, normal)), 1e-30)
-    offset = opinion.offset[:, :, kept]
+    offset = others.offset[:, :, kept]
     along = offset[:, 0] * normal[0] + offset[:, 1] * normal[1] + offset[:, 2] * normal[2]
     footprint = points.footprint[kept]
-    shift = _robust_mean(along, opinion.weight[:, kept].astype(np.float64), footprint)
+    shift = _robust_mean(along, others.weight[:, kept].astype(np.float64), footprint)
     pieces = SurfacePieces(points.pieces.xyz[:, kept] + normal * shift, normal)
     return FusedPoints(pieces, footprint, np.minimum(count[kept] - 1, MOST).astype(np.uint8))
 
 
-def _heard(
+def _other_positions(
     points: DepthPoints, parts: Sequence[DepthPart]
-) -> tuple[_Opinion, Float64[np.ndarray, "3 n"], Int64[np.ndarray, " n"]]:
+) -> tuple[_OtherPositions, Float64[np.ndarray, "3 n"], Int64[np.ndarray, " n"]]:
     """The other photos' positions; the sum of all normals; and how many more photos see a point than see through it."""
     size = len(points.footprint)
     normal, balance = points.pieces.normal.copy(), np.ones(size, np.int64)
@@ -163,34 +170,37 @@ def _heard(
     for part in parts:
         if part.number == points.number:
             continue
-        look = look_at(part.camera, points.pieces)
-        sight = look.sight(part, np.s_[:])
-        facing = np.isfinite(look.footprint)
-        balance -= sight.through
-        seen = sight.seen & facing
+        view = view_pieces(part.camera, points.pieces)
+        visibility = view.classify(part, np.s_[:])
+        facing = np.isfinite(view.footprint)
+        balance -= visibility.through
+        seen = visibility.seen & facing
         if not seen.any():
             continue
         balance += seen
-        offset, theirs = _place_and_normal(points.pieces, part, look, seen)
+        offset, theirs = _place_and_normal(points.pieces, part, view, seen)
         normal[:, seen] += theirs
         whole, weight = np.zeros((1, 3, size), np.float32), np.zeros((1, size), np.float32)
         whole[0][:, seen] = offset
-        weight[0, seen] = np.square(points.footprint[seen] / look.footprint[seen])
+        weight[0, seen] = np.square(points.footprint[seen] / view.footprint[seen])
         offsets.append(whole)
         weights.append(weight)
-    return _Opinion(np.concatenate(offsets), np.concatenate(weights)), normal, balance
+    return _OtherPositions(np.concatenate(offsets), np.concatenate(weights)), normal, balance
 
 
 def _place_and_normal(
-    pieces: SurfacePieces, part: DepthPart, look: SurfaceView, seen: Bool[np.ndarray, " n"]
+    pieces: SurfacePieces, part: DepthPart, view: SurfaceView, seen: Bool[np.ndarray, " n"]
 ) -> tuple[Float64[np.ndarray, "3 k"], Float64[np.ndarray, "3 k"]]:
     """Offsets from points to the surface at their pixels in another photo, and the normals there; zero where unknown.
 
     A pixel's centre lies beside the point, but on the surface's plane, so along the normal the offset is the plane's.
     """
-    row, column = look.place.row[seen].astype(np.int64), look.place.column[seen].astype(np.int64)
-    offset = place_of(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64)) - pieces.xyz[:, seen]
-    normal, flat = picture_normals(part, row, column, REACHES[0])
+    row, column = view.place.row[seen].astype(np.int64), view.place.column[seen].astype(np.int64)
+    offset = (
+        unproject_pixels(part.camera, row, column, 1.0 / part.depth[row, column].astype(np.float64))
+        - pieces.xyz[:, seen]
+    )
+    normal, flat = pixel_normals(part, row, column, REACHES[0])
     return offset, np.where(flat, normal, 0.0)
 
 

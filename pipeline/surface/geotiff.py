@@ -38,7 +38,7 @@ from splatpipe.pipeline.surface.tiles import Tile
 from splatpipe.pipeline.surface.whole_file import whole_file
 
 NODATA_HEIGHT = -9999.0
-HEIGHT_STEPS_A_UNIT = 1024.0  # a power of two, so that steps have few bits and compress well
+HEIGHT_STEPS_PER_UNIT = 1024.0  # a power of two, so that steps have few bits and compress well
 CACHE_MEGABYTES = 128  # for GDAL's blocks; the default is a share of the machine's memory
 JPEG_QUALITY = 92
 GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)  # the last if a GDAL copy fails without a message
@@ -194,7 +194,7 @@ def _describe(raster: Any, grid: Grid, form: RasterForm) -> None:
 
 def _packed_heights(values: np.ndarray) -> np.ndarray:
     """Heights rounded to whole steps; nodata where they are not finite."""
-    steps = np.round(values.astype(np.float64) * HEIGHT_STEPS_A_UNIT) / HEIGHT_STEPS_A_UNIT
+    steps = np.round(values.astype(np.float64) * HEIGHT_STEPS_PER_UNIT) / HEIGHT_STEPS_PER_UNIT
     return np.where(np.isfinite(steps), steps, NODATA_HEIGHT).astype(np.float32)
 
 

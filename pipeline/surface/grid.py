@@ -1,8 +1,8 @@
 """The raster grid of a run's surface products: north up in the run's CRS, aligned to whole multiples of its cell size.
 
-So rasters of one cell size align, whatever their extents, without resampling. Cells are counted from the upper left
-corner; the centre of the first is (0.5, 0.5). A value stands for its cell's area (GeoTIFF's PixelIsArea, the default of
-all readers, without a half-cell shift).
+So rasters with the same cell size align without resampling, whatever their extents. Cells are counted from the upper
+left corner; the centre of the first is (0.5, 0.5). A value represents its cell's area (GeoTIFF's PixelIsArea, the
+default of all readers, without a half-cell shift).
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.world import World
 
 TILE = 512  # cells: a block of the files
-DIGITS = 3  # significant digits of the cell size: 0.028 rather than 0.027963; at most half a per cent off
-LIKE_GROUND = 0.005  # a grid metre this close to a ground metre counts as one: 2 cm stay 2 cm in UTM
+DIGITS = 3  # significant digits of the cell size: 0.028 rather than 0.027963; at most 0.5 % off
+LIKE_GROUND = 0.005  # a grid metre this close to a ground metre counts as one, so that 2 cm stay 2 cm in UTM
 MIN_CELL_M, MAX_CELL_M = 1e-4, 1e3
-MAX_CELLS_A_SIDE = 1_000_000
+MAX_CELLS_PER_SIDE = 1_000_000
 MAX_CELLS = 20_000_000_000  # 8 km² at 2 cm, a file of 80 GB of heights before compression
 ROUNDING = 1e-6  # cells: an extent that ends on a grid line gets no cell beyond it
 EDGE_STEPS = 9  # samples along each side of the scene's box
@@ -151,7 +151,7 @@ def _ground_scale(world: World) -> float:
 
 
 def _require_reasonable(width: int, height: int, gsd_m: float) -> None:
-    if max(width, height) > MAX_CELLS_A_SIDE or width * height > MAX_CELLS:
+    if max(width, height) > MAX_CELLS_PER_SIDE or width * height > MAX_CELLS:
         raise SplatpipeError(
             f"A raster of {width:,} × {height:,} cells of {gsd_m:g} m is too large.",
             "Choose larger cells with --gsd, or a part of the scene with --boundary.",

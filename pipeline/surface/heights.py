@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.surface.holes import filled
+from splatpipe.pipeline.surface.holes import fill_holes
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.point_visibility import PointVisibility, sight
+from splatpipe.pipeline.surface.point_visibility import PointVisibility, classify_points
 from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, PosedDepthMap, photos_seeing
 from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.surface.votes import HALF, HeightVotes, Layer, undecided
+from splatpipe.pipeline.surface.votes import HALF, HeightVotes, Layer, needs_check
 
 TILE = 256  # cells per side
 MIN_PHOTOS = 3  # photos that have to see a cell
@@ -23,7 +23,7 @@ NEAR = 4  # cells: holes up to this size are filled from their surroundings,
 FAR = 16  # larger ones up to this if photos may see the filled surface,
 FAR_ON_WALLS = 28  # and still larger ones on walls, which are flat and textureless where depths are missing
 BEHIND = 8  # one photo that sees through a surface outweighs this many that see it: depths widen foreground objects
-FEW = 2  # photos that agree on a height suffice where a third one may see it
+FEW = 2  # photos that agree on a height are enough where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
 MAX_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
 MIN_CELLS = 1 << 12  # smaller tiles are not split: they would be mostly margin
@@ -57,14 +57,14 @@ class HeightInput:
         sources: Depths of the photos, always in the same order.
         lattice: Cells that get heights.
         relief: Lowest and highest height to consider.
-        shelf: Cache of a few depth maps.
+        cache: Cache of a few depth maps.
         upright: Whether the lattice is a wall's instead of the ground's.
     """
 
     sources: Sequence[DepthSource]
     lattice: Lattice
     relief: HeightRange
-    shelf: LruCache[PosedDepthMap]
+    cache: LruCache[PosedDepthMap]
     upright: bool = False
 
     @property
@@ -79,7 +79,7 @@ class HeightInput:
 
     def depths(self, number: int) -> PosedDepthMap:
         """A photo's depths, loaded if they are not cached."""
-        return self.shelf.get(number, self.sources[number].loaded)
+        return self.cache.get(number, self.sources[number].load_sized)
 
 
 def surface_heights(capture: HeightInput, tiles: Sequence[Tile], threads: int) -> Iterator[Heights]:
@@ -107,7 +107,7 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MAX_VOTES) -> Hei
     wide = tile.grown(capture.margin)
     seen = photos_seeing([source.camera for source in capture.sources], capture.lattice, wide, capture.relief)
     if len(seen) * wide.cells > most and tile.cells > MIN_CELLS:
-        return _joined(tile, [tile_heights(capture, half, most) for half in tile.halves()])
+        return _join_halves(tile, [tile_heights(capture, half, most) for half in tile.halves()])
     votes = HeightVotes(capture.lattice, wide, capture.relief)
     for number, window in seen:
         votes.add(capture.depths(number), window)
@@ -115,12 +115,12 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MAX_VOTES) -> Hei
     if not found:
         return _empty(tile)
     numbers = [number for number, _ in seen]
-    fit = votes.fitted(_chosen(capture, wide, found, numbers))
+    fit = votes.fit(_choose_surface(capture, wide, found, numbers))
     agreed = np.where(fit.photos >= MIN_PHOTOS, fit.height, np.nan)
     few = np.flatnonzero((fit.photos == FEW) & np.isfinite(fit.height))
-    may = _may_see(capture, wide, few, fit.height[few], numbers) >= MIN_PHOTOS
+    may = _count_possible_views(capture, wide, few, fit.height[few], numbers) >= MIN_PHOTOS
     agreed[few[may]] = fit.height[few[may]]
-    height, new = _filled(capture, wide, agreed, numbers)
+    height, new = _fill_holes(capture, wide, agreed, numbers)
     shape = (wide.height, wide.width)
     sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma).reshape(shape)
     counted = np.where(np.isfinite(agreed), np.minimum(fit.photos, MOST), 0)
@@ -135,29 +135,29 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MAX_VOTES) -> Hei
     )
 
 
-def _filled(
+def _fill_holes(
     capture: HeightInput, tile: Tile, height: Float64[np.ndarray, " c"], numbers: Sequence[int]
 ) -> tuple[Float64[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
     """Fill a tile's small holes, and larger ones where enough photos may see the result; also returns which are new."""
     shape, cell_m = (tile.height, tile.width), capture.lattice.cell_m
-    near, _ = filled(height.reshape(shape), cell_m, NEAR, capture.upright)
-    far, new = filled(near, cell_m, capture.far, capture.upright)
-    result, asked = far.ravel(), np.flatnonzero(new)
-    seen = _may_see(capture, tile, asked, result[asked], numbers) >= MIN_PHOTOS
-    result[asked[~seen]] = np.nan
+    near, _ = fill_holes(height.reshape(shape), cell_m, NEAR, capture.upright)
+    far, new = fill_holes(near, cell_m, capture.far, capture.upright)
+    result, candidates = far.ravel(), np.flatnonzero(new)
+    seen = _count_possible_views(capture, tile, candidates, result[candidates], numbers) >= MIN_PHOTOS
+    result[candidates[~seen]] = np.nan
     return result, np.isfinite(result) & np.isnan(height)
 
 
-def _may_see(
+def _count_possible_views(
     capture: HeightInput,
     tile: Tile,
-    asked: Int64[np.ndarray, " a"],
+    candidates: Int64[np.ndarray, " a"],
     height: Float64[np.ndarray, " a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, " a"]:
-    """How many photos see each place, or view it without having a depth there."""
-    count = np.zeros(len(asked), np.int64)
-    for _, view in _views(capture, tile, asked, height[None], numbers):
+    """How many photos see each place, or have it in view without a depth there."""
+    count = np.zeros(len(candidates), np.int64)
+    for _, view in _views(capture, tile, candidates, height[None], numbers):
         count += view.seen | view.unknown
     return count
 
@@ -165,19 +165,19 @@ def _may_see(
 def _views(
     capture: HeightInput,
     tile: Tile,
-    asked: Int64[np.ndarray, " a"],
+    candidates: Int64[np.ndarray, " a"],
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Iterator[tuple[int, PointVisibility]]:
     """Visibility of places in some of a tile's cells in each photo, layer by layer, with the layer's index."""
-    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[asked].T)
-    for number in reversed(numbers) if asked.size else ():  # the last ones are still cached
+    east, north = np.ascontiguousarray(capture.lattice.centres(tile).reshape(-1, 2)[candidates].T)
+    for number in reversed(numbers) if candidates.size else ():  # the last ones are still cached
         found = capture.depths(number)
         for layer, height in enumerate(heights):
-            yield layer, sight(found, (east, north, height), capture.lattice.cell_m)
+            yield layer, classify_points(found, (east, north, height), capture.lattice.cell_m)
 
 
-def _joined(tile: Tile, halves: Sequence[Heights]) -> Heights:
+def _join_halves(tile: Tile, halves: Sequence[Heights]) -> Heights:
     """Join the halves of a tile."""
     axis = 0 if halves[0].tile.width == tile.width else 1
     columns = zip(*((half.height, half.sigma, half.photos) for half in halves), strict=True)
@@ -189,34 +189,34 @@ def _empty(tile: Tile) -> Heights:
     return Heights(tile, nothing, nothing.copy(), np.zeros((tile.height, tile.width), np.uint8))
 
 
-def _chosen(
+def _choose_surface(
     capture: HeightInput, tile: Tile, found: Sequence[Layer], numbers: Sequence[int]
 ) -> Float64[np.ndarray, " c"]:
     """The highest surface in each cell that not too many photos see through; NaN where there is none.
 
     Surfaces that cover at least half of the cell take precedence.
     """
-    asked = np.flatnonzero(undecided(found, MIN_PHOTOS))
-    heights = np.stack([layer.height[asked] for layer in found])
-    balance = _balance(capture, tile, asked, heights, numbers)
+    candidates = np.flatnonzero(needs_check(found, MIN_PHOTOS))
+    heights = np.stack([layer.height[candidates] for layer in found])
+    balance = _balance(capture, tile, candidates, heights, numbers)
     good = np.isfinite(heights) & (balance >= 0)
-    covering = good & (np.stack([layer.cover[asked] for layer in found]) >= HALF)
+    covering = good & (np.stack([layer.cover[candidates] for layer in found]) >= HALF)
     good = np.where(covering.any(axis=0), covering, good)
     highest = np.where(good.any(axis=0), np.argmax(good, axis=0), -1)
     start = found[0].height.copy()
-    start[asked] = np.where(highest >= 0, heights[highest, np.arange(len(asked))], np.nan)
+    start[candidates] = np.where(highest >= 0, heights[highest, np.arange(len(candidates))], np.nan)
     return start
 
 
 def _balance(
     capture: HeightInput,
     tile: Tile,
-    asked: Int64[np.ndarray, " a"],
+    candidates: Int64[np.ndarray, " a"],
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
     """Number of photos that see a surface, minus ``BEHIND`` times those that see through it."""
     balance = np.zeros(heights.shape, np.int64)
-    for layer, view in _views(capture, tile, asked, heights, numbers):  # whole numbers add up in any order
+    for layer, view in _views(capture, tile, candidates, heights, numbers):  # whole numbers add up in any order
         balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)
     return balance

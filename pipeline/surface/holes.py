@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float64
 
-SIDES = 3  # of the four directions in which there has to be something within reach
-STEP_CELLS = 3.0  # heights this many cells above the lowest around are another surface: a hole at a wall is ground
+SIDES = 3  # of the four directions, in which there has to be a height within reach
+STEP_CELLS = 3.0  # heights this many cells above the lowest one nearby are another surface: a hole at a wall is ground
 
 
-def filled(
+def fill_holes(
     height: Float64[np.ndarray, "h w"], cell_m: float, reach: int, upright: bool = False
 ) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Fill cells that have heights nearby on at least three sides.
@@ -38,7 +38,11 @@ def filled(
     value, weight = np.stack(values), np.stack(nearness)
     known = weight > 0.0
     enough = known.sum(axis=0) >= SIDES
-    like = _likest(value, weight, STEP_CELLS * cell_m) if upright else np.min(np.where(known, value, np.inf), axis=0)
+    like = (
+        _best_supported(value, weight, STEP_CELLS * cell_m)
+        if upright
+        else np.min(np.where(known, value, np.inf), axis=0)
+    )
     used = np.where(known & (np.abs(value - like) <= STEP_CELLS * cell_m), weight, 0.0)
     total = used[0] + used[1] + used[2] + used[3]
     parts = used * np.where(known, value, 0.0)
@@ -49,7 +53,7 @@ def filled(
     return result, new
 
 
-def _likest(
+def _best_supported(
     value: Float64[np.ndarray, "4 n"], weight: Float64[np.ndarray, "4 n"], step_m: float
 ) -> Float64[np.ndarray, " n"]:
     """Of the heights around each hole, the one with most support from the others, weighted by nearness."""

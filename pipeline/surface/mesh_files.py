@@ -17,7 +17,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.splat.formats.plain_ply import frame_comments
-from splatpipe.pipeline.surface.photo_samples import linear
+from splatpipe.pipeline.surface.photo_samples import linear_light
 from splatpipe.pipeline.surface.triangles import ColouredMesh
 from splatpipe.pipeline.surface.whole_file import whole_file
 from splatpipe.pipeline.survey.frames import Frame
@@ -54,7 +54,7 @@ def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, boundary: Path | 
 
 def _write_glb(file: BinaryIO, made: ColouredMesh) -> None:
     positions = (made.mesh.vertices @ GLTF_FROM_WORLD.T).astype("<f4")
-    light = np.round(linear(made.colours / 255.0) * MAX_SHORT).astype("<u2")
+    light = np.round(linear_light(made.colours / 255.0) * MAX_SHORT).astype("<u2")
     colours = np.column_stack([light, np.full(len(light), MAX_SHORT, "<u2")])  # 8 bytes a vertex: aligned
     triangles = made.mesh.triangles.astype("<u4")
     arrays = (positions, colours, triangles)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Int16, UInt8, UInt16
 
 from splatpipe.pipeline.raster import _native
 
-KEPT = 8  # candidate photos per cell: enough to detect outliers
+MAX_CANDIDATES = 8  # candidate photos per cell: enough to detect outliers
 MARGIN: int = _native.MOSAIC_MARGIN  # cells around a tile that its colours depend on
 
 
@@ -44,11 +44,11 @@ def keep_best(seen: Bool[np.ndarray, "n h w"], cost: UInt16[np.ndarray, "n h w"]
         How many photos saw each cell, at most 255.
     """
     seen_by = np.empty(seen.shape[1:], np.uint8)
-    _native.keep_best(seen.view(np.uint8), cost, KEPT, seen_by)
+    _native.keep_best(seen.view(np.uint8), cost, MAX_CANDIDATES, seen_by)
     return seen_by
 
 
-def composed(
+def compose_mosaic(
     seen: Bool[np.ndarray, "n h w"],
     cost: UInt16[np.ndarray, "n h w"],
     colour: UInt8[np.ndarray, "n h w 3"],
@@ -69,7 +69,7 @@ def composed(
     return made
 
 
-def spread(
+def extend_colours(
     colour: UInt8[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], wanted: Bool[np.ndarray, "h w"], cells: int
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Extend colours from known into wanted cells, cell by cell outwards, up to a number of cells.

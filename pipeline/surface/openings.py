@@ -8,13 +8,16 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from splatpipe.pipeline.surface.sheet import Sheet
 
-RECESS_M, JUT_M = 0.05, 0.12  # behind the plane: frames of windows; before it: canopies, not shutters and plinths
-STEP_GSD = 2.0  # and at least so many pixels: depths of coarse photos scatter more
+RECESS_M, JUT_M = 0.05, 0.12  # behind the plane: window frames; in front of it: canopies, not shutters and plinths
+STEP_GSD = 2.0  # and at least this many pixels: depths of coarse photos scatter more
 MIN_AREA_M2 = 0.15  # of an opening; smaller ones are vents and noise
-SOFT_M = 0.06  # of a mask: notches and spots that are narrower go
-BRIDGED_M = 1.2  # of the wall's outline: bushes before it that are narrower make no notch
-STRAIGHT_CELLS = 1.5  # that an outline's corners may be off by
-ENCLOSED, RIM_CELLS = 0.5, 3  # share of the cells around an opening that are the wall: of a roof behind it a few are
+SOFT_M = 0.06  # narrower notches and spots of a mask are removed
+BRIDGED_M = 1.2  # narrower notches in the wall's outline, e.g. by bushes in front of it, are closed
+STRAIGHT_CELLS = 1.5  # tolerance of a simplified outline
+ENCLOSED, RIM_CELLS = (
+    0.5,
+    3,
+)  # least share of the wall's face in the cells around an opening: around a roof, it is small
 SQUARE = 0.8  # share of its level rectangle that an opening fills to be drawn as one; a round window fills 0.79
 Ring = Float64[np.ndarray, "_ 2"]
 
@@ -71,7 +74,7 @@ def _rings(there: Bool[np.ndarray, "h w"], sheet: Sheet, face: Bool[np.ndarray, 
         own = parts[top : top + height, left : left + width] == part
         if face is not None and _enclosed(own, left, top, face) < ENCLOSED:
             continue
-        ring = _level_rectangle(own) if face is not None and own.mean() >= SQUARE else _traced(own)
+        ring = _level_rectangle(own) if face is not None and own.mean() >= SQUARE else _trace_outline(own)
         columns, rows = (ring + np.array([left, top])).T
         rings.append(np.column_stack([sheet.lattice.east_m + columns * cell, sheet.lattice.north_m - rows * cell]))
     return rings
@@ -95,7 +98,7 @@ def _level_rectangle(own: Bool[np.ndarray, "h w"]) -> Ring:
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
 
 
-def _traced(own: Bool[np.ndarray, "h w"]) -> Ring:
+def _trace_outline(own: Bool[np.ndarray, "h w"]) -> Ring:
     """A part's simplified outline; cells are doubled so that it follows their borders instead of their centres."""
     fine = np.pad(np.kron(own.view(np.uint8), np.ones((2, 2), np.uint8)), 1)
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

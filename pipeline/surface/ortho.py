@@ -14,14 +14,14 @@ from jaxtyping import Float64, UInt8
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.surface.dsm import HELD_BYTES, height_range
-from splatpipe.pipeline.surface.exposures import COMPARED_AT, exposure_levels
+from splatpipe.pipeline.surface.dsm import CACHE_BYTES, height_range
+from splatpipe.pipeline.surface.exposures import COMPARED_POINTS, exposure_levels
 from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.known_cells import KnownCells, known_cells
 from splatpipe.pipeline.surface.mosaic import MARGIN
-from splatpipe.pipeline.surface.orthophoto import SPREAD, TILE, OrthoInput, orthophotos
+from splatpipe.pipeline.surface.orthophoto import EXTENDED_CELLS, TILE, OrthoInput, orthophotos
 from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.pixel_file import pixels_on_disk
@@ -112,10 +112,10 @@ def _colours(
 ) -> Iterator[tuple[Tile, Arrays]]:
     """The colours of a sheet's tiles."""
     plane = sheet.sheet
-    photos = [plane.moved_photo(photo) for photo in pictures.sources]
+    photos = [plane.transform_photo(photo) for photo in pictures.sources]
     surface = _surface(sheet, task.dsm, heights)
     album = OrthoInput(
-        photos, surface, plane.lattice, plane.relief, pictures.levels, pictures.pixels, LruCache(HELD_BYTES)
+        photos, surface, plane.lattice, plane.relief, pictures.levels, pictures.pixels, LruCache(CACHE_BYTES)
     )
     for part in orthophotos(album, tiles, task.threads):
         alpha = np.where(part.known, 255, 0).astype(np.uint8)
@@ -146,13 +146,13 @@ def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
 
 def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
     """The heights under a sheet's pixels, relative to the sheet."""
-    margin = (MARGIN + SPREAD) * sheet.grid.cell + AROUND * heights.cell
+    margin = (MARGIN + EXTENDED_CELLS) * sheet.grid.cell + AROUND * heights.cell
     part = _cells_under(sheet.grid, sheet.part, heights, margin)
     rows = np.clip([part.row, part.row + part.height], 0, heights.height)
     columns = np.clip([part.column, part.column + part.width], 0, heights.width)
     part = Tile(int(rows[0]), int(columns[0]), int(max(rows[1] - rows[0], 1)), int(max(columns[1] - columns[0], 1)))
     found = _read(dsm, part)
-    return HeightField(sheet.lattice_of(heights, part), sheet.over(heights, part, found).astype(np.float32))
+    return HeightField(sheet.lattice_of(heights, part), sheet.heights_over(heights, part, found).astype(np.float32))
 
 
 def _read(dsm: Path, part: Tile) -> Float64[np.ndarray, "h w"]:
@@ -166,7 +166,7 @@ def _read(dsm: Path, part: Tile) -> Float64[np.ndarray, "h w"]:
 def _places(dsm: Path, heights: Grid) -> Float64[np.ndarray, "m 3"]:
     """Evenly spaced cells of the surface, local metres."""
     rows, columns = (
-        max(1, round((COMPARED_AT * a / b) ** 0.5))
+        max(1, round((COMPARED_POINTS * a / b) ** 0.5))
         for a, b in ((heights.height, heights.width), (heights.width, heights.height))
     )
     row = (np.arange(min(rows, heights.height)) + 0.5) * heights.height / min(rows, heights.height)

@@ -12,16 +12,16 @@ from jaxtyping import Bool, Int16, Int64, UInt8, UInt16
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.mosaic import MARGIN, composed, keep_best, spread
+from splatpipe.pipeline.surface.mosaic import MARGIN, compose_mosaic, extend_colours, keep_best
 from splatpipe.pipeline.surface.photo_gains import PhotoGains
-from splatpipe.pipeline.surface.photo_samples import PhotoSource, loader, rated
-from splatpipe.pipeline.surface.point_visibility import Points, contiguous, sight
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, pixel_loader, rate_points
+from splatpipe.pipeline.surface.point_visibility import Points, classify_points, contiguous
 from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PosedDepthMap, photos_seeing
 from splatpipe.pipeline.surface.tiles import Tile
 
 TILE = 384  # cells per side
-SPREAD = 24  # cells over which colours are extended into areas that no photo sees; farther away there is none
-MAX_RATED = 24_000_000  # cells times photos at once: 70 MB of costs, and colours of a few photos
+EXTENDED_CELLS = 24  # cells over which colours are extended into areas that no photo sees; farther away there is none
+MAX_COSTS = 24_000_000  # cells times photos at once: 70 MB of costs, and colours of a few photos
 MIN_CELLS = 1 << 14  # smaller tiles are not split: they would be mostly margin
 
 
@@ -81,7 +81,7 @@ def orthophotos(album: OrthoInput, tiles: Sequence[Tile], threads: int) -> Itera
     return ordered_map(partial(tile_orthophoto, album), tiles, threads)
 
 
-def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MAX_RATED) -> Orthophoto:
+def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MAX_COSTS) -> Orthophoto:
     """Compute one tile of the orthophoto.
 
     Args:
@@ -89,29 +89,29 @@ def tile_orthophoto(album: OrthoInput, tile: Tile, most: int = MAX_RATED) -> Ort
         tile: The tile.
         most: Limit on cells times photos; tiles above it are computed in parts.
     """
-    wide = tile.grown(MARGIN + SPREAD)
+    wide = tile.grown(MARGIN + EXTENDED_CELLS)
     windows = photos_seeing([source.camera for source in album.sources], album.lattice, wide, album.relief)
     if len(windows) * wide.cells > most and tile.cells > MIN_CELLS:
-        return _joined(tile, [tile_orthophoto(album, half, most) for half in tile.halves()])
+        return _join_halves(tile, [tile_orthophoto(album, half, most) for half in tile.halves()])
     east, north = np.moveaxis(album.lattice.centres(wide), -1, 0)
     points = contiguous((east, north, album.surface.at(east, north)))
-    numbers, seen, cost = _rated(album, [number for number, _ in windows], points)
+    numbers, seen, cost = _rate_photos(album, [number for number, _ in windows], points)
     photos = keep_best(seen, cost)
     best = np.flatnonzero(seen.any(axis=(1, 2)))
     numbers, seen, cost = numbers[best], seen[best], cost[best]
     colour = np.empty((*seen.shape, 3), np.uint8)
     for number, there, out in zip(numbers, seen, colour, strict=True):
         source = album.sources[number]
-        pixels = album.pixels.get(number, loader(source))
-        out[:] = album.levels.sampled(int(number), (source, pixels), points, there, album.lattice.cell_m)
-    made = composed(seen, cost, colour, (wide.row + wide.column) % 2)
-    filled, known = spread(made.colour, made.label >= 0, np.isfinite(points[2]), SPREAD)
-    inner = tuple(slice(MARGIN + SPREAD, MARGIN + SPREAD + size) for size in (tile.height, tile.width))
+        pixels = album.pixels.get(number, pixel_loader(source))
+        out[:] = album.levels.sample(int(number), (source, pixels), points, there, album.lattice.cell_m)
+    made = compose_mosaic(seen, cost, colour, (wide.row + wide.column) % 2)
+    filled, known = extend_colours(made.colour, made.label >= 0, np.isfinite(points[2]), EXTENDED_CELLS)
+    inner = tuple(slice(MARGIN + EXTENDED_CELLS, MARGIN + EXTENDED_CELLS + size) for size in (tile.height, tile.width))
     label = np.append(numbers, -1).astype(np.int16)[made.label]
     return Orthophoto(tile, filled[inner], photos[inner], label[inner], known[inner])
 
 
-def _rated(
+def _rate_photos(
     album: OrthoInput, numbers: Sequence[int], points: Points
 ) -> tuple[Int64[np.ndarray, " n"], Bool[np.ndarray, "n h w"], UInt16[np.ndarray, "n h w"]]:
     """Indices of the photos that see any of the points, where they see them, and the cost of colouring from each.
@@ -125,15 +125,15 @@ def _rated(
         source = album.sources[number]
         if source.depths is None:
             continue
-        view = sight(album.depths.get(number, source.depths.loaded), points, 0.0)
-        each, there = rated(source.camera, points, album.lattice.cell_m, view.said)
+        view = classify_points(album.depths.get(number, source.depths.load_sized), points, 0.0)
+        each, there = rate_points(source.camera, points, album.lattice.cell_m, view.flags)
         if there.any():
             cost[len(found)], seen[len(found)] = each, there
             found.append(number)
     return np.array(found, np.int64), seen[: len(found)], cost[: len(found)]
 
 
-def _joined(tile: Tile, halves: Sequence[Orthophoto]) -> Orthophoto:
+def _join_halves(tile: Tile, halves: Sequence[Orthophoto]) -> Orthophoto:
     """Join the halves of a tile."""
     axis = 0 if halves[0].tile.width == tile.width else 1
     columns = zip(*((half.colour, half.photos, half.label, half.known) for half in halves), strict=True)

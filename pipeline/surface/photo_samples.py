@@ -59,8 +59,8 @@ class PhotoSource:
         return (self.camera.width, self.camera.height) if self.lens is None else (self.lens.width, self.lens.height)
 
 
-def rated(
-    camera: Camera, points: Points, cell_m: float, said: UInt8[np.ndarray, " *n"]
+def rate_points(
+    camera: Camera, points: Points, cell_m: float, flags: UInt8[np.ndarray, " *n"]
 ) -> tuple[UInt16[np.ndarray, " *n"], Bool[np.ndarray, " *n"]]:
     """Cost of colouring points from a photo, in thousandths, and whether it sees them.
 
@@ -71,14 +71,14 @@ def rated(
         camera: The photo's pinhole camera.
         points: East, north, up; NaN for missing points.
         cell_m: Size of the points' cells, metres.
-        said: Visibility according to its depths, from ``sight``.
+        flags: Visibility according to its depths, from ``classify_points``.
     """
-    cost, seen = np.empty(said.shape, np.uint16), np.empty(said.shape, np.bool_)
-    _native.rate(native_camera(camera), contiguous(points), cell_m, said, cost, seen.view(np.uint8))
+    cost, seen = np.empty(flags.shape, np.uint16), np.empty(flags.shape, np.bool_)
+    _native.rate(native_camera(camera), contiguous(points), cell_m, flags, cost, seen.view(np.uint8))
     return cost, seen
 
 
-def sampled(
+def sample_colours(
     source: PhotoSource,
     pixels: UInt8[np.ndarray, "h w 3"],
     points: Points,
@@ -109,8 +109,8 @@ def sampled(
     return colour
 
 
-def loaded(source: PhotoSource) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
-    """Load a photo; returns it with its size in bytes, as ``LruCache`` needs.
+def load_pixels(source: PhotoSource) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
+    """Load a photo's pixels; returns them with their size in bytes, as ``LruCache`` needs.
 
     Raises:
         ValueError: if its size differs from its camera's.
@@ -122,9 +122,9 @@ def loaded(source: PhotoSource) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
     return pixels, pixels.nbytes
 
 
-def loader(source: PhotoSource) -> Callable[[], tuple[UInt8[np.ndarray, "h w 3"], int]]:
-    """``loaded`` for this photo as a function to call later."""
-    return partial(loaded, source)
+def pixel_loader(source: PhotoSource) -> Callable[[], tuple[UInt8[np.ndarray, "h w 3"], int]]:
+    """``load_pixels`` for this photo as a function to call later."""
+    return partial(load_pixels, source)
 
 
 PLAIN_TONE = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
@@ -132,11 +132,11 @@ PLAIN_TONE = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
 
 def tone_curve(gain: Float64[np.ndarray, " 3"]) -> UInt8[np.ndarray, "256 3"]:
     """Lookup table that multiplies a photo's exposure by a gain per channel (IEC 61966-2-1 for sRGB)."""
-    light = linear(np.arange(256) / 255.0)[:, None] * gain
+    light = linear_light(np.arange(256) / 255.0)[:, None] * gain
     encoded = np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
     return np.asarray(np.clip(np.round(encoded * 255.0), 0, 255), np.uint8)
 
 
-def linear(value: Float64[np.ndarray, " *n"]) -> Float64[np.ndarray, " *n"]:
+def linear_light(value: Float64[np.ndarray, " *n"]) -> Float64[np.ndarray, " *n"]:
     """Linear light of sRGB values, 0 to 1."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

@@ -12,14 +12,19 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.point_visibility import PhotoCoordinates, PointVisibility, place_in, sight
+from splatpipe.pipeline.surface.point_visibility import (
+    PhotoCoordinates,
+    PointVisibility,
+    classify_points,
+    project_points,
+)
 from splatpipe.pipeline.surface.sources import HeightRange, LruCache, PhotoWindow, PosedDepthMap, window_of
 from splatpipe.pipeline.surface.tiles import Tile
 
-EVERY = 4  # pixels, of which one is looked at where heights are looked for
-LAYER_M = 1.0  # of such heights, and their margin
-MIN_PHOTOS = 2  # that see something between them
-MIN_COSINE = 0.1  # of a ray and a surface's normal: flatter rays count as this one
+SAMPLE_STEP = 4  # pixels, per axis, in the search for a tile's height range
+LAYER_M = 1.0  # thickness of a layer of heights, and the margin of the range
+MIN_PHOTOS = 2  # that have to see something in a layer
+MIN_COSINE = 0.1  # of the angle between a ray and a surface's normal: lower limit for flatter rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +53,7 @@ class PhotoSet:
         """
         source = self.sources[number].depths
         assert source is not None
-        return self.depths.get(number, source.loaded)
+        return self.depths.get(number, source.load_sized)
 
     def parts_in(self, lattice: Lattice, tile: Tile, relief: HeightRange) -> list[DepthPart]:
         """The parts of all photos' depths that may lie in a tile, within the tile's own height range.
@@ -58,7 +63,7 @@ class PhotoSet:
         numbers = self._seeing(lattice, tile, relief)
         narrow = self._heights_in(numbers, lattice, tile, relief)
         found = []
-        for number in reversed(numbers) if narrow is not None else ():  # the last ones are still at hand
+        for number in reversed(numbers) if narrow is not None else ():  # the last ones are still cached
             whole = self.depth_map(number)
             window = window_of(whole.camera, lattice, tile, narrow or relief)
             if window is not None:
@@ -78,7 +83,7 @@ class PhotoSet:
             found = self.depth_map(number)
             window = window_of(found.camera, lattice, tile, relief)
             assert window is not None
-            east, north, up = _some_places(found, window)
+            east, north, up = _sample_positions(found, window)
             inside = (lattice.cells(tile, east, north) >= 0) & (up >= relief.low_m) & (up < relief.high_m)
             photos[np.unique(((up[inside] - relief.low_m) / LAYER_M).astype(np.int64))] += 1
         layers = np.flatnonzero(photos >= MIN_PHOTOS)
@@ -88,27 +93,28 @@ class PhotoSet:
         return HeightRange(max(low, relief.low_m), min(high, relief.high_m))
 
 
-def _some_places(found: PosedDepthMap, window: PhotoWindow) -> Float64[np.ndarray, "3 n"]:
+def _sample_positions(found: PosedDepthMap, window: PhotoWindow) -> Float64[np.ndarray, "3 n"]:
     """East, north, up of evenly sampled depths in a window."""
     row, column = (
-        grid.ravel() for grid in np.mgrid[window.top : window.bottom : EVERY, window.left : window.right : EVERY]
+        grid.ravel()
+        for grid in np.mgrid[window.top : window.bottom : SAMPLE_STEP, window.left : window.right : SAMPLE_STEP]
     )
     depth = found.depth[row, column].astype(np.float64)
     row, column, depth = (each[depth > 0.0] for each in (row, column, depth))
-    return place_of(found.camera, row, column, 1.0 / depth)
+    return unproject_pixels(found.camera, row, column, 1.0 / depth)
 
 
-def place_of(
+def unproject_pixels(
     camera: Camera, row: Int64[np.ndarray, " n"], column: Int64[np.ndarray, " n"], inverse: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "3 n"]:
     """East, north, up of pixel centres at inverse depths, each computed independently."""
     x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
-    ray = turned(camera.cam_from_world[:3, :3].T, x, y)
+    ray = rotate(camera.cam_from_world[:3, :3].T, x, y)
     centre = camera.centre()
     return np.stack([centre[axis] + ray[axis] / inverse for axis in range(3)])
 
 
-def turned(
+def rotate(
     turn: Float64[np.ndarray, "3 3"],
     x: Float64[np.ndarray, " n"],
     y: Float64[np.ndarray, " n"],
@@ -173,15 +179,15 @@ class SurfaceView:
     place: PhotoCoordinates
     footprint: Float64[np.ndarray, " n"]
 
-    def sight(self, found: PosedDepthMap, rows: np.ndarray | slice) -> PointVisibility:
+    def classify(self, found: PosedDepthMap, rows: np.ndarray | slice) -> PointVisibility:
         """Visibility of some of the pieces according to the photo's depths, which must have this view's grid."""
         east, north, up = self.pieces.xyz[:, rows]
-        return sight(found, (east, north, up), 0.0, np.ascontiguousarray(self.place.sine[rows]))
+        return classify_points(found, (east, north, up), 0.0, np.ascontiguousarray(self.place.sine[rows]))
 
 
-def look_at(camera: Camera, pieces: SurfacePieces) -> SurfaceView:
+def view_pieces(camera: Camera, pieces: SurfacePieces) -> SurfaceView:
     """Project surface pieces into a camera, with their footprints; each computed independently."""
-    place = place_in(camera, *pieces.xyz)
+    place = project_points(camera, *pieces.xyz)
     towards = camera.centre()[:, None] - pieces.xyz
     away = np.sqrt(np.square(towards[0]) + np.square(towards[1]) + np.square(towards[2]))
     cosine = dot(towards, pieces.normal) / np.maximum(away, 1e-9)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from splatpipe.pipeline.surface.photo_samples import PhotoSource, loaded
+from splatpipe.pipeline.surface.photo_samples import PhotoSource, load_pixels
 
 SHARE_OF_FREE = 0.5  # of the disk's free space at most: the files that are made need room, too
 
@@ -76,7 +76,7 @@ class _PhotoSlot:
         """Map the photo, after writing it the first time."""
         with self.lock:
             if not self.written:
-                self._write(loaded(self.source)[0])
+                self._write(load_pixels(self.source)[0])
                 self.written = True
         width, height = self.source.size
         mapped = mmap.mmap(self.file, width * height * 3, offset=self.start, access=mmap.ACCESS_READ)

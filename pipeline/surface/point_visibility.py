@@ -34,7 +34,7 @@ class PhotoCoordinates:
     inside: Bool[np.ndarray, " *n"]
 
 
-def place_in(
+def project_points(
     camera: Camera,
     east: Float64[np.ndarray, "*#n"],
     north: Float64[np.ndarray, "*#n"],
@@ -57,33 +57,33 @@ class PointVisibility:
     """Visibility of points in a photo.
 
     Attributes:
-        said: Bit flags for each point, as in the kernels.
+        flags: Bit flags for each point, as in the kernels.
     """
 
-    said: UInt8[np.ndarray, " *n"]
+    flags: UInt8[np.ndarray, " *n"]
 
     @property
     def seen(self) -> Bool[np.ndarray, " *n"]:
         """Points that the photo sees."""
-        return np.asarray(self.said & _native.SEEN != 0)
+        return np.asarray(self.flags & _native.SEEN != 0)
 
     @property
     def through(self) -> Bool[np.ndarray, " *n"]:
         """Points that the photo sees through, to something behind them."""
-        return np.asarray(self.said & _native.THROUGH != 0)
+        return np.asarray(self.flags & _native.THROUGH != 0)
 
     @property
     def mixed(self) -> Bool[np.ndarray, " *n"]:
         """Points that the photo sees, but with a nearer surface in an adjacent pixel."""
-        return np.asarray(self.said & _native.MIXED != 0)
+        return np.asarray(self.flags & _native.MIXED != 0)
 
     @property
     def unknown(self) -> Bool[np.ndarray, " *n"]:
         """Points in view where the photo has no depth, so it may see them."""
-        return np.asarray(self.said & _native.UNKNOWN != 0)
+        return np.asarray(self.flags & _native.UNKNOWN != 0)
 
 
-def sight(
+def classify_points(
     found: PosedDepthMap, points: Points, least_m: float, sines: Float64[np.ndarray, " *n"] | None = None
 ) -> PointVisibility:
     """Compare points with a photo's depths, with a tolerance of a few pixel widths, larger for grazing rays.
@@ -97,9 +97,9 @@ def sight(
     Raises:
         ValueError: if the depths do not fit their camera.
     """
-    said = np.empty(points[2].shape, np.uint8)
-    _native.look(found.depth, native_camera(found.camera), contiguous(points), sines, least_m, said)
-    return PointVisibility(said)
+    flags = np.empty(points[2].shape, np.uint8)
+    _native.look(found.depth, native_camera(found.camera), contiguous(points), sines, least_m, flags)
+    return PointVisibility(flags)
 
 
 def contiguous(points: Points) -> Points:

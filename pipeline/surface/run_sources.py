@@ -41,7 +41,7 @@ class RunSurface:
         boundary: The part with the area; None if the run has none.
         depths: Depths of its photos.
         photos: The original photos, with or without depths.
-        finer: Side of a depth pixel in pixels of the original photo, the median over all photos.
+        finer: Side of a depth pixel in pixels of the original photo, median over all photos.
     """
 
     frame: Frame
@@ -65,7 +65,7 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
     """
     frame, views = load_frame(inputs["georef.frame"]), load_views(inputs["undistort.dataset"])
     found, rendered = (kept_depth_maps(inputs[part], views) for part in ("depths.maps", "splat_depths.maps"))
-    maps = _of_both(found, rendered)
+    maps = _pair_maps(found, rendered)
     if not maps or not frame.in_metres:
         return None
     local_from_model = frame.world_from_model
@@ -105,7 +105,7 @@ def metric_depths(maps: Sequence[DepthMapFile], local_from_model: Similarity) ->
     return [_in_metres(kept, None, local_from_model) for kept in maps]
 
 
-def _of_both(
+def _pair_maps(
     found: Sequence[DepthMapFile], rendered: Sequence[DepthMapFile]
 ) -> dict[str, tuple[DepthMapFile, DepthMapFile | None]]:
     """Each photo's depths by its name, and the rendered depths that fill their gaps."""

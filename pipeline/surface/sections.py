@@ -21,7 +21,7 @@ from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, DepthSource, PosedDepthMap
 from splatpipe.pipeline.surface.surface_file import SurfaceFile
 
-SAMPLES_A_CELL = 2.0  # along the line, so that no cell that it crosses for some length is left out
+SAMPLES_PER_CELL = 2.0  # along the line, so that no cell that it crosses for some length is left out
 MAX_SAMPLES = 2_000_000  # 20 km at 2 cm: more is a wrong coordinate
 THICKNESS_CELLS = 1.5  # on either side of the plane, from where points are taken
 MIN_PHOTOS = 2  # that have a point in a cell of the section
@@ -71,7 +71,7 @@ def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence
     start, end = np.array(line[:2], np.float64), np.array(line[2:], np.float64)
     length = float(np.linalg.norm(end - start)) if np.isfinite([start, end]).all() else 0.0
     told = ",".join(f"{number:.10g}" for number in line)
-    count = math.ceil(length / surface.cell * SAMPLES_A_CELL) + 1
+    count = math.ceil(length / surface.cell * SAMPLES_PER_CELL) + 1
     if length == 0.0 or count > MAX_SAMPLES:
         raise SplatpipeError(f"The section {told} has no length, or is far too long.", "Check its coordinates.")
     share = np.linspace(0.0, 1.0, count)

@@ -37,24 +37,24 @@ class Sheet:
     lattice: Lattice
     relief: HeightRange
 
-    def place(self, local: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
+    def sheet_from_local(self, local: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         """East, north, up (metres) in the sheet's frame."""
         return np.asarray(local @ self.from_local[:3, :3].T + self.from_local[:3, 3])
 
-    def local(self, places: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """The inverse of ``place``."""
+    def local_from_sheet(self, places: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
+        """The inverse of ``sheet_from_local``."""
         return np.asarray((places - self.from_local[:3, 3]) @ self.from_local[:3, :3])
 
-    def moved(self, camera: Camera) -> Camera:
+    def transform_camera(self, camera: Camera) -> Camera:
         """Transform a camera from the local to the sheet's frame."""
         back = np.eye(4)
         back[:3, :3] = self.from_local[:3, :3].T
         back[:3, 3] = -back[:3, :3] @ self.from_local[:3, 3]
         return replace(camera, cam_from_world=camera.cam_from_world @ back)
 
-    def moved_depths(self, source: DepthSource) -> DepthSource:
+    def transform_depths(self, source: DepthSource) -> DepthSource:
         """Transform a photo's depths from the local to the sheet's frame."""
-        camera = self.moved(source.camera)
+        camera = self.transform_camera(source.camera)
 
         def load() -> PosedDepthMap:
             found = source.load()
@@ -62,10 +62,10 @@ class Sheet:
 
         return DepthSource(camera, load)
 
-    def moved_photo(self, photo: PhotoSource) -> PhotoSource:
+    def transform_photo(self, photo: PhotoSource) -> PhotoSource:
         """Transform a photo with its depths from the local to the sheet's frame."""
-        depths = None if photo.depths is None else self.moved_depths(photo.depths)
-        return replace(photo, camera=self.moved(photo.camera), depths=depths)
+        depths = None if photo.depths is None else self.transform_depths(photo.depths)
+        return replace(photo, camera=self.transform_camera(photo.camera), depths=depths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class GridSheet:
             over: Heights of its cells over the sheet, metres; NaN where there are none.
         """
         places = np.concatenate([self.sheet.lattice.centres(tile), over.astype(np.float64)[..., None]], axis=-1)
-        cells = self.grid.cells_from_local(self.sheet.local(places.reshape(-1, 3)))
+        cells = self.grid.cells_from_local(self.sheet.local_from_sheet(places.reshape(-1, 3)))
         return np.asarray(cells[:, 2].reshape(over.shape))
 
     def lattice_of(self, other: Grid, part: Tile) -> Lattice:
@@ -107,10 +107,10 @@ class GridSheet:
         east_m, north_m = lattice.east_m + (west - left) * scale, lattice.north_m + (north - top) * scale
         return Lattice(east_m, north_m, other.cell * scale, part.width, part.height)
 
-    def over(self, other: Grid, part: Tile, heights: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
+    def heights_over(self, other: Grid, part: Tile, heights: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
         """Convert heights of another grid's cells in the CRS's unit to metres over this sheet."""
         local = other.centres_in_local(part, heights)
-        return np.asarray(self.sheet.place(local)[..., 2])
+        return np.asarray(self.sheet.sheet_from_local(local)[..., 2])
 
 
 def grid_sheets(grid: Grid, low: float, high: float, side: int = SIDE) -> Iterator[GridSheet]:

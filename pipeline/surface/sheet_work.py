@@ -89,4 +89,4 @@ class SheetWork:
     def _inside(area: PlanArea, sheet: GridSheet, tile: Tile) -> np.ndarray:
         centres = sheet.sheet.lattice.centres(tile)
         places = np.concatenate([centres, np.zeros((*centres.shape[:2], 1))], axis=-1)
-        return area.contains(sheet.sheet.local(places.reshape(-1, 3))).reshape(tile.height, tile.width)
+        return area.contains(sheet.sheet.local_from_sheet(places.reshape(-1, 3))).reshape(tile.height, tile.width)

@@ -26,7 +26,7 @@ SAMPLES = 3000  # evenly spaced depths per photo
 CELL_GSD = 100.0  # plan cell size in GSDs, such that each cell that a photo sees has several of its samples
 MAX_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
 MIN_PHOTOS = 3  # photos that have to see a cell
-FARTHEST = 4.0  # pixels larger on the ground than this many times the usual show distant land, not the site
+DISTANT = 4.0  # pixels more than this many times as large on the ground as usual show distant land, not the site
 MIN_PART = 0.02  # of the area seen: smaller isolated parts are left out
 NOISE = 0.001  # share of the lowest and of the highest samples that may be wrong
 MARGIN = 0.1  # of the relief, below and above, for what the samples missed,
@@ -96,16 +96,16 @@ def load_site(path: Path) -> tuple[SiteExtent, float] | None:
         StageError: if the file is broken.
     """
     try:
-        told: dict[str, Any] | None = json.loads(path.read_text(encoding="utf-8"))
-        if told is None:
+        stored: dict[str, Any] | None = json.loads(path.read_text(encoding="utf-8"))
+        if stored is None:
             return None
-        shape = int(told["rows"]), int(told["columns"])
-        bits = np.unpackbits(np.frombuffer(bytes.fromhex(told["covered"]), np.uint8))[: shape[0] * shape[1]]
+        shape = int(stored["rows"]), int(stored["columns"])
+        bits = np.unpackbits(np.frombuffer(bytes.fromhex(stored["covered"]), np.uint8))[: shape[0] * shape[1]]
         gsd, low, high, cell, dsm_cell = (
-            float(told[name]) for name in ("gsd_m", "low_m", "high_m", "cell_m", "dsm_cell_m")
+            float(stored[name]) for name in ("gsd_m", "low_m", "high_m", "cell_m", "dsm_cell_m")
         )
-        west, south, east, north = (float(each) for each in told["reach"])
-        corner_east, corner_north = (float(each) for each in told["corner"])
+        west, south, east, north = (float(each) for each in stored["reach"])
+        corner_east, corner_north = (float(each) for each in stored["corner"])
         covered, corner = bits.reshape(shape).astype(np.bool_), (corner_east, corner_north)
         return SiteExtent(gsd, low, high, (west, south, east, north), corner, cell, covered), dsm_cell
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -123,14 +123,14 @@ def measure_extent(
         area: Only depths inside count; None for all.
         threads: Photos in parallel.
     """
-    looks = list(ordered_map(partial(_look, finer), sources, threads))
-    seen = [look for look in looks if len(look)]
+    samples = list(ordered_map(partial(_sample_depths, finer), sources, threads))
+    seen = [sample for sample in samples if len(sample)]
     if not seen:
         return None
-    gsd = float(np.mean([np.median(look[:, 4]) for look in seen]))
-    number = np.repeat(np.arange(len(looks)), [len(look) for look in looks])
-    every = np.concatenate(looks)
-    near = every[:, 3] <= FARTHEST * gsd
+    gsd = float(np.mean([np.median(sample[:, 4]) for sample in seen]))
+    number = np.repeat(np.arange(len(samples)), [len(sample) for sample in samples])
+    every = np.concatenate(samples)
+    near = every[:, 3] <= DISTANT * gsd
     if area is not None:
         near &= area.contains(every[:, :3])
     every, number = every[near], number[near]
@@ -150,7 +150,7 @@ def measure_extent(
     return SiteExtent(gsd, low, high, reach, (float(corner[0]), float(corner[1])), cell, wider)
 
 
-def _look(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
+def _sample_depths(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
     """East, north, up of sampled depths, and the pixel size there: on the ground, and across the ray."""
     found: PosedDepthMap = source.load()
     camera = found.camera
@@ -178,7 +178,7 @@ def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) ->
     _, parts = cv2.connectedComponents(covered, connectivity=8)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    kept = sizes >= min(MIN_PART * sizes.sum(), sizes.max())  # of a site in many pieces, too, the largest
+    kept = sizes >= min(MIN_PART * sizes.sum(), sizes.max())  # the largest one, even if the site is in many pieces
     return np.asarray((covered > 0) & kept[parts])
 
 

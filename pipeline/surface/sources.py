@@ -60,7 +60,7 @@ class DepthSource:
     camera: Camera
     load: Callable[[], PosedDepthMap]
 
-    def loaded(self) -> tuple[PosedDepthMap, int]:
+    def load_sized(self) -> tuple[PosedDepthMap, int]:
         """Load the map; returns it with its size in bytes, as ``LruCache`` needs.
 
         Raises:

@@ -23,8 +23,8 @@ from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, wit
 from splatpipe.pipeline.surface.tsdf import open3d, tsdf_mesh
 
 MAX_BLOCKS = 55_000  # of voxels: 0.25 GB, and 2.5 million triangles before decimation; beyond it voxels are larger
-CRUMB_VOXELS = 200.0  # faces of voxels: a piece of a smaller area hangs in the air, or is nobody's interest
-GREY = 128  # of what no photo shows, where nothing near has a colour
+CRUMB_VOXELS = 200.0  # area in voxel faces: smaller pieces are floating noise or not worth keeping
+GREY = 128  # of a mesh that no photo shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +70,10 @@ def make_mesh(task: MeshTask, work: Path, out: Path, report: Reporter) -> dict[s
     work.mkdir(exist_ok=True)
     kept = work / "fine.npz"
     if not kept.is_file():
-        _keep(kept, *fine_mesh(task, photos, report))
-    mesh, voxel_m = _kept(kept)
+        _save_fine(kept, *fine_mesh(task, photos, report))
+    mesh, voxel_m = _load_fine(kept)
     report.progress(0, 1, "decimating the mesh", "meshes")
-    mesh = decimated(mesh, task.most_triangles)
+    mesh = decimate(mesh, task.most_triangles)
     report.progress(1, 1, "decimating the mesh", "meshes")
     made = ColouredMesh(mesh, vertex_colours(photos, mesh, task.threads))
     write_mesh(out, made, task.surface.frame, task.surface.boundary)
@@ -85,11 +85,11 @@ def make_mesh(task: MeshTask, work: Path, out: Path, report: Reporter) -> dict[s
     }
 
 
-def _keep(path: Path, mesh: TriangleMesh, voxel_m: float) -> None:
+def _save_fine(path: Path, mesh: TriangleMesh, voxel_m: float) -> None:
     save_arrays(path, vertices=mesh.vertices, triangles=mesh.triangles, voxel_m=np.array(voxel_m))
 
 
-def _kept(path: Path) -> tuple[TriangleMesh, float]:
+def _load_fine(path: Path) -> tuple[TriangleMesh, float]:
     with np.load(path, allow_pickle=False) as kept:
         return TriangleMesh(kept["vertices"], kept["triangles"]), float(kept["voxel_m"])
 
@@ -111,7 +111,7 @@ def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[Trian
     return mesh, blocks.voxel_m
 
 
-def decimated(mesh: TriangleMesh, most: int) -> TriangleMesh:
+def decimate(mesh: TriangleMesh, most: int) -> TriangleMesh:
     """Decimate a mesh to a maximum number of triangles (quadric error metrics; Garland and Heckbert 1997).
 
     Args:
@@ -125,7 +125,7 @@ def decimated(mesh: TriangleMesh, most: int) -> TriangleMesh:
     vertices, triangles = (mesh.vertices - low).astype(np.float32), mesh.triangles.astype(np.int32)
     coarse = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
     size, before = len(triangles), 0
-    while size > most and size != before:  # of a large mesh, one pass leaves more than it is asked to
+    while size > most and size != before:  # one pass over a large mesh leaves more than requested
         coarse = coarse.simplify_quadric_decimation(1.0 - most / size)
         size, before = len(coarse.triangle.indices), size
     found = coarse.vertex.positions.numpy().astype(np.float64) + low
@@ -138,10 +138,10 @@ def vertex_colours(photos: PhotoSet, mesh: TriangleMesh, threads: int) -> UInt8[
     pieces = SurfacePieces(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.normals().T))
     spacing_m = float(np.sqrt(mesh.areas().sum() / len(mesh.vertices)))
     colours, known = point_colours(photos, pieces, spacing_m, threads)
-    return _spread(mesh, colours, known)
+    return _fill_unseen(mesh, colours, known)
 
 
-def _spread(
+def _fill_unseen(
     mesh: TriangleMesh, colours: UInt8[np.ndarray, "n 3"], known: Bool[np.ndarray, " n"]
 ) -> UInt8[np.ndarray, "n 3"]:
     if not known.any():

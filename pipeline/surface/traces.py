@@ -27,7 +27,7 @@ def section_trace(section: Section, crs: MapCrs, most: int) -> dict[str, Column]
         surface has a hole), ``x``, ``y``, ``z`` of the same places in the world frame; and ``point_distance``,
         ``point_height`` of what photos see near the plane.
     """
-    rows = _thinned(section.height, most)
+    rows = _rows_to_keep(section.height, most)
     height = section.height[rows]
     known = np.isfinite(height)
     local = np.full((len(rows), 3), np.nan)
@@ -73,7 +73,7 @@ def _ring_trace(surface: SurfaceFile, ring: Ring, crs: MapCrs, most: int) -> dic
     return dict(zip("xyz", map(_column, local.T), strict=True))
 
 
-def _thinned(height: Float64[np.ndarray, " n"], most: int) -> Int64[np.ndarray, " k"]:
+def _rows_to_keep(height: Float64[np.ndarray, " n"], most: int) -> Int64[np.ndarray, " k"]:
     """Rows of places to keep: all if few; else both ends, and each stretch's lowest and highest. Holes stay holes."""
     if len(height) <= most:
         return np.arange(len(height))

@@ -78,7 +78,7 @@ def tsdf_mesh(photos: PhotoSet, box: Box, blocks: Blocks, threads: int, report: 
             image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
             grid.integrate(core.Tensor(places[near]), image, intrinsic, extrinsic, 1.0, FARTHEST_M, BAND)
         report.progress(done, len(numbers), "joining depths to a surface", "photos")
-    found = grid.extract_triangle_mesh(MIN_PHOTOS - 0.5)  # open3d leaves out what has that weight or less
+    found = grid.extract_triangle_mesh(MIN_PHOTOS - 0.5)  # open3d omits voxels of that weight or less
     vertices = found.vertex.positions.numpy().astype(np.float64) + blocks.low
     return in_order(TriangleMesh(vertices, found.triangle.indices.numpy().astype(np.int64)))
 

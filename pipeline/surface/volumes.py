@@ -27,15 +27,15 @@ from splatpipe.pipeline.surface.tiles import Tile, tiled
 WINDOW = 1024  # cells per side
 PARTS = 5  # subdivisions of a cell's side, for the share inside of a cell that the outline crosses
 SHARED_CELLS = 1.0  # s of the noise correlation exp(-d² / 4 s²) of two cells at distance d, in cells: 3.5 along a line
-SHARED_ALONG = 2.0 * math.sqrt(math.pi) * SHARED_CELLS  # that sum over a line of cells,
+SHARED_ALONG = 2.0 * math.sqrt(math.pi) * SHARED_CELLS  # sum of that correlation over a line of cells,
 SHARED_AROUND = 4.0 * math.pi * SHARED_CELLS**2  # and over an area
 RIM_CELLS = 1.0  # spacing of samples on the rim, in cells
 MAX_RIM = 1_000_000  # samples: 20 km at 2 cm; a longer rim means a wrong coordinate
 MIN_RIM = 12  # samples with heights needed to fit a plane
 MIN_RIM_SHARE = 0.5  # of the rim that needs heights: with less, the base is unreliable
-LOWEST_OF = 5  # neighbouring samples in the median filter: a single cell may be in a hole
-UNTOLD_SIGMA_CELLS = 0.5  # assumed deviation where none is stated, in cells
-ROUNDS, HUBER = 5, 1.5  # of the plane's robust fit, and deviations beyond which a place counts less
+MEDIAN_OF = 5  # neighbouring samples in the median filter: a single cell may be in a hole
+DEFAULT_SIGMA_CELLS = 0.5  # assumed deviation where none is stated, in cells
+ROUNDS, HUBER = 5, 1.5  # of the plane's robust fit; residuals beyond this many deviations are weighted down
 
 Kind = Literal["rim", "lowest", "stated"]
 
@@ -159,10 +159,10 @@ def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
     if not isinstance(stated, str):
         height = float(stated) * ground.height_m
         return Base("stated", middle, np.array([height, 0.0, 0.0]), np.diag([datum_sigma_m**2, 0.0, 0.0]), None)
-    places = [_along(ring, ground.surface.cell * RIM_CELLS) for ring in ground.rings()]
+    places = [_sample_ring(ring, ground.surface.cell * RIM_CELLS) for ring in ground.rings()]
     heights = [ground.surface.along(place) for place in places]
     up = np.concatenate([height for height, _ in heights]) * ground.height_m
-    sigma = _told(np.concatenate([sigma for _, sigma in heights]), ground.cell_m)
+    sigma = _or_default(np.concatenate([sigma for _, sigma in heights]), ground.cell_m)
     known = np.isfinite(up)
     if known.sum() < MIN_RIM or known.mean() < MIN_RIM_SHARE:
         raise SplatpipeError(
@@ -170,12 +170,12 @@ def _base(ground: _Ground, stated: Kind | float, datum_sigma_m: float) -> Base:
             "Draw it where the surface has heights, or give the base's height.",
         )
     if stated == "lowest":
-        return _lowest(middle, up[known], sigma[known])
+        return _lowest_base(middle, up[known], sigma[known])
     east, north = ((np.concatenate(places) - middle)[known] * ground.plan_m).T
-    return _fitted(middle, np.stack([np.ones(len(east)), east, north], axis=1), up[known], sigma[known])
+    return _fit_rim(middle, np.stack([np.ones(len(east)), east, north], axis=1), up[known], sigma[known])
 
 
-def _along(ring: Ring, step: float) -> Float64[np.ndarray, "n 2"]:
+def _sample_ring(ring: Ring, step: float) -> Float64[np.ndarray, "n 2"]:
     """Evenly spaced points on a closed outline."""
     closed, way = np.concatenate([ring, ring[:1]]), _lengths(ring)
     count = max(MIN_RIM, round(way[-1] / step))
@@ -189,19 +189,21 @@ def _lengths(ring: Ring) -> Float64[np.ndarray, " n"]:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
 
 
-def _told(sigma: Float64[np.ndarray, " *n"], cell_m: float) -> Float64[np.ndarray, " *n"]:
-    return np.where(np.isfinite(sigma), sigma, UNTOLD_SIGMA_CELLS * cell_m)
+def _or_default(sigma: Float64[np.ndarray, " *n"], cell_m: float) -> Float64[np.ndarray, " *n"]:
+    return np.where(np.isfinite(sigma), sigma, DEFAULT_SIGMA_CELLS * cell_m)
 
 
-def _lowest(middle: Float64[np.ndarray, " 2"], up: Float64[np.ndarray, " n"], sigma: Float64[np.ndarray, " n"]) -> Base:
-    wide = np.concatenate([up[-(LOWEST_OF // 2) :], up, up[: LOWEST_OF // 2]])
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(wide, LOWEST_OF), axis=1)
+def _lowest_base(
+    middle: Float64[np.ndarray, " 2"], up: Float64[np.ndarray, " n"], sigma: Float64[np.ndarray, " n"]
+) -> Base:
+    wide = np.concatenate([up[-(MEDIAN_OF // 2) :], up, up[: MEDIAN_OF // 2]])
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(wide, MEDIAN_OF), axis=1)
     least = int(np.argmin(smooth))
     variance = float(sigma[least] ** 2)
     return Base("lowest", middle, np.array([smooth[least], 0.0, 0.0]), np.diag([variance, 0.0, 0.0]), None)
 
 
-def _fitted(
+def _fit_rim(
     middle: Float64[np.ndarray, " 2"],
     design: Float64[np.ndarray, "n 3"],
     up: Float64[np.ndarray, " n"],
@@ -272,7 +274,7 @@ def _part(ground: _Ground, base: Base, part: Tile) -> _CutFillSums:
     terms = np.column_stack([np.ones(len(places)), places])
     over = height[known] - terms @ base.terms
     cells_m2 = share[known] * ground.cell_m**2
-    noise = np.square(cells_m2 * _told(ground.surface.sigmas_m(part)[known], ground.cell_m)) * SHARED_AROUND
+    noise = np.square(cells_m2 * _or_default(ground.surface.sigmas_m(part)[known], ground.cell_m)) * SHARED_AROUND
     above = over > 0.0
     sides = [cells_m2 * above, cells_m2 * ~above]
     return _CutFillSums(
@@ -291,7 +293,7 @@ def _shares(ground: _Ground, part: Tile) -> Float64[np.ndarray, "h w"]:
     share = ground.area.contains(_flat(centres.reshape(-1, 2))).astype(np.float64).reshape(shape)
     crossed = np.zeros(shape, np.bool_)
     for ring in ground.rings():
-        column, row = lattice.places(*_along(ring, lattice.cell_m / PARTS).T)
+        column, row = lattice.places(*_sample_ring(ring, lattice.cell_m / PARTS).T)
         for down in (-1, 0, 1):  # also a sample's neighbours: an outline may cut a corner between two samples
             for right in (-1, 0, 1):
                 j = np.floor(column).astype(np.int64) - part.column + right

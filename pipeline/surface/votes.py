@@ -18,8 +18,8 @@ from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.sources import HeightRange, PhotoWindow, PosedDepthMap
 from splatpipe.pipeline.surface.tiles import Tile
 
-HALF = 0.5  # of a cell that its surface covers, where there is another one below: else edges would grow outwards
-LAYERS = 3  # surfaces above each other in a cell that are looked at
+HALF = 0.5  # of a cell that a surface has to cover if there is another one below: otherwise edges would grow outwards
+LAYERS = 3  # surfaces above each other in a cell that are considered
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class HeightVotes:
         self._held.layers(height, count, cover)
         return [Layer(height[k], count[k], cover[k]) for k in range(LAYERS) if count[k].any()]
 
-    def fitted(self, start: Float64[np.ndarray, " c"]) -> Fit:
+    def fit(self, start: Float64[np.ndarray, " c"]) -> Fit:
         """The robust mean of each cell's votes about a height (Tukey's biweight; Beaton and Tukey 1974).
 
         Args:
@@ -100,7 +100,7 @@ class HeightVotes:
         return fit
 
 
-def undecided(found: Sequence[Layer], least: int) -> Bool[np.ndarray, " c"]:
+def needs_check(found: Sequence[Layer], least: int) -> Bool[np.ndarray, " c"]:
     """Cells with several surfaces, or with one that few photos saw, which need a check for photos that see through."""
     first = found[0]
     few = (first.count < least) & np.isfinite(first.height)

@@ -20,17 +20,17 @@ from splatpipe.pipeline.survey.boundary import DIRECTIONS
 SEED_M, SEED_SECTORS = 1.0, 24  # bins of plan and of direction whose facets seed the search for walls
 SEED_M2 = 2.0  # least area of a seed's facets, of all photos together
 SEED_HEIGHT_M = 1.2  # least height of the facets in a seed's plane; half a wall's
-SAME_WAY = math.cos(math.radians(30.0))  # of a facet's direction and its wall's: three deviations of a facet's noise
-REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # to which a wall grows, with its plane fitted again each time
-BAND_M = 0.12  # about a plane: includes plinths and shutters, but not window panes
-BAND_PIXELS = 4.0  # the same of coarse depths
-CLAIM_BANDS = 4.0  # about a wall, in which no other wall is searched for...
-CLAIM_COSINE = 0.5  # ...that faces nearly as it does: noise turns some of its own facets by more than ``SAME_WAY``
+SAME_WAY = math.cos(math.radians(30.0))  # of a facet's and its wall's direction: three times a facet's noise
+REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # lengths to which a wall grows step by step, each with a new fit of its plane
+BAND_M = 0.12  # on either side of a plane: includes plinths and shutters, but not window panes
+BAND_PIXELS = 4.0  # the same for coarse depths
+CLAIM_BANDS = 4.0  # about a wall, within which no other wall is searched for...
+CLAIM_COSINE = 0.5  # ...in nearly the same direction: noise turns some of its own facets by more than ``SAME_WAY``
 BIN_M = 0.5  # along a wall
 GAP_M = 3.0  # between pieces of one wall: a tree in front of it, a gate
 CELL_M = 0.25  # of a wall's face, occupied if it has three facets
 CELL_FACETS = 3
-CLOSED_CELLS = 5  # over which openings are bridged
+CLOSED_CELLS = 5  # openings up to this size are bridged
 MIN_HEIGHT_M, MIN_LENGTH_M, MIN_AREA_M2 = 2.1, 2.0, 6.0  # of a wall that meets others: garden walls are lower
 FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
 LOW_FLAT = 0.22  # of the band, within which half of the facets of a wall lower than that have to lie: on the demo, half
@@ -143,7 +143,7 @@ def find_walls(facets: Facets) -> list[Wall]:
         if weights[strongest] < SEED_M2:
             break
         start = free & (seeds == strongest)
-        grown = _grown(facets, free, start, band_m)
+        grown = _grow_plane(facets, free, start, band_m)
         if grown is not None:
             line, ends = grown
             piece = _piece(facets, line, ends, band_m)
@@ -153,7 +153,7 @@ def find_walls(facets: Facets) -> list[Wall]:
             else:
                 free &= ~_around(facets, line, ends, band_m)
         free &= ~start
-    return named([_wall(piece) for piece in _cornered(pieces)])
+    return name_walls([_wall(piece) for piece in _join_corners(pieces)])
 
 
 def _band(facets: Facets) -> float:
@@ -161,7 +161,7 @@ def _band(facets: Facets) -> float:
     return max(BAND_M, BAND_PIXELS * float(np.median(facets.pixels_m)))
 
 
-def named(walls: Sequence[Wall]) -> list[Wall]:
+def name_walls(walls: Sequence[Wall]) -> list[Wall]:
     """Name walls by the direction that they face, numbered by size within a direction, the largest first."""
     counts: dict[str, int] = {}
     result = []
@@ -187,16 +187,16 @@ def stated_wall(left: Plan, right: Plan, facets: Facets) -> Wall | None:
     face = _face(facets, line, (float(line.along @ left), float(line.along @ right)), CLAIM_BANDS * BAND_M)
     if face is None:
         return None
-    low, high = _reached(face.heights)
+    low, high = _foot_and_top(face.heights)
     return replace(wall, low_m=low, high_m=high)
 
 
-def _grown(
+def _grow_plane(
     facets: Facets, free: Bool[np.ndarray, " n"], start: Bool[np.ndarray, " n"], band_m: float
 ) -> tuple[_Line, tuple[float, float]] | None:
     """Grow a plane from starting facets; returns it with its two ends, or None if it is not a wall."""
     rows = np.flatnonzero(start)
-    line = _fitted(facets.select(rows), None, 2.0 * band_m)
+    line = _fit_plane(facets.select(rows), None, 2.0 * band_m)
     if line is None:
         return None
     middle = float(np.average(facets.places[rows, :2] @ line.along, weights=facets.areas[rows]))
@@ -206,14 +206,14 @@ def _grown(
         near = _near(facets.select(rows), line, band_m)
         along = facets.places[rows, :2] @ line.along
         rows = rows[near & (np.abs(along - middle) < reach)]
-        run = _run(facets.places[rows, :2] @ line.along, middle)
+        run = _run_around(facets.places[rows, :2] @ line.along, middle)
         if run is None:
             return None
         ends = run
         if np.ptp(facets.places[rows, 2]) < SEED_HEIGHT_M:
-            return None  # soon, for most seeds are those of low things
+            return None  # early, as most seeds belong to low objects
         along = facets.places[rows, :2] @ line.along
-        found = _fitted(facets.select(rows[(along >= ends[0]) & (along <= ends[1])]), line, band_m)
+        found = _fit_plane(facets.select(rows[(along >= ends[0]) & (along <= ends[1])]), line, band_m)
         if found is None:
             return None
         line = found
@@ -232,7 +232,7 @@ def _around(
     return np.asarray(_near(facets, line, band_m, cosine) & (along >= ends[0]) & (along <= ends[1]))
 
 
-def _run(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float] | None:
+def _run_around(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float] | None:
     """Start and end of the run of positions without a gap around a position; None if there is none."""
     if not len(along):
         return None
@@ -242,7 +242,7 @@ def _run(along: Float64[np.ndarray, " n"], middle: float) -> tuple[float, float]
     return float(nearest[0] * BIN_M), float((nearest[-1] + 1) * BIN_M)
 
 
-def _fitted(facets: Facets, start: _Line | None, band_m: float) -> _Line | None:
+def _fit_plane(facets: Facets, start: _Line | None, band_m: float) -> _Line | None:
     """Fit a vertical plane to facets: robust least squares in plan (Tukey's biweight); None if there are too few.
 
     Args:
@@ -325,7 +325,7 @@ def _piece(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float
     return _Piece(line, face.ends, face.heights) if flat.areas.sum() >= MIN_FLAT * around else None
 
 
-def _cornered(pieces: Sequence[_Piece]) -> list[_Piece]:
+def _join_corners(pieces: Sequence[_Piece]) -> list[_Piece]:
     """Extend or trim the walls' ends to the planes of walls that they meet; drops low walls that meet none."""
     result = []
     for piece in pieces:
@@ -341,9 +341,9 @@ def _cornered(pieces: Sequence[_Piece]) -> list[_Piece]:
 
 def _wall(piece: _Piece) -> Wall:
     left, right = (piece.line.at(end) for end in piece.ends)
-    return Wall("", left, right, *_reached(piece.heights))
+    return Wall("", left, right, *_foot_and_top(piece.heights))
 
 
-def _reached(heights: tuple[float, float]) -> tuple[float, float]:
+def _foot_and_top(heights: tuple[float, float]) -> tuple[float, float]:
     """Foot and top of a wall, from the heights of its facets."""
     return heights[0], heights[1] + TOP_M
