@@ -104,7 +104,7 @@ def test_the_page_renders_on_the_device_of_the_current_run(
     source = ModelSource(tmp_path, "checkpoint", "stamp", None)
     monkeypatch.setattr(checkpoint_render, "newest", lambda opened: source)
     monkeypatch.setattr(checkpoint_render, "load", lambda source, opened: shown())
-    monkeypatch.setattr(Live, "_look", lambda live: (live._log.read(), (Contents(), (view,)))[1])
+    monkeypatch.setattr(Live, "_refresh", lambda live: (live._log.read(), (Contents(), (view,)))[1])
     for asked, machine in (("cpu", {"device": "cpu"}), ("cuda", {"device": "auto"}), ("cuda", 3)):
         event = {"kind": "run_started", "stage": "", "data": {"stages": ["train"], "machine": machine}, "time_s": 1.0}
         (tmp_path / "events.jsonl").write_text(json.dumps(event) + "\n")

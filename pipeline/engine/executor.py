@@ -1,4 +1,4 @@
-"""Runs tasks in a worker process: starts it, forwards its events, ends it, and explains crashes."""
+"""Runs tasks in a worker process: starts and ends it, forwards its events, and explains crashes."""
 
 from __future__ import annotations
 

@@ -293,10 +293,12 @@ def open_store(out: Path, *, create: bool) -> Store:
     _check_format(out)
     store = Store(out)
     if create and not store.stages.exists():
-        taken = [name for name in ("splat.ply", "config.toml", "metrics.json", "cameras.json") if (out / name).exists()]
-        if taken:
+        foreign = [
+            name for name in ("splat.ply", "config.toml", "metrics.json", "cameras.json") if (out / name).exists()
+        ]
+        if foreign:
             raise UsageError(
-                f"{out} contains files that are not a run's ({', '.join(taken)}).",
+                f"{out} contains files that are not a run's ({', '.join(foreign)}).",
                 hint="Choose an empty or a new folder.",
             )
     if not create:

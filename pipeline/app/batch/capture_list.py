@@ -57,7 +57,7 @@ def read_captures(captures: Path, out: Path) -> tuple[ListedCapture, ...]:
 
     Args:
         captures: A folder of photo folders, or a ``.toml`` or ``.csv`` list.
-        out: The batch's folder, which is not taken for a capture.
+        out: The batch's folder, which is not treated as a capture.
 
     Raises:
         UsageError: if it is neither, has no captures, or has duplicate names.
@@ -221,7 +221,7 @@ def with_files_from(folder: Path, table: Table) -> Table:
 
 
 def _check_places(captures: Sequence[ListedCapture], out: Path) -> None:
-    """Check that no capture's results lie among another's photos, where its images would be taken for photos."""
+    """Check that no capture's results lie among another's photos, where its images would be mistaken for photos."""
     around = {out, *out.parents}
     for capture in captures:
         if capture.photos.resolve() in around:

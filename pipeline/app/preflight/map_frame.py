@@ -64,13 +64,13 @@ class MapFrame:
 
 def frame_of(preflight: Preflight) -> MapFrame | None:
     """The frame of all photos with positions and their footprints, gaps and nearby control; None without any."""
-    taken = [photo.position_m[:2] for photo in preflight.photos if photo.position_m is not None]
-    if not taken:
+    cameras = [photo.position_m[:2] for photo in preflight.photos if photo.position_m is not None]
+    if not cameras:
         return None
-    reach = REACH * max(_span(taken, 0), _span(taken, 1), MIN_SPAN_M)
+    reach = REACH * max(_span(cameras, 0), _span(cameras, 1), MIN_SPAN_M)
     shown: list[Place] = [place for photo in preflight.photos for place in photo.footprint_m or ()]
     shown += [place for gap in preflight.gaps for place in gap.outline_m]
-    low, high = ([bound(place[axis] for place in taken) for axis in (0, 1)] for bound in (min, max))
+    low, high = ([bound(place[axis] for place in cameras) for axis in (0, 1)] for bound in (min, max))
     for point in (point.position_m for point in preflight.control):
         if all(low[axis] - reach <= point[axis] <= high[axis] + reach for axis in (0, 1)):
             shown.append(point)
