@@ -164,7 +164,7 @@ def test_a_killed_stage_is_restarted_and_ctrl_c_ends_everything_cleanly(tmp_path
     filed = json.loads((out / "batch.json").read_text())
     (house,) = filed["captures"]
     assert (house["state"], house["stage"], house["tries"], filed["at_work"]) == ("stopped", "features", 2, False)
-    assert "features: The stage features was ended by SIGKILL" in house["earlier"][0]
+    assert "features: The stage features was killed by SIGKILL" in house["earlier"][0]
 
 
 def test_a_killed_batch_leaves_no_process_and_no_false_report(tmp_path: Path) -> None:

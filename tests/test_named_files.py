@@ -130,7 +130,7 @@ def make_large(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (Path.exists, "is not there"),
+        (Path.exists, "does not exist"),
         (Path.mkdir, "is a folder"),
         (os.mkfifo, "not a regular file"),
         (make_large, "too large"),

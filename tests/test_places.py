@@ -24,7 +24,10 @@ PLACES = PathLabels.of(
         (f"The log: {OUT}/splatpipe.log", "The log: OUT/splatpipe.log"),
         (f"Run again: splatpipe run {PHOTOS} {OUT}", "Run again: splatpipe run PHOTOS OUT"),
         (f"{PHOTOS}/a b/DJI_0001.JPG is broken.", "PHOTOS/a b/DJI_0001.JPG is broken."),
-        (f"The file {GCP} of georef.control is not there.", "The file gcp list.csv of georef.control is not there."),
+        (
+            f"The file {GCP} of georef.control does not exist.",
+            "The file gcp list.csv of georef.control does not exist.",
+        ),
         ("~/grids/a b.tif", "a b.tif"),
         ("/mnt/nas share/jane/survey (2)/other.csv", "other.csv"),
         ("See /opt/cuda/lib64/libcudart.so.12, please.", "See libcudart.so.12, please."),

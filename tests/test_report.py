@@ -25,7 +25,7 @@ from splatpipe.pipeline.app.report import make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
-from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MOST_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MAX_CHIPS, chosen_views, cut_chips
 from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.stages.line import LINE
@@ -204,7 +204,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     steps = [event["data"]["step"] for event in events if event["kind"] == "metric"]
     assert iteration == max(*progress, *steps)
     assert "30 trained on, 10 held out" in words(watched)  # of the plan that it had
-    assert state_of(watched, "train") == "stopped" and state_of(watched, "sparse") == "made before"
+    assert state_of(watched, "train") == "stopped" and state_of(watched, "sparse") == "earlier run"
     assert watched.page.locator("#training .chart").count() == 2
     assert watched.page.locator("#views").count() == 0 and "PSNR" not in watched.page.locator(".cards").inner_text()
     assert "6 check points are off by" in told  # what was found before is not lost
@@ -469,7 +469,7 @@ def test_hundreds_of_photos_keep_the_report_small() -> None:
     seen = [{"photo": f"{i}.jpg", "pixel": [10.0, 10.0], "residual_px": [i / 100.0, 0.0]} for i in range(400)]
     points = [{"observations": seen}, {"observations": seen}, {"observations": seen[:3]}]
     chips = cut_chips(points, None, None)
-    assert len(chips) == MOST_CHIPS
+    assert len(chips) == MAX_CHIPS
     assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(chips) and (0, 0) not in chips
 
 

@@ -136,7 +136,7 @@ def test_shards_of_many_processes_each_killed_once_have_the_bits_of_a_single_run
 
 def test_a_killed_shard_costs_only_itself(numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sharded.KILL_VARIABLE, "2")
-    with pytest.raises(StageError, match=r"sum\.2 was ended by SIGKILL"):
+    with pytest.raises(StageError, match=r"sum\.2 was killed by SIGKILL"):
         walk(request_of(numbers, out))
     history = read_history(out / "events.jsonl", running=False)
     assert history.culprit is not None and history.culprit.name == "sum.2"

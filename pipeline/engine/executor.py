@@ -150,9 +150,9 @@ def _cause(code: int) -> str:
     if code >= 0:
         return f"crashed (exit code {code})"
     try:
-        return f"was ended by {signal.Signals(-code).name}"
+        return f"was killed by {signal.Signals(-code).name}"
     except ValueError:
-        return f"was ended by signal {-code}"
+        return f"was killed by signal {-code}"
 
 
 def _remedy(code: int) -> str:

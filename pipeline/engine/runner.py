@@ -239,7 +239,7 @@ class Runner:
         outcome.failed = stage.name
         began_s = time.monotonic()
         known = self.store.find(stage, inputs.key) is not None
-        reason = "asked for" if known else explain(inputs, self.store.artifacts(stage.name))
+        reason = "requested" if known else explain(inputs, self.store.artifacts(stage.name))
         reason = f"{job.shard}: {reason}" if job.shard else reason
         of = {"shard": asdict(job.shard)} if job.shard else {}
         self.sink(Event("stage_started", stage.name, {"reason": reason, "key": inputs.key, **of}))
@@ -322,8 +322,8 @@ class Runner:
         free = shutil.disk_usage(self.store.out).free
         if free < MIN_FREE_BYTES:
             raise MachineError(
-                f"The disk of {self.store.out} is full: {free >> 20} MiB are free, and {MIN_FREE_BYTES >> 20} are "
-                "the least that a stage needs.",
+                f"The disk of {self.store.out} is full: {free >> 20} MiB are free, and a stage "
+                f"needs at least {MIN_FREE_BYTES >> 20}.",
                 hint="Free some space, then run again: it resumes from here.",
             )
 

@@ -56,8 +56,8 @@ class RunSource:
         }
         if len(photos) > MAX_SOURCE_FILES:
             raise SplatpipeError(
-                f"{self.folder} holds {len(photos):,} files.",
-                hint="Give the folder that has the photos of one capture.",
+                f"{self.folder} contains {len(photos):,} files.",
+                hint="Give a folder with the photos of one capture.",
             )
         parts = {"source.photos": photos}
         if self.model is not None:
@@ -99,7 +99,7 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
     if not folder.exists():
         raise SplatpipeError(f"There is no folder {photos}.", hint="Check the path of the photos.")
     if not folder.is_dir():
-        raise SplatpipeError(f"{photos} is a file.", hint="Give the folder that has the photos.")
+        raise SplatpipeError(f"{photos} is a file.", hint="Give the folder with the photos.")
     if not os.access(folder, os.R_OK | os.X_OK):
         raise SplatpipeError(f"The folder {photos} cannot be read: permission denied.", hint="Check its permissions.")
     destination = out.expanduser().resolve()
@@ -164,7 +164,7 @@ def _choose(file: NamedFile, option: str, setting: str, beside: Mapping[Path, Ma
 
 def _check_file(path: Path, option: str) -> Path:
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "is not a regular file" if path.exists() else "is not there"
+        what = "is a folder" if path.is_dir() else "is not a regular file" if path.exists() else "does not exist"
         raise SplatpipeError(f"The file {path} of {option} {what}.", hint=f"Check the path, or set {option}=none.")
     if not os.access(path, os.R_OK):
         raise SplatpipeError(
@@ -172,7 +172,7 @@ def _check_file(path: Path, option: str) -> Path:
         )
     if path.stat().st_size > MAX_NAMED_BYTES:
         raise SplatpipeError(
-            f"The file {path} of {option} has {path.stat().st_size / 1e6:,.0f} MB, too large for a table of positions.",
+            f"The file {path} of {option} is {path.stat().st_size / 1e6:,.0f} MB, too large for a table of positions.",
             hint=f"Check the path, or set {option}=none.",
         )
     return path

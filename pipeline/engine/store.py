@@ -337,5 +337,5 @@ def _check_format(out: Path) -> None:
     if found != FORMAT:
         raise UsageError(
             f"{out} was made by a version of splatpipe with a different layout ({found}; this one has {FORMAT}).",
-            hint="Choose another OUT, or use the version that made it. Nothing in it was touched.",
+            hint="Choose another OUT, or use the version that made it. Nothing in it was changed.",
         )

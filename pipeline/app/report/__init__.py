@@ -18,7 +18,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 
 REPORT_FILE = "report.html"
 PATIENCE_S = 600.0  # far more than hundreds of photos take
-LEAST_S = 2.0  # least time granted: enough for the report without images, even on a busy machine
+MIN_S = 2.0  # minimum time granted: enough for the report without images, even on a busy machine
 POLL_S = 0.02
 
 
@@ -73,7 +73,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
 
     def over() -> bool:
         now_s = time.monotonic()
-        return now_s > end_s and (_stamp(path) != before or now_s > began_s + LEAST_S)
+        return now_s > end_s and (_stamp(path) != before or now_s > began_s + MIN_S)
 
     try:
         with log.open("a", encoding="utf-8") as stream:

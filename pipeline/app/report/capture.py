@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.geometry import Geometry
 
 Chapter = dict[str, Any]
-MOST_LISTED = 200  # rows of a table of photos
-LEAST_POINTS = 100  # observed by a well registered photo
+MAX_LISTED = 200  # rows of a table of photos
+MIN_POINTS = 100  # observed by a well registered photo
 
 
 def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: bool) -> Chapter:
@@ -42,11 +42,11 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
     chapter: Chapter = {
         "facts": [fact for fact in facts if fact[1]],
         "cameras": [_camera(camera, row) for camera, row in zip(cameras, groups, strict=False)],
-        "left_out": left_out[:MOST_LISTED],
-        "left_out_more": max(0, len(left_out) - MOST_LISTED),
+        "left_out": left_out[:MAX_LISTED],
+        "left_out_more": max(0, len(left_out) - MAX_LISTED),
     }
     if geometry is not None:
-        chapter |= _mapped(inputs, geometry)
+        chapter |= _map_part(inputs, geometry)
     elif drawn and len(positions) > 1:
         from splatpipe.pipeline.app.report.charts import stated_map
 
@@ -64,8 +64,8 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Cha
         ("Photos placed", f"{count(sparse.get('registered'))} of {count(sparse.get('photos'))}"),
         ("Keypoints", f"{count(features.get('keypoints'))}, {count(features.get('keypoints_per_photo'))} per photo"),
         ("Pairs", f"{count(matches.get('verified'))} verified of {count(matches.get('pairs'))} tried"),
-        ("Matches a pair", f"{count(matches.get('median_inliers'))} (median)"),
-        ("Pairs chosen", str(matches.get("pairing", ""))),
+        ("Matches per pair", f"{count(matches.get('median_inliers'))} (median)"),
+        ("Pairing", str(matches.get("pairing", ""))),
         ("Sparse points", count(sparse.get("points3d"))),
         ("Track length", f"{number(sparse.get('mean_track_length'), 1)} photos per point on average"),
         ("Reprojection error", f"{number(sparse.get('mean_reprojection_error_px'), 2)} pixels on average"),
@@ -76,12 +76,12 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Cha
     lenses = {row["camera"]: row for row in models.get("lenses", [])}
     chapter: Chapter = {
         "facts": facts,
-        "unregistered": unregistered[:MOST_LISTED],
-        "unregistered_more": max(0, len(unregistered) - MOST_LISTED),
+        "unregistered": unregistered[:MAX_LISTED],
+        "unregistered_more": max(0, len(unregistered) - MAX_LISTED),
         "other_models": models.get("other_models", []),
         "cameras": [_calibrated(camera, lenses.get(camera.get("id"), {})) for camera in sparse.get("cameras", [])],
-        "tried": [_tried(row) for row in sparse.get("tried", [])],
-        "rungs": [_rung(row) for row in sparse.get("ladder", [])],
+        "tried": [_attempt_row(row) for row in sparse.get("tried", [])],
+        "rungs": [_step_row(row) for row in sparse.get("ladder", [])],
     }
     if geometry is not None:
         chapter |= _registration_charts(inputs, geometry)
@@ -101,7 +101,7 @@ def held_out(inputs: ReportInputs) -> list[str]:
     return [str(name) for name in inputs.read("split.views").get("held_out", [])]
 
 
-def _mapped(inputs: ReportInputs, geometry: Geometry) -> Chapter:
+def _map_part(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     from splatpipe.pipeline.app.report.charts import overlap_map, survey_map
 
     unit, shares = unit_of(inputs), geometry.overlap.shares
@@ -128,10 +128,10 @@ def _mapped(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     maps = [
         {
             "svg": survey_map(geometry, unit, held_out(inputs)),
-            "text": "Camera positions, viewing directions, and the ground that each photo covers (footprint), up to "
-            "where its points end; that walls and trees are in the way is not counted.",
+            "text": "Camera positions, viewing directions, and the ground that each photo covers (footprint), as "
+            "far as its points reach; occlusion by walls and trees is ignored.",
         },
-        {"svg": overlap_map(geometry.overlap, unit), "text": "The number of these footprints that cover each place."},
+        {"svg": overlap_map(geometry.overlap, unit), "text": "Number of footprints that cover each place."},
     ]
     return {"map_facts": facts, "maps": maps}
 
@@ -144,7 +144,7 @@ def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
     drawn = [
         (
             charts.observations_bars(geometry),
-            f"Photos with fewer than {LEAST_POINTS} points (red) are poorly constrained.",
+            f"Photos with fewer than {MIN_POINTS} points (red) are poorly constrained.",
         ),
         (
             charts.track_histogram(geometry),
@@ -153,7 +153,9 @@ def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
         (charts.error_histogram(geometry), "Distribution of the reprojection errors."),
     ]
     for number_of, field in enumerate(geometry.fields[:4], start=1):
-        text = "Mean residuals over the picture, much enlarged: a pattern would tell that the lens model does not fit."
+        text = (
+            "Mean residuals over the image, greatly exaggerated: a pattern indicates that the lens model does not fit."
+        )
         drawn.append((charts.residual_field(field, number_of), text))
     if pairs:
         drawn.append((charts.match_map(geometry, pairs, unit_of(inputs)), "Pairs of photos that were matched."))
@@ -201,7 +203,7 @@ def _calibrated(camera: Mapping[str, Any], lens: Mapping[str, Any]) -> dict[str,
     }
 
 
-def _tried(row: Mapping[str, Any]) -> dict[str, str]:
+def _attempt_row(row: Mapping[str, Any]) -> dict[str, str]:
     """A table row for a mapping attempt; missing figures are dashes."""
     against, pairs = row.get("contradicted") or (None, None)
     return {
@@ -219,7 +221,7 @@ def _tried(row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _rung(row: Mapping[str, Any]) -> dict[str, str]:
+def _step_row(row: Mapping[str, Any]) -> dict[str, str]:
     """A table row for a step of the attempts to register the remaining photos."""
     return {
         "rung": str(row.get("rung", "")).replace("_", " "),
@@ -253,5 +255,5 @@ def _positions(summary: Mapping[str, Any], positions: Sequence[Mapping[str, Any]
     text += f", {count(flights)} flights" if isinstance(flights, int) and flights > 1 else ""
     horizontal, vertical = summary.get("sigma_horizontal_m"), summary.get("sigma_vertical_m")
     if horizontal is not None:
-        text += f"; taken to be good to {length(horizontal)} horizontally, {length(vertical)} in height"
+        text += f"; assumed accurate to {length(horizontal)} horizontally, {length(vertical)} in height"
     return text

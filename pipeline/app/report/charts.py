@@ -37,7 +37,7 @@ OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa5
 ARROW_SHARE = 0.12  # length of the longest residual as a share of the map's width
 SQUASHED = 4.0  # times the iterations reached: a planned end farther away would squash the curve
 METRES_A_DEGREE = 111_195.0  # on a sphere: accurate enough for drawing
-MOST_NAMES = 30  # points with their names on a map
+MAX_NAMES = 30  # points with their names on a map
 Residual = tuple[str, Sequence[float], Sequence[float]]  # name, position and residual: east, north, up, metres
 
 
@@ -193,7 +193,7 @@ def residual_map(geometry: Geometry, groups: Mapping[str, Sequence[Residual]]) -
         colour = colours.get(kind, GREEN)
         axes.plot(*place.T, "o", ms=3.5, color=colour, label=kind)
         axes.quiver(*place.T, *residual.T, angles="xy", scale_units="xy", scale=scale, color=colour, width=0.004)
-        if kind != "photo" and len(entries) <= MOST_NAMES:
+        if kind != "photo" and len(entries) <= MAX_NAMES:
             for (name, _, _), (x, y) in zip(entries, place, strict=True):
                 axes.annotate(name[:16], (x, y), xytext=(3, 3), textcoords="offset points", fontsize=7, color=INK)
     axes.set_title(

@@ -20,13 +20,13 @@ BORDER_STEPS = 6  # rays along each side of an image, for its footprint
 GROUND_PERCENTILE = 5.0  # of the sparse points' heights: roofs and walls are above
 REACH_PERCENTILE = 95.0  # of the distances of a photo's own points, which limits its footprint
 REACH_POINTS = 20_000  # points used for that: all of them, for hundreds of photos, would take seconds
-LEAST_DROP = 0.02  # of a ray's length: flatter rays meet the ground beyond the reach
+MIN_DROP = 0.02  # of a ray's length: flatter rays meet the ground beyond the reach
 BOX_PERCENTILES = (4.0, 96.0)  # of the sparse points: some lie far behind the scene
 BOX_MARGIN = 0.15  # of its longer side
 GRID_CELLS = 240  # along the longer side of the overlap map
 FIELD_CELLS = 16  # along the longer side of an image, for the mean residuals
 FIELD_PHOTOS = 24  # photos used for them: enough observations, and more would take seconds
-LEAST_IN_CELL = 5  # observations needed for a meaningful mean
+MIN_IN_CELL = 5  # observations needed for a meaningful mean
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,8 @@ def _footprint(
     """Points where the rays meet the ground, or end at the photo's reach."""
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     height = centre[2] - ground
-    falls = (unit[:, 2] < -LEAST_DROP) & (height > 0.0)
-    lengths = np.where(falls, height / np.maximum(-unit[:, 2], LEAST_DROP), reach)
+    falls = (unit[:, 2] < -MIN_DROP) & (height > 0.0)
+    lengths = np.where(falls, height / np.maximum(-unit[:, 2], MIN_DROP), reach)
     return np.asarray(centre[:2] + np.minimum(lengths, reach)[:, None] * unit[:, :2])
 
 
@@ -253,6 +253,6 @@ def _field(
     flat = np.maximum(index[:, 1], 0) * columns + np.clip(index[:, 0], 0, columns - 1)
     number = np.bincount(flat)
     sums = np.stack([np.bincount(flat, weights=residuals[good][:, axis]) for axis in range(2)], axis=1)
-    full = np.flatnonzero(number >= LEAST_IN_CELL)
+    full = np.flatnonzero(number >= MIN_IN_CELL)
     places = np.stack([full % columns + 0.5, full // columns + 0.5], axis=1) * cell
     return ResidualField(size, places, sums[full] / number[full, None])

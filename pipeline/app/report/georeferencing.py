@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 Chapter = dict[str, Any]
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
-MOST_POINTS = 200  # rows of the table; metrics.json has all
-MOST_BARS = 20
+MAX_POINTS = 200  # rows of the table; metrics.json has all
+MAX_BARS = 20
 AXES = ("east", "north", "up", "horizontal", "3d")
 
 
@@ -38,14 +38,14 @@ def georeferencing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> C
         "tables": _tables(report.get("tables") or {}, splat.get("tables") or {}),
         "flights": _flights(report.get("tables") or {}),
         "left_out": [str(name) for name in frame.get("left_out", [])],
-        "points": [_point(point, splat) for point in points[:MOST_POINTS]],
-        "points_more": max(0, len(points) - MOST_POINTS),
+        "points": [_point(point, splat) for point in points[:MAX_POINTS]],
+        "points_more": max(0, len(points) - MAX_POINTS),
         "has_splat": bool(splat["points"]),
         "marks": [],
         "marks_left_out": 0,
     }
     if geometry is not None:
-        chapter |= _drawn(inputs, geometry, frame, points)
+        chapter |= _charts_and_marks(inputs, geometry, frame, points)
     return chapter
 
 
@@ -101,7 +101,7 @@ def _bars(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if not scale:
         return []
     facts = [("Scale bars", str(scale["sentence"]))]
-    for bar in scale["bars"][:MOST_BARS]:
+    for bar in scale["bars"][:MAX_BARS]:
         off = (
             "one of its targets was not found"
             if bar["error_m"] is None
@@ -185,7 +185,7 @@ def _rms_px(observations: Sequence[Mapping[str, Any]]) -> float | None:
     return math.sqrt(math.fsum(squares) / len(squares)) if squares else None
 
 
-def _drawn(
+def _charts_and_marks(
     inputs: ReportInputs, geometry: Geometry, frame: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
 ) -> Chapter:
     """The residual maps, and the crops for each point."""

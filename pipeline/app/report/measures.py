@@ -10,7 +10,7 @@ from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, outdated, rea
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import length
 
-MOST_ROWS = 200  # of volumes; the file has all of them
+MAX_ROWS = 200  # of volumes; the file has all of them
 BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated"}
 SIGMA_DIGITS = 2  # significant digits of a standard deviation
 
@@ -27,8 +27,8 @@ def measures(inputs: ReportInputs) -> dict[str, Any]:
     volumes = read_measurements(inputs.out, "volumes", surface)
     return {
         "sections": [_section(inputs.out, item) for item in read_measurements(inputs.out, "sections", surface)],
-        "volumes": [_volume(item) for item in volumes[:MOST_ROWS]],
-        "more": max(0, len(volumes) - MOST_ROWS),
+        "volumes": [_volume(item) for item in volumes[:MAX_ROWS]],
+        "more": max(0, len(volumes) - MAX_ROWS),
         "volumes_file": VOLUMES,
         "outdated": outdated(inputs.out, surface),
     }

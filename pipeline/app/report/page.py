@@ -135,5 +135,5 @@ def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:
         cards.append(("Gaussians", count(inputs.summary("clean").get("gaussians", train.get("gaussians"))), ""))
     seconds = [float(artifact.manifest["seconds"]) for artifact in inputs.artifacts.values()]
     if seconds:
-        cards.append(("Computed in", duration(sum(seconds)), "elapsed time of all stages"))
+        cards.append(("Computing time", duration(sum(seconds)), "elapsed time of all stages"))
     return cards

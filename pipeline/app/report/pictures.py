@@ -18,15 +18,15 @@ from splatpipe.pipeline.photos.photo_list import Photo, decode, load_photo_list
 
 VIEW_SIDE = 960  # pixels of the longer side of a held-out photo in the report
 VIEW_QUALITY = 82
-MOST_VIEWS = 12  # the worst and the best; the table has the figures of all
+MAX_VIEWS = 12  # the worst and the best; the table has the figures of all
 CHIP_SIDE = 48  # photo pixels across a crop: a mark, its surroundings, and a large reprojection error
 WIDEST_CHIP = 768  # if the reprojection error is larger than that
 CHIP_PIXELS = 96  # most pixels across in the report; the browser enlarges smaller crops
 CHIP_QUALITY = 80
-MOST_CHIPS = 600  # about two megabytes; if there are more, the worst of each point have priority
-MOST_DECODED = 1_500_000_000  # pixels of photos decoded for them: about fifteen seconds on one core
-TURNS = {3: 180, 6: 90, 8: 270}  # degrees, clockwise, by EXIF orientation; mirrored ones are left as they are
-CODES = {180: cv2.ROTATE_180, 90: cv2.ROTATE_90_CLOCKWISE, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+MAX_CHIPS = 600  # about two megabytes; if there are more, the worst of each point have priority
+MAX_DECODED = 1_500_000_000  # pixels of photos decoded for them: about fifteen seconds on one core
+ROTATIONS_DEG = {3: 180, 6: 90, 8: 270}  # degrees, clockwise, by EXIF orientation; mirrored ones are left as they are
+ROTATION_CODES = {180: cv2.ROTATE_180, 90: cv2.ROTATE_90_CLOCKWISE, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def view_pictures(stem: Path, orientation: int) -> ViewPictures | None:
         pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
         if pixels is None:
             return None
-        small = _turned(shrunk(np.asarray(pixels, np.uint8), VIEW_SIDE), orientation)
+        small = _rotated(shrunk(np.asarray(pixels, np.uint8), VIEW_SIDE), orientation)
         made.append(jpeg(small, VIEW_QUALITY))
         shape = (small.shape[1], small.shape[0])
     photo, render, error = made
@@ -85,9 +85,9 @@ def view_pictures(stem: Path, orientation: int) -> ViewPictures | None:
 
 def chosen_views(views: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """The views to show, worst first; if there are many, the worst and the best."""
-    if len(views) <= MOST_VIEWS:
+    if len(views) <= MAX_VIEWS:
         return list(views)
-    return [*views[: MOST_VIEWS - 1], views[-1]]
+    return [*views[: MAX_VIEWS - 1], views[-1]]
 
 
 def cut_chips(
@@ -105,7 +105,7 @@ def cut_chips(
     """
     photos = {} if photos_part is None else load_photo_list(photos_part).by_name()
     by_photo: dict[str, list[tuple[int, int]]] = {}
-    for place in _worst_first(points)[:MOST_CHIPS]:
+    for place in _worst_first(points)[:MAX_CHIPS]:
         by_photo.setdefault(str(points[place[0]]["observations"][place[1]]["photo"]), []).append(place)
     chips: dict[tuple[int, int], Chip] = {}
     decoded = 0
@@ -113,7 +113,7 @@ def cut_chips(
         photo, pixels = photos.get(name), None
         if photo is not None and photos_part is not None and photos_dir is not None:
             decoded += photo.width * photo.height
-            if decoded > MOST_DECODED:
+            if decoded > MAX_DECODED:
                 continue
             pixels = _decoded(photo, photos_part, photos_dir)
         for place in places:
@@ -174,7 +174,7 @@ def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, or
     if residual:
         x, y = (mark + residual - corner) / side * 100.0
         found = (float(x), float(y)) if 0.0 <= x <= 100.0 and 0.0 <= y <= 100.0 else None
-    return Chip(picture, TURNS.get(orientation, 0), (float(marked[0]), float(marked[1])), found, side)
+    return Chip(picture, ROTATIONS_DEG.get(orientation, 0), (float(marked[0]), float(marked[1])), found, side)
 
 
 def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> UInt8[np.ndarray, "side side 3"]:
@@ -197,6 +197,6 @@ def shrunk(pixels: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _turned(pixels: UInt8[np.ndarray, "h w 3"], orientation: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    turn = TURNS.get(orientation)
-    return pixels if turn is None else np.asarray(cv2.rotate(pixels, CODES[turn]), np.uint8)
+def _rotated(pixels: UInt8[np.ndarray, "h w 3"], orientation: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    turn = ROTATIONS_DEG.get(orientation)
+    return pixels if turn is None else np.asarray(cv2.rotate(pixels, ROTATION_CODES[turn]), np.uint8)

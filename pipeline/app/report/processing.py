@@ -49,7 +49,7 @@ def processing_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
     """
     names = dict.fromkeys((*(stage.name for stage in LINE), *inputs.history.stages))
     rows = [_stage_row(inputs, name) for name in shards_first(names)]
-    rows = [row for row in rows if row["state"] != "not asked for" or row["made"]]
+    rows = [row for row in rows if row["state"] != "not requested" or row["made"]]
     versions, machine = dict(inputs.history.versions), dict(inputs.history.machine)
     for artifact in inputs.artifacts.values():
         versions = versions or dict(artifact.manifest.get("versions", {}))
@@ -64,7 +64,7 @@ def processing_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
         "forecast": _forecast([row["foreseen"] for row in rows if row["foreseen"]]),
         "machine": _machine(machine),
         "versions": sorted((str(name), str(value)) for name, value in versions.items()),
-        "otherwise": _made_otherwise(inputs, versions),
+        "other_versions": _other_versions(inputs, versions),
         "seeds": [
             (f"{name}.seed", str(section["seed"]))
             for name, section in options.items()
@@ -123,9 +123,9 @@ def _is_in_stage(inputs: ReportInputs, name: str) -> bool:
 def _stage_row(inputs: ReportInputs, name: str) -> dict[str, Any]:
     history, artifact = inputs.history.stages.get(name), inputs.artifacts.get(name)
     manifest: Mapping[str, Any] = {} if artifact is None else artifact.manifest
-    state: str = "not asked for" if history is None else history.state
+    state: str = "not requested" if history is None else history.state
     if history is None and artifact is not None:
-        state = "made before"
+        state = "earlier run"
     seconds = manifest.get("seconds", None if history is None else history.seconds)
     memory = manifest.get("peak_memory_bytes", None if history is None else history.memory_bytes)
     return {
@@ -153,7 +153,7 @@ def _forecast(needs: Sequence[Mapping[str, Any]]) -> str:
     return f"{duration(seconds)}, {size(max(int(need['memory_bytes']) for need in needs))}"
 
 
-def _made_otherwise(inputs: ReportInputs, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _other_versions(inputs: ReportInputs, versions: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Stages reused from an earlier run with other versions, and these versions."""
     stages = []
     for name, artifact in inputs.artifacts.items():

@@ -11,9 +11,9 @@ from splatpipe.pipeline.app.report.wording import count, length
 
 PICTURE_SIDE = 960  # pixels
 FACADE_SIDE = 480
-MOST_FACADES = 12  # with an image; the list has all
+MAX_FACADES = 12  # with an image; the list has all
 SECTION_SIDE = 720
-MOST_SECTIONS = 12  # likewise
+MAX_SECTIONS = 12  # likewise
 QUALITY = 85
 
 Chapter = dict[str, Any]
@@ -47,15 +47,15 @@ def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
         facts.append(("triangles of the mesh", f"{count(mesh['triangles'])}, of voxels of {length(mesh['voxel_m'])}"))
     facades = _facades(inputs, drawn=drawn)
     chapter = {"facts": facts, "pictures": _pictures(inputs) if drawn else [], "facades": facades}
-    return {**chapter, "measured": _measured(inputs, drawn=drawn)}
+    return {**chapter, "measured": _measurement_tables(inputs, drawn=drawn)}
 
 
-def _measured(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
+def _measurement_tables(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
     """Sections and volumes, with thumbnails of the first sections."""
     tables = measures(inputs)
     for number, row in enumerate(tables["sections"]):
         path = row.pop("picture")
-        row |= _small_picture(path, SECTION_SIDE) if drawn and path is not None and number < MOST_SECTIONS else {}
+        row |= _small_picture(path, SECTION_SIDE) if drawn and path is not None and number < MAX_SECTIONS else {}
     return tables
 
 
@@ -71,7 +71,7 @@ def _facades(inputs: ReportInputs, *, drawn: bool) -> list[dict[str, Any]]:
         row["known"] = f"{100.0 * float(each['share_with_depth']):.0f} %"
         path = _file(inputs, "facades.files", f"facades/{each['picture']}")
         rows.append(
-            row | (_small_picture(path, FACADE_SIDE) if drawn and path is not None and number < MOST_FACADES else {})
+            row | (_small_picture(path, FACADE_SIDE) if drawn and path is not None and number < MAX_FACADES else {})
         )
     return rows
 

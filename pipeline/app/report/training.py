@@ -17,7 +17,7 @@ MEASURES = {  # metrics of a held-out photo: title with the unit, digits
     "gmsd": ("GMSD", 3),
     "sharpness": ("sharpness", 3),
 }
-MOST_ROWS = 200  # of the table of held-out photos
+MAX_ROWS = 200  # of the table of held-out photos
 
 
 def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
@@ -43,13 +43,13 @@ def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
         ("Blocks", _blocks(inputs)),
         ("Iterations", f"{count(reached)} of {count(planned)} planned" + _why_earlier(summary)),
         ("Gaussians", f"{count(gaussians)}, {count(inputs.summary('initialize').get('gaussians'))} at the start"),
-        ("Cleaned", removed_in_words(inputs.summary("clean"))),
+        ("Cleaning", removed_in_words(inputs.summary("clean"))),
         (
-            "Size of the photos",
+            "Training resolution",
             f"{number(summary.get('train_megapixels'), 2)} megapixels",
         ),
         ("Photos", f"{len(split.get('train', []))} trained on, {len(split.get('held_out', []))} held out"),
-        ("Last loss", number(summary.get("loss") or _last(curves.get("loss", {})), 4)),
+        ("Final loss", number(summary.get("loss") or _last(curves.get("loss", {})), 4)),
         ("Time", duration(summary.get("train_seconds") or (stage.seconds if stage else None))),
         ("Memory", size(summary.get("peak_memory_bytes") or (stage.memory_bytes if stage else None))),
         ("Device", " ".join(str(summary[name]) for name in ("device", "instruction_set") if summary.get(name))),
@@ -94,8 +94,8 @@ def views_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     ]
     chapter: Chapter = {
         "titles": [title for _, title, _ in measures],
-        "rows": [_row(view, measures) for view in views[:MOST_ROWS]],
-        "rows_more": max(0, len(views) - MOST_ROWS),
+        "rows": [_row(view, measures) for view in views[:MAX_ROWS]],
+        "rows_more": max(0, len(views) - MAX_ROWS),
         "mean": [number(metrics["mean"].get(name), digits) for name, _, digits in measures],
         "count": len(views),
         "bounded": "whole" in metrics,
@@ -105,11 +105,11 @@ def views_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
         "charts": [],
     }
     if drawn and views:
-        chapter |= _views_drawn(inputs, views, measures)
+        chapter |= _view_images(inputs, views, measures)
     return chapter
 
 
-def _views_drawn(
+def _view_images(
     inputs: ReportInputs, views: Sequence[Mapping[str, Any]], measures: Sequence[tuple[str, str, int]]
 ) -> Chapter:
     from splatpipe.pipeline.app.report.charts import view_bars

@@ -22,7 +22,7 @@ ERROR_GOOD_PX, ERROR_DOUBT_PX = 1.0, 2.0  # mean reprojection error
 FOCAL_GOOD = 0.05  # relative deviation from the prior
 HORIZONTAL_GSDS, VERTICAL_GSDS = 2.0, 3.0  # RMSE at check points
 SURFACE_GSDS = 6.0  # of one surveyed point: twice the usual RMSE in height
-MOST_NAMED = 3
+MAX_NAMED = 3
 FEW_CHECKS = 3  # check points; fewer prove little
 PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos at 2 megapixels, exposure compensated (trials.md)
 CAMERAS = "Cameras"
@@ -82,13 +82,13 @@ def _ending(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
     history = inputs.history
     when = f"{moment(history.ended_s)}, after {duration(history.ended_s - history.began_s)}"
     if not history.stages:
-        return VerdictLine("bad", "Nothing has run yet", "The folder has no record of a run that began."), ""
+        return VerdictLine("bad", "Nothing has run yet", "The folder has no record of a run."), ""
     if history.complete:
         missing = [name for name in history.stages if name == stage_name(name) and name not in inputs.artifacts]
         if missing:
-            lost = f"It ended on {when}, but what {', '.join(missing)} made is missing or can no longer be read."
+            lost = f"It ended on {when}, but results of {', '.join(missing)} are missing or unreadable."
             return VerdictLine(
-                "bad", "Finished, but its results are damaged", f"{lost} Repeat the command to restore it."
+                "bad", "Finished, but its results are damaged", f"{lost} Repeat the command to restore them."
             ), ""
         last = [stage.name for stage in LINE if stage.name in inputs.artifacts][-1:]
         if last == [LINE[-1].name]:
@@ -160,7 +160,7 @@ def _photos(inputs: ReportInputs) -> VerdictLine | None:
     if placed == photos:
         return VerdictLine(level, "Photos", f"All {photos:,} photos were placed.")
     lost = f"{photos - placed:,} of {photos:,} photos could not be placed ({share(1 - placed / photos)})"
-    return VerdictLine(level, "Photos", f"{lost}: what only they show is missing.")
+    return VerdictLine(level, "Photos", f"{lost}: areas that only they show are missing.")
 
 
 def _reprojection(inputs: ReportInputs) -> VerdictLine | None:
@@ -204,7 +204,7 @@ def _georeference(inputs: ReportInputs) -> VerdictLine | None:
         return VerdictLine("good" if good else "doubt", "Georeferencing", f"{text} {UNPLACED}")
     if frame.get("kind") != "enu":
         why = str(frame.get("note", "")).removeprefix("Arbitrary scale: ").partition(". Up is from")[0].rstrip(".")
-        text = f"The model has neither scale nor georeference: {why or 'no reason recorded'}, and no control places it."
+        text = f"The model has neither scale nor georeference: {why or 'no reason recorded'}, and there is no control."
         return VerdictLine("doubt", "Georeferencing", f"{text} It cannot be measured in metres.")
     report = inputs.read("georef.accuracy")
     tables, gsd = report["tables"], report.get("gsd_m")
@@ -263,8 +263,8 @@ def _splat(inputs: ReportInputs) -> VerdictLine | None:
         return VerdictLine("good", "Surface", text)
     text = f"The splat's surface is off by more than {length(bound)} ({SURFACE_GSDS:g} ground sample distances) at "
     text += f"{len(far)} of {plural(len(points), 'surveyed point')}: "
-    text += ", ".join(f"{name} ({length(lengths[name])})" for name in far[:MOST_NAMED])
-    return VerdictLine("doubt", "Surface", text + (", …" if len(far) > MOST_NAMED else "") + ".")
+    text += ", ".join(f"{name} ({length(lengths[name])})" for name in far[:MAX_NAMED])
+    return VerdictLine("doubt", "Surface", text + (", …" if len(far) > MAX_NAMED else "") + ".")
 
 
 def _views(inputs: ReportInputs) -> VerdictLine | None:
