@@ -36,7 +36,7 @@ LARGEST_FRONT = 200.0  # megapixels
 FOLLOW = VARIANTS.with_name("time_to_quality.py")
 CURVE = "curve.json"
 TOLD = ("psnr", "psnr_cc", "best_psnr")  # figures of a finished run, recorded along the way
-AS_TRAINED = ("clean.enabled=false",)  # training is what is compared; a variant that cleans says so
+AS_TRAINED = ("clean.enabled=false",)  # training is what is compared; a variant with cleaning sets this option
 FRONT = ("ingest", "features", "matches", "sparse", "georef", "undistort")
 
 

@@ -23,7 +23,7 @@ CHECK = "import splatpipe.pipeline as p, sys; sys.exit(not p.__file__.startswith
 
 
 def main(wheel: Path) -> None:
-    """Install the links that stand for a wheel."""
+    """Install links in place of a wheel."""
     with (ROOT / "pyproject.toml").open("rb") as file:
         folders = tomllib.load(file)["tool"]["scikit-build"]["wheel"]["packages"]
     for installed, source in folders.items():

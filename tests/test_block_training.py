@@ -62,7 +62,7 @@ CONFIG = TrainConfig(
     iterations=450, least_iterations=1, sh_degree=1, prune_free_space=2, exposure="affine", max_gaussians=400
 )
 TASK = BlockTask(0, share=160, trained=230, frozen=120, window_pixels=WINDOW)
-STEP_SHARE = 1e-3  # L2 of how far parameters move, as for windows without blocks
+STEP_SHARE = 1e-3  # L2 of the parameters' displacements, as for windows without blocks
 
 
 @pytest.fixture(scope="module")

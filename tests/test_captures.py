@@ -51,7 +51,7 @@ def test_a_phones_wrong_focal_length_does_not_cost_the_cameras(captures: Path, t
 def test_a_thousand_iterations_reach_the_peer_on_sceaux(captures: Path, tmp_path: Path) -> None:
     """18.4 dB is what the best CPU peer reaches at its best on the same view, resolution and points.
 
-    It has the sparse points alone and models no exposure; nothing fits the render's colours to the photo's.
+    It has only the sparse points and models no exposure; nothing fits the render's colours to the photo's.
     """
     settings = ("undistort.max_megapixels=0.4", "train.iterations=1000", "split.views=100_7105.JPG")
     settings += ("initialize.dense=false", "train.exposure=off")

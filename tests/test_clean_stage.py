@@ -98,7 +98,7 @@ def test_where_nothing_is_removed_the_bytes_are_those_of_training(enabled: bool,
 
 
 def test_disabled_it_still_reads_the_trained_model() -> None:
-    """A line of its own is run so by `test_ablation.py`."""
+    """`test_ablation.py` runs a pipeline of its own in this way."""
     assert not CleanConfig(enabled=False).is_off
 
 

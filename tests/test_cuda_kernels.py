@@ -78,7 +78,7 @@ def left_half_empty() -> RenderCase:
 
 
 def far_too_long() -> RenderCase:
-    """Across more tile rows than a thread counts by itself, and hundreds of pairs each."""
+    """Gaussians across more tile rows than one thread counts, with hundreds of pairs each."""
     scene = random_scene(13, 40, 0, size=-1.0)
     scene.log_scales[:, 0] += 2.5
     return case_of(scene, random_camera(13, 50, 260))

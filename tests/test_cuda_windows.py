@@ -30,7 +30,7 @@ OPTIONS = tiny_scene.plain(
 )
 LOOKS = [TrainingSize(1)] * 3 + [TrainingSize(0, 800)] * 9
 """Whole photos, then windows: six per photo, some of a masked photo."""
-STEP_SHARE = 1e-3  # L2 of how far parameters move: 5e-6 here; a first step of Adam goes by a sign
+STEP_SHARE = 1e-3  # L2 of the parameters' displacements: 5e-6 here; Adam's first step depends only on the sign
 SCORE_RTOL = 1e-4  # L2 of the gradients on the screen, after as many steps
 
 

@@ -8,7 +8,7 @@ from splatpipe.pipeline.mvs.filling import MIN_CONFIDENCE, behind, filled
 
 
 def both(off: float, size: tuple[int, int] = (60, 80)) -> tuple[DepthMap, DepthMap]:
-    """A slanted wall, of which the photo lacks a patch, and the splat's, so much farther, with outliers."""
+    """Depths of a slanted wall: the photo's with a hole, and the splat's, farther by a share, with outliers."""
     true = np.broadcast_to(np.linspace(8.0, 12.0, size[1], dtype=np.float32), size)
     known = np.ones(size, bool)
     known[10:20, 10:30] = False

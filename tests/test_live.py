@@ -24,7 +24,7 @@ from timeouts import TIMEOUT_S, wait_until
 
 @pytest.fixture
 def training(demo_run: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
-    """The demo, trained again and for longer; all before it is reused."""
+    """The demo, trained again and for longer; the stages before training are reused."""
     out = linked_copy(demo_run, tmp_path / "out")
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out)]
     command += ["--threads", "1", "--config", str(demo_run / "config.toml"), "--set", "train.iterations=20000"]

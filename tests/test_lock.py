@@ -125,7 +125,7 @@ def test_the_message_says_how_to_break_a_dead_machines_lock_kept_by_a_server(out
             pass
         assert str(path) in refused.value.hint
         path.unlink()
-        with locked(out) as hold:  # as the hint says; a holder that is alive after all notices it, and ends
+        with locked(out) as hold:  # as the hint advises; a holder that is still alive notices it and ends
             hold.confirm()
         assert process.poll() is None
 

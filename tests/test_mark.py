@@ -35,7 +35,7 @@ from served import Served, linked_copy, serving
 TRUTH = {point["name"]: point for point in json.loads((CAPTURE / "truth.json").read_text())["points"]}
 TWELVE = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08", "P15", "P16", "P17", "P18")
 MARKS = 4  # of a point
-GSD_M = 0.0278  # of the capture as a whole; that of the photos which are marked is smaller
+GSD_M = 0.0278  # of the whole capture; that of the marked photos is smaller
 POINTS = "EPSG:32633\nname,x,y,z\n" + "".join(
     "{},{:.4f},{:.4f},{:.4f}\n".format(name, *point["utm_m"]) for name, point in TRUTH.items()
 )
@@ -498,7 +498,7 @@ def test_detected_targets_are_shown_moved_and_rejected_in_the_browser(found_run:
 
 
 def test_a_turned_photo_is_shown_as_it_is_stored(tmp_path: Path, open_page: Callable) -> None:
-    """Marks count in the stored grid: the browser must not turn what EXIF would have turned."""
+    """Marks count in the stored grid: the browser must not apply the rotation in EXIF."""
     rng = np.random.default_rng(1)
     picture = Image.fromarray(rng.integers(0, 255, (30, 50, 3), np.uint8))
     exif = Image.Exif()

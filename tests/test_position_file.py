@@ -1,4 +1,4 @@
-"""Files of photo positions: geo.txt as ODM defines it, CSV as people write it, and invalid files."""
+"""Files of photo positions: geo.txt as ODM defines it, CSV in the forms that people write, and invalid files."""
 
 import random
 from pathlib import Path

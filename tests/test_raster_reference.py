@@ -121,7 +121,7 @@ def test_gaussians_that_reach_the_cameras_plane_are_not_visible() -> None:
 
 
 def test_a_disc_below_the_camera_is_no_veil_over_its_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    disc = gaussian([0.0, 2.0, 0.6], 1.5, 0.9999, [1.0, 1.0, 1.0])  # ground, of which next to nothing is in view
+    disc = gaussian([0.0, 2.0, 0.6], 1.5, 0.9999, [1.0, 1.0, 1.0])  # ground, almost all of it out of view
     disc.log_scales[:, 1] = -5.0
     assert draw(disc, camera(focal=8.0)).alpha.max() == 0.0
     monkeypatch.setattr(reference, "PLANE_SIGMAS", 0.0)

@@ -22,7 +22,7 @@ from view_graph import Ring, add_points, make_ring, model_of, moved, turn_up, wr
 
 
 def capture_of(ring: Ring, folder: Path, reach: int = 99) -> MappingInput:
-    """Matches of photos up to ``reach`` places apart, and none round the end; descriptors of all."""
+    """Matches of photos up to ``reach`` places apart, the ring left open; descriptors of all."""
     folder.mkdir()
     write_database(ring.verified, folder / "matches.db", lambda i, j: j - i <= reach)
     write_database(ring.verified, folder / "features.db", lambda i, j: False)

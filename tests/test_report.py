@@ -180,7 +180,7 @@ def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
 
 
 def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open_page: Callable[..., object]) -> None:
-    """Ctrl-C in a longer training: how far it came, its curve, and that the files beside it are an earlier run's."""
+    """Ctrl-C in a longer training: its progress, its curve, and a note that the other files are from an earlier run."""
     before = len((copy_of_run / "events.jsonl").read_text())
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "stage", "train", str(copy_of_run)]
     command += sets("train.iterations=100000")

@@ -107,7 +107,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> ViewerScene:
 
 @pytest.fixture(scope="module")
 def site(scene: ViewerScene, model: Gaussians, root: LevelNode, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, and beside it the page."""
+    """The site, and the page next to it."""
     folder = tmp_path_factory.mktemp("site")
     write_site(folder / "web", scene, Scene(model, SceneFacts("z up")), root)
     write_viewer(folder, scene, model, largest_bytes=1e9)

@@ -1,4 +1,4 @@
-"""Sections through a house with known heights and walls, and their files as other programs read them."""
+"""Sections through a house with known heights and walls, and their files read by other programs."""
 
 import csv
 import sys

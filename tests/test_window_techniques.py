@@ -111,7 +111,7 @@ def said(photos: list[TrainingPhoto], weights: list[float], penalties: bool) -> 
 def test_windows_weighted_by_their_shares_give_the_whole_photos_loss(masked: bool) -> None:
     mask = torch.rand(CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)) > 0.3 if masked else None
     if mask is not None:
-        mask[:60, 100:] = False  # a window of which little counts
+        mask[:60, 100:] = False  # a window with few unmasked pixels
     whole = the_photo(mask)
     parts = windows(whole)
     assert sum(part.share for part in parts) == pytest.approx(1.0)

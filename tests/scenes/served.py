@@ -1,4 +1,4 @@
-"""A real ``splatpipe view`` process, and raw requests to it such as no client would send."""
+"""A real ``splatpipe view`` process, and raw requests to it that no ordinary client would send."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The record of the sources that each stage's version stands for: ``stages/versions.toml``."""
+"""The record of the sources behind each stage's version: ``stages/versions.toml``."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Verdict:
     """What must be done about a stage.
 
     Attributes:
-        accepted: Whether its present version stands for its present sources.
+        accepted: Whether its present version is recorded for its present sources.
         why: The reason, in a few words.
     """
 
