@@ -14,7 +14,7 @@ import pytest
 from playwright.sync_api import expect
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.preflight.coverage import CELLS, STEPS, covered, shades
+from splatpipe.pipeline.app.preflight.coverage import CELLS, STEPS, count_footprints, shades
 from splatpipe.pipeline.app.preflight.finding_pictures import MAX_PER_FINDING, MAX_PICTURES, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import (
     ControlPlace,
@@ -161,7 +161,7 @@ def test_overlap_counts_the_footprints_that_contain_a_place(demo_names: list[str
     preflight = grid(capture_path(), demo_names)
     frame = frame_of(preflight)
     assert frame is not None
-    counts = covered(frame, [photo.footprint_m for photo in preflight.photos if photo.footprint_m])
+    counts = count_footprints(frame, [photo.footprint_m for photo in preflight.photos if photo.footprint_m])
     cell = WIDTH / CELLS
     for place in ((25.0, 25.0), (-10.0, -10.0), (-13.0, 20.0), (52.0, 3.0)):
         x, y = frame.point(place)

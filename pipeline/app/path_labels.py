@@ -48,7 +48,7 @@ class PathLabels:
         if "/" not in text:
             return text
         for path, name in self.names:
-            shown = rf"{_escaped(name)}\1" if name else ""
+            shown = rf"{_escape_backslashes(name)}\1" if name else ""
             text = re.sub(rf"(?<![\w.-]){re.escape(path)}(?![\w-])(/?)", shown, text)
         return _BESIDE.sub(r"\1", _ELSEWHERE.sub(r"\1", text))
 
@@ -60,7 +60,7 @@ class PathLabels:
         return self.plain(value) if type(value) is str else value
 
 
-def _escaped(name: str) -> str:
+def _escape_backslashes(name: str) -> str:
     return name.replace("\\", r"\\")
 
 

@@ -72,7 +72,7 @@ def crop_middle(path: Path, width: int, height: int) -> Thumbnail | None:
         return None
     image, whole = opened
     left, top = max(0, (image.width - width) // 2), max(0, (image.height - height) // 2)
-    return _coded(image.crop((left, top, min(image.width, left + width), min(image.height, top + height))), whole)
+    return _encode(image.crop((left, top, min(image.width, left + width), min(image.height, top + height))), whole)
 
 
 def _file_stamp(path: Path) -> tuple[int, int] | None:
@@ -95,7 +95,7 @@ def _thumbnail(path: Path, side: int, orientation: int, _stamp: tuple[int, int])
     if orientation in TURNS:
         image = image.transpose(TURNS[orientation])
     image.thumbnail((side, side), Image.Resampling.BOX if whole else Image.Resampling.NEAREST)
-    return _coded(image, whole)
+    return _encode(image, whole)
 
 
 def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
@@ -122,7 +122,7 @@ def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
     return None
 
 
-def _coded(image: Image.Image, whole: bool) -> Thumbnail:
+def _encode(image: Image.Image, whole: bool) -> Thumbnail:
     file = io.BytesIO()
     image.save(file, "JPEG", quality=QUALITY, optimize=True)
     code = base64.b64encode(file.getvalue()).decode()

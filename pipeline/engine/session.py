@@ -24,7 +24,7 @@ from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_F
 from splatpipe.pipeline.engine.runner import Runner
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Machine, Stage
-from splatpipe.pipeline.engine.store import Part, Store, open_store, unwritable
+from splatpipe.pipeline.engine.store import Part, Store, open_store, write_error
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _open_log(store: Store, path: Path) -> EventLog:
     try:
         return EventLog(path)
     except OSError as error:
-        raise unwritable(store.out, error) from error
+        raise write_error(store.out, error) from error
 
 
 def status_of(request: Request) -> tuple[Line, Store]:

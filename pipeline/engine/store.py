@@ -312,11 +312,11 @@ def open_store(out: Path, *, create: bool) -> Store:
         if not format_file.exists():
             write_durably(format_file, json.dumps({"format": FORMAT}))
     except OSError as error:
-        raise unwritable(out, error) from error
+        raise write_error(out, error) from error
     return store
 
 
-def unwritable(out: Path, error: OSError) -> MachineError:
+def write_error(out: Path, error: OSError) -> MachineError:
     """The error for an OUT that cannot be written: full, read-only, another user's, or gone."""
     return MachineError(
         f"Cannot write to {out}: {error.strerror or error}.",

@@ -118,12 +118,12 @@ def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
     captures = table.pop("capture", [])
     if not isinstance(captures, list) or not all(isinstance(each, Mapping) for each in captures):
         raise UsageError(f"{name} has no tables [[capture]].", hint=TOML_HINT)
-    for_all = _validated(table, name, ("preset", "config", "time_budget", "max_memory", "set"))
-    own = [_validated(each, f"Capture {at} of {path.name}", KEYS) for at, each in enumerate(captures, 1)]
+    for_all = _validate(table, name, ("preset", "config", "time_budget", "max_memory", "set"))
+    own = [_validate(each, f"Capture {at} of {path.name}", KEYS) for at, each in enumerate(captures, 1)]
     return [{**for_all, **each, "set": [*for_all.get("set", []), *each.get("set", [])]} for each in own]
 
 
-def _validated(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[str, JSON]:
+def _validate(table: Mapping[str, JSON], where: str, keys: Sequence[str]) -> dict[str, JSON]:
     """Validate a table's keys and value types."""
     result = dict(table)
     for key, value in result.items():

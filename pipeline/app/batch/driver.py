@@ -33,7 +33,7 @@ from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, StopSignal, UsageError, exit_code
 from splatpipe.pipeline.engine.lock import locked
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.engine.store import unwritable
+from splatpipe.pipeline.engine.store import write_error
 from splatpipe.stages.line import LINE
 
 POLL_S = 1.0
@@ -71,7 +71,7 @@ def lock_folder(out: Path) -> Iterator[int]:
     try:
         (out / BATCH_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise unwritable(out, error) from error
+        raise write_error(out, error) from error
     with ExitStack() as stack:
         deadline = time.monotonic() + LOCK_PATIENCE_S
         while True:
@@ -290,7 +290,7 @@ def dry_run(call: Call, profile: Profile) -> int:
     require_snakemake()
     plan = call.plan()
     write_workflow(call, plan, LINE)
-    sys.stderr.write("".join(f"{planned_line(capture)}\n" for capture in plan.captures))
+    sys.stderr.write("".join(f"{plan_text(capture)}\n" for capture in plan.captures))
     sys.stderr.flush()
     command = [*snakemake_command(call, plan, profile), "--dry-run", "--quiet", "rules", "host", "reason"]
     done = subprocess.run(
@@ -299,7 +299,7 @@ def dry_run(call: Call, profile: Profile) -> int:
     return done.returncode
 
 
-def planned_line(capture: PlannedCapture) -> str:
+def plan_text(capture: PlannedCapture) -> str:
     """What a capture would run, with the forecast of its working time, in one line."""
     if capture.message:
         return f"{capture.name}: fails before it starts. {capture.message} {capture.hint}".rstrip()

@@ -41,7 +41,7 @@ def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Positio
                 Finding("boundary-crossing", "warning", text, "Redraw it so that it does not cross itself.")
             )
         if not stated:
-            return [*findings, *([] if controlled else [_unplaced(path.name)])]
+            return [*findings, *([] if controlled else [_no_positions(path.name)])]
         geodetic = np.array([[each.latitude, each.longitude, each.altitude_m] for each in stated], dtype=np.float64)
         origin = Origin(*np.median(np.nan_to_num(geodetic), axis=0).tolist())
         frame = in_crs(Frame("enu", Similarity.identity(), origin), config.crs, "", config.approximate_crs)
@@ -57,6 +57,6 @@ def boundary_findings(path: Path, config: GeorefConfig, stated: Sequence[Positio
     return findings
 
 
-def _unplaced(name: str) -> Finding:
+def _no_positions(name: str) -> Finding:
     text = f"The boundary {name} cannot be used with photos that have no positions."
     return Finding("boundary-broken", "error", text, "Give positions (geo.txt) or control points, or run without it.")

@@ -13,7 +13,9 @@ CELLS = 100  # across the map
 STEPS = (1, 2, 3, 5, 10)  # numbers of photos at which a new shade begins; below three, a surface is poorly determined
 
 
-def covered(frame: MapFrame, footprints: Sequence[Sequence[Sequence[float]]]) -> Int32[np.ndarray, "rows columns"]:
+def count_footprints(
+    frame: MapFrame, footprints: Sequence[Sequence[Sequence[float]]]
+) -> Int32[np.ndarray, "rows columns"]:
     """The number of footprints that contain the centre of each cell, northern rows first.
 
     Args:

@@ -217,7 +217,7 @@ def _facts(intake: Intake, examination: PhotoExamination) -> tuple[PhotoFacts, .
             orientation=photo.exif.orientation,
             camera=intake.camera_of[photo.name],
             time=photo.exif.time,
-            position_m=_rounded(places[k]),
+            position_m=_round_position(places[k]),
             footprint_m=footprint(intake.layout.views, k),
             sharpness=_number(examination.sharpness[k]),
             brightness_ev=_number(examination.brighter_ev[k]),
@@ -232,7 +232,7 @@ def _number(value: float) -> float | None:
     return round(float(value), 3) if np.isfinite(value) else None
 
 
-def _rounded(place: Float64[np.ndarray, " 3"]) -> tuple[float, float, float] | None:
+def _round_position(place: Float64[np.ndarray, " 3"]) -> tuple[float, float, float] | None:
     if not np.isfinite(place).all():
         return None
     east, north, up = (round(float(value), 2) for value in place)

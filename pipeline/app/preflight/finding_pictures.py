@@ -52,12 +52,12 @@ def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
         for name in names[: min(MAX_PER_FINDING, left)]:
             close = finding.code in CLOSE and cuts > 0
             cuts -= close
-            pictures.append(_pictured(root, name, finding, photos.get(name), close=close))
+            pictures.append(_make_picture(root, name, finding, photos.get(name), close=close))
         if finding.code in CLOSE and pictures and cuts > 0:
             other = _sharp_neighbour(preflight, names[0])
             if other is not None:
                 cuts -= 1
-                pictures.insert(1, _pictured(root, other.name, finding, other, close=True, beside=True))
+                pictures.insert(1, _make_picture(root, other.name, finding, other, close=True, beside=True))
         left = max(0, left - len(pictures))
         every.append(pictures)
     return every
@@ -91,7 +91,7 @@ def _examples(preflight: Preflight, finding: Finding) -> tuple[str, ...]:
     return tuple(word for word in (each if each in names else each.rstrip(".") for each in words) if word in names)
 
 
-def _pictured(
+def _make_picture(
     root: Path, name: str, finding: Finding, photo: PhotoFacts | None, *, close: bool, beside: bool = False
 ) -> FindingPicture:
     path = root / name

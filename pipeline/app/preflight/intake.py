@@ -97,7 +97,7 @@ def from_doubt(doubt: Doubt) -> Finding:
     return Finding(doubt.code, doubt.weight, doubt.message, doubt.hint, doubt.photos)
 
 
-def listed(photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int]) -> list[Photo]:
+def ingest_photos(photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int]) -> list[Photo]:
     """The photos as in ingest's list; none is converted."""
     return [
         Photo(
@@ -119,7 +119,7 @@ def _layout(
     camera_of: Mapping[str, int],
     positions: PositionList,
 ) -> Layout:
-    own = listed(photos, camera_of)
+    own = ingest_photos(photos, camera_of)
     entries: Sequence[dict[str, JSON]] = positions_json(positions)["positions"]
     sizes: Float64[np.ndarray, "n 2"] = np.array(
         [np.array([p.width, p.height]) / (2.0 * groups[camera_of[p.name]].focal_px) for p in photos]

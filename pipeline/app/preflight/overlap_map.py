@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from splatpipe.pipeline.app.page_file import one_line, printable
-from splatpipe.pipeline.app.preflight.coverage import covered, shades
+from splatpipe.pipeline.app.preflight.coverage import count_footprints, shades
 from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
 from splatpipe.pipeline.app.report.wording import count, length, plural
@@ -140,7 +140,7 @@ def _path(name: str, d: str, title: str = "") -> str:
 
 
 def _overlap(frame: MapFrame, outlines: Sequence[Sequence[Sequence[float]]]) -> str:
-    paths = shades(covered(frame, outlines)) if outlines else []
+    paths = shades(count_footprints(frame, outlines)) if outlines else []
     return "".join(_path(f"cover{step}", d) for step, d in enumerate(paths, start=1))
 
 

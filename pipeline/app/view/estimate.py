@@ -133,7 +133,7 @@ class Estimator:
         try:
             fitted = self._fit(survey, collector)
         except (NoPlaceError, SplatpipeError) as error:
-            if marks_many(points):
+            if has_enough_marks(points):
                 collector.warnings.append(
                     str(error) if isinstance(error, SplatpipeError) else f"No frame yet: {error}."
                 )
@@ -182,7 +182,7 @@ class Estimator:
         site = make_site(survey, self._geodetic, stations, job.frame, job.config)
         start = start_similarity(site, survey, job.model, job.positions, job.frame)
         if not survey.of_role("control"):
-            start = (self._lifted(start[0], site), start[1])
+            start = (self._shift_to_points(start[0], site), start[1])
         survey = name_blunders(survey, site, job.model, start, job.config, collector)
         observed = observed_in(site, survey, job.model, start[0].scale, job.config.mark_sigma_px)
         fit = fit_jointly(start[0], observed, start[1])
@@ -191,7 +191,7 @@ class Estimator:
             fit = replace(fit, similarity=start[0])
         return _GeoreferencedSite(site, fit, survey)
 
-    def _lifted(self, similarity: Similarity, site: LocalSurvey) -> Similarity:
+    def _shift_to_points(self, similarity: Similarity, site: LocalSurvey) -> Similarity:
         """Before any mark: shift the model vertically so that the points lie on it, whatever their datums."""
         cloud = similarity.apply(self._job.model.points)
         lifts = []
@@ -234,7 +234,7 @@ class Estimator:
         return float(np.median(np.hypot(sigmas[:, 0], sigmas[:, 1]))), float(np.median(sigmas[:, 2]))
 
 
-def marks_many(points: list[SurveyPoint]) -> bool:
+def has_enough_marks(points: list[SurveyPoint]) -> bool:
     """Whether enough points are marked that a frame should exist."""
     return sum(point.found is not None for point in points) >= 3
 

@@ -33,7 +33,7 @@ WHAT = {
 SHOWN_IN_BROWSER = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
 
 
-def fetchable(run: RunFolder) -> tuple[str, ...]:
+def downloadable_files(run: RunFolder) -> tuple[str, ...]:
     """The files that may be fetched, relative to OUT: the report and the stages' deliverables."""
     return tuple(name for name in (REPORT, *run.deliverables()) if is_inside(run.out, name))
 
@@ -47,7 +47,7 @@ def landing(run: RunFolder, marking: bool) -> dict[str, Any]:
     """
     log = RunLog(run.out, EVENTS_FILE)
     log.read()
-    names = fetchable(run)
+    names = downloadable_files(run)
     at_work = run.is_running
     state = _state(log, at_work)
     return {

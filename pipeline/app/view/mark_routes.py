@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from splatpipe.pipeline.app.view.marking import Change, Marking, State, WrongRequestError
-from splatpipe.pipeline.app.view.photo import shown_photo
+from splatpipe.pipeline.app.view.photo import photo_for_browser
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.view.server import Pages
@@ -67,7 +67,7 @@ class MarkPages:
         headers = {"etag": tag, "cache-control": "private, no-cache"}
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers=headers)
-        data, kind = shown_photo(photo, job.photos_part, job.photos_dir)
+        data, kind = photo_for_browser(photo, job.photos_part, job.photos_dir)
         return Response(data, media_type=kind, headers=headers)
 
     def _change(self, request: Request) -> Response:

@@ -206,14 +206,14 @@ class Marking:
             row = self._photo_row(photo, index.get(photo), number, projection)
             sighting = shown.get(photo)
             off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
-            mark = self._shifted(marks[photo]) if photo in marks else found.get(photo)
+            mark = self._shift_pixel(marks[photo]) if photo in marks else found.get(photo)
             row |= {
                 "mark": None if mark is None else [round(mark[0], DIGITS), round(mark[1], DIGITS)],
                 "found": photo in found,
                 "hidden": (name, photo) in hidden,
                 "agrees": sighting.agrees if sighting is not None else True,
                 "residual_px": off,
-                "line": None if lines is None or photo not in index else _listed(lines[:, index[photo]]),
+                "line": None if lines is None or photo not in index else _visible_part(lines[:, index[photo]]),
             }
             rows.append(row)
         rows.sort(key=lambda row: (row["predicted"] is None, row["doubtful"], row["rank"]))
@@ -242,7 +242,7 @@ class Marking:
             for name, pixels in self.job.found.items()
         }
 
-    def _shifted(self, pixel: tuple[float, float]) -> tuple[float, float]:
+    def _shift_pixel(self, pixel: tuple[float, float]) -> tuple[float, float]:
         shift = self.job.pixel_shift
         return round(pixel[0] + shift, DIGITS), round(pixel[1] + shift, DIGITS)
 
@@ -267,7 +267,7 @@ class Marking:
         if self._estimated is None or self._estimated[0] != self.revision:
             marks = {name: dict(pixels) for name, pixels in self._detections().items()}
             for name, seen in self._text.marks.items():
-                marks.setdefault(name, {}).update((photo, self._shifted(pixel)) for photo, pixel in seen.items())
+                marks.setdefault(name, {}).update((photo, self._shift_pixel(pixel)) for photo, pixel in seen.items())
             estimate = self._estimator.estimate(marks)
             self._estimated = self.revision, estimate, self._projector.project(estimate.places, estimate.radius_m)
         return self._estimated
@@ -327,7 +327,7 @@ def helpful_order(
     return [*chosen, *(k for k in range(len(ranks)) if k not in chosen)]
 
 
-def _listed(line: Float64[np.ndarray, "steps 2"]) -> list[list[float]] | None:
+def _visible_part(line: Float64[np.ndarray, "steps 2"]) -> list[list[float]] | None:
     """The part of a line within the photo."""
     shown = line[np.isfinite(line).all(axis=1)]
     return np.round(shown, 1).tolist() if len(shown) > 1 else None

@@ -171,10 +171,12 @@ def _text_and_points(
             f"{points_file} is in {stated.crs}, and {text.path} in {text.table.crs}.",
             hint="One control file has one CRS: convert the points to it.",
         )
-    return text, _together(known, () if stated is None else stated.points, text.path)
+    return text, _merge_points(known, () if stated is None else stated.points, text.path)
 
 
-def _together(known: Sequence[SurveyedPoint], stated: Sequence[SurveyedPoint], path: Path) -> tuple[SurveyedPoint, ...]:
+def _merge_points(
+    known: Sequence[SurveyedPoint], stated: Sequence[SurveyedPoint], path: Path
+) -> tuple[SurveyedPoint, ...]:
     """The points of the GCP file, then those that it does not have yet."""
     by_name = {point.name: point for point in known}
     for point in stated:
@@ -199,8 +201,8 @@ def _command(run: RunFolder, path: Path, setting: str, control: Path | None) -> 
     """The command that applies the marks; it names the file unless the run finds it automatically."""
     named = GEOREF.files["control"].names
     found = control is not None or (setting == AUTO and path.name in named and path.parent != run.out)
-    return f"splatpipe georef {_quoted(run.out)}" + ("" if found else f" --gcp {_quoted(path)}")
+    return f"splatpipe georef {_quote(run.out)}" + ("" if found else f" --gcp {_quote(path)}")
 
 
-def _quoted(path: Path) -> str:
+def _quote(path: Path) -> str:
     return shlex.quote(str(path))

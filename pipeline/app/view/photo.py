@@ -20,7 +20,7 @@ ICC = b"ICC_PROFILE\0"
 PLAIN_MODES = ("RGB", "L")
 
 
-def shown_photo(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes, str]:
+def photo_for_browser(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes, str]:
     """A photo's bytes for the browser, and their media type.
 
     Args:

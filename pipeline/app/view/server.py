@@ -26,7 +26,7 @@ from starlette.types import ASGIApp
 
 from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, FileNotServedError, open_inside
 from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, Guard
-from splatpipe.pipeline.app.view.landing import fetchable, landing
+from splatpipe.pipeline.app.view.landing import downloadable_files, landing
 from splatpipe.pipeline.app.view.live import Live
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, StopSignal, UsageError
 from splatpipe.pipeline.engine.run_folder import RunFolder, open_run_folder
@@ -46,7 +46,7 @@ ASSETS = {
 }
 OF_RUN = {"content-security-policy": CSP_OF_RUN, "cache-control": "no-cache"}
 OF_SITE = {"content-security-policy": CSP_OF_SITE, "cache-control": "no-cache"}
-FETCHABLE_FOR_S = 1.0  # the list of files is cached, since a page may request thousands of files
+FILES_CACHED_S = 1.0  # the list of files is cached, since a page may request thousands of files
 ALONE = {"cross-origin-opener-policy": "same-origin"}  # isolates it from the run's pages, which have our origin
 
 
@@ -280,7 +280,7 @@ class Pages:
     def _file(self, request: Request) -> Response:
         """A deliverable of the run; its name is only compared with the known ones."""
         path = request.path_params["path"]
-        if path not in self._fetchable():
+        if path not in self._downloadable_files():
             raise HTTPException(404)
         try:
             file = open_inside(self.run.out, path)
@@ -289,10 +289,10 @@ class Pages:
         kind = TYPES.get(PurePosixPath(path).suffix, "application/octet-stream")
         return FileAnswer(file, kind, OF_SITE if path.startswith(SITE) else OF_RUN)
 
-    def _fetchable(self) -> frozenset[str]:
+    def _downloadable_files(self) -> frozenset[str]:
         now = time.monotonic()
         since, names = self._known
-        if now - since > FETCHABLE_FOR_S:
-            names = frozenset(fetchable(self.run))
+        if now - since > FILES_CACHED_S:
+            names = frozenset(downloadable_files(self.run))
             self._known = now, names
         return names
