@@ -1,5 +1,5 @@
-// Adam, fused and row by row, so that what no photo saw costs nothing. Compiled once per ISA: internal linkage, no std
-// templates.
+// Adam, fused and row by row, so that rows that no photo saw cost nothing. Compiled once per ISA: internal linkage, no
+// std templates.
 
 #include "adam.h"
 #include "adam_math.h"
@@ -10,13 +10,13 @@ namespace {
 constexpr unsigned kAllRows = (1u << kAdamBlock) - 1;
 static_assert(kAdamBlock % kLanes == 0, "a block of any width is whole vectors");
 
-// A block of rows of one tensor, wherever it lies.
+// A block of rows of one tensor, in the tensor or in a copy.
 struct Block {
     float *values, *mean, *square;
     const float *gradient, *rates;
 };
 
-// kLanes values from j on; with lanes given, only where they are set.
+// kLanes values starting at j; if lanes are given, only where those are set.
 SPLAT_INLINE void step_lanes(const Block& b, int j, const AdamConstants& c, const Mask* lanes) {
     const AdamValues old = {load(b.values + j), load(b.mean + j), load(b.square + j)};
     AdamValues next = adam_step(c, load(b.rates + j), load(b.gradient + j), old);
@@ -28,7 +28,7 @@ SPLAT_INLINE void step_lanes(const Block& b, int j, const AdamConstants& c, cons
     store(b.mean + j, next.mean), store(b.square + j, next.square), store(b.values + j, next.value);
 }
 
-// The rows of a block that are set, bit by bit.
+// Steps the rows of a block whose bits are set.
 SPLAT_INLINE void step_block(const Block& b, const AdamTensor& tensor, const AdamConstants& c, unsigned rows) {
     const int width = tensor.width, n = kAdamBlock * width;
     if (rows == kAllRows) {
@@ -47,7 +47,7 @@ SPLAT_INLINE void step_block(const Block& b, const AdamTensor& tensor, const Ada
     }
 }
 
-// Whether n values are finite: those that are not differ from themselves once multiplied by zero.
+// Whether n values are finite: others, multiplied by zero, give NaN, which differs from itself.
 bool all_finite(const float* p, int n) {
     Floats sum = {};
     int j = 0;
@@ -58,7 +58,7 @@ bool all_finite(const float* p, int n) {
     return rest == 0.0f;
 }
 
-// Which rows of a block of count rows step, as bits; counts those that would but for their gradients.
+// Which of a block's `count` rows are stepped, as bits; counts those skipped for their gradients.
 unsigned stepping_rows(const AdamJob& job, std::int64_t from, int count, std::int64_t* skipped) {
     unsigned rows = 0;
     for (int i = 0; i < count; ++i) rows |= unsigned(!job.visible || job.visible[from + i]) << i;
@@ -83,7 +83,7 @@ unsigned stepping_rows(const AdamJob& job, std::int64_t from, int count, std::in
     return rows;
 }
 
-// The last block, of fewer rows: through a copy, so that nothing beyond the tensors is touched.
+// The last, incomplete block: through a copy, so that nothing beyond the tensors is touched.
 void step_last(const AdamTensor& tensor, std::int64_t from, int count, const AdamConstants& c, unsigned rows) {
     float values[kAdamBlock * kAdamWidth], mean[kAdamBlock * kAdamWidth], square[kAdamBlock * kAdamWidth];
     float gradient[kAdamBlock * kAdamWidth];
@@ -104,7 +104,7 @@ void step_last(const AdamTensor& tensor, std::int64_t from, int count, const Ada
     }
 }
 
-// Tensor by tensor, each over all the rows: four streams of memory at a time are as many as a CPU foresees well.
+// Tensor by tensor, each over all rows: a CPU prefetches no more than about four memory streams well.
 std::int64_t adam_rows(const AdamJob& job, std::int64_t from, std::int64_t to) {
     const AdamConstants c = adam_constants(job.beta1, job.beta2, job.epsilon, job.inverse_root_correction);
     std::int64_t skipped = 0;
@@ -130,8 +130,8 @@ std::int64_t adam_rows(const AdamJob& job, std::int64_t from, std::int64_t to) {
     return skipped;
 }
 
-// Rows of one tensor that lie apart, at most kAdamBlock of them: each by itself where it is whole vectors, else through
-// a copy of all.
+// Up to kAdamBlock scattered rows of one tensor: one by one if a row consists of whole vectors, otherwise through a
+// copy of all.
 void step_apart(const AdamTensor& tensor, const float* gradient, const std::int32_t* rows, int count,
                 const AdamConstants& c, unsigned stepping) {
     const int width = tensor.width;
@@ -165,7 +165,7 @@ void step_apart(const AdamTensor& tensor, const float* gradient, const std::int3
     }
 }
 
-// Which of at most kAdamBlock rows that lie apart step, as bits; counts those that would but for their gradients.
+// Which of up to kAdamBlock scattered rows are stepped, as bits; counts those skipped for their gradients.
 unsigned stepping_apart(const AdamJob& job, const std::int32_t* rows, int count, const float* const* gradients,
                         std::int64_t* skipped) {
     unsigned stepping = 0;

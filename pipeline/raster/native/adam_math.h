@@ -1,4 +1,4 @@
-// Adam's step for a value, for kernel files: on the CPU, where values are vectors, and on CUDA, one by one.
+// Adam's step for one value, for kernel files: a vector on the CPU, a scalar on CUDA.
 #pragma once
 
 #if defined(__CUDACC__) || SPLAT_ON_CPU
@@ -23,7 +23,7 @@ struct AdamValues {
     Floats value, mean, square;  // the running means of the gradient and of its square
 };
 
-// `rate`: with its bias correction.
+// `rate` includes the bias correction.
 SPLAT_INLINE AdamValues adam_step(const AdamConstants& c, Floats rate, Floats gradient, const AdamValues& old) {
     AdamValues next;
     next.mean = fma(c.one_less_beta1, gradient - old.mean, old.mean);

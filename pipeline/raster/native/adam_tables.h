@@ -1,4 +1,4 @@
-// A step of Adam as the CPU's kernels take it. Not for kernel files.
+// The arguments of an Adam step in the form that the CPU kernels need. Not for kernel files.
 #pragma once
 
 #include "adam.h"
@@ -6,7 +6,7 @@
 
 namespace splat {
 
-// The job and the tables that it points into, which live as long as this object.
+// The job and the tables that it points to, which live as long as this object.
 class AdamTables {
   public:
     // At most kAdamTensors tensors.

@@ -1,11 +1,11 @@
-// An affine map of a whole picture's colours: threads around the kernels. Not for kernel files.
+// Applying an affine map to a whole image's colours: threads around the kernels. Not for kernel files.
 #pragma once
 
 #include <cstdint>
 
 namespace splat {
 
-// A (pixels, 3) picture through a (3, 4) map.
+// Applies a (3, 4) map to a (pixels, 3) image.
 void affine_colour(const float* map, const float* in, std::int64_t pixels, float* out);
 
 // dL/d(in) and, (3, 4), dL/d(map) from dL/d(out); the same bits for any number of threads.

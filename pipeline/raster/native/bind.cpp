@@ -34,7 +34,7 @@ void set_isa(const std::string& name) {
 }  // namespace
 
 NB_MODULE(_native, m) {
-    nb::set_leak_warnings(false);  // a graph that somebody still holds at exit is no leak
+    nb::set_leak_warnings(false);  // a graph that is still referenced at exit is not a leak
     m.doc() = "Native kernels: rasterizer, loss, optimiser, depths, surfaces.";
     m.def("set_threads", &splat::set_threads, "threads"_a, "Threads of the one pool that all kernels share.");
     m.def("threads", &splat::thread_count);

@@ -1,4 +1,4 @@
-// Python faces of the loss, what is between it and the rasterizer, and the optimiser: checks around their drivers.
+// Python bindings of the loss, the steps between it and the rasterizer, and the optimiser: argument checks.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>

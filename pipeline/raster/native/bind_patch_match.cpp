@@ -1,4 +1,4 @@
-// Python face of PatchMatch: checks around its driver; see _native.pyi.
+// Python bindings of PatchMatch: argument checks; see _native.pyi.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
@@ -23,8 +23,8 @@ using Matrix = nb::ndarray<const float, nb::shape<3, 3>, nb::c_contig, nb::devic
 using Vector = nb::ndarray<const float, nb::shape<3>, nb::c_contig, nb::device::cpu>;
 using Planes = nb::ndarray<float, nb::shape<3, -1, -1>, nb::c_contig, nb::device::cpu>;
 using Costs = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Picture = std::tuple<Bytes, Bytes>;                // grey values, and where they count
-using Other = std::tuple<Bytes, Bytes, Matrix, Vector>;  // the same, turn and shift
+using Picture = std::tuple<Bytes, Bytes>;                // grey values, and the mask of valid ones
+using Other = std::tuple<Bytes, Bytes, Matrix, Vector>;  // the same, rotation and translation
 
 constexpr std::size_t kLeastSide = 4;
 constexpr std::size_t kMostPixels = INT_MAX / 4;
@@ -44,7 +44,7 @@ void check(const Bytes& grey, const Bytes& counts) {
     require(same_size(grey, counts), "a photo and its mask differ in size");
 }
 
-// Four grey values a pixel: its own, right, below, below right; at the borders the last ones again.
+// Four grey values per pixel: its own, right, below, below right; border values are repeated.
 std::vector<std::uint32_t> corners_of(const Bytes& grey) {
     const std::size_t height = grey.shape(0), width = grey.shape(1);
     std::vector<std::uint32_t> corners(height * width);

@@ -1,4 +1,4 @@
-// The rasterizer's Python face; see _native.pyi.
+// Python bindings of the rasterizer; see _native.pyi.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
@@ -37,7 +37,7 @@ template <class T>
 using ParameterArrays = std::tuple<Grid<T>, Grid<T>, Grid<T>, Line<T>, Cube<T>>;
 // cam_from_world; width, height; fx, fy, cx, cy
 using CameraTuple = std::tuple<Pose, std::array<int, 2>, std::array<double, 4>>;
-// left, top; width and height of the whole picture of which the camera's is a part
+// left, top; width and height of the whole image that the camera's window is part of
 using WindowArray = std::array<int, 4>;
 // sh_degree, antialias, near, depth_origin, background
 using OptionsTuple = std::tuple<int, bool, double, double, std::array<double, 3>>;
@@ -48,9 +48,9 @@ using OutputArrays = std::tuple<Cube<float>, Grid<float>, std::optional<DepthArr
 // colour, alpha, depth_sum, depth_square_sum
 using PictureGradientArrays = std::tuple<std::optional<Cube<const float>>, std::optional<Grid<const float>>,
                                          std::optional<Grid<const float>>, std::optional<Grid<const float>>>;
-// of each parameter, the rate of every value of a row
+// for each parameter, the learning rate of each value of a row
 using RateArrays = std::array<Line<const float>, 5>;
-// rows that are stepped; the gradients by their centres on the screen
+// rows that are stepped; the gradients for their centres on the screen
 using SeenArrays = std::tuple<Line<int64_t>, Grid<float>>;
 // beta1, beta2, epsilon; the step, from 1
 using AdamTuple = std::tuple<double, double, double, int64_t>;
@@ -199,7 +199,7 @@ class Frame {
             step.means2d = checked(std::get<1>(*seen), visible, 2, "means2d");
         }
         nb::gil_scoped_release release;
-        is_blended_back_ = false;  // the parameters are others now
+        is_blended_back_ = false;  // the parameters have changed
         return frame_->step(in, step);
     }
 
@@ -216,7 +216,7 @@ class Frame {
         if (count_ < 0) throw nb::value_error("nothing is rendered yet");
     }
 
-    // What forward() rendered and blend_backward() carried back to the screen.
+    // Results of forward(), and the screen-space gradients of blend_backward().
     splat::Parameters rendered(const ParameterArrays<const float>& arrays) const {
         const splat::Parameters in = parameters_of(arrays);
         if (!is_blended_back_ || in.count != count_ || std::get<4>(arrays).shape(1) != size_t(view_.sh_count))
@@ -226,7 +226,7 @@ class Frame {
 
     std::shared_ptr<splat::RasterFrame> frame_ = splat::borrow_frame();
     splat::View view_{};
-    int64_t count_ = -1;  // Gaussians of the render it holds, or none
+    int64_t count_ = -1;  // Gaussians in the stored render; -1 if there is none
     bool is_blended_back_ = false;
 };
 

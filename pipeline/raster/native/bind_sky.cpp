@@ -1,4 +1,4 @@
-// Python face of the sky behind a render: checks around its driver; see _native.pyi.
+// Python bindings of the sky behind a render: argument checks; see _native.pyi.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>

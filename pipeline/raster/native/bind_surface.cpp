@@ -1,4 +1,4 @@
-// Python face of the surface model's kernels: checks around them; see _native.pyi.
+// Python bindings of the surface model's kernels: argument checks; see _native.pyi.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>

@@ -1,4 +1,5 @@
-// A picture's colours through one affine map, and back. Compiled once per ISA: internal linkage, no std templates.
+// Applying an affine map to an image's colours, forward and backward. Compiled once per ISA: internal linkage, no std
+// templates.
 #include "colour.h"
 #include "rgb.h"
 

@@ -6,14 +6,14 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr float kOddFree = 15.0f;   // grey values that a photo may differ from the others without being odd...
-constexpr float kOdd = 15.0f;       // ...and what each more costs
-constexpr float kOddMost = 60.0f;   // more differ by no more
-constexpr float kEvenCost = 64.0f;  // that is added to costs: the best photo does not count a hundred times
+constexpr float kOddFree = 15.0f;   // a photo may differ from the others by so many grey values at no cost...
+constexpr float kOdd = 15.0f;       // ...and costs so much for each one more
+constexpr float kOddMost = 60.0f;   // larger differences are clamped to this
+constexpr float kEvenCost = 64.0f;  // added to costs, so that the best photo does not outweigh the rest a hundredfold
 constexpr int kRounds = 2;          // of the mean
 
 void rank(const uint8_t* seen, const uint16_t* cost, int most, int64_t cells, uint16_t* least, uint8_t* seen_by) {
-    constexpr int kPart = 512;  // cells at a time: their numbers stay in the nearest cache
+    constexpr int kPart = 512;  // cells at a time: their values stay in the L1 cache
     uint16_t rest[kPart];
     for (int64_t first = 0; first < cells; first += kPart) {
         const int count = cells - first < kPart ? static_cast<int>(cells - first) : kPart;
@@ -71,7 +71,7 @@ void across(const int32_t* sums, int radius, int count, int32_t* out) {
         for (int k = 0; k < count; ++k) out[k] += sums[k + step];
 }
 
-// The others' grey is a mean in which better photos count more, taken again without those that are far from it.
+// The others' grey value is a mean weighted towards better photos, recomputed without outliers.
 void compare(const LikenessRow& row) {
     const int width = row.width;
     float *total = row.total, *mean = row.mean;

@@ -14,7 +14,7 @@ struct Places {
     const double *east, *north, *up;
 };
 
-// Bits of what a photo says about a place.
+// Flags: the visibility of a place in a photo.
 constexpr std::uint8_t kSeen = 1;     // it sees the place
 constexpr std::uint8_t kThrough = 2;  // it sees something behind it
 constexpr std::uint8_t kMixed = 4;    // it sees it, but a nearer surface lies in the next pixel
@@ -22,7 +22,7 @@ constexpr std::uint8_t kUnknown = 8;  // it covers the place but has no depth th
 
 constexpr std::uint16_t kHidden = 4000;  // cost of a photo that does not see a place; the maximum cost
 
-// How close two photos' depths of one place have to be.
+// Tolerances for two photos' depths of one place.
 struct Agreeing {
     double share;     // of the depth;
     double pixels;    // far away as much of it as moves the place so far in the other photo,

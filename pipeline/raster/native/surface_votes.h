@@ -8,14 +8,14 @@
 
 namespace splat {
 
-constexpr double kHeightStep = 1e-4;  // metres: heights are counted in whole steps
+constexpr double kHeightStep = 1e-4;  // metres: heights are whole multiples of this
 // A height found in a cell is one whole number, to be sorted: the cell, the steps above the lowest height, how much of
 // the cell is covered, and the confidence.
 constexpr int kConfidenceBits = 3, kCoverBits = 8, kStepBits = 27, kCellBits = 26;
-constexpr double kCoverUnit = 128.0;  // parts of a cell that covers are counted in
-constexpr int kMostParts = 4;         // of a pixel a side; larger ones leave gaps, which other photos fill
+constexpr double kCoverUnit = 128.0;  // covered areas are counted in such parts of a cell
+constexpr int kMostParts = 4;         // per side of a pixel; larger pixels leave gaps, which other photos fill
 constexpr int kSlopeReach = 2;        // pixels around one that its slope is taken from
-constexpr int kRowPadding = 64;       // numbers behind a row's inverse depths that may be read
+constexpr int kRowPadding = 64;       // values past the end of a row's inverse depths that may be read
 
 // A row of pixels that is turned into heights of cells.
 struct HeightRow {

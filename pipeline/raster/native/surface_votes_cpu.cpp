@@ -10,10 +10,10 @@ namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
 constexpr float kSamePixels = 10.0f;  // depths that differ by more than this many pixel widths are not one surface
-constexpr double kSteepest = 3.0;     // rise over run; steeper is a wall, whose height at a place says nothing
+constexpr double kSteepest = 3.0;     // rise over run; steeper is a wall, which has no single height at a place
 constexpr double kCovered = 0.75;     // of a cell: pixels further apart than that are divided
-constexpr int kWidest = 4;            // cells from a pixel's centre to its edge; a larger one says too little
-constexpr int kBlock = kRowPadding;   // pixels at a time: their planes stay in the nearest cache
+constexpr int kWidest = 4;            // cells from a pixel's centre to its edge; larger pixels are too coarse
+constexpr int kBlock = kRowPadding;   // pixels at a time: their planes stay in the L1 cache
 constexpr int kMostConfident = (1 << kConfidenceBits) - 1;
 constexpr double kMostCover = (1 << kCoverBits) - 1;
 
