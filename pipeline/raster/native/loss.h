@@ -21,7 +21,7 @@ struct LossJob {
     float* gradient;           // (height, width, 3), written whole
     int height;
     int width;
-    LossTile inner;    // pixels elsewhere are seen by windows and do not count
+    LossTile inner;    // pixels outside are in windows but do not count
     float taps[6];     // the window's weight at a distance of 0..5 pixels
     float l1_scale;    // (1 - w) / (3 counting pixels)
     float ssim_scale;  // w / (3 counting pixels)
@@ -29,7 +29,7 @@ struct LossJob {
 
 constexpr int kLossTileRows = 128;
 constexpr int kLossTileCols = 256;
-constexpr std::size_t kLossScratch = 116'000;  // floats a tile works in
+constexpr std::size_t kLossScratch = 116'000;  // floats of working memory per tile
 
 // Sums over a tile's counting pixels and channels.
 struct LossSums {

@@ -1,7 +1,7 @@
 // A tile of the photometric loss and its gradient. Compiled once per ISA: internal linkage, no std templates.
 // The formulas are loss_math.h's.
 //
-// A tile is worked off in bands of rows; each blur goes down the columns first, for a band at once with the sums in
+// A tile is processed in bands of rows; each blur goes down the columns first, for a band at once with the sums in
 // registers, then along the rows. RGB stays interleaved: a row's taps are 3 floats apart.
 
 #include "loss.h"
@@ -34,7 +34,7 @@ void transposed_taps(const float* taps, int i, int n, float* out) {
     for (int k = 0; k < kTaps; ++k) out[k] = transposed_tap(taps, i, i + k - kRadius, n);
 }
 
-// The window's weights, each in every lane: in registers for the length of a loop, whatever it stores.
+// The window's weights, broadcast to all lanes: they stay in registers throughout a loop, whatever it stores.
 struct Window {
     Floats at[kRadius + 1];
 };
@@ -114,7 +114,7 @@ SPLAT_INLINE void blur_columns(const float* const* rows, const float* taps, int 
     }
 }
 
-// Down the columns: one row with taps of its own.
+// Down the columns: one row with its own taps.
 void blur_columns_row(const float* const* rows, const float* own_taps, int n, float* out) {
     for (int at = 0; at < n; at += kLanes) {
         const int j = least(at, n - kLanes);
@@ -143,7 +143,7 @@ const float* expand_mask(const std::uint8_t* mask, int pixels, float* out) {
     return out;
 }
 
-// n pixels of a row from a column on, as far as the inner rectangle has them: [from, to) of them.
+// Which of n pixels of a row, starting at a column, are in the inner rectangle: [from, to).
 struct Part {
     int from, to;
 };
@@ -154,7 +154,7 @@ SPLAT_INLINE Part inner_part(const LossTile& inner, int row, int col, int n) {
     return {from, most(from, least(inner.col1 - col, n))};
 }
 
-// What counts (null: all of it) without what lies outside the inner rectangle, in out; itself where that is nothing.
+// `counts` (null: all ones) zeroed outside the inner rectangle: in out, or `counts` itself if nothing is outside.
 const float* confine(const Part& part, const float* counts, int pixels, float* out) {
     if (part.from == 0 && part.to == pixels) return counts;
     for (int i = 0; i < pixels * kChannels; ++i)
@@ -191,7 +191,7 @@ struct Span {
     int row0, row1, col0, col1;
 };
 
-// 1 - SSIM at each value of a row, and its derivatives by the windowed means, from the means down the columns.
+// 1 - SSIM at each value of a row, and its derivatives with respect to the windowed means, from the column means.
 SPLAT_INLINE void similarity_row(const float* const* means, const float* taps, const float* counts, int n,
                                  float* const* maps, float* out) {
     const Window window = window_of(taps);
@@ -221,7 +221,7 @@ void reflect_row(float* row, const Span& span, int width) {
     }
 }
 
-// The maps of rows [row, row + kBand), as many as the span has; returns what the tile's own pixels add to the sums.
+// The maps of rows [row, row + kBand), as many as the span has; returns the sums over the tile's own pixels.
 double similarity_band(const LossJob& job, const Span& span, const Scratch& s, int row) {
     const int first = most(0, span.col0 - kRadius), last = least(job.width, span.col1 + kRadius);
     const int lead = (first - (span.col0 - kRadius)) * kChannels, n = (last - first) * kChannels;

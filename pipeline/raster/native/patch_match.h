@@ -32,7 +32,7 @@ struct PatchJob {
     std::uint32_t seed;
     int begun;              // how many times planes were changed less than at first
     float* planes;          // (3, height, width): inverse depth at the pixel's centre, across and down a pixel
-    float* costs;           // (height, width): 0 alike to 1 unlike; kPatchWorst where nothing can be told
+    float* costs;           // (height, width): 0 alike to 1 unlike; kPatchWorst where no photo constrains it
     std::uint32_t* chosen;  // (height, width): the photos that a pixel is compared with at first; filled by `begin`
 };
 

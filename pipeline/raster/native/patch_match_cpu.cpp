@@ -11,21 +11,21 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kSamples = 32;                 // of a round window: 6 x 6, two pixels apart, without the corners
-constexpr int kLooked = 4;                   // photos in which a pixel's planes are tried: the most similar ones so far
-constexpr int kBest = 2;                     // photos that count
-constexpr int kNoView = 255;                 // in the place of a photo's number
-constexpr float kUnlike = 1.2f;              // cost above which a photo is uninformative: it shows something else
-constexpr float kNoise2 = 1.5f * 1.5f;       // of grey values: contrast below it does not count as similarity
-constexpr float kPerGrey = 0.047f;           // of a weight's logarithm to base two
-constexpr float kPerPixel2 = 0.028f;         // the same, by squared distance
-constexpr float kNearest = 1e-6f;            // homogeneous: what is nearer is behind
-constexpr float kDepthShare = 0.25f;         // of the inverse depth, that it is changed by at first
-constexpr float kSlopeShare = 2.0f;          // of the inverse depth over the photo's width, the same of a slope
-constexpr float kFainter = 0.5f;             // from one iteration to the next
-constexpr float kSame = 1e-3f;               // of the inverse depth: planes closer than that everywhere in the window
-constexpr float kReach = 6.0f;               // pixels from the middle to the window's sides
-constexpr int kTries = 2;                    // each of a depth, a slope, and both a little
+constexpr int kSamples = 32;            // of a round window: 6 x 6, two pixels apart, without the corners
+constexpr int kLooked = 4;              // photos in which a pixel's planes are tried: the most similar ones so far
+constexpr int kBest = 2;                // photos that count
+constexpr int kNoView = 255;            // instead of a photo's index
+constexpr float kUnlike = 1.2f;         // cost above which a photo is uninformative: it shows something else
+constexpr float kNoise2 = 1.5f * 1.5f;  // variance of grey values: contrast below it does not count as similarity
+constexpr float kPerGrey = 0.047f;      // of a weight's logarithm to base two
+constexpr float kPerPixel2 = 0.028f;    // the same, by squared distance
+constexpr float kNearest = 1e-6f;       // homogeneous coordinate: points nearer than this count as behind the camera
+constexpr float kDepthShare = 0.25f;    // first change of an inverse depth, relative to it
+constexpr float kSlopeShare = 2.0f;     // the same for a slope, relative to the inverse depth over the photo's width
+constexpr float kFainter = 0.5f;        // factor on changes from one iteration to the next
+constexpr float kSame = 1e-3f;          // of the inverse depth: planes closer than that everywhere in the window
+constexpr float kReach = 6.0f;          // pixels from the middle to the window's sides
+constexpr int kTries = 2;               // each of a depth, a slope, and both a little
 constexpr int kFirstFar = 7, kLastFar = 23;  // pixels away along rows and columns; odd, so of the other colour
 
 // Right and down of a pixel, as sides of the window. Even distances from the middle, half a step away from it.
@@ -46,7 +46,7 @@ SPLAT_INLINE uint32_t mixed(uint32_t x) {
     return x ^ (x >> 16);
 }
 
-// Random numbers that a pixel, an iteration and a seed name.
+// Random numbers determined by a pixel, an iteration and a seed.
 struct Draws {
     uint32_t state;
     SPLAT_METHOD float next() {  // [0, 1)

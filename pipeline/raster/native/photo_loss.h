@@ -14,7 +14,7 @@ struct LossRectangle {
 struct LossImages {
     const float *render, *photo;
     const std::uint8_t* mask;  // (height, width), zero does not count; null: every pixel counts
-    float* gradient;           // by the render; written whole
+    float* gradient;           // with respect to the render; written whole
     int height, width;
     LossRectangle inner;  // not empty, within the image: what counts; windows look at everything
 };

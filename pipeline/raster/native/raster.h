@@ -11,7 +11,7 @@
 
 namespace splat {
 
-// The definition's constants; see definitions.py for the reasons.
+// The definition's constants; definitions.py gives the reasons.
 constexpr float kAlphaMax = 0.99f;
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kLog2AlphaMax = -0.014499569695115089f;
@@ -43,13 +43,13 @@ struct View {
     int width, height, tiles_x, tiles_y;
     float fx, fy, cx, cy;
     float rotation[9], translation[3];  // cam_from_world, row-major
-    float centre[3];                    // of projection, world
+    float centre[3];                    // centre of projection, world
     float ratio_min[2], ratio_max[2];   // x/z and y/z are clamped to these in the Jacobian
     float near_z;
     float depth_origin;  // squared depths are measured from it, along the view axis
     float background[3];
-    int sh_degree;  // that counts
-    int sh_count;   // coefficients a channel that are stored, >= (sh_degree + 1)^2
+    int sh_degree;  // that is evaluated
+    int sh_count;   // stored coefficients per channel, >= (sh_degree + 1)^2
     bool antialias;
 };
 

@@ -5,10 +5,10 @@
 
 namespace splat {
 
-// Whether a job is valid: its nodes reach the last pixel and nothing else is missing.
+// Whether a job is valid: its nodes reach the last pixel, and `elsewhere` comes with `around`.
 bool is_sound(const SkyJob& job);
 
-// To `out`, (height, width, 3).
+// Writes `out`, (height, width, 3).
 void lay_over(const SkyJob& job, float* out);
 
 // dL/d(alpha) and, unless null, dL/d(nodes) from dL/d(out); the same bits for any number of threads. dL/d(colour) is

@@ -1,6 +1,6 @@
-// A render laid over the sky, and back. Compiled once per ISA: internal linkage, no std templates.
+// Compositing a render over the sky, forward and backward. Compiled once per ISA: internal linkage, no std templates.
 //
-// A band is worked off in tiles of columns. Between two nodes of a row colours are interpolated once for the band's two
+// A band is processed in tiles of columns. Between two nodes of a row colours are interpolated once for the band's two
 // rows of nodes; a pixel then mixes those of its column.
 #include "rgb.h"
 #include "sky.h"
@@ -11,7 +11,7 @@ namespace {
 
 constexpr int kCells = 32;                              // of a tile
 constexpr int kTile = kCells * kSkyMostStep;            // columns at most
-constexpr int kPadded = kTile + kLanes + kSkyMostStep;  // with those that a last vector and a last cell go over
+constexpr int kPadded = kTile + kLanes + kSkyMostStep;  // including what the last vector and the last cell may overrun
 
 SPLAT_INLINE int least(int a, int b) { return a < b ? a : b; }
 
@@ -67,7 +67,7 @@ SPLAT_INLINE Floats mixed(const Lines& lines, int k, int x, Floats down) {
     return fma(down, load(lines.slope[k] + x), load(lines.top[k] + x));
 }
 
-// What is behind a vector of a tile's pixels, less what the render has there.
+// The colour behind a vector of a tile's pixels, minus the render's background.
 SPLAT_INLINE Colours added(const Lines& nodes, const Lines& elsewhere, const uint8_t* around, int x, Floats down) {
     Colours c;
     for (int k = 0; k < 3; ++k) c.channel[k] = mixed(nodes, k, x, down);
