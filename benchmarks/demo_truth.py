@@ -37,7 +37,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.images import Pixels
 from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.resampling import resample
-from splatpipe.pipeline.photos.undistortion import place
+from splatpipe.pipeline.photos.undistortion import plan_views
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.view_measures import flat_stems, mean_measures, measure
 
@@ -154,10 +154,10 @@ def photos_at(run: OpenedRun, names: Sequence[str], factor: float) -> dict[str, 
     part = run.parts["ingest.photos"].path
     model, photos = pycolmap.Reconstruction(run.parts["georef.model"].path), load_photo_list(part).photos
     cameras = {view.camera.name: run.camera(view) for view in run.views}
-    full = place(model, photos, LARGEST_MEGAPIXELS, SilentReporter())[0]
+    full = plan_views(model, photos, LARGEST_MEGAPIXELS, SilentReporter())[0]
     trained, whole = cameras[full.photo.name], full.target
     scale = factor * max(trained.width / whole.width, trained.height / whole.height) + 1e-9  # sizes are rounded down
-    placed = place(model, photos, scale**2 * 1e-6 * whole.width * whole.height, SilentReporter())
+    placed = plan_views(model, photos, scale**2 * 1e-6 * whole.width * whole.height, SilentReporter())
     return {
         view.photo.name: (
             cameras[view.photo.name].scaled(view.target.width, view.target.height),

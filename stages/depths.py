@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.mvs.depth_maps import find_depth_maps, keep_depth_maps
+from splatpipe.pipeline.mvs.depth_maps import find_depth_maps, save_depth_maps
 from splatpipe.pipeline.mvs.options import DepthsConfig
 from splatpipe.pipeline.photos.dataset import load_views
 
@@ -23,8 +23,8 @@ def run(config: DepthsConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     shutil.rmtree(maps, ignore_errors=True)
     if not config.enabled:
         report.progress(1, 1, "no depth maps are made", "steps")
-        return keep_depth_maps(maps, [])
+        return save_depth_maps(maps, [])
     search.mkdir(exist_ok=True)
     dataset = inputs["undistort.dataset"]
     found = find_depth_maps(dataset, load_views(dataset), config.max_megapixels, search, inputs.machine.threads, report)
-    return keep_depth_maps(maps, found)
+    return save_depth_maps(maps, found)

@@ -18,12 +18,12 @@ from splatpipe.pipeline.photos.camera_groups import (
     describe_cameras,
     group_cameras,
     refused_calibrations,
-    tell_cameras,
+    report_cameras,
 )
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.doubts import FAR_M, median_distance_m
 from splatpipe.pipeline.photos.duplicates import split_duplicates
-from splatpipe.pipeline.photos.names import NAMES_SHOWN, printable, some
+from splatpipe.pipeline.photos.names import NAMES_SHOWN, list_names, printable
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
     MASK_DIR,
@@ -38,7 +38,7 @@ from splatpipe.pipeline.photos.preparation import (
     SKIES,
     Preparation,
     check_photos,
-    convert_odd,
+    convert_unusual,
     converted_path,
     mask_path,
     prepare_masks,
@@ -79,7 +79,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         _tell_left_out(left_out, report)
         groups, camera_of = group_cameras(photos)
         groups, lenses = _lenses(inputs, groups, camera_of, photos, report)
-        opacity = convert_odd(photos, camera_of, work)
+        opacity = convert_unusual(photos, camera_of, work)
         others = [entry.name for entry in left_out]
         masked = prepare_masks(MASKS, root, photos, others, opacity, work)
         skies = prepare_masks(SKIES, root, photos, others, {}, work)
@@ -89,7 +89,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         if doubt.weight == "warning":
             report.warning(doubt.message, doubt.hint)
     described = describe_cameras(photos, groups, camera_of)
-    tell_cameras(described, report)
+    report_cameras(described, report)
     if find_model(inputs.photos_dir) is None:  # a given model comes with its calibration
         _tell_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
@@ -153,7 +153,7 @@ def _tell_left_out(left_out: Sequence[ExcludedPhoto], report: Reporter) -> None:
     for entry in left_out:
         by_reason.setdefault(entry.reason, []).append(entry.name)
     for reason, names in by_reason.items():
-        report.warning(f"Left out: {some(names)} {reason}.")
+        report.warning(f"Left out: {list_names(names)} {reason}.")
 
 
 def _lenses(
@@ -183,13 +183,13 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
     report.note(f"{path.name}: positions of {len(places.by_name)} of {len(photos)} photos, in {places.note}.")
     if places.unknown:
         report.warning(
-            f"{path.name} names photos that are missing, or names them twice: {some(places.unknown)}.",
+            f"{path.name} names photos that are missing, or names them twice: {list_names(places.unknown)}.",
             "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
         )
     others = [photo.name for photo in photos if photo.name not in places.by_name and photo.exif.gps is not None]
     if others:
         report.warning(
-            f"{path.name} does not name {some(others)}: their own positions are used, as a separate flight.",
+            f"{path.name} does not name {list_names(others)}: their own positions are used, as a separate flight.",
             "Add better positions for them to the file, if you have any.",
         )
     both = [(places.by_name[photo.name], photo.exif.gps) for photo in photos if photo.name in places.by_name]
@@ -223,7 +223,8 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
 def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:
     if refused:
         report.warning(
-            f"The calibrated focal length in {some(refused)} is far from the value of lens and sensor; it is not used.",
+            f"The calibrated focal length in {list_names(refused)} is far from the value of lens and sensor; "
+            "it is not used.",
             "Was the photo cropped or resized, or its metadata copied?",
         )
     unknown = sum(group.photos for group in groups if not group.has_prior)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.names import some
+from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
@@ -142,12 +142,12 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
         elsewhere = [name for name in other if name in set(left)]
         if elsewhere:
             report.warning(
-                f"{len(elsewhere)} photos form another model that could not be joined: {some(elsewhere)}.",
+                f"{len(elsewhere)} photos form another model that could not be joined: {list_names(elsewhere)}.",
                 hint="They show another scene, or do not overlap with the others.",
             )
     alone = sorted(set(left).difference(*summary["other_models"]))
     if alone:
-        report.warning(f"{len(alone)} of {summary['photos']} photos could not be placed: {some(alone)}.")
+        report.warning(f"{len(alone)} of {summary['photos']} photos could not be placed: {list_names(alone)}.")
     for reason in summary["verdict"]["reasons"]:
         if reason["kind"] != "placed":  # reported above, by name
             bad = "The camera poses are unreliable: " if reason["level"] == "bad" else ""

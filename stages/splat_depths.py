@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import keep_depth_maps
+from splatpipe.pipeline.mvs.depth_maps import save_depth_maps
 from splatpipe.pipeline.mvs.rendered_depths import rendered_depth_maps
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.photos.images import reduced_camera
@@ -42,7 +42,7 @@ def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) 
     shutil.rmtree(maps, ignore_errors=True)
     if not config.enabled:
         report.progress(1, 1, "not requested", "steps")
-        return keep_depth_maps(maps, [])
+        return save_depth_maps(maps, [])
     gaussians, render = _model(inputs, out, report)
     options, _ = as_trained(inputs["train.rendering"], gaussians)
     placed = gaussians.to(choose_device(inputs.machine.device).tensors)
@@ -55,7 +55,7 @@ def run(config: SplatDepthsConfig, inputs: Inputs, out: Path, report: Reporter) 
             return render(placed, camera, options)
 
         found = rendered_depth_maps(depth_of, dataset, cameras, rendered, inputs.machine.threads, report)
-        summary = keep_depth_maps(maps, found)
+        summary = save_depth_maps(maps, found)
     shutil.rmtree(rendered)
     (out / FLATTENED).unlink(missing_ok=True)
     return {"gaussians": len(gaussians), **summary}

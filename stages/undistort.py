@@ -11,7 +11,13 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import MODEL
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.photos.undistortion import RegisteredPhoto, pinhole_model, place, read_flown, write_view
+from splatpipe.pipeline.photos.undistortion import (
+    RegisteredPhoto,
+    pinhole_model,
+    plan_views,
+    read_registered,
+    write_view,
+)
 from splatpipe.pipeline.sfm.sparse_model import write_model
 
 
@@ -23,9 +29,9 @@ def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) ->
     Raises:
         SplatpipeError: if the model cannot be read, or its photos are missing.
     """
-    model = read_flown(inputs["georef.model"])
+    model = read_registered(inputs["georef.model"])
     photos = load_photo_list(inputs["ingest.photos"]).photos
-    placed = place(model, photos, config.max_megapixels, report)
+    placed = plan_views(model, photos, config.max_megapixels, report)
     dataset = out / "dataset"
 
     def work(view: RegisteredPhoto) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.dense import WIDER, DensePoints, PointBudget, dense_points, thinned
+from splatpipe.pipeline.mvs.dense import WIDER, DensePoints, PointBudget, dense_points, thin_out
 from splatpipe.pipeline.mvs.depth_search import confirm
 from splatpipe.pipeline.mvs.neighbours import SparseVisibility, inverse_depths, neighbours
 from splatpipe.pipeline.mvs.options import InitializeConfig
@@ -190,7 +190,7 @@ def test_off_reads_no_photo_and_no_setting(room: Path, started: tuple[dict, byte
 
 
 def test_cap_spreads_the_points_evenly(room: Path, points: DensePoints) -> None:
-    few = thinned(points, load_points(room).xyz, 60)
+    few = thin_out(points, load_points(room).xyz, 60)
     assert 20 <= len(few) <= 60
     to_few = np.linalg.norm(points.xyz[:, None] - few.xyz[None], axis=2).min(axis=1)
     between = np.linalg.norm(few.xyz[:, None] - few.xyz[None], axis=2) + 9.0 * np.eye(len(few))
@@ -252,7 +252,7 @@ def test_neighbours_prefer_ten_degrees_and_skip_views_that_share_nothing() -> No
 def test_a_voxel_without_a_sparse_point_keeps_its_most_certain_point() -> None:
     xyz = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [5.1, 0.0, 0.0], [9.0, 9.0, 9.0]])
     points = DensePoints(xyz, np.zeros((4, 3), np.uint8), np.array([1.0, 2.0, 1.0, 3.0]), np.full(4, 1.0))
-    kept = thinned(points, np.array([[5.2, 0.1, 0.1]]), 10)
+    kept = thin_out(points, np.array([[5.2, 0.1, 0.1]]), 10)
     np.testing.assert_array_equal(kept.xyz, xyz[[1, 3]])
 
 
@@ -262,7 +262,7 @@ def test_voxels_have_the_photos_resolution() -> None:
     )
     spacing = np.array([0.5, 0.5, 4.0, 4.0, 0.5, 4.0])
     points = DensePoints(xyz, np.zeros((6, 3), np.uint8), np.arange(6.0), spacing)
-    kept = thinned(points, np.zeros((0, 3)), 10)
+    kept = thin_out(points, np.zeros((0, 3)), 10)
     np.testing.assert_array_equal(kept.xyz, xyz[[0, 1, 3, 4]])  # the last has a finer one in its voxel
 
 
@@ -282,5 +282,5 @@ def test_photos_agree_within_half_a_pixel_far_away(depth: float, agrees: bool) -
 def test_a_cap_of_one_leaves_one_point_on_all_sides_of_the_origin() -> None:
     xyz = np.random.default_rng(6).normal(size=(100, 3))
     points = DensePoints(xyz, np.zeros((100, 3), np.uint8), np.arange(100.0), np.full(100, 0.1))
-    kept = thinned(points, np.zeros((0, 3)), 1)
+    kept = thin_out(points, np.zeros((0, 3)), 1)
     np.testing.assert_array_equal(kept.xyz, xyz[99:])

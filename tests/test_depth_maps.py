@@ -8,7 +8,7 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import DepthMap, DepthMapFile, keep_depth_maps
+from splatpipe.pipeline.mvs.depth_maps import DepthMap, DepthMapFile, save_depth_maps
 
 CAMERA = Camera("a.png", 4, 3, 5.0, 5.0, 2.0, 1.5, np.eye(4))
 
@@ -27,7 +27,7 @@ def one_array() -> bytes:
 
 def test_a_map_reads_back_as_written(tmp_path: Path) -> None:
     kept = DepthMap(np.full((3, 4), 2.5, np.float32), np.full((3, 4), 3, np.uint8))
-    told = keep_depth_maps(tmp_path / "maps", [(CAMERA, kept)])
+    told = save_depth_maps(tmp_path / "maps", [(CAMERA, kept)])
     assert told == {"maps": 1, "megapixels": 12e-6, "found": 1.0}
     read = DepthMapFile(CAMERA, tmp_path / "maps/00000.npz").load()
     np.testing.assert_array_equal(read.depth, kept.depth)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.mvs.depth_maps import DepthMap
-from splatpipe.pipeline.mvs.filling import MIN_CONFIDENCE, behind, filled
+from splatpipe.pipeline.mvs.filling import MIN_CONFIDENCE, fill_gaps, median_offset
 
 
 def both(off: float, size: tuple[int, int] = (60, 80)) -> tuple[DepthMap, DepthMap]:
@@ -22,8 +22,8 @@ def both(off: float, size: tuple[int, int] = (60, 80)) -> tuple[DepthMap, DepthM
 
 def test_holes_are_filled_with_confirmed_depths_at_the_surface() -> None:
     found, rendered = both(0.001)
-    assert behind(found, rendered) == pytest.approx(0.001, rel=1e-2)
-    result = filled(found, rendered)
+    assert median_offset(found, rendered) == pytest.approx(0.001, rel=1e-2)
+    result = fill_gaps(found, rendered)
     known = found.confidence > 0
     assert np.array_equal(result.depth[known], found.depth[known])
     assert np.array_equal(result.confidence[known], found.confidence[known])
@@ -34,10 +34,10 @@ def test_holes_are_filled_with_confirmed_depths_at_the_surface() -> None:
 
 
 def test_with_little_overlap_or_another_surface_nothing_is_shifted() -> None:
-    assert behind(*both(0.001, (30, 30))) == 0.0
-    assert behind(*both(0.1)) == 0.0
+    assert median_offset(*both(0.001, (30, 30))) == 0.0
+    assert median_offset(*both(0.1)) == 0.0
 
 
 def test_other_grids_are_refused() -> None:
-    with pytest.raises(ValueError, match="one grid"):
-        filled(both(0.0)[0], both(0.0, (30, 80))[1])
+    with pytest.raises(ValueError, match="different grids"):
+        fill_gaps(both(0.0)[0], both(0.0, (30, 80))[1])

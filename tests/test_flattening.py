@@ -15,7 +15,7 @@ import torch
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import kept_depth_maps
+from splatpipe.pipeline.mvs.depth_maps import list_depth_maps
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.definitions import Render
@@ -213,7 +213,7 @@ def test_stage_writes_a_map_for_every_photo_and_resumes_after_a_kill(
     assert len(list((twice / "rendered").iterdir())) == 3
     splat_depths.run(SplatDepthsConfig(enabled=True), inputs_of(parts, tmp_path, 2), twice, tiny_scene.Recorder())
     for first, second in zip(
-        kept_depth_maps(once / "maps", views), kept_depth_maps(twice / "maps", views), strict=True
+        list_depth_maps(once / "maps", views), list_depth_maps(twice / "maps", views), strict=True
     ):
         assert first.path.read_bytes() == second.path.read_bytes()
         found = first.load()

@@ -90,7 +90,7 @@ def test_exif_for_another_size_is_scaled_with_a_note() -> None:
         (None, False),
     ]
     notes = Notes()
-    ingest_cameras.tell_cameras(rows, notes)
+    ingest_cameras.report_cameras(rows, notes)
     assert any(
         "1600 × 1200 pixels" in note and "4000 × 3000" in note and "scaled by 0.4" in note for note in notes.notes
     )

@@ -8,9 +8,9 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.upright import enu_from_gimbal
-from splatpipe.pipeline.photos.camera_angles import gimbal_from_nadir, tell_convention
+from splatpipe.pipeline.photos.camera_angles import detect_convention, gimbal_from_nadir
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import find_wrong
+from splatpipe.pipeline.photos.doubts import find_misplaced
 from splatpipe.pipeline.photos.exif import Exif, Gps
 from splatpipe.pipeline.survey.photo_positions import Position, PositionList, positions_json, read_positions
 from splatpipe.pipeline.survey.stated_positions import read_places
@@ -133,10 +133,10 @@ def test_nadir_angles_are_the_same_view_as_a_gimbal(angles: tuple[float, float, 
 
 
 def test_the_convention_is_recognised_by_the_views_of_a_camera() -> None:
-    assert tell_convention([-90.0, -89.5, -45.0]) == "gimbal"
-    assert tell_convention([0.0, 1.5, -2.0, 45.0]) == "nadir"
-    assert tell_convention([270.0]) == "gimbal"
-    assert tell_convention([]) == "nadir"
+    assert detect_convention([-90.0, -89.5, -45.0]) == "gimbal"
+    assert detect_convention([0.0, 1.5, -2.0, 45.0]) == "nadir"
+    assert detect_convention([270.0]) == "gimbal"
+    assert detect_convention([]) == "nadir"
 
 
 def test_camera_angles_count_where_there_is_no_gimbal() -> None:
@@ -172,12 +172,12 @@ def test_impossible_positions_are_reported_with_the_reason() -> None:
 
 def test_long_captures_and_the_date_line_are_not_wrong() -> None:
     corridor = {str(index): (47.0 + 0.001 * index, 13.0) for index in range(100)}  # 11 km
-    assert find_wrong(corridor) == {}
-    assert find_wrong({"a": (10.0, 179.9999), "b": (10.0, -179.9999), "c": (10.0, 180.0)}) == {}
-    assert set(find_wrong({"a": (10.0, 179.9999), "b": (10.0, -179.9999), "c": (10.0, 180.0), "d": (11.0, 180.0)})) == {
-        "d"
-    }
-    assert find_wrong({"a": (10.0, 0.0), "b": (40.0, 0.0)}) == {}
+    assert find_misplaced(corridor) == {}
+    assert find_misplaced({"a": (10.0, 179.9999), "b": (10.0, -179.9999), "c": (10.0, 180.0)}) == {}
+    assert set(
+        find_misplaced({"a": (10.0, 179.9999), "b": (10.0, -179.9999), "c": (10.0, 180.0), "d": (11.0, 180.0)})
+    ) == {"d"}
+    assert find_misplaced({"a": (10.0, 0.0), "b": (40.0, 0.0)}) == {}
 
 
 def test_flights_are_numbered_by_time_aircraft_and_source(tmp_path: Path) -> None:

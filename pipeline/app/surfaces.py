@@ -217,7 +217,7 @@ def _open_surface(out: Path) -> _SurfaceModel:
 
 def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threads: int) -> Items:
     """Cut all sections, and write their files into a folder."""
-    from splatpipe.pipeline.mvs.depth_maps import kept_depth_maps
+    from splatpipe.pipeline.mvs.depth_maps import list_depth_maps
     from splatpipe.pipeline.photos.dataset import load_views
     from splatpipe.pipeline.surface.run_sources import metric_depths
     from splatpipe.pipeline.surface.section_files import write_section
@@ -226,7 +226,7 @@ def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threa
 
     if not lines:
         return []
-    maps = kept_depth_maps(surface.parts["depths.maps"].path, load_views(surface.parts["undistort.dataset"].path))
+    maps = list_depth_maps(surface.parts["depths.maps"].path, load_views(surface.parts["undistort.dataset"].path))
     sources = metric_depths(maps, surface.frame.world_from_model)
     most = min(SECTION_PLACES, ALL_PLACES // len(lines))
     found = []

@@ -55,7 +55,7 @@ class PointBudget:
 
     Attributes:
         most: Maximum number of points, spread evenly.
-        inside: Tells which points lie in the area of interest; up to ``most`` more are kept outside. None: no area.
+        inside: Returns which points lie in the area of interest; up to ``most`` more are kept outside. None: no area.
     """
 
     most: int
@@ -82,25 +82,27 @@ def dense_points(
         search = DepthSearch.begin(dataset, views, Path(kept), PLAN)
         search.run(threads, report)
         found = []
-        for done, points in enumerate(ordered_map(partial(_agreed, search), range(len(views)), threads), start=1):
+        for done, points in enumerate(
+            ordered_map(partial(_confirmed_points, search), range(len(views)), threads), start=1
+        ):
             found += [points] if points is not None else []
             report.progress(done, len(views), "comparing depths", "photos")
         sparse = search.tracks.xyz
-    every = _joined(found)
+    every = _concatenate(found)
     if cover.inside is None:
-        return thinned(every, sparse, cover.most)
+        return thin_out(every, sparse, cover.most)
     within = cover.inside(every.xyz)
     parts = [every.select(np.flatnonzero(rows)) for rows in (within, ~within)]
-    return _joined([thinned(part, sparse, cover.most) for part in parts])
+    return _concatenate([thin_out(part, sparse, cover.most) for part in parts])
 
 
-def _joined(parts: Sequence[DensePoints]) -> DensePoints:
+def _concatenate(parts: Sequence[DensePoints]) -> DensePoints:
     empty = DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0))
     columns = zip(*((part.xyz, part.rgb, part.scores, part.spacing) for part in (empty, *parts)), strict=True)
     return DensePoints(*(np.concatenate(column) for column in columns))
 
 
-def _agreed(search: DepthSearch, number: int) -> DensePoints | None:
+def _confirmed_points(search: DepthSearch, number: int) -> DensePoints | None:
     """The most confident confirmed point for each cell of a photo without a sparse point."""
     agreement = search.agreement(number)
     if agreement is None:
@@ -126,7 +128,7 @@ def _cells(camera: Camera, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, 
     return np.asarray(np.floor(y / size) * (CELLS + 1) + np.floor(x / size), np.int64)
 
 
-def thinned(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int) -> DensePoints:
+def thin_out(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int) -> DensePoints:
     """Keep the most confident point of each voxel without a sparse point; voxels grow until few enough points remain.
 
     A voxel is about as large as its point's spacing, rounded to a power of two times the median spacing, so that it has
@@ -143,13 +145,13 @@ def thinned(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int) 
     sizes = middle * 2.0 ** np.round(np.log2(points.spacing / middle))
     ranked = np.argsort(-points.scores, kind="stable")
     while True:
-        rows = _one_each(points.xyz[ranked], sizes[ranked], sparse)
+        rows = _first_per_voxel(points.xyz[ranked], sizes[ranked], sparse)
         if rows.size <= most:
             return points.select(np.sort(ranked[rows]))
         sizes = sizes * GROWTH
 
 
-def _one_each(
+def _first_per_voxel(
     points: Float64[np.ndarray, "n 3"], sizes: Float64[np.ndarray, " n"], sparse: Float64[np.ndarray, "m 3"]
 ) -> Int64[np.ndarray, " k"]:
     """Rows of the first point in each voxel that holds neither a sparse point nor one kept from a smaller voxel."""

@@ -26,8 +26,8 @@ from splatpipe.pipeline.mvs.edges import pixels_behind
 from splatpipe.pipeline.photos.dataset import View
 
 LIST = "maps.json"
-COMPARED = 16  # neighbours a photo is matched with: strips behind hedges are seen by few, and not by the nearest
-ASKED = 24  # neighbours that may confirm: of points seen by three photos, 20 can confirm 96 %, 8 only 39 %
+COMPARED = 16  # neighbours that a photo is matched with: few photos, and not the nearest, see behind hedges
+CONFIRMING = 24  # neighbours that may confirm a depth: 20 confirm 96 % of the points that three photos see, 8 only 39 %
 WIDER = 2.0  # search this many times nearer than the sparse points: a treetop close to the camera has none
 
 
@@ -72,7 +72,7 @@ class DepthMapFile:
         return found
 
 
-def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> dict[str, int | float]:
+def save_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> dict[str, int | float]:
     """Write depth maps as they arrive: `00000.npz` and so on, and `maps.json`, which lists their photos.
 
     Args:
@@ -83,20 +83,20 @@ def keep_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> di
         The number of ``maps``, their ``megapixels``, and the share of pixels with a depth as ``found``.
     """
     folder.mkdir()
-    told: list[dict[str, str | int]] = []
+    listed: list[dict[str, str | int]] = []
     pixels = found = 0
     for number, (camera, each) in enumerate(maps):
         file = f"{number:05d}.npz"
         np.savez(folder / file, depth=each.depth, confidence=each.confidence)
-        told.append({"photo": camera.name, "file": file, "width": camera.width, "height": camera.height})
+        listed.append({"photo": camera.name, "file": file, "width": camera.width, "height": camera.height})
         pixels += each.depth.size
         found += int(np.count_nonzero(each.confidence))
-    write_json(folder / LIST, {"maps": told})
-    return {"maps": len(told), "megapixels": pixels / 1e6, "found": found / max(pixels, 1)}
+    write_json(folder / LIST, {"maps": listed})
+    return {"maps": len(listed), "megapixels": pixels / 1e6, "found": found / max(pixels, 1)}
 
 
-def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[DepthMapFile]:
-    """List the depth maps that ``keep_depth_maps`` wrote, to be loaded one by one.
+def list_depth_maps(folder: Path, views: Sequence[View]) -> list[DepthMapFile]:
+    """List the depth maps that ``save_depth_maps`` wrote, to be loaded one by one.
 
     Args:
         folder: The folder of the maps.
@@ -107,10 +107,10 @@ def kept_depth_maps(folder: Path, views: Sequence[View]) -> list[DepthMapFile]:
     """
     cameras = {view.camera.name: view.camera for view in views}
     try:
-        told = json.loads((folder / LIST).read_text(encoding="utf-8"))["maps"]
+        listed = json.loads((folder / LIST).read_text(encoding="utf-8"))["maps"]
         return [
             DepthMapFile(cameras[each["photo"]].scaled(int(each["width"]), int(each["height"])), folder / each["file"])
-            for each in told
+            for each in listed
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _unreadable(LIST) from error
@@ -139,7 +139,7 @@ def find_depth_maps(
     Raises:
         StageError: if the model or a photo cannot be read.
     """
-    plan = SearchPlan(megapixels, WIDER, True, COMPARED, ASKED)
+    plan = SearchPlan(megapixels, WIDER, True, COMPARED, CONFIRMING)
     search = DepthSearch.begin(dataset, views, folder, plan)
     search.run(threads, report)
     maps = confirmed_maps(search.cameras, search.agreement, threads, report)

@@ -28,10 +28,10 @@ from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.raster.threads import same_bits
 
-AGREEING = 2  # other photos that have to agree at least
-TOLERANCE = 0.01  # of the depth, within which two photos agree;
-TOLERANCE_PX = 0.5  # for far points, the share of the depth that moves the point this far in the other photo,
-LOOSEST = 0.2  # but at most this share of the depth
+AGREEING = 2  # other photos that have to agree, at least
+TOLERANCE = 0.01  # share of the depth within which two photos agree;
+TOLERANCE_PX = 0.5  # for distant points, the share that moves the point by this much in the other photo,
+MAX_TOLERANCE = 0.2  # but at most this share
 
 Inverse = Float32[np.ndarray, "_ _"]
 Axes = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]
@@ -67,14 +67,14 @@ class SearchPlan:
         wider: How many times nearer than its sparse points a photo is searched.
         plain: Whether pixels without texture get depths, too; others have to confirm them.
         compared: Neighbours that a photo is matched with, at most 16.
-        asked: Neighbours whose depths may confirm a photo's; at least ``compared``.
+        confirming: Neighbours whose depths may confirm a photo's; at least ``compared``.
     """
 
     megapixels: float
     wider: float
     plain: bool
     compared: int
-    asked: int
+    confirming: int
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class DepthSearch:
         """
         cameras = [reduced_camera(view.camera, plan.megapixels) for view in views]
         tracks = load_tracks(dataset, [camera.name for camera in cameras])
-        return cls(views, cameras, tracks, neighbours(tracks, cameras, plan.asked), folder, plan)
+        return cls(views, cameras, tracks, neighbours(tracks, cameras, plan.confirming), folder, plan)
 
     def run(self, threads: int, report: Reporter) -> None:
         """Estimate depths for every photo without a file in the folder yet; identical for any number of threads.
@@ -126,10 +126,10 @@ class DepthSearch:
         """
         numbers = range(len(self.views))
         with same_bits(threads):
-            for _ in ordered_map(partial(DepthSearch._keep_photo, self), numbers, threads):
+            for _ in ordered_map(partial(DepthSearch._save_photo, self), numbers, threads):
                 pass
             for number in numbers:
-                self._keep_depths(number)
+                self._save_depths(number)
                 report.progress(number + 1, len(self.views), "finding depths", "photos")
 
     def colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -163,7 +163,7 @@ class DepthSearch:
     def _depths_path(self, number: int) -> Path:
         return self.folder / f"depths-{number}.npz"
 
-    def _keep_photo(self, number: int) -> None:
+    def _save_photo(self, number: int) -> None:
         """Reduce one photo and store it: its neighbours need it, too."""
         if self._photo_path(number).is_file():
             return
@@ -171,7 +171,7 @@ class DepthSearch:
         counts = np.ones(colour.shape[:2], np.bool_) if mask is None else mask
         save_arrays(self._photo_path(number), colour=colour, counts=counts)
 
-    def _keep_depths(self, number: int) -> None:
+    def _save_depths(self, number: int) -> None:
         """Estimate one photo's depths and store them."""
         if self._depths_path(number).is_file():
             return
@@ -238,5 +238,5 @@ def confirm(
             to the first array, and a vote to the second.
     """
     parallax = camera.fx * float(np.linalg.norm(camera.centre() - photo.centre()))  # pixels, at a depth of one unit
-    agreeing = TOLERANCE, TOLERANCE_PX, LOOSEST, max(parallax, 1e-9)
+    agreeing = TOLERANCE, TOLERANCE_PX, MAX_TOLERANCE, max(parallax, 1e-9)
     _native.confirm(inverse, native_camera(camera), places, agreeing, *found)

@@ -16,10 +16,10 @@ from jaxtyping import Float32, Int64, UInt8
 REACH_PX = 3  # the most by which an object's depth extends beyond its edge
 AROUND_PX = 2 * REACH_PX + 1  # radius in which both sides of an edge are sampled,
 SIGMA_PX = REACH_PX + 1.0  # with this Gaussian weight
-BEHIND = 0.02  # of the depth: at least this much farther is another object,
-SAME = 0.01  # and within this much the same object
-MIN_APART = 30.0  # of 441, between the colours of both sides: where these are alike, a pixel is not decidable
-LIKER = 0.7  # a background pixel's colour difference from the background, over that from the foreground, at most
+BEHIND = 0.02  # of the depth: farther by more than this is another object,
+SAME = 0.01  # and within this much is the same object
+MIN_CONTRAST = 30.0  # of 441, between the colours of both sides: below it, a pixel cannot be assigned to a side
+MAX_RATIO = 0.7  # of a background pixel's colour difference from the background, to that from the foreground
 
 Pixels = tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]
 Values = Float32[np.ndarray, " n"]
@@ -44,7 +44,7 @@ class Side:
 def pixels_behind(
     depth: Float32[np.ndarray, "h w"], colour: UInt8[np.ndarray, "h w 3"]
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Values]:
-    """Find pixels with a foreground depth whose colour is rather the background's.
+    """Find pixels with a foreground depth whose colour is closer to the background's.
 
     Args:
         depth: Depth along the camera's z; 0 where there is none.
@@ -58,8 +58,8 @@ def pixels_behind(
     rows, columns = np.nonzero(at_edge)
     front, back = _sides(np.where(at_edge, np.float32(0.0), depth), depth, colour, (rows, columns))
     seen = colour[rows, columns].astype(np.float32)
-    told = (front.weight > 0.0) & (back.weight > 0.0) & (_apart(front.colour, back.colour) > MIN_APART)
-    wrong = told & (_apart(seen, back.colour) < LIKER * _apart(seen, front.colour))
+    decidable = (front.weight > 0.0) & (back.weight > 0.0) & (_difference(front.colour, back.colour) > MIN_CONTRAST)
+    wrong = decidable & (_difference(seen, back.colour) < MAX_RATIO * _difference(seen, front.colour))
     return rows[wrong], columns[wrong], back.depth[wrong]
 
 
@@ -108,6 +108,6 @@ def _around() -> Iterator[tuple[int, int, np.float32]]:
                 yield down, right, np.float32(np.exp(-square / (2.0 * SIGMA_PX**2)))
 
 
-def _apart(a: Colours, b: Colours) -> Values:
+def _difference(a: Colours, b: Colours) -> Values:
     between = a - b
     return np.asarray(np.sqrt((between * between).sum(axis=1)), np.float32)

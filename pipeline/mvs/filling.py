@@ -11,13 +11,13 @@ import numpy as np
 
 from splatpipe.pipeline.mvs.depth_maps import DepthMap
 
-MIN_CONFIDENCE = 5  # of a rendered depth: with fewer, 3 in 4 on plain walls were more than 2 GSD off, else 1 in 8
-SAME = 0.02  # of the depth, within which both are on the same surface
-FEWEST = 1000  # pixels with both depths needed to estimate the offset
+MIN_CONFIDENCE = 5  # of a rendered depth: on plain walls, 3 in 4 below it were more than 2 GSD off, and 1 in 8 above it
+SAME = 0.02  # of the depth: a smaller difference means the same surface
+MIN_PIXELS = 1000  # pixels with both depths needed to estimate the offset
 
 
-def filled(found: DepthMap, rendered: DepthMap) -> DepthMap:
-    """Combine a photo's depths from both sources.
+def fill_gaps(found: DepthMap, rendered: DepthMap) -> DepthMap:
+    """Fill the gaps in a photo's depths with rendered ones.
 
     Args:
         found: Depths estimated from photos.
@@ -31,16 +31,16 @@ def filled(found: DepthMap, rendered: DepthMap) -> DepthMap:
         ValueError: if the sizes differ.
     """
     if found.depth.shape != rendered.depth.shape:
-        raise ValueError(f"depths of {found.depth.shape} and of {rendered.depth.shape} are not of one grid")
+        raise ValueError(f"depths of {found.depth.shape} and of {rendered.depth.shape} have different grids")
     sure = rendered.confidence >= MIN_CONFIDENCE
-    takes = sure & (found.confidence == 0)
-    depth = np.where(takes, rendered.depth * np.float32(1.0 - behind(found, rendered)), found.depth)
-    return DepthMap(depth.astype(np.float32), np.where(takes, rendered.confidence, found.confidence))
+    fills = sure & (found.confidence == 0)
+    depth = np.where(fills, rendered.depth * np.float32(1.0 - median_offset(found, rendered)), found.depth)
+    return DepthMap(depth.astype(np.float32), np.where(fills, rendered.confidence, found.confidence))
 
 
-def behind(found: DepthMap, rendered: DepthMap) -> float:
+def median_offset(found: DepthMap, rendered: DepthMap) -> float:
     """Median offset of rendered behind photo depths, as a share of the depth; 0 if few pixels have both."""
     both = (found.confidence > 0) & (rendered.confidence >= MIN_CONFIDENCE)
     share = rendered.depth[both].astype(np.float64) / found.depth[both] - 1.0
     share = share[np.abs(share) < SAME]
-    return float(np.median(share)) if share.size >= FEWEST else 0.0
+    return float(np.median(share)) if share.size >= MIN_PIXELS else 0.0

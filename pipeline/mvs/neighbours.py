@@ -12,14 +12,14 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 
-BEST_ANGLE_DEG = 10.0  # between two rays: a smaller angle is imprecise, with a larger one appearance differs too much
+BEST_ANGLE_DEG = 10.0  # between two rays: smaller angles are imprecise, and at larger ones appearance differs too much
 NARROW_DEG = 4.0  # spread of the weight below the best angle
 WIDE_DEG = 10.0  # and above
 MIN_SHARED = 8  # points; two photos with fewer overlap by chance or only at an edge
 MIN_POINTS = 20  # a photo with fewer has no reliable depth range
-PERCENTILES = (1.0, 99.0)  # of the depths: the few wrong points lie outside
-DEEPEST = 1000.0  # maximum ratio of far to near end
-FARTHER = 10.0  # times farther than the farthest points: hills and trees behind have few; costs only a few more planes
+PERCENTILES = (1.0, 99.0)  # of the depths: excludes the few wrong points
+MAX_DEPTH_RATIO = 1000.0  # of the far to the near end of the range
+BEYOND = 10.0  # times the depth of the farthest points: hills and trees behind have few; costs only a few more planes
 
 
 @dataclass(frozen=True)
@@ -110,4 +110,4 @@ def inverse_depths(tracks: SparseVisibility, view: int, camera: Camera, wider: f
     if depths.size < MIN_POINTS:
         return None
     near, far = (float(depth) for depth in np.percentile(depths, PERCENTILES))
-    return 1.0 / (far * FARTHER), wider / max(near, far / DEEPEST)
+    return 1.0 / (far * BEYOND), wider / max(near, far / MAX_DEPTH_RATIO)

@@ -19,10 +19,10 @@ from splatpipe.pipeline.mvs.picture import Picture, relative
 from splatpipe.pipeline.raster import _native
 
 ITERATIONS = (6, 3, 1)  # from the coarsest size; each size is half the next
-BEGUN = (0, 1, 4)  # how often the perturbation was already reduced: the planes of larger sizes are nearly right
+PERTURBATION_STEPS = (0, 1, 4)  # reductions of the perturbation at the start: planes of larger sizes are nearly right
 MIN_SIDE = 24  # pixels; a photo is not halved below this
-ALIKE = 0.5  # cost for the two best-matching photos up to which there is a depth
-FAR_END = 2.0  # times the smallest inverse depth; anything farther has no usable depth: clouds
+MAX_COST = 0.5  # for the two best-matching photos: a pixel with a higher cost has no depth
+FAR_END = 2.0  # times the smallest inverse depth; anything farther, e.g. clouds, has no usable depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +56,25 @@ def find_depths(
     planes = np.zeros((3, *sizes[-1][0].grey.shape), np.float32)
     costs = np.zeros(planes.shape[1:], np.float32)
     for number, (small, near) in enumerate(reversed(sizes)):
-        planes = _spread(planes, small)
+        planes = _upsample(planes, small)
         costs = np.zeros(planes.shape[1:], np.float32)
         seen = [_seen_from(small, other) for other in near]
         _native.patch_match(
-            _bytes(small), seen, inverse_range, ITERATIONS[number], BEGUN[number], seed + number, planes, costs
+            _bytes(small),
+            seen,
+            inverse_range,
+            ITERATIONS[number],
+            PERTURBATION_STEPS[number],
+            seed + number,
+            planes,
+            costs,
         )
     usable = photo.whole() if plain else photo.textured()
-    found = usable & (costs <= ALIKE) & (planes[0] > FAR_END * inverse_range[0])
+    found = usable & (costs <= MAX_COST) & (planes[0] > FAR_END * inverse_range[0])
     return DepthEstimate(np.where(found, planes[0], np.float32(0.0)), costs)
 
 
-def _spread(planes: Float32[np.ndarray, "3 h w"], photo: Picture) -> Float32[np.ndarray, "3 h2 w2"]:
+def _upsample(planes: Float32[np.ndarray, "3 h w"], photo: Picture) -> Float32[np.ndarray, "3 h2 w2"]:
     """Upsample planes to the grid of a larger photo."""
     height, width = photo.grey.shape
     if planes.shape[1:] == (height, width):

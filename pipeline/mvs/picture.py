@@ -12,8 +12,8 @@ from splatpipe.pipeline.geometry.camera import Camera
 
 WINDOW = 11  # side of the matching window in pixels, as in the kernel
 NOISE = 1.5  # grey values: contrast below this counts as noise
-TEXTURE = 3.0  # standard deviation in the matching window below which a pixel has no depth...
-AT_HAND = 3  # ...nor where a window of this side has no contrast, e.g. sky beside a roof
+TEXTURE = 3.0  # standard deviation in the matching window: below it, a pixel has no depth,
+NARROW_WINDOW = 3  # and neither where a window of this side has no contrast, e.g. sky beside a roof
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Picture:
     def textured(self) -> Bool[np.ndarray, "h w"]:
         """Pixels with texture around them and nothing masked in the window."""
         grey = self.grey.astype(np.float32)
-        wide, narrow = (_variance(grey, side) for side in (WINDOW, AT_HAND))
+        wide, narrow = (_variance(grey, side) for side in (WINDOW, NARROW_WINDOW))
         return np.asarray((wide > TEXTURE**2) & (narrow > NOISE**2) & self.whole())
 
     def whole(self) -> Bool[np.ndarray, "h w"]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import ASKED, DepthMap, confirmed_maps
+from splatpipe.pipeline.mvs.depth_maps import CONFIRMING, DepthMap, confirmed_maps
 from splatpipe.pipeline.mvs.depth_search import ConfirmedDepths, Inverse, agreement_of
 from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
 from splatpipe.pipeline.mvs.patch_match import DepthEstimate
@@ -47,20 +47,20 @@ def rendered_depth_maps(
         StageError: if the sparse model cannot be read.
     """
     for number, camera in enumerate(cameras):
-        _keep(folder / f"{number}.npy", partial(depth_of, camera))
+        _render_to_file(folder / f"{number}.npy", partial(depth_of, camera))
         report.progress(number + 1, len(cameras), "rendering depths", "photos")
     tracks = load_tracks(dataset, [camera.name for camera in cameras])
-    near = neighbours(tracks, cameras, ASKED)
+    near = neighbours(tracks, cameras, CONFIRMING)
 
     def agreement(number: int) -> ConfirmedDepths | None:
-        inverse = _kept(folder, number)
+        inverse = _load_inverse(folder, number)
         own = DepthEstimate(inverse, np.zeros_like(inverse))
-        return agreement_of(number, cameras, near[number], (own, partial(_kept, folder)))
+        return agreement_of(number, cameras, near[number], (own, partial(_load_inverse, folder)))
 
     yield from confirmed_maps(cameras, agreement, threads, report)
 
 
-def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
+def _render_to_file(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
     """Render inverse depths into a file that is complete or absent; an existing file is left alone."""
     if path.is_file():
         return
@@ -70,5 +70,5 @@ def _keep(path: Path, render: Callable[[], Float[np.ndarray, "h w"]]) -> None:
     write_durably(path, partial(np.save, arr=inverse))
 
 
-def _kept(folder: Path, number: int) -> Inverse:
+def _load_inverse(folder: Path, number: int) -> Inverse:
     return np.asarray(np.load(folder / f"{number}.npy", allow_pickle=False), np.float32)

@@ -9,11 +9,11 @@ from typing import Literal
 from scipy.spatial.transform import Rotation
 
 Convention = Literal["gimbal", "nadir"]
-DOWNWARD_DEG = -60.0  # a lower pitch is counted from the horizon: counted from nadir, it would look backwards and up
-LOCKED = 1e-6  # cosine of the pitch: straight down, gimbal lock, where yaw and roll turn about the same axis
+DOWNWARD_DEG = -60.0  # a lower pitch is counted from the horizon: counted from nadir, it would look far backwards
+LOCKED = 1e-6  # cosine of the pitch: below it, gimbal lock, as yaw and roll turn about the same axis
 
 
-def tell_convention(pitches_deg: Iterable[float]) -> Convention:
+def detect_convention(pitches_deg: Iterable[float]) -> Convention:
     """Detect what pitch 0 means in a camera's photos: the horizon (``gimbal``) or straight down (``nadir``).
 
     Pix4D's ``Camera:`` tags count from nadir, but some makers write the gimbal's angle there. Some mapping photos

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from splatpipe.pipeline.photos.camera_groups import CameraGroup, camera_name, picture_scale
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.doubts import Doubt
-from splatpipe.pipeline.photos.names import some
+from splatpipe.pipeline.photos.names import list_names
 
 MINORITY = 0.25  # of the photos: a camera that took more of them was used on purpose
 
@@ -41,7 +41,9 @@ def camera_doubts(
     for what in sorted({resized[name] for name in odd}):
         names = sorted(name for name in odd if resized[name] == what)
         doubts.append(
-            Doubt("resized", f"{some(names)}: {what}, unlike the others.", "Take the original files.", tuple(names))
+            Doubt(
+                "resized", f"{list_names(names)}: {what}, unlike the others.", "Take the original files.", tuple(names)
+            )
         )
     return doubts
 
@@ -71,9 +73,9 @@ def _mixed_cameras(
     doubts = []
     many = [number for number, own in members.items() if len(own) > MINORITY * len(photos)]
     if len(many) > 1:
-        told = "; ".join(f"{len(members[number])} photos of {_described(members[number][0])}" for number in many)
+        listed = "; ".join(f"{len(members[number])} photos of {_describe(members[number][0])}" for number in many)
         doubts.append(
-            Doubt("cameras", f"The capture mixes cameras: {told}.", "Each is calibrated separately.", weight="note")
+            Doubt("cameras", f"The capture mixes cameras: {listed}.", "Each is calibrated separately.", weight="note")
         )
     for number, own in sorted(members.items()):
         names = tuple(photo.name for photo in own if photo.name not in resized)
@@ -83,7 +85,7 @@ def _mixed_cameras(
         doubts.append(
             Doubt(
                 code,
-                f"{some(names)}: {what}.",
+                f"{list_names(names)}: {what}.",
                 "A camera with few photos cannot be calibrated well: leave them out, or fly again with one camera.",
                 names,
             )
@@ -98,7 +100,7 @@ def _difference(photo: CheckedPhoto, other: CheckedPhoto) -> tuple[str, str]:
     if mine != theirs and not (other_size and not any(mine)):
         if mine[:2] == theirs[:2]:
             return "cameras", f"another {camera_name(*mine[:2])} than the others, by its serial number"
-        return "cameras", f"taken with {_described(photo)}, the others with {_described(other)}"
+        return "cameras", f"taken with {_describe(photo)}, the others with {_describe(other)}"
     if other_size:
         return "resized", f"{photo.width} × {photo.height} px, the others {other.width} × {other.height}"
     if (photo.exif.focal_mm, photo.exif.focal_35mm) != (other.exif.focal_mm, other.exif.focal_35mm):
@@ -110,7 +112,7 @@ def _body(photo: CheckedPhoto) -> tuple[str, str, str]:
     return photo.exif.make, photo.exif.model, photo.exif.serial
 
 
-def _described(photo: CheckedPhoto) -> str:
+def _describe(photo: CheckedPhoto) -> str:
     name = camera_name(photo.exif.make, photo.exif.model)
     focal = _focal(photo)
     return f"a {name}" + (f" ({focal})" if focal != "unknown" else "")

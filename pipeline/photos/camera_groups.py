@@ -17,16 +17,16 @@ from splatpipe.pipeline.photos.xmp import xmp_number
 
 MODEL = "SIMPLE_RADIAL"
 DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's default guess: a lens of 43 mm on 35 mm film
-FOCAL_BOUNDS = (0.2, 30.0)  # of the longer side; a value outside is not a camera's focal length
+FOCAL_BOUNDS = (0.2, 30.0)  # of the longer side; values outside are errors
 ASPECT_TOLERANCE = 0.01
 SHAPE_TOLERANCE = 0.03  # between a sensor's specified aspect ratio and that of the images that use all of it
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 WIDEST_SENSOR = 1.51  # width over height; wider images are cropped from a 4:3 sensor
 PANORAMA = 2.5  # no sensor has this aspect ratio or a larger one
-CAMERAS_TOLD = 10  # on the console; the report has them all
+CAMERAS_SHOWN = 10  # on the console; the report lists them all
 EQUIVALENT_TOLERANCE = 0.05  # of the 35 mm equivalent, which is rounded; a larger difference is digital zoom
-ZOOM_TOLERANCE = 0.01  # of the focal length: within it photos share a camera, as focus and heat change it by as much
-CALIBRATION_STRAY = 0.15  # from the focal length by sensor size: more means another unit, or another mode of the camera
+ZOOM_TOLERANCE = 0.01  # of the focal length: focus and heat change it by as much
+CALIBRATION_TOLERANCE = 0.15  # of the focal length by sensor size: more means another unit, or another camera mode
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> 
     if aspect < PANORAMA and scale is not None:
         plane = "focal-plane-resolution" if scale == 1.0 else "focal-plane-resolution-resized"
         found = {
-            "xmp-calibrated": _times(xmp_number(xmp, "drone-dji:CalibratedFocalLength", 1.0, 1e6), scale),
+            "xmp-calibrated": _product(xmp_number(xmp, "drone-dji:CalibratedFocalLength", 1.0, 1e6), scale),
             "sensor-table": _from_sensor(exif, width, height),
-            plane: _times(exif.focal_mm, exif.focal_plane_px_per_mm, scale),
+            plane: _product(exif.focal_mm, exif.focal_plane_px_per_mm, scale),
             "35mm-equivalent": _from_35mm(exif.focal_35mm, longer, aspect),
         }
         if not _is_credible(found["xmp-calibrated"], found["sensor-table"] or found["35mm-equivalent"]):
@@ -116,7 +116,7 @@ def focal_prior(exif: Exif, xmp: Mapping[str, str], width: int, height: int) -> 
 
 def _is_credible(calibrated: float | None, nominal: float | None) -> bool:
     """Whether a maker's calibration agrees with the nominal focal length, where both are known."""
-    return calibrated is None or nominal is None or abs(calibrated / nominal - 1.0) <= CALIBRATION_STRAY
+    return calibrated is None or nominal is None or abs(calibrated / nominal - 1.0) <= CALIBRATION_TOLERANCE
 
 
 def refused_calibrations(photos: Sequence[CheckedPhoto]) -> list[str]:
@@ -208,21 +208,21 @@ def describe_cameras(
 
 def camera_name(make: str, model: str) -> str:
     """A camera's display name."""
-    told = model if model.casefold().startswith(make.casefold()) else f"{make} {model}"
-    return told.strip() or "unknown camera"
+    name = model if model.casefold().startswith(make.casefold()) else f"{make} {model}"
+    return name.strip() or "unknown camera"
 
 
-def tell_cameras(rows: Sequence[JSON], report: Reporter) -> None:
+def report_cameras(rows: Sequence[JSON], report: Reporter) -> None:
     """Report the cameras if there are several, and how EXIF that states another image size was handled."""
     if len(rows) > 1:
-        for row in rows[:CAMERAS_TOLD]:
+        for row in rows[:CAMERAS_SHOWN]:
             zoom = f", {row['focal_mm']:g} mm" if row["focal_mm"] else ""
             width, height = row["size"]
             focal = f"{row['focal_px']:.0f} px ({row['focal_source'].replace('-', ' ')})"
             report.note(f"{row['name']}{zoom}: {row['photos']} photos of {width} × {height}, focal length {focal}.")
-        if len(rows) > CAMERAS_TOLD:
-            report.note(f"And {len(rows) - CAMERAS_TOLD} more cameras.")
-    for row in rows[:CAMERAS_TOLD]:
+        if len(rows) > CAMERAS_SHOWN:
+            report.note(f"And {len(rows) - CAMERAS_SHOWN} more cameras.")
+    for row in rows[:CAMERAS_SHOWN]:
         if row["exif_size"] is None:
             continue
         (width, height), (taken_width, taken_height) = row["size"], row["exif_size"]
@@ -298,6 +298,6 @@ def _from_35mm(focal_35mm: float | None, longer: int, aspect: float) -> float | 
     return focal_35mm * longer / (FILM_DIAGONAL_MM * shape / math.hypot(shape, 1.0))
 
 
-def _times(*factors: float | None) -> float | None:
+def _product(*factors: float | None) -> float | None:
     known = [factor for factor in factors if factor is not None]
     return math.prod(known) if len(known) == len(factors) else None

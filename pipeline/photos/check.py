@@ -31,7 +31,7 @@ TAG_DNG_VERSION = 50706
 DEEP_GREY_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 COLOUR_MODES = ("RGB", "RGBA")
 READ_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *DEEP_GREY_MODES)
-RANGE_QUANTILES = (0.001, 0.999)  # of a deep image's values: hot and dead pixels must not set the range
+RANGE_QUANTILES = (0.001, 0.999)  # of a deep image's values: excludes hot and dead pixels
 _one_large_at_a_time = threading.Lock()
 
 
@@ -79,7 +79,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
 
     Args:
         candidate: The file.
-        limits: What a picture may measure.
+        limits: Limits on the image's size.
 
     Returns:
         The photo, or why it is left out.
@@ -93,9 +93,9 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
     try:
         picture = open_picture(BytesIO(data))
     except Exception as error:  # Pillow's readers raise almost anything on broken images
-        return ExcludedPhoto(candidate.name, _why_broken(error))
+        return ExcludedPhoto(candidate.name, _decode_problem(error))
     with picture:
-        reason = _refusal(picture, limits)
+        reason = _refusal_reason(picture, limits)
         return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
 
 
@@ -115,7 +115,7 @@ def deep_pixels(data: bytes, picture: Image.Image, orientation: int) -> Shaped[n
     if picture.mode not in COLOUR_MODES or _bits(data, picture) <= 8:
         return None
     # Pillow keeps only the upper byte of 16-bit colours. OpenCV keeps both, but fails on TIFFs with an orientation.
-    encoded = np.frombuffer(_without_turn(data) if picture.format == "TIFF" else data, np.uint8)
+    encoded = np.frombuffer(_without_orientation(data) if picture.format == "TIFF" else data, np.uint8)
     pixels: Any = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype == np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         return None
@@ -141,7 +141,7 @@ def _read_once(path: Path) -> tuple[bytes, str]:
     return data, sha.hexdigest()
 
 
-def _refusal(picture: Image.Image, limits: PictureLimits) -> str:
+def _refusal_reason(picture: Image.Image, limits: PictureLimits) -> str:
     """Why an opened image must not be decoded; empty if it may be."""
     width, height = picture.size
     if width * height > limits.max_pixels:
@@ -172,7 +172,7 @@ def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image
         except MemoryError:
             return ExcludedPhoto(candidate.name, "is too large for this machine's memory")
         except Exception as error:  # as above
-            return ExcludedPhoto(candidate.name, _why_broken(error))
+            return ExcludedPhoto(candidate.name, _decode_problem(error))
         pixels = _deep_facts(loaded) if isinstance(loaded, np.ndarray) else _plain_facts(loaded, (width, height))
     if pixels is None:
         return ExcludedPhoto(candidate.name, "has no valid pixel")
@@ -250,7 +250,7 @@ def _tiff_tag(picture: Image.Image, tag: int, default: Any) -> Any:
         return default
 
 
-def _without_turn(data: bytes) -> bytes:
+def _without_orientation(data: bytes) -> bytes:
     """A classic TIFF's bytes with the orientation of its first directory set to 1."""
     order = "little" if data[:2] == b"II" else "big"
 
@@ -272,7 +272,7 @@ def _xmp_bytes(picture: Image.Image) -> bytes:
     return packet if isinstance(packet, bytes) else str(packet).encode()
 
 
-def _why_broken(error: Exception) -> str:
+def _decode_problem(error: Exception) -> str:
     text = str(error)
     if "truncated" in text.lower() or isinstance(error, EOFError):
         return "is truncated: it ends before its last pixel; copy it again from the camera"

@@ -78,11 +78,11 @@ def find_coded_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[CodedTarget]:
     height, width = grey.shape
     found: list[CodedTarget] = []
     if max(height, width) > TILE_PX:
-        found = _found_in(grey, 1, SMALLEST_PX * ENLARGED)
+        found = _search_scale(grey, 1, SMALLEST_PX * ENLARGED)
     for top in _starts(height):
         for left in _starts(width):
             tile = np.ascontiguousarray(grey[top : top + TILE_PX, left : left + TILE_PX])
-            for target in _found_in(tile, ENLARGED, SMALLEST_PX):
+            for target in _search_scale(tile, ENLARGED, SMALLEST_PX):
                 there = replace(target, x=target.x + left, y=target.y + top)
                 found = [other for other in found if not _same(other, there)] + [there]
     return sorted(found, key=lambda target: (target.dictionary, target.number, target.y, target.x))
@@ -98,7 +98,7 @@ def _same(a: CodedTarget, b: CodedTarget) -> bool:
     return named and np.hypot(a.x - b.x, a.y - b.y) < 0.5 * min(a.size_px, b.size_px)
 
 
-def _found_in(grey: UInt8[np.ndarray, "h w"], scale: int, smallest_px: float) -> list[CodedTarget]:
+def _search_scale(grey: UInt8[np.ndarray, "h w"], scale: int, smallest_px: float) -> list[CodedTarget]:
     """Find the targets in an image that is first enlarged by ``scale``; coordinates are those of the original."""
     height, width = grey.shape
     if min(height, width) < smallest_px:
@@ -120,13 +120,13 @@ def _found_in(grey: UInt8[np.ndarray, "h w"], scale: int, smallest_px: float) ->
     ):
         # In OpenCV, pixel centres are whole numbers, in the enlarged image too.
         square = (quad.reshape(4, 2).astype(np.float64) + 0.5) / scale
-        target = _judged(grey, square, dictionaries[int(index)], int(number), names[int(index)])
+        target = _check_pattern(grey, square, dictionaries[int(index)], int(number), names[int(index)])
         if target is not None:
             found.append(target)
     return found
 
 
-def _judged(
+def _check_pattern(
     grey: UInt8[np.ndarray, "h w"],
     square: Float64[np.ndarray, "4 2"],
     dictionary: cv2.aruco.Dictionary,

@@ -12,7 +12,7 @@ from PIL import Image
 from splatpipe.pipeline.photos.check import CheckedPhoto, deep_pixels, stored_orientation
 from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, read_checked
 
-PNG_LEVEL = 1  # zlib's fastest: half the size is not worth ten times the time for an intermediate file
+PNG_LEVEL = 1  # zlib's fastest: for an intermediate file, half the size is not worth ten times the time
 FULL_RANGE = 65535.0
 NARROW_RANGE = FULL_RANGE / 4  # 16-bit files that use less hold 10 to 14 bits, or temperatures
 
@@ -50,7 +50,7 @@ def read_8bit(
         if scale is not None:
             deep = deep_pixels(data, picture, orientation)
             if deep is not None:
-                return _scaled(deep, scale)
+                return _scale(deep, scale)
         stored = load_stored(picture, orientation)
     if stored.has_transparency_data:
         rgba = np.asarray(stored.convert("RGBA"))
@@ -84,7 +84,7 @@ def save_png(pixels: UInt8[np.ndarray, "h w *channels"], target: Path) -> None:
     Image.fromarray(np.ascontiguousarray(pixels)).save(target, format="PNG", compress_level=PNG_LEVEL)
 
 
-def _scaled(
+def _scale(
     deep: Shaped[np.ndarray, "h w *channels"], scale: tuple[float, float]
 ) -> tuple[np.ndarray, UInt8[np.ndarray, "h w"] | None]:
     low, high = scale

@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.colmap_model import Cloud, ModelPhoto, read_cloud, read_photos
-from splatpipe.pipeline.photos.names import NameFinder, some
+from splatpipe.pipeline.photos.names import NameFinder, list_names
 
 IMAGES = "images"
 MASKS = "masks"
@@ -165,8 +165,8 @@ def split_views(names: Sequence[str], every: int, views: str) -> Split:
         found = {name: find(name) for name in sorted(stated)}
         if unknown := [name for name, photo in found.items() if photo is None]:
             raise SplatpipeError(
-                f"split.views names {some(unknown)}, which the model does not have, or more than once.",
-                hint=f"Its photos are named like {some(ordered)}.",
+                f"split.views names {list_names(unknown)}, which the model does not have, or more than once.",
+                hint=f"Its photos are named like {list_names(ordered)}.",
             )
         wanted = {photo for photo in found.values() if photo is not None}
     else:

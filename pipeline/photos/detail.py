@@ -18,14 +18,14 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.convert import read_8bit
 from splatpipe.pipeline.photos.photo_list import open_picture, read_checked
 
-MIN_SIDE_PX = 2000  # a JPEG is decoded at the half, quarter or eighth that still has as many
+MIN_SIDE_PX = 2000  # a JPEG is decoded at the smallest of 1/2, 1/4 and 1/8 that still has as many
 PATCH = 32  # pixels: the coarse band includes its three longest waves
 DIRECTIONS = 4  # of 45° each
 COARSE, FINE = (0.05, 0.14), (0.2, 0.42)  # cycles per pixel; JPEG keeps little beyond
 QUIET = 0.35  # grey levels: standard deviation of rounding and of JPEG's own noise, in a band
-WHITE, BLACK = 250, 5  # grey levels from which up, and down to which, no detail is left
+WHITE, BLACK = 250, 5  # grey levels: no detail is left at or above the first, and at or below the second
 PATCH_LEVEL_PX = 9  # side of the square whose mean is a place's brightness
-DARKEST = 1.0 / 4096.0  # linear; below, a ratio of two levels is meaningless
+DARKEST = 1.0 / 4096.0  # linear; below it, the ratio of two levels is meaningless
 SIGNATURE = 48  # side of the thumbnail by which a re-saved photo is recognized
 
 

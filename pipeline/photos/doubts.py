@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-METRES_A_DEGREE = 111_195.0  # of a sphere: these distances only serve to detect what is far
+METRES_PER_DEGREE = 111_195.0  # on a sphere: accurate enough to detect distant positions
 FAR_M = 500.0  # nobody photographs one building with a drone from farther away
 FAR_SPREADS = 20.0  # times the median distance from the middle: long corridors are valid captures, too
-MIN_POSITIONS = 3  # of two, it cannot be known which is wrong
+MIN_POSITIONS = 3  # with two, there is no telling which one is wrong
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Doubt:
     weight: Literal["warning", "note"] = "warning"
 
 
-def find_wrong(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:
+def find_misplaced(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:
     """Find photos whose stated position is far from all others.
 
     Args:
@@ -73,10 +73,10 @@ def median_distance_m(first: Sequence[tuple[float, float]], second: Sequence[tup
     apart = np.array(first, dtype=np.float64) - np.array(second, dtype=np.float64)
     apart[:, 1] = (apart[:, 1] + 180.0) % 360.0 - 180.0
     apart[:, 1] *= np.cos(np.radians(np.array(second, dtype=np.float64)[:, 0]))
-    return float(METRES_A_DEGREE * np.median(np.hypot(apart[:, 0], apart[:, 1])))
+    return float(METRES_PER_DEGREE * np.median(np.hypot(apart[:, 0], apart[:, 1])))
 
 
 def _distances_m(places: Float64[np.ndarray, "n 2"], middle: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " n"]:
-    """Distances in metres, along the meridian and the parallel; accurate enough to detect what is far."""
+    """Distances in metres, along the meridian and the parallel; accurate enough to detect distant positions."""
     east = (places[:, 1] - middle[1]) * np.cos(np.radians(middle[0]))
-    return np.asarray(METRES_A_DEGREE * np.hypot(places[:, 0] - middle[0], east))
+    return np.asarray(METRES_PER_DEGREE * np.hypot(places[:, 0] - middle[0], east))

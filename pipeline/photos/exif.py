@@ -15,8 +15,8 @@ GPS = ExifTags.GPS
 MAX_TEXT_CHARS = 64
 MAX_SIDE_PX = 1_000_000
 MM_PER_FOCAL_PLANE_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF 2.32, FocalPlaneResolutionUnit; 4, 5 by TIFF/EP
-BELOW = (1, 3)  # GPSAltitudeRef: below sea level; EXIF 3.0 adds 3, below the ellipsoid
-VOID = "V"  # GPSStatus of a receiver without a fix
+BELOW_SEA_LEVEL = (1, 3)  # GPSAltitudeRef: below sea level; EXIF 3.0 adds 3, below the ellipsoid
+NO_FIX = "V"  # GPSStatus of a receiver without a fix
 
 
 @dataclass(frozen=True)
@@ -170,14 +170,14 @@ def _gps(tags: Mapping[int, Any]) -> Gps | None:
     reference = tags.get(GPS.GPSAltitudeRef)
     if isinstance(reference, bytes):
         reference = reference[0] if reference else 0
-    if altitude is not None and reference in BELOW:
+    if altitude is not None and reference in BELOW_SEA_LEVEL:
         altitude = -abs(altitude)
     return Gps(
         latitude=_degrees(tags[GPS.GPSLatitude], tags.get(GPS.GPSLatitudeRef), "S"),
         longitude=_degrees(tags[GPS.GPSLongitude], tags.get(GPS.GPSLongitudeRef), "W"),
         altitude_m=altitude,
         horizontal_error_m=_number(tags.get(GPS.GPSHPositioningError), 1e-4, 1e5),
-        void=_text(tags.get(GPS.GPSStatus)).upper() == VOID,
+        void=_text(tags.get(GPS.GPSStatus)).upper() == NO_FIX,
     )
 
 

@@ -43,8 +43,8 @@ def write_jpeg(path: Path, strips: Iterable[Strip], height: int) -> None:
         StageError: if a strip cannot be encoded.
     """
     with path.open("wb") as file:
-        for number, strip in enumerate(_even(strips)):
-            head, scan = _parts(_encoded(path.name, strip))
+        for number, strip in enumerate(_equal_strips(strips)):
+            head, scan = _parts(_encode(path.name, strip))
             if number == 0:
                 file.write(head if len(strip) == height else _head(head, strip, height))
             else:
@@ -53,7 +53,7 @@ def write_jpeg(path: Path, strips: Iterable[Strip], height: int) -> None:
         file.write(END)
 
 
-def _even(strips: Iterable[Strip]) -> Iterator[Strip]:
+def _equal_strips(strips: Iterable[Strip]) -> Iterator[Strip]:
     """Regroup rows into strips of equal heights, multiples of a block; the last strip holds the rest."""
     kept: list[Strip] = []
     for strip in strips:
@@ -67,7 +67,7 @@ def _even(strips: Iterable[Strip]) -> Iterator[Strip]:
         yield np.concatenate(kept)
 
 
-def _encoded(name: str, pixels: Strip) -> bytes:
+def _encode(name: str, pixels: Strip) -> bytes:
     done, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels), list(OPTIONS))
     if not done:
         raise StageError(f"{name} could not be encoded.")

@@ -13,12 +13,12 @@ from PIL import Image
 
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import read_exif
-from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, unturn
+from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, undo_orientation
 from splatpipe.pipeline.photos.scan import MASK_FOLDER, PHOTO_SUFFIXES
 
 ASPECT_TOLERANCE = 0.01
 IMAGE_FOLDER = "images"
-FEW_LABELS = 128  # a lossless mask with only lower values holds labels (0 and 1, or classes): all but 0 count
+FEW_LABELS = 128  # a lossless mask with only lower values contains labels (0 and 1, or classes): all but 0 count
 HALF = 128
 QUARTER_TURNS = (5, 6, 7, 8)
 
@@ -82,7 +82,7 @@ def match_masks(masks: Sequence[MaskFile], names: Sequence[str]) -> tuple[dict[s
     used = {mask.path for mask in matched.values()}
     free = {key: mask for key, mask in by_key.items() if mask.path not in used}
     for name in names:
-        short = _beside_images(name)
+        short = _name_beside_images(name)
         if name not in matched and short is not None and (key := _key(short, free)) is not None:
             matched[name] = free[key]
     used = {mask.path for mask in matched.values()}
@@ -93,7 +93,7 @@ def _key(name: str, by_key: Mapping[str, MaskFile]) -> str | None:
     return next((key for key in (name, str(PurePosixPath(name).with_suffix(""))) if key in by_key), None)
 
 
-def _beside_images(name: str) -> str | None:
+def _name_beside_images(name: str) -> str | None:
     """A photo's name without the last folder called ``images``, as masks beside that folder are named; else None."""
     *folders, last = PurePosixPath(name).parts
     places = [place for place, folder in enumerate(folders) if folder.casefold() == IMAGE_FOLDER]
@@ -140,18 +140,18 @@ def _to_stored(grey: Image.Image, own_orientation: int, photo: CheckedPhoto) -> 
     size = (photo.width, photo.height)
     orientation = photo.exif.orientation
     turned = size[::-1] if orientation in QUARTER_TURNS else size
-    if own_orientation != 1:  # it says how people are to see it, and they see it as they see the photo
-        upright = _turn(grey, own_orientation)
+    if own_orientation != 1:  # it was drawn on the photo as displayed
+        upright = _apply_orientation(grey, own_orientation)
         if _same_shape(upright.size, turned):
-            return unturn(upright, orientation)
+            return undo_orientation(upright, orientation)
     if not _same_shape(grey.size, size) and _same_shape(grey.size, turned):
-        return unturn(grey, orientation)
+        return undo_orientation(grey, orientation)
     return grey
 
 
-def _turn(picture: Image.Image, orientation: int) -> Image.Image:
+def _apply_orientation(picture: Image.Image, orientation: int) -> Image.Image:
     inverse = {6: 8, 8: 6}.get(orientation, orientation)
-    return unturn(picture, inverse)
+    return undo_orientation(picture, inverse)
 
 
 def _same_shape(first: tuple[int, int], second: tuple[int, int]) -> bool:

@@ -72,10 +72,10 @@ def _without_suffix(name: str) -> str:
     return stem if dot and suffix in PHOTO_SUFFIXES else _folded(name)
 
 
-NAMES_SHOWN = 10  # in one message; left_out.json has them all
+NAMES_SHOWN = 10  # in one message; left_out.json lists them all
 
 
-def some(names: Iterable[str], shown: int = NAMES_SHOWN) -> str:
+def list_names(names: Iterable[str], shown: int = NAMES_SHOWN) -> str:
     """Format names for a message: the first few, and how many more."""
     listed = [printable(name) for name in names]
     more = f" and {len(listed) - shown} more" if len(listed) > shown else ""

@@ -30,7 +30,7 @@ CONVERTED_DIR = "converted"
 MASK_DIR = "masks"
 STRIP_ROWS = 256  # of a photo, copied at a time
 SKY_DIR = "sky_masks"
-UNTURN = {  # the inverse of the transposition that each EXIF orientation requires
+INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -245,12 +245,12 @@ def load_stored(picture: Image.Image, orientation: int) -> Image.Image:
     """
     picture.load()
     # Pillow applies the orientation while loading a TIFF, but for no other format.
-    return unturn(picture, orientation) if picture.format == "TIFF" else picture
+    return undo_orientation(picture, orientation) if picture.format == "TIFF" else picture
 
 
-def unturn(picture: Image.Image, orientation: int) -> Image.Image:
+def undo_orientation(picture: Image.Image, orientation: int) -> Image.Image:
     """Convert an image to which an EXIF orientation (1 to 8) was applied back to the stored grid."""
-    method = UNTURN.get(orientation)
+    method = INVERSE_ORIENTATION.get(orientation)
     return picture if method is None else picture.transpose(method)
 
 

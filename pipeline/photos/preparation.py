@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.photos.convert import convert_photo, save_png, scale_of
 from splatpipe.pipeline.photos.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
-from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
     CONVERTED_DIR,
@@ -72,7 +72,7 @@ def check_photos(scan: Scan, work: Preparation) -> tuple[list[CheckedPhoto], lis
     return checked, [result for result in results if isinstance(result, ExcludedPhoto)]
 
 
-def convert_odd(
+def convert_unusual(
     photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int], work: Preparation
 ) -> dict[str, UInt8[np.ndarray, "h w"]]:
     """Write the PNGs of photos that are not plain; return the masks of transparent ones by name."""
@@ -105,7 +105,7 @@ def prepare_masks(
     files = find_masks(root, kind.folder) if work.config.masks else []
     matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
     if unused:
-        names = some([mask.label for mask in unused])
+        names = list_names([mask.label for mask in unused])
         work.report.warning(f"There is no photo for the mask {names}.", "A mask must have its photo's name: NAME.png.")
     masked = [photo for photo in photos if photo.name in matched or photo.name in opacity]
 

@@ -35,7 +35,7 @@ class LinePair:
         return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def sampled(
+def sample_bilinearly(
     grey: Float32[np.ndarray, "h w"], x: Float32[np.ndarray, "n m"], y: Float32[np.ndarray, "n m"]
 ) -> Float32[np.ndarray, "n m"]:
     """Sample bilinearly, in pieces that remap supports (fewer than 32,768 rows)."""
@@ -48,24 +48,24 @@ def sampled(
     return np.concatenate(pieces)
 
 
-def ring_about(
+def sample_ring(
     grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"], radius: float
 ) -> Float64[np.ndarray, "n steps"]:
     """Brightness on a circle around each place."""
     angles = 2.0 * np.pi * np.arange(RING_STEPS) / RING_STEPS
     x = (places[:, 0, None] + radius * np.cos(angles)).astype(np.float32)
     y = (places[:, 1, None] + radius * np.sin(angles)).astype(np.float32)
-    return sampled(grey, x, y).astype(np.float64)
+    return sample_bilinearly(grey, x, y).astype(np.float64)
 
 
-def lines_about(
+def fit_near(
     grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
 ) -> tuple[Float64[np.ndarray, "k 7"], Float64[np.ndarray, " k"]]:
     """Fit lines through places to nearby pixels; return them and their correlations, for places that have lines."""
     found, scores = [np.zeros((0, 7))], [np.zeros(0)]
     for first in range(0, len(places), AT_ONCE):
         values = _starts(grey, places[first : first + AT_ONCE])
-        values, score = _fit_near(grey, values)
+        values, score = _fit_discs(grey, values)
         found.append(values)
         scores.append(score)
     return np.concatenate(found), np.concatenate(scores)
@@ -73,7 +73,7 @@ def lines_about(
 
 def _starts(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "k 7"]:
     """Initial lines, where the ring around a place crosses its mean brightness."""
-    ring, half = ring_about(grey, places, RING_PX), RING_STEPS // 2
+    ring, half = sample_ring(grey, places, RING_PX), RING_STEPS // 2
     ring = (ring[:, :half] + ring[:, half:]) / 2.0
     low, high = ring.min(axis=1), ring.max(axis=1)
     middle = (low + high) / 2.0
@@ -91,7 +91,7 @@ def _starts(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]
     return np.concatenate([places[two], angles, np.stack([middle, contrast, blur], axis=1)], axis=1)
 
 
-def _fit_near(
+def _fit_discs(
     grey: Float32[np.ndarray, "h w"], values: Float64[np.ndarray, "n 7"]
 ) -> tuple[Float64[np.ndarray, "n 7"], Float64[np.ndarray, " n"]]:
     """Fit lines by least squares over the pixels of a disc, all places at once, each with its own damping."""
@@ -107,7 +107,7 @@ def _fit_near(
     shown, derivatives = model(values, x, y)
     cost = ((seen - shown) ** 2).sum(axis=1)
     for _ in range(NEAR_ROUNDS):
-        trial = _stepped(values, seen - shown, derivatives, damping)
+        trial = _take_step(values, seen - shown, derivatives, damping)
         shown_there, derivatives_there = model(trial, x, y)
         there = ((seen - shown_there) ** 2).sum(axis=1)
         better = there < cost
@@ -135,7 +135,7 @@ def fit_within(grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64
     shown, derivatives = model(values, x, y)
     cost = float(((seen - shown) ** 2).sum())
     for _ in range(ROUNDS):
-        trial = _stepped(values, seen - shown, derivatives, damping)
+        trial = _take_step(values, seen - shown, derivatives, damping)
         shown_there, derivatives_there = model(trial, x, y)
         there = float(((seen - shown_there) ** 2).sum())
         if there >= cost:
@@ -149,7 +149,7 @@ def fit_within(grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64
     return LinePair(values[0]) if np.isfinite(values).all() else None
 
 
-def _stepped(
+def _take_step(
     values: Float64[np.ndarray, "n 7"],
     residuals: Float64[np.ndarray, "n m"],
     derivatives: Float64[np.ndarray, "n m 7"],

@@ -21,15 +21,15 @@ from splatpipe.pipeline.photos.quadrant_lines import (
     RING_STEPS,
     LinePair,
     correlation,
+    fit_near,
     fit_within,
-    lines_about,
     model,
     pixels_within,
-    ring_about,
-    sampled,
+    sample_bilinearly,
+    sample_ring,
 )
 
-SADDLE_SIGMA_PX = 1.0  # less admits noise, more loses targets of 12 px seen obliquely
+SADDLE_SIGMA_PX = 1.0  # a smaller one admits noise, a larger one loses targets of 12 px seen obliquely
 MIN_CONTRAST = 40.0  # of white over black, of 255
 BLURRED_SIGMA_PX = 1.5  # of a saddle that is still found: lens blur, motion blur and our smoothing together
 MIN_SADDLE = MIN_CONTRAST / (np.pi * BLURRED_SIGMA_PX**2)  # a quadrant's is contrast / (π σ²) at its centre
@@ -52,7 +52,7 @@ MAX_MOVED_PX = 2.5  # from where the lines of the first fit meet
 APART_PX = 3.0  # one target has one centre
 NEAR_CORRELATION = 0.9  # of the first fit
 MIN_CORRELATION = 0.975  # of an isolated target: a shadow's edge may cross it
-CORRELATION_AMONG = 0.986  # of one with similar patterns around it, which gravel, leaves and façades have everywhere
+CORRELATION_AMONG = 0.986  # of one among similar patterns, which are everywhere in gravel, leaves and façades
 AROUND_PX = (2.0, 16.0)  # beyond a target's corners
 MAX_AROUND = 0.5  # of a saddle's own strength: the strongest other one around an isolated target
 OWN_PX = 1.6  # from its centre
@@ -97,27 +97,27 @@ def find_quadrant_targets(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTa
     found: list[QuadrantTarget] = []
     for top in range(0, max(pixels.shape[0] - OVERLAP_PX, 1), TILE_PX - OVERLAP_PX):
         for left in range(0, max(pixels.shape[1] - OVERLAP_PX, 1), TILE_PX - OVERLAP_PX):
-            for target in _found_in(np.ascontiguousarray(pixels[top : top + TILE_PX, left : left + TILE_PX])):
+            for target in _search_tile(np.ascontiguousarray(pixels[top : top + TILE_PX, left : left + TILE_PX])):
                 there = replace(target, x=target.x + left, y=target.y + top)
                 if all(np.hypot(there.x - other.x, there.y - other.y) > APART_PX for other in found):
                     found.append(there)
     return sorted(found, key=lambda target: (target.y, target.x))
 
 
-def _found_in(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
+def _search_tile(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
     """Find the targets in a tile of an image."""
     if min(pixels.shape[:2]) < 4 * int(RINGS_PX[-1]):
         return []
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
     places = _saddles(grey)
-    values, scores = lines_about(grey, places[_ring_like(grey, places)])
+    values, scores = fit_near(grey, places[_has_quadrant_ring(grey, places)])
     dark = (values[:, 4] - np.abs(values[:, 5])) / np.maximum(values[:, 4] + np.abs(values[:, 5]), 1e-9)
     worth = (scores > NEAR_CORRELATION) & (dark < RING_DARK) & (2.0 * np.abs(values[:, 5]) > MIN_CONTRAST)
     found: list[QuadrantTarget] = []
     for k in np.flatnonzero(worth).tolist():
         x, y = (values[k, :2] + 0.5).tolist()
         if all(np.hypot(x - other.x, y - other.y) > APART_PX for other in found):
-            target = _fitted(grey, pixels, LinePair(values[k]))
+            target = _fit_target(grey, pixels, LinePair(values[k]))
             if target is not None:
                 found.append(target)
     return found
@@ -161,14 +161,14 @@ def _to_level(
     return np.asarray(np.clip(np.stack([(xy * gy - yy * gx) / det, (xy * gx - xx * gy) / det], axis=1), -1.0, 1.0))
 
 
-def _ring_like(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+def _has_quadrant_ring(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     """Whether places have two bright and two dark sectors around them, point-symmetrically."""
     good = np.ones(len(places), dtype=bool)
     for radius in RINGS_PX:
         chosen = np.flatnonzero(good)
         if len(chosen) == 0:
             break
-        ring = ring_about(grey, places[chosen], radius)
+        ring = sample_ring(grey, places[chosen], radius)
         low, high = ring.min(axis=1), ring.max(axis=1)
         above = ring > ((low + high) / 2.0)[:, None]
         crossings = (above != np.roll(above, 1, axis=1)).sum(axis=1)
@@ -184,19 +184,19 @@ def _ring_like(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndarray, "n 
     return good
 
 
-def _fitted(
+def _fit_target(
     grey: Float32[np.ndarray, "h w"], pixels: UInt8[np.ndarray, "h w 3"], start: LinePair
 ) -> QuadrantTarget | None:
     """Fit the target that starts from these lines; None if there is none."""
     reach = _reach(grey, start)
-    lines = None if reach is None else fit_within(grey, start, _fitted_part(reach))
+    lines = None if reach is None else fit_within(grey, start, _fit_radius(reach))
     if lines is None or np.hypot(*(lines.values[:2] - start.values[:2])) > MAX_MOVED_PX:
         return None
     reach = _reach(grey, lines)
-    return None if reach is None else _judged(grey, pixels, lines, reach)
+    return None if reach is None else _check_target(grey, pixels, lines, reach)
 
 
-def _fitted_part(reach: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
+def _fit_radius(reach: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
     return np.clip(FIT_SHARE * reach, MIN_FIT_PX, LARGEST_FIT_PX)
 
 
@@ -216,7 +216,7 @@ def _reach(grey: Float32[np.ndarray, "h w"], lines: LinePair) -> Float64[np.ndar
         ways = []
         for way in (1.0, -1.0):
             x, y = cx + way * steps * along[0], cy + way * steps * along[1]
-            sides = sampled(
+            sides = sample_bilinearly(
                 grey,
                 np.stack([x + aside[0], x - aside[0]]).astype(np.float32),
                 np.stack([y + aside[1], y - aside[1]]).astype(np.float32),
@@ -241,23 +241,23 @@ def _side(directions: Float64[np.ndarray, "2 2"], k: int) -> float:
     return float(np.sign(u * v))
 
 
-def _judged(
+def _check_target(
     grey: Float32[np.ndarray, "h w"],
     pixels: UInt8[np.ndarray, "h w 3"],
     lines: LinePair,
     reach: Float64[np.ndarray, " 2"],
 ) -> QuadrantTarget | None:
     """Return the target if its pixels pass the tests, else None."""
-    around = pixels_within(grey, lines, _fitted_part(reach))
+    around = pixels_within(grey, lines, _fit_radius(reach))
     if around is None or lines.values[6] > MAX_BLUR_PX:
         return None
     x, y, seen = around
     shown, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
     score = float(correlation(seen[None], shown[None])[0])
     middle, half = float(lines.values[4]), abs(float(lines.values[5]))
-    if not _even(lines, x, y, seen):
+    if not _is_even(lines, x, y, seen):
         return None
-    if score < MIN_CORRELATION or middle - half > MAX_DARK * (middle + half) or not _neutral(pixels, x, y, shown):
+    if score < MIN_CORRELATION or middle - half > MAX_DARK * (middle + half) or not _is_neutral(pixels, x, y, shown):
         return None
     variance = float(((seen - shown) ** 2).sum()) / max(len(seen) - 7, 1)
     covariance = variance * np.linalg.pinv(derivatives.T @ derivatives)
@@ -266,12 +266,12 @@ def _judged(
     area = 4.0 * reach[0] * reach[1] * abs(float(np.linalg.det(directions)))
     cx, cy = lines.values[:2].tolist()
     size = float(np.sqrt(area))
-    if size < MIN_SIZE_PX or (score < CORRELATION_AMONG and not _alone(grey, cx, cy, size)):
+    if size < MIN_SIZE_PX or (score < CORRELATION_AMONG and not _is_isolated(grey, cx, cy, size)):
         return None
     return QuadrantTarget(cx + 0.5, cy + 0.5, size, sigma, score)
 
 
-def _alone(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: float) -> bool:
+def _is_isolated(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: float) -> bool:
     """Whether no saddle around a target is nearly as strong as its centre."""
     corners = size_px / np.sqrt(2.0)
     reach = int(np.ceil(corners + AROUND_PX[1]))
@@ -286,7 +286,7 @@ def _alone(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px: floa
     return bool(strengths[around].max() < MAX_AROUND**2 * strengths[away < OWN_PX].max())
 
 
-def _even(
+def _is_even(
     lines: LinePair, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, " n"]
 ) -> bool:
     """Whether opposite sectors are equally bright: those of cars and their shadows are not."""
@@ -301,7 +301,7 @@ def _even(
     return bool(off < UNEVEN * 2.0 * abs(contrast))
 
 
-def _neutral(
+def _is_neutral(
     pixels: UInt8[np.ndarray, "h w 3"],
     x: Float64[np.ndarray, " n"],
     y: Float64[np.ndarray, " n"],

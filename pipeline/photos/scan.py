@@ -77,19 +77,19 @@ def scan_folder(root: Path) -> Scan:
         )
 
     for folder, folders, files in os.walk(root, onerror=unreadable):
-        passed = [name for name in folders if name.startswith(".") or name.casefold() in (MASK_FOLDER, SKY_FOLDER)]
-        folders[:] = sorted(set(folders) - set(passed))
+        skipped = [name for name in folders if name.startswith(".") or name.casefold() in (MASK_FOLDER, SKY_FOLDER)]
+        folders[:] = sorted(set(folders) - set(skipped))
         links = [Path(folder) / name for name in folders if (Path(folder) / name).is_symlink()]
         left_out += [ExcludedPhoto(_name(link, root), "is a link to a folder, which is not followed") for link in links]
         for name in files:
             if name.startswith("."):
                 continue
             path = Path(folder) / name
-            reason = _why_not(path)
+            reason = _exclusion_reason(path)
             if reason == "":
                 others += 1
                 continue
-            reason = reason or _why_not_name(path.relative_to(root))
+            reason = reason or _name_problem(path.relative_to(root))
             if reason is None:
                 candidates.append(Candidate(_name(path, root), path))
             else:
@@ -106,18 +106,18 @@ def _name(path: Path, root: Path) -> str:
     return os.fsencode(path.relative_to(root).as_posix()).decode("utf-8", errors="backslashreplace")
 
 
-def _why_not(path: Path) -> str | None:
+def _exclusion_reason(path: Path) -> str | None:
     """None for a candidate; the reason for a file that claims to be a photo; an empty text for any other file."""
     suffix = path.suffix.casefold()
-    pretends = suffix in PHOTO_SUFFIXES or suffix in RAW_SUFFIXES or suffix in OTHER_PICTURES
+    claims = suffix in PHOTO_SUFFIXES or suffix in RAW_SUFFIXES or suffix in OTHER_PICTURES
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            return "is not a regular file" if pretends else ""
+            return "is not a regular file" if claims else ""
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
     except OSError as error:
-        return f"cannot be read ({error.strerror})" if pretends else ""
+        return f"cannot be read ({error.strerror})" if claims else ""
     if suffix in RAW_SUFFIXES:  # most raw formats are TIFF files with a thumbnail in front
         return "is a camera's raw file: develop it to JPEG or TIFF"
     kind = _kind(head)
@@ -125,12 +125,12 @@ def _why_not(path: Path) -> str | None:
         return None
     if kind:
         return f"is a {kind} picture, which is not supported: convert it to JPEG or PNG"
-    if not pretends:
+    if not claims:
         return ""
-    return "is empty" if not head else f"is no {_claim(suffix)} picture, whatever its name says"
+    return "is empty" if not head else f"is no {_claimed_format(suffix)} picture, whatever its name says"
 
 
-def _why_not_name(relative: Path) -> str | None:
+def _name_problem(relative: Path) -> str | None:
     try:
         str(relative).encode()
     except UnicodeEncodeError:
@@ -139,7 +139,7 @@ def _why_not_name(relative: Path) -> str | None:
     return "has a name that is too long: rename it" if len(relative.name.encode()) > MAX_NAME_BYTES else None
 
 
-def _claim(suffix: str) -> str:
+def _claimed_format(suffix: str) -> str:
     if suffix in OTHER_PICTURES:
         return OTHER_PICTURES[suffix]
     return {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}.get(suffix, "JPEG")

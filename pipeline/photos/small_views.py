@@ -18,7 +18,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import Mask, Pixels, load_mask, read_image, reduced_camera, reduced_mask
 
-ROOM = 2  # the decoded image is at least this many times the wanted size: below, the decoder's own filter would show
+SLACK = 2  # the decoded image is at least this many times the wanted size, or the decoder's own filter would show
 STEPS = (
     (8, cv2.IMREAD_REDUCED_COLOR_8),
     (4, cv2.IMREAD_REDUCED_COLOR_4),
@@ -71,7 +71,7 @@ def read_small(path: Path, size: tuple[int, int], wanted: tuple[int, int]) -> tu
     Raises:
         StageError: if it cannot be read.
     """
-    room = min(side // (ROOM * want) for side, want in zip(size, wanted, strict=True))
+    room = min(side // (SLACK * want) for side, want in zip(size, wanted, strict=True))
     small = room >= STEPS[-1][0] and _is_jpeg(path)
     factor, flag = next(((by, how) for by, how in STEPS if small and room >= by), (1, cv2.IMREAD_COLOR))
     return factor, read_image(path, flag)

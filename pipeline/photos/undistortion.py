@@ -16,12 +16,12 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter
 from splatpipe.pipeline.geometry.camera import reduced_size
 from splatpipe.pipeline.photos.dataset import MASKS, SKY_MASKS, image_path, mask_path
 from splatpipe.pipeline.photos.jpeg_strips import write_jpeg
-from splatpipe.pipeline.photos.names import match_names, some
+from splatpipe.pipeline.photos.names import list_names, match_names
 from splatpipe.pipeline.photos.photo_list import Photo, decode_mask, decode_sky_mask, open_decoded
 from splatpipe.pipeline.photos.resampling import resample, resampled_strips
 
 SHAPE_TOLERANCE = 0.01  # between the aspect ratios of a photo and of its camera in the model
-WHITE = 254.5  # of 255: a pixel counts only if no part of it is masked, and is sky only if all of it is
+WHITE = 254.5  # of 255: a pixel counts only if no part of it is masked, and is sky only if all of it is sky
 MIN_VIEWS = 2
 
 
@@ -42,7 +42,7 @@ class RegisteredPhoto:
     target: pycolmap.Camera
 
 
-def place(
+def plan_views(
     model: pycolmap.Reconstruction, photos: Sequence[Photo], max_megapixels: float, report: Reporter
 ) -> list[RegisteredPhoto]:
     """Find each image's photo and both its cameras, sorted by photo name.
@@ -77,16 +77,19 @@ def place(
             hint="images/ must contain them, with the names and aspect ratios of the model.",
         )
     if missing:
-        report.warning(f"{len(missing)} photos of the sparse model are missing and are left out: {some(missing)}.")
-    if unusable:
         report.warning(
-            f"{len(unusable)} photos do not fit their cameras in the sparse model and are left out: {some(unusable)}.",
+            f"{len(missing)} photos of the sparse model are missing and are left out: {list_names(missing)}."
+        )
+    if unusable:
+        names = list_names(unusable)
+        report.warning(
+            f"{len(unusable)} photos do not fit their cameras in the sparse model and are left out: {names}.",
             hint="Their aspect ratio differs, or their camera or pose is not finite.",
         )
     return [placed[name] for name in sorted(placed)]
 
 
-def read_flown(path: Path) -> pycolmap.Reconstruction:
+def read_registered(path: Path) -> pycolmap.Reconstruction:
     """Read the sparse model with the photos' original cameras.
 
     Args:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Reporter
-from splatpipe.pipeline.photos.camera_groups import CALIBRATION_STRAY, CameraGroup, picture_scale
+from splatpipe.pipeline.photos.camera_groups import CALIBRATION_TOLERANCE, CameraGroup, picture_scale
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.sfm.lens_file import FileLens, checked_lens, fitted, read_lens_file
@@ -127,7 +127,7 @@ def _of_metadata(group: CameraGroup, photos: Sequence[CheckedPhoto]) -> StatedLe
         return None
     lens, count = counts.most_common(1)[0]
     stray = abs(0.5 * (lens.params[0] + lens.params[1]) / group.focal_px - 1.0)
-    if 2 * count <= len(photos) or (group.has_prior and stray > CALIBRATION_STRAY):
+    if 2 * count <= len(photos) or (group.has_prior and stray > CALIBRATION_TOLERANCE):
         return None
     return lens
 

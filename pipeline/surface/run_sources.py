@@ -18,11 +18,11 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.mvs.depth_maps import DepthMapFile, kept_depth_maps
-from splatpipe.pipeline.mvs.filling import filled
+from splatpipe.pipeline.mvs.depth_maps import DepthMapFile, list_depth_maps
+from splatpipe.pipeline.mvs.filling import fill_gaps
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
-from splatpipe.pipeline.photos.undistortion import RegisteredPhoto, place, read_flown
+from splatpipe.pipeline.photos.undistortion import RegisteredPhoto, plan_views, read_registered
 from splatpipe.pipeline.surface.photo_samples import DistortionGrid, PhotoSource
 from splatpipe.pipeline.surface.site_extent import SiteExtent, load_site
 from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, PosedDepthMap
@@ -64,14 +64,14 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
         SplatpipeError: if one of them is broken.
     """
     frame, views = load_frame(inputs["georef.frame"]), load_views(inputs["undistort.dataset"])
-    found, rendered = (kept_depth_maps(inputs[part], views) for part in ("depths.maps", "splat_depths.maps"))
+    found, rendered = (list_depth_maps(inputs[part], views) for part in ("depths.maps", "splat_depths.maps"))
     maps = _pair_maps(found, rendered)
     if not maps or not frame.in_metres:
         return None
     local_from_model = frame.world_from_model
     depths = {name: _in_metres(*each, local_from_model) for name, each in maps.items()}
     flown = load_photo_list(inputs["ingest.photos"]).photos
-    placed = place(read_flown(inputs["georef.model"]), flown, math.inf, report)
+    placed = plan_views(read_registered(inputs["georef.model"]), flown, math.inf, report)
     photos = photo_sources(placed, depths, local_from_model, (inputs["ingest.photos"], inputs.photos_dir))
     focal = {view.photo.name: view.source.mean_focal_length() for view in placed}
     finer = statistics.median(focal.get(name, each.camera.fx) / each.camera.fx for name, each in depths.items())
@@ -122,7 +122,7 @@ def _in_metres(kept: DepthMapFile, filling: DepthMapFile | None, local_from_mode
         found = kept.load()
         if filling is not None:
             try:
-                found = filled(found, filling.load())
+                found = fill_gaps(found, filling.load())
             except ValueError as error:
                 raise StageError(f"{camera.name}: {error}.", "Run again with --rerun splat_depths.") from error
         return MetricMap(camera, found.depth * np.float32(local_from_model.scale), found.confidence)

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
-from splatpipe.pipeline.photos.names import some
+from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.fitting import (
     MAX_SIGMA_ROTATION_RAD,
@@ -200,7 +200,7 @@ def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Position
     if frame.left_out:
         report.warning(
             f"The stated position of {len(frame.left_out)} photos is wrong and is left out of the fit: "
-            f"{some(frame.left_out)}.",
+            f"{list_names(frame.left_out)}.",
             "The photos themselves are used.",
         )
     heights = _heights(frame, model, positions)

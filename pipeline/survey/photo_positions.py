@@ -16,9 +16,9 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.camera_angles import Convention, gimbal_from_nadir, tell_convention
+from splatpipe.pipeline.photos.camera_angles import Convention, detect_convention, gimbal_from_nadir
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import find_wrong
+from splatpipe.pipeline.photos.doubts import find_misplaced
 from splatpipe.pipeline.photos.exif import Gps
 from splatpipe.pipeline.photos.xmp import xmp_number
 from splatpipe.pipeline.survey.crs_names import ELLIPSOIDAL, UNKNOWN, parse_vertical
@@ -137,7 +137,7 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
         exif_altitude, xmp_altitude = _exif_altitude(photo.exif.gps), _xmp_altitude(photo.xmp)
         if exif_altitude is not None and xmp_altitude is not None:
             steps.append(exif_altitude - xmp_altitude)
-    wrong |= find_wrong({each.name: (each.latitude, each.longitude) for each in found})
+    wrong |= find_misplaced({each.name: (each.latitude, each.longitude) for each in found})
     flights = tell_flights(stamps)
     numbered = [replace(each, flight=flight) for each, flight in zip(found, flights, strict=True)]
     return PositionList(
@@ -233,7 +233,7 @@ def _conventions(photos: Sequence[CheckedPhoto]) -> dict[tuple[str, str], Conven
         pitch = xmp_number(photo.xmp, "Camera:Pitch", -360.0, 360.0)
         if pitch is not None:
             pitches.setdefault(_camera(photo), []).append(pitch)
-    return {camera: tell_convention(values) for camera, values in pitches.items()}
+    return {camera: detect_convention(values) for camera, values in pitches.items()}
 
 
 def _angles(

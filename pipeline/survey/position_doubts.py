@@ -9,7 +9,7 @@ import numpy as np
 
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.doubts import Doubt, median_distance_m
-from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.survey.photo_positions import (
     DATUM_STEP_M,
     NOWHERE,
@@ -51,7 +51,7 @@ def _none_on_earth(positions: PositionList) -> list[Doubt]:
         doubts.append(
             Doubt(
                 "position-impossible",
-                f"Impossible positions: {some(positions.impossible)}.",
+                f"Impossible positions: {list_names(positions.impossible)}.",
                 "These photos are used without their positions.",
                 positions.impossible,
             )
@@ -85,7 +85,7 @@ def _missing(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Do
                 weight="note",
             )
         ]
-    which = some(without) if len(without) <= len(photos) / 2 else f"{len(without)} of {len(photos)} photos"
+    which = list_names(without) if len(without) <= len(photos) / 2 else f"{len(without)} of {len(photos)} photos"
     single = without if len(without) <= len(photos) / 2 else ()
     hint = "Was the receiver's fix lost, or the EXIF in a copy? They are used without it."
     return [Doubt("position-missing", f"Without a position: {which}.", hint, single)]
@@ -110,7 +110,7 @@ def _contradicting(photos: Sequence[CheckedPhoto]) -> list[Doubt]:
     if not names:
         return []
     furthest = max(names, key=apart.__getitem__)
-    text = f"EXIF and XMP state different positions: {some(names)} (up to {apart[furthest]:,.0f} m apart)."
+    text = f"EXIF and XMP state different positions: {list_names(names)} (up to {apart[furthest]:,.0f} m apart)."
     return [Doubt("position-contradiction", text, "EXIF's are used: correct them, or restore the originals.", names)]
 
 
@@ -120,7 +120,7 @@ def _altitudes(positions: Sequence[Position]) -> list[Doubt]:
     doubts = []
     without = tuple(each.name for each in positions if each.altitude_m is None)
     if stated and without and len(without) <= len(positions) / 2:
-        text = f"Without an altitude: {some(without)}."
+        text = f"Without an altitude: {list_names(without)}."
         doubts.append(Doubt("altitude-missing", text, "Their heights are treated as unknown.", without))
     if len(stated) < 3:
         return doubts
@@ -129,7 +129,7 @@ def _altitudes(positions: Sequence[Position]) -> list[Doubt]:
     limit = max(MIN_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
     odd = tuple(name for name, metres in zip(stated, off.tolist(), strict=True) if metres > limit)
     if odd:
-        text = f"Altitudes far from the others' ({np.median(values):.0f} m): {some(odd)}."
+        text = f"Altitudes far from the others' ({np.median(values):.0f} m): {list_names(odd)}."
         doubts.append(Doubt("altitude-far", text, "Correct them, or leave the photos out.", odd))
     return doubts
 
@@ -173,7 +173,7 @@ def _lost_fix(positions: Sequence[Position]) -> list[Doubt]:
         return []
     sigmas: Mapping[str, float] = {each.name: each.sigma_horizontal_m for each in positions}
     worst = max(sigmas[name] for name in lost)
-    text = f"RTK was lost: {some(lost)} (their positions are accurate to {worst:.2g} m; the others' to "
+    text = f"RTK was lost: {list_names(lost)} (their positions are accurate to {worst:.2g} m; the others' to "
     text += f"{np.median([sigmas[name] for name in fixed if fixed[name]]):.2g} m)."
     return [Doubt("rtk-lost", text, "They get less weight; PPK, or flying them again with a fix, would help.", lost)]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.camera_angles import gimbal_from_nadir, tell_convention
-from splatpipe.pipeline.photos.names import NameFinder, some
+from splatpipe.pipeline.photos.camera_angles import detect_convention, gimbal_from_nadir
+from splatpipe.pipeline.photos.names import NameFinder, list_names
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
 from splatpipe.pipeline.survey.position_file import PhotoPlace, read_position_file
 
@@ -74,7 +74,7 @@ def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False)
             matched[name] = photo
     if not matched:
         raise SplatpipeError(
-            f"{path.name} lists no photo of this capture: {some(unknown)}.",
+            f"{path.name} lists no photo of this capture: {list_names(unknown)}.",
             "It may belong to another capture: give the right one with --set ingest.positions=PATH, or =none to "
             "ignore it.",
         )
@@ -95,6 +95,6 @@ def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False)
 def _gimbal_angles(rows: Sequence[PhotoPlace]) -> list[tuple[float, float, float] | None]:
     """The photos' angles in the gimbal's convention, whichever of the two conventions the file uses."""
     known = [row.angles_deg for row in rows if row.angles_deg is not None]
-    if tell_convention(angles[1] for angles in known) == "gimbal":
+    if detect_convention(angles[1] for angles in known) == "gimbal":
         return [row.angles_deg for row in rows]
     return [None if row.angles_deg is None else gimbal_from_nadir(*row.angles_deg) for row in rows]

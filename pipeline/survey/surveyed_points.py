@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.triangulation import Rays, TriangulatedPoint, triangulate
-from splatpipe.pipeline.photos.names import NameFinder, some
+from splatpipe.pipeline.photos.names import NameFinder, list_names
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.control_file import ControlFile, SurveyedPoint, read_control_file
 from splatpipe.pipeline.survey.crs import Crs, parse_crs
@@ -145,7 +145,7 @@ def load_survey(
         return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
     if file.zero_heights:
         report.note(
-            f"A height of 0.0 is treated as unknown: {some(file.zero_heights)} of {path.name} "
+            f"A height of 0.0 is treated as unknown: {list_names(file.zero_heights)} of {path.name} "
             f"{'controls' if len(file.zero_heights) == 1 else 'control'} horizontally only."
         )
     _tell_unusable(points, path.name, model, photos, report)
@@ -258,7 +258,7 @@ def _tell_marks(
         return
     if all_missing:
         raise SplatpipeError(
-            f"None of the photos that {name} names is in this capture: {some(missing)}.",
+            f"None of the photos that {name} names is in this capture: {list_names(missing)}.",
             "Check that the file belongs to these photos; photos must be listed by their file names."
             " --set georef.control=none runs without control.",
         )
@@ -269,12 +269,12 @@ def _tell_marks(
         )
     if len(outside) > OUTSIDE_SHARE * marks:
         raise SplatpipeError(
-            f"{len(outside)} of {marks} marks of {name} lie outside their photos: {some(outside)}.",
+            f"{len(outside)} of {marks} marks of {name} lie outside their photos: {list_names(outside)}.",
             "Were they made in photos that were resized or rotated? Pixel coordinates must be in these photos.",
         )
     if outside:
         report.warning(
-            f"{len(outside)} marks of {name} lie outside their photos and are left out: {some(outside)}.",
+            f"{len(outside)} marks of {name} lie outside their photos and are left out: {list_names(outside)}.",
             "Correct their pixel coordinates.",
         )
 
@@ -282,7 +282,7 @@ def _tell_marks(
 def missing_photos(names: Sequence[str]) -> str:
     """Phrase for messages about photos that a file names and the capture does not have."""
     many = "1 photo that is" if len(names) == 1 else f"{len(names)} photos that are"
-    return f"{many} not in this capture: {some(names)}"
+    return f"{many} not in this capture: {list_names(names)}"
 
 
 def _tell_overruled(points: Sequence[SurveyPoint], name: str, setting: str, report: Reporter) -> None:
@@ -292,7 +292,7 @@ def _tell_overruled(points: Sequence[SurveyPoint], name: str, setting: str, repo
     if any(point.surveyed.role for point in usable) and stated != {p.name for p in usable if p.role == "check"}:
         report.note(
             f"georef.check_points={setting} goes before the roles in {name}, which has "
-            f"{some(sorted(stated)) if stated else 'no point'} as check points; "
+            f"{list_names(sorted(stated)) if stated else 'no point'} as check points; "
             "--set georef.check_points=auto takes the file's."
         )
 
@@ -323,7 +323,7 @@ def _tell_unusable(
                 s.photo if r is None else f"{s.photo} ({np.hypot(*r):.0f} px)" for s, r in zip(wrong, off, strict=True)
             ]
             report.warning(
-                f"Marks of {point.name} disagree with its other marks, and are left out: {some(named)}.",
+                f"Marks of {point.name} disagree with its other marks, and are left out: {list_names(named)}.",
                 "Correct these marks: another point may have been marked, or the wrong photo given.",
             )
 
@@ -352,8 +352,8 @@ def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]
         unknown = sorted(checks - {point.name for point in points})
         if unknown:
             raise SplatpipeError(
-                f"georef.check_points has points that are not in the control file: {some(unknown)}.",
-                f"It has {some([point.name for point in points])}.",
+                f"georef.check_points has points that are not in the control file: {list_names(unknown)}.",
+                f"It has {list_names([point.name for point in points])}.",
             )
     return [
         replace(point, role="check") if point.role == "control" and point.name in checks else point for point in points

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.photos.names import NameFinder, some
+from splatpipe.pipeline.photos.names import NameFinder, list_names
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.expected_places import expected_enu, free_enu
@@ -59,7 +59,7 @@ class TargetSurvey:
         found = named_tracks(self.finds, names, (self.model, self.photos), self._expected(points), seeds)
         if found.named:
             marks = sum(len(each.track.finds) for each in found.named)
-            told = some([each.name for each in found.named])
+            told = list_names([each.name for each in found.named])
             report.note(f"Targets detected in the photos: {told}, with {marks} marks.")
         refused = [f"{count} {what}" for what, count in sorted(found.refused.items())]
         if refused:
@@ -110,7 +110,7 @@ def scale_of(
     missing = [f"{bar.a} to {bar.b}" for bar in bars if bar.a not in places or bar.b not in places]
     if missing:
         report.warning(
-            f"Of {len(missing)} of {len(bars)} scale bars a target was not detected: {some(missing)}.",
+            f"Of {len(missing)} of {len(bars)} scale bars a target was not detected: {list_names(missing)}.",
             "A coded target's name must end in its number; each must be sharp in two photos and at least 20 pixels "
             "wide.",
         )
@@ -124,7 +124,9 @@ def scale_of(
         if k not in scale.used and np.isfinite(scale.errors_m[k])
     ]
     if wrong:
-        report.warning(f"Scale bars contradict the others and are left out: {some(wrong)}.", "Measure them again.")
+        report.warning(
+            f"Scale bars contradict the others and are left out: {list_names(wrong)}.", "Measure them again."
+        )
     return scale
 
 

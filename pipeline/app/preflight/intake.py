@@ -19,7 +19,7 @@ from splatpipe.pipeline.photos.camera_groups import CameraGroup, group_cameras
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.doubts import Doubt
 from splatpipe.pipeline.photos.duplicates import split_duplicates
-from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.photo_list import Photo, photo_root
 from splatpipe.pipeline.photos.preparation import Preparation, check_photos
 from splatpipe.pipeline.photos.scan import ExcludedPhoto, scan_folder
@@ -143,7 +143,7 @@ def _file_places(
         return {}, [Finding("positions-file", "error", error.message, error.hint)]
     if not places.unknown:
         return places.by_name, []
-    text = f"{path.name} names photos that are missing, or names them twice: {some(places.unknown)}."
+    text = f"{path.name} names photos that are missing, or names them twice: {list_names(places.unknown)}."
     return places.by_name, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
 
 
@@ -154,7 +154,7 @@ def _unreadable(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
         by_reason.setdefault(entry.reason, []).append(entry.name)
     hint = "A run leaves it out: copy it from the card again, or retake the photo."
     return [
-        Finding("unreadable", "warning", f"{some(names)} {reason}.", hint, tuple(sorted(names)))
+        Finding("unreadable", "warning", f"{list_names(names)} {reason}.", hint, tuple(sorted(names)))
         for reason, names in sorted(by_reason.items())
     ]
 

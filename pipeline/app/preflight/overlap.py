@@ -10,7 +10,7 @@ import numpy as np
 
 from splatpipe.pipeline.app.preflight.findings import Finding, Gap
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.sfm.pairs import (
     Costs,
     Layout,
@@ -108,13 +108,13 @@ def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]
     findings = []
     alone = tuple(sorted(names[piece[0]] for piece in pieces if len(piece) == 1))
     if alone:
-        text = f"Matches no other photo: {some(alone)}." if len(alone) <= count / 10 else ""
+        text = f"Matches no other photo: {list_names(alone)}." if len(alone) <= count / 10 else ""
         text = text or f"{len(alone)} of {count} photos match no other photo at low resolution."
         hint = "A run will probably fail to place them: take more photos around them, with two thirds overlap."
         findings.append(Finding("orphan", "warning", text, hint, alone if len(alone) <= count / 10 else ()))
     islands = [piece for piece in pieces[1:] if len(piece) > 1]
     if islands:
-        groups = "; ".join(some([names[k] for k in piece], 4) for piece in islands[:3])
+        groups = "; ".join(list_names([names[k] for k in piece], 4) for piece in islands[:3])
         text = f"The photos fall into {len(islands) + 1} groups that do not overlap: {groups}"
         text += " …" if len(islands) > 3 else ""
         hint = "Take photos between the groups, to connect them."

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.app.preflight.findings import Finding
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.names import printable, some
+from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.sfm.quick_match import QuickFeatures
 
 DULL = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
@@ -54,7 +54,7 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
     if len(dull):
         names = tuple(photos[k].name for k in dull)
         least = float(np.exp(-worst[dull].max() / 2.0))
-        text = f"Blurred: {some(names)} (down to {least:.0%} of their neighbours' detail)."
+        text = f"Blurred: {list_names(names)} (down to {least:.0%} of their neighbours' detail)."
         findings.append(Finding("blurred", "warning", text, "Retake them, or leave them out.", names))
     return findings
 
@@ -94,7 +94,7 @@ def _empty(
     if not found:
         return []
     names = tuple(photos[k].name for k in found)
-    text = f"Hardly any detail, {level} over most of the picture: {some(names)}."
+    text = f"Hardly any detail, {level} over most of the picture: {list_names(names)}."
     return [Finding(code, "warning", text, "Retake them, or leave them out.", names)]
 
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.app.preflight.findings import ControlPlace, Finding, Place
 from splatpipe.pipeline.app.preflight.intake import Intake
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.names import NameFinder, some
+from splatpipe.pipeline.photos.names import NameFinder, list_names
 from splatpipe.pipeline.sfm.footprints import FURTHEST, MIN_HEIGHT_M, StatedPoses
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
@@ -139,7 +139,7 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
                 outside.append(f"{point} in {photo}")
     findings = []
     if marks and all(photo is None for _, _, photo in marks):
-        text = f"None of the photos that {name} names is in this capture: {some(missing)}."
+        text = f"None of the photos that {name} names is in this capture: {list_names(missing)}."
         return [Finding("control-broken", "error", text, "Check that the file belongs to these photos.")]
     if missing:
         text = f"{name} names {missing_photos(missing)}."
@@ -148,7 +148,7 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
         )
     if outside:
         severe = len(outside) > OUTSIDE_SHARE * len(marks)
-        text = f"{len(outside)} of {len(marks)} marks of {name} lie outside of their photos: {some(outside)}."
+        text = f"{len(outside)} of {len(marks)} marks of {name} lie outside of their photos: {list_names(outside)}."
         hint = "Were they made in photos that were resized or rotated?"
         findings.append(Finding("control-marks", "error" if severe else "warning", text, hint))
     return findings
@@ -190,7 +190,7 @@ def _outside(
     ]
     if not off:
         return []
-    text = f"Points of {name} outside the view of all photos: {some(off)}."
+    text = f"Points of {name} outside the view of all photos: {list_names(off)}."
     return [Finding("control-outside", "warning", text, "Check their coordinates, or take photos around them.")]
 
 
