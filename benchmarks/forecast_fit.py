@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from splatpipe.stages.costs import REFERENCE, Costs, StageCosts
-from splatpipe.stages.forecast import counted, forecast
+from splatpipe.stages.forecast import capture_size, forecast
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import NEIGHBOURS, CaptureSize, CaptureWork, WorkUnits
 
@@ -82,7 +82,7 @@ def read_run(out: Path, config: LineConfig, name: str) -> FinishedRun:
         if before is None or manifest["finished_s"] > before["finished_s"]:
             manifests[manifest["stage"]] = manifest
     summaries = {stage: manifest["summary"] for stage, manifest in manifests.items()}
-    size = counted(summaries)
+    size = capture_size(summaries)
     if size is None or "flythrough" not in summaries:
         raise ValueError(f"{out} holds no whole run of photos.")
     counts = {
@@ -146,7 +146,7 @@ def scene_of(run: FinishedRun, base: Costs) -> Costs:
     options, counts = run.config, run.counts
     keypoints = {
         **base.keypoints,
-        options.features.extractor: counts["keypoints"] / run.size.photos / bare.looked_at,
+        options.features.extractor: counts["keypoints"] / run.size.photos / bare.keypoint_megapixels,
     }
     return replace(
         base,

@@ -17,11 +17,11 @@ from splatpipe.pipeline.train.blocks.needs import (
 from splatpipe.pipeline.train.lengths import Length, PhotoSizes, growth_until, stretches
 from splatpipe.pipeline.train.limits import PIXEL_BYTES, bytes_per_gaussian
 
-SEEN_BY = 35.0  # photos that show a point: about 12 in a nadir flight, 60 in the tiled demo, which has orbits
-LOOKS_FARTHER = 3.0  # share of the site that a block sees over its share of the photos: 3.6 and 2.4 in the tiled demo
-BEGINNING_S = 5.0  # CPU seconds per block before its first iteration: libraries, its photos' exposures and skies
+PHOTOS_PER_POINT = 35.0  # photos that show a point: about 12 in a nadir flight, 60 in the tiled demo, which has orbits
+VISIBLE_SHARE = 3.0  # of the site that a block sees, over its share of the photos: 3.6 and 2.4 in the tiled demo
+START_S = 5.0  # CPU seconds per block before its first iteration: libraries, its photos' exposures and skies
 LAYOUT_S = 0.07  # CPU seconds per pair of photo and visible block, to find its surroundings; from the tiled demo
-EVERY = 100  # iterations between two density-control steps, unless the training is short
+DENSIFY_EVERY = 100  # iterations between two density-control steps, unless the training is short
 SITE_PHOTO_BYTES = 40_000  # per photo of the site, in every block: its camera and its free space
 
 
@@ -74,7 +74,7 @@ class BlockWork:
         """Mean number of blocks that train on each window."""
         blocks, photos = self.division.blocks, max(1, self.footage.photos)
         parts = self.footage.parts(level) / photos
-        return blocks * round_pixels(1.0, blocks, math.sqrt(min(1.0, SEEN_BY / photos) / parts), 1.0)
+        return blocks * round_pixels(1.0, blocks, math.sqrt(min(1.0, PHOTOS_PER_POINT / photos) / parts), 1.0)
 
     @property
     def lengths(self) -> tuple[Length, ...]:
@@ -82,15 +82,15 @@ class BlockWork:
         return tuple((level, round(count * self.repeats(level))) for level, count in self.finer)
 
     @property
-    def looks(self) -> float:
+    def blocks_per_photo(self) -> float:
         """Mean number of blocks that use each photo, whole or in part."""
         blocks, photos = self.division.blocks, max(1, self.footage.photos)
-        return blocks * round_pixels(1.0, blocks, math.sqrt(min(1.0, SEEN_BY / photos)), 1.0)
+        return blocks * round_pixels(1.0, blocks, math.sqrt(min(1.0, PHOTOS_PER_POINT / photos)), 1.0)
 
     @property
     def photos(self) -> float:
         """Mean number of photos that each block uses, whole or in part."""
-        return max(1, self.footage.photos) * self.looks / self.division.blocks
+        return max(1, self.footage.photos) * self.blocks_per_photo / self.division.blocks
 
     @property
     def coarse_gaussians(self) -> float:
@@ -104,7 +104,7 @@ class BlockWork:
         start = MARGIN_GROWTH * self.coarse_gaussians / division.blocks
         asked = max(start, MARGIN_GROWTH * self.grown / division.blocks)
         trained = min(float(grown_from(int(start), self.steps, division.need.trained)), asked)
-        around = self.coarse_gaussians * min(1.0, LOOKS_FARTHER * self.looks / division.blocks)
+        around = self.coarse_gaussians * min(1.0, VISIBLE_SHARE * self.blocks_per_photo / division.blocks)
         return BlockLoad(trained, min(float(division.need.frozen), around))
 
     @property
@@ -114,7 +114,7 @@ class BlockWork:
         If the number of iterations follows from the photos, steps are at least one pass over the block's photos apart.
         """
         own = [(level, round(count / self.division.blocks)) for level, count in self.lengths]
-        every = min(EVERY, max(1, (self.pace or sum(count for _, count in own)) // 10))
+        every = min(DENSIFY_EVERY, max(1, (self.pace or sum(count for _, count in own)) // 10))
         return int(growth_until(own) // max(every, self.photos if self.pace else 1.0))
 
     @property

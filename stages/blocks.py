@@ -29,7 +29,7 @@ from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import MEGA, CaptureSize, CaptureWork
 
-LARGEST_PHOTO = 200.0  # megapixels: the dataset's own size is what counts
+MAX_PHOTO_MEGAPIXELS = 200.0  # practically no limit: the dataset's own size decides
 
 
 def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -48,34 +48,34 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     )
     device = choose_device(inputs.machine.device, train.unfit_for_cuda(), report.note)
     plan = _whole_plan(train, inputs, device)
-    division = kept_division(out / "division.json", lambda: _division(config, train, plan, device))
+    division = stored_division(out / "division.json", lambda: _division(config, train, plan, device))
     report.progress(1, 1, "choosing blocks")
     coarse = out / COARSE
     for folder in (coarse, out / PROSPECTS):
         folder.mkdir(exist_ok=True)
     if division.is_whole:
-        limit = _unasked_limit(division, train, device, report)
+        limit = _default_limit(division, train, device, report)
         (out / "blocks.json").write_text(whole_json(limit), encoding="utf-8")
         return {"blocks": 1} | ({"limit_bytes": limit} if limit else {})
-    _tell(division, train, division.limit_bytes and division.limit_bytes - _beside(device), report)
-    told = out / "coarse.json"
-    if not told.is_file():
+    _report_division(division, train, division.limit_bytes and division.limit_bytes - _host_bytes(device), report)
+    finished = out / "coarse.json"
+    if not finished.is_file():
         limits = TrainingLimits(division.coarse_cap, division.window_pixels)
         summary = train_coarse(train, inputs, limits, coarse, report)
         sync_tree(coarse)  # before the file that marks it complete, so that a power cut loses nothing
-        write_durably(told, json.dumps(dict(summary)))
+        write_durably(finished, json.dumps(dict(summary)))
     (coarse / "checkpoint.npz").unlink(missing_ok=True)
-    site, told_of_blocks = lay_out(train, inputs, division, out, report)
+    site, block_summary = lay_out(train, inputs, division, out, report)
     (out / "blocks.json").write_text(site.to_json(), encoding="utf-8")
     return {
         "blocks": division.blocks,
         "division": asdict(division),
-        **told_of_blocks,
-        "coarse": json.loads(told.read_text(encoding="utf-8")),
+        **block_summary,
+        "coarse": json.loads(finished.read_text(encoding="utf-8")),
     }
 
 
-def kept_division(path: Path, make: Callable[[], Division]) -> Division:
+def stored_division(path: Path, make: Callable[[], Division]) -> Division:
     """Return the stored division, or make and store one if there is none.
 
     Args:
@@ -100,11 +100,11 @@ def _whole_plan(train: TrainConfig, inputs: Inputs, device: Device) -> TrainingP
 def _division(config: BlocksConfig, train: TrainConfig, plan: TrainingPlan, device: Device) -> Division:
     if train.time_budget_s:  # a time budget plans a single training
         return divided(_scene(train, plan), 0)
-    limit = memory_limit(train.max_memory_bytes, _memory_of(device))
-    return divided(_scene(train, plan), limit and limit + _beside(device), config.least)
+    limit = memory_limit(train.max_memory_bytes, _memory_bytes(device))
+    return divided(_scene(train, plan), limit and limit + _host_bytes(device), config.least)
 
 
-def _unasked_limit(division: Division, train: TrainConfig, device: Device, report: Reporter) -> int:
+def _default_limit(division: Division, train: TrainConfig, device: Device, report: Reporter) -> int:
     """Memory limit for training the scene whole if the user set none, bytes; 0 if training will not come near it.
 
     On CUDA, the device's own memory ends growth.
@@ -118,12 +118,12 @@ def _unasked_limit(division: Division, train: TrainConfig, device: Device, repor
     return division.limit_bytes
 
 
-def _beside(device: Device) -> int:
+def _host_bytes(device: Device) -> int:
     """Bytes of training memory that are not on the device: the libraries', if it is a GPU."""
     return LIBRARIES_BYTES if device.name == "cuda" else 0
 
 
-def _memory_of(device: Device) -> int:
+def _memory_bytes(device: Device) -> int:
     if device.name == "cuda":
         return int(torch.cuda.get_device_properties(device.tensors).total_memory)
     return available_memory_bytes()
@@ -134,7 +134,7 @@ def _scene(train: TrainConfig, plan: TrainingPlan) -> SceneSize:
     photos = sum(count for _width, _height, count in plan.sizes)
     pixels = sum(width * height * count for width, height, count in plan.sizes) / max(photos, 1)
     size = CaptureSize(photos, pixels / MEGA, True, _shape(plan))
-    whole = LineConfig(train=train, undistort=UndistortConfig(max_megapixels=LARGEST_PHOTO))
+    whole = LineConfig(train=train, undistort=UndistortConfig(max_megapixels=MAX_PHOTO_MEGAPIXELS))
     expected = CaptureWork.of(size, whole, REFERENCE, threads=1).grown
     return SceneSize(train.max_gaussians, expected, window, train.sh_degree, photos)
 
@@ -145,12 +145,12 @@ def _shape(plan: TrainingPlan) -> float:
     return min(width, height) / max(width, height)
 
 
-def _tell(division: Division, train: TrainConfig, limit_bytes: int, report: Reporter) -> None:
+def _report_division(division: Division, train: TrainConfig, limit_bytes: int, report: Reporter) -> None:
     """Report the decision to the user, with the memory limit as the user gave it."""
-    told = f"{division.cap:,} Gaussians are trained in {division.blocks} blocks"
+    text = f"{division.cap:,} Gaussians are trained in {division.blocks} blocks"
     if limit_bytes:
-        told += f", each within {limit_bytes / 1e9:.1f} GB"
-    report.note(f"{told}, after a coarse pass with {division.coarse_cap:,}")
+        text += f", each within {limit_bytes / 1e9:.1f} GB"
+    report.note(f"{text}, after a coarse pass with {division.coarse_cap:,}")
     if division.cap < train.max_gaussians:
         report.warning(
             f"{limit_bytes / 1e9:.2f} GB hold {division.cap:,} Gaussians in {division.blocks} blocks, fewer "

@@ -40,7 +40,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     gaussians = read_splat(trained)
     device = choose_device(inputs.machine.device)
     with same_bits(inputs.machine.threads):
-        cleaned = _cleaned(gaussians.to(device.tensors), inputs, report)
+        cleaned = _clean(gaussians.to(device.tensors), inputs, report)
     removed = sum(cleaned.removed.values())
     if removed:
         kept = (piece.select(keep) for piece, keep in _pieces(gaussians, cleaned.keep))
@@ -58,7 +58,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     }
 
 
-def _cleaned(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> CleaningResult:
+def _clean(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> CleaningResult:
     """Clean by the training photos only: the held-out ones must stay independent for evaluation."""
     held_out = set(load_split(inputs["split.views"]).held_out)
     views = [view for view in load_views(inputs["undistort.dataset"]) if view.camera.name not in held_out]
@@ -76,10 +76,10 @@ def _cleaned(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> Cleaning
         None if sky is None else sky.to(gaussians.means.device),
     )
 
-    def told(done: int, total: int) -> None:
+    def progress(done: int, total: int) -> None:
         report.progress(done, total, "looking for floaters", "photos")
 
-    return clean_scene(gaussians, photos, told)
+    return clean_scene(gaussians, photos, progress)
 
 
 def _pieces(gaussians: Gaussians, keep: Bool[Tensor, " n"]) -> Iterator[tuple[Gaussians, Bool[Tensor, " m"]]]:

@@ -32,7 +32,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 
 Pictures = tuple[tuple[Camera, Pixels, Mask | None], Pixels, Path, Mask | None]  # view, render, stem, inside mask
 
-MEASURED_AT_ONCE = 4  # views, each with 0.3 GB of images in double precision
+MEASURED_TOGETHER = 4  # views, each with 0.3 GB of images in double precision
 
 
 def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -70,7 +70,7 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     per_view: list[dict[str, Any]] = []
     cameras = [reduced_camera(view.camera, JUDGED_MEGAPIXELS) for view in views]
     with same_bits(inputs.machine.threads):
-        for found in ordered_map(_measured, pictures(), min(inputs.machine.threads, MEASURED_AT_ONCE)):
+        for found in ordered_map(_measure, pictures(), min(inputs.machine.threads, MEASURED_TOGETHER)):
             per_view.append(found)
             report.progress(len(per_view), len(chosen), "measuring held-out photos", "photos")
         floaters = measure_floaters(gaussians, cameras, set(held_out), inputs["undistort.dataset"], options, area)
@@ -89,5 +89,5 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     return summary | {"veil": floaters["veil"]["mean"], "device": device.name}
 
 
-def _measured(pictures: Pictures) -> dict[str, Any]:
+def _measure(pictures: Pictures) -> dict[str, Any]:
     return evaluate_view(*pictures)

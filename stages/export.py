@@ -39,7 +39,7 @@ from splatpipe.pipeline.survey.handover import (
 )
 from splatpipe.pipeline.survey.sparse_scene import sparse_glb
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
-from splatpipe.pipeline.web.options import ExportConfig, format_names
+from splatpipe.pipeline.web.options import ExportConfig, parse_formats
 from splatpipe.pipeline.web.viewer import ViewerScene
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
@@ -99,7 +99,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         if config.viewer_megabytes > 0.0:
             write_viewer(out / "viewer", shown, gaussians, config.viewer_megabytes * 1e6)
         run = RunSplat(Scene(gaussians, facts), frame, dataset, cameras, points, held_out_names(inputs), placed, shown)
-        sizes = write_deliverables(format_names(config.formats), run, out / "formats", report)
+        sizes = write_deliverables(parse_formats(config.formats), run, out / "formats", report)
     report.progress(4, 4, "writing the viewer", "files")
     summary: dict[str, Any] = {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
     summary |= {"formats": sizes} if sizes else {}

@@ -17,7 +17,7 @@ from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
 from splatpipe.pipeline.sfm.keypoints import Bytes, extract, single_threaded_opencv
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 
-MIN_KEYPOINTS = 16  # COLMAP needs 15 inliers per pair; with fewer keypoints a photo can never be placed
+MIN_KEYPOINTS = 16  # COLMAP needs 15 inliers per pair; a photo with fewer keypoints can never be placed
 
 
 def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

@@ -28,7 +28,7 @@ from splatpipe.pipeline.train.limits import (
     SMALLEST_WINDOW,
     bytes_per_gaussian,
 )
-from splatpipe.stages.block_work import BEGINNING_S, BlockLoad
+from splatpipe.stages.block_work import START_S, BlockLoad
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import FEWEST_GAUSSIANS, MEGA, MIN_SHARE, CaptureSize, CaptureWork
@@ -80,7 +80,7 @@ def needs_of(work: CaptureWork, speed: float) -> dict[str, Need]:
     return {**filled, "train": replace(filled["train"], cpu_seconds=whole_time)}
 
 
-def least_memory_bytes(config: LineConfig) -> int:
+def min_memory_bytes(config: LineConfig) -> int:
     """Smallest memory limit that training can keep: libraries, the smallest window, the fewest Gaussians."""
     model = FEWEST_GAUSSIANS * bytes_per_gaussian(config.train.sh_degree)
     return LIBRARIES_BYTES + FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + model
@@ -109,13 +109,13 @@ class Forecaster:
 
         After ``blocks``, the forecast follows its decision and includes each block's own needs.
         """
-        size = counted(summaries)
+        size = capture_size(summaries)
         if size is None:
             return {}
         decided = summaries.get("blocks")
         work = self._work(size, decided)
-        told = {} if decided is None else decided.get("of_blocks", {})
-        return needs_of(work, self.speed) | needs_of_blocks(work, told, self.speed)
+        summary = {} if decided is None else decided.get("of_blocks", {})
+        return needs_of(work, self.speed) | needs_of_blocks(work, summary, self.speed)
 
     def _work(self, size: CaptureSize, decided: Summary | None) -> CaptureWork:
         """The work of all stages, cached until ``blocks`` has decided."""
@@ -141,32 +141,34 @@ def work_as_decided(size: CaptureSize, config: LineConfig, threads: int, decided
     return whole_scene if division is None else whole_scene.divided_as(Division.of_facts(division))
 
 
-def needs_of_blocks(work: CaptureWork, told: Mapping[str, Any], speed: float) -> dict[str, Need]:
+def needs_of_blocks(work: CaptureWork, summary: Mapping[str, Any], speed: float) -> dict[str, Need]:
     """Return each block's needs by shard name, and under ``train`` those of all blocks; empty without blocks.
 
     Args:
         work: The work of all stages.
-        told: The blocks' figures (start, steps, limits, iterations) from the summary of ``blocks``; may be empty.
+        summary: The blocks' figures (start, steps, limits, iterations) from the summary of ``blocks``; may be empty.
         speed: Relative speed of this machine's cores.
     """
     blocks = work.blocks
-    if blocks is None or not told:
+    if blocks is None or not summary:
         return {}
     train, cost, planned = work.needs(speed)["train"], work.costs.stages["train"], work.blocks_iterations
     loads = [
         BlockLoad(float(grown_from(*figures)), float(frozen))
-        for *figures, frozen in zip(told["start"], told["steps"], told["trained"], told["frozen"], strict=True)
+        for *figures, frozen in zip(
+            summary["start"], summary["steps"], summary["trained"], summary["frozen"], strict=True
+        )
     ]
     found = {}
     for number, load in enumerate(loads):
-        own = int(told["iterations"][number])
+        own = int(summary["iterations"][number])
         cpu = cost.cpu * work.done * work.blocks_training(blocks.lengths, load) * own / max(1, planned)
         found[f"train.{number + 1}"] = replace(
             train,
             memory_bytes=work.block_memory_bytes(load),
-            cpu_seconds=(cpu + BEGINNING_S) / speed,
+            cpu_seconds=(cpu + START_S) / speed,
             disk_bytes=load.left_bytes,
-            scratch_bytes=int(told["disk_bytes"][number]) + load.work_bytes,
+            scratch_bytes=int(summary["disk_bytes"][number]) + load.work_bytes,
         )
     each = list(found.values())
     merged = sum(load.trained for load in loads) / MARGIN_GROWTH
@@ -180,16 +182,18 @@ def needs_of_blocks(work: CaptureWork, told: Mapping[str, Any], speed: float) ->
     return found | {"train": of_all}
 
 
-def counted(summaries: Mapping[str, Summary]) -> CaptureSize | None:
+def capture_size(summaries: Mapping[str, Summary]) -> CaptureSize | None:
     """Capture size from the summary of ``ingest``, by its most common camera; None if it did not run."""
-    told = summaries.get("ingest", {})
-    groups = told.get("camera_groups", ())
+    summary = summaries.get("ingest", {})
+    groups = summary.get("camera_groups", ())
     if not groups:
         return None
     shorter, longer = sorted(max(groups, key=lambda group: int(group["photos"]))["size"])
-    photos, wanted = int(told["photos"]), summaries.get("control", {})
+    photos, wanted = int(summary["photos"]), summaries.get("control", {})
     control = bool(wanted.get("points") or wanted.get("scale_bars"))
-    return CaptureSize(photos, shorter * longer / MEGA, 2 * int(told["positions"]) > photos, shorter / longer, control)
+    return CaptureSize(
+        photos, shorter * longer / MEGA, 2 * int(summary["positions"]) > photos, shorter / longer, control
+    )
 
 
 def has_control(source: RunSource) -> bool:

@@ -173,15 +173,15 @@ def _accuracy(
         control = control_json(controlled.survey, controlled.site, controlled.placed, photos, config.mark_sigma_px)
         gsd = gsd_m(controlled.survey, controlled.placed.model, controlled.placed.world_from_model.scale)
         accuracy = accuracy_json(controlled.survey, controlled.site, controlled.placed, gsd or None)
-        _tell_heights(accuracy["tables"], report)
+        _warn_of_heights(accuracy["tables"], report)
     else:
         control = no_control()
         accuracy = _accuracy_of_positions(*alone)
     return control, dict(accuracy)
 
 
-def _tell_heights(tables: JSON, report: Reporter) -> None:
-    """Warn if the check points' heights seem to be in a different datum from the positions, with no control to tell."""
+def _warn_of_heights(tables: JSON, report: Reporter) -> None:
+    """Warn if the check points' heights seem to be in another datum than the positions, and no control shows which."""
     check = tables["check"]
     if tables["control"] is None and check is not None and abs(check["mean_m"][2] or 0.0) > DATUM_STEP_M:
         report.warning(
@@ -197,12 +197,12 @@ def _accuracy_of_positions(model: SparseModel, positions: Positions, frame: Fram
     stations = stations_of(model, positions, frame)
     nothing = Targets(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
     site = LocalSurvey(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))
-    placed = replace(placed, offsets=_stated_offsets(frame, stations.flights))
+    placed = replace(placed, offsets=_flight_offsets(frame, stations.flights))
     gsd = model.gsd(frame.world_from_model.scale)
     return accuracy_json(None, site, placed, gsd, frame.residuals["uncertainty"])
 
 
-def _stated_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:
+def _flight_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:
     """(f, 3) offset of each flight from the fit of positions, metres."""
     found = {int(flight["flight"]): flight["offset_m"] for flight in frame.residuals.get("flights", [])}
     return np.array([found.get(flight, [0.0, 0.0, 0.0]) for flight in flights], dtype=np.float64).reshape(-1, 3)

@@ -76,7 +76,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         photos, duplicates = split_duplicates(checked)
         left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
         _require_photos(inputs.photos_dir, scan, photos, left_out)
-        _tell_left_out(left_out, report)
+        _warn_of_excluded(left_out, report)
         groups, camera_of = group_cameras(photos)
         groups, lenses = _lenses(inputs, groups, camera_of, photos, report)
         opacity = convert_unusual(photos, camera_of, work)
@@ -91,7 +91,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     described = describe_cameras(photos, groups, camera_of)
     report_cameras(described, report)
     if find_model(inputs.photos_dir) is None:  # a given model comes with its calibration
-        _tell_focal(groups, refused_calibrations(photos), report)
+        _warn_of_focal(groups, refused_calibrations(photos), report)
     save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
     write_json(out / "cameras.json", cameras_json(groups))
     write_json(out / "lenses.json", lenses_json(lenses))
@@ -147,7 +147,7 @@ def _require_photos(
     raise SplatpipeError(message + (f" Left out:{listing}{more}" if left_out else ""), hint=hint)
 
 
-def _tell_left_out(left_out: Sequence[ExcludedPhoto], report: Reporter) -> None:
+def _warn_of_excluded(left_out: Sequence[ExcludedPhoto], report: Reporter) -> None:
     """Issue one warning per reason, naming the photos."""
     by_reason: dict[str, list[str]] = {}
     for entry in left_out:
@@ -220,7 +220,7 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
     }
 
 
-def _tell_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:
+def _warn_of_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:
     if refused:
         report.warning(
             f"The calibrated focal length in {list_names(refused)} is far from the value of lens and sensor; "

@@ -26,8 +26,8 @@ Singles = npt.NDArray[np.float32]
 
 SH_DEGREE = 3
 NEIGHBOURS = 3
-SMALLEST_PER_EXTENT = 1e-6  # least size of a Gaussian, relative to the scene's extent
-TINY = 1e-12  # least extent, for a scene of one point at its camera
+MIN_SIZE_PER_EXTENT = 1e-6  # least size of a Gaussian, relative to the scene's extent
+MIN_EXTENT = 1e-12  # least extent, for a scene of one point at its camera
 QUERY_CHUNK = 65_536
 MAX_DENSE = 50_000  # dense points, spread evenly; density control adds finer detail where it pays
 
@@ -115,7 +115,7 @@ def point_sizes(xyz: Doubles, centres: Doubles, max_angle: float, report: Report
     neighbours = min(NEIGHBOURS, len(places) - 1)
     if neighbours > 0:  # the nearest position is the point's own
         sizes = np.minimum(sizes, _distances(places, places, neighbours + 1, report)[:, 1:].mean(axis=1))
-    sizes = np.maximum(sizes, SMALLEST_PER_EXTENT * max(extent, TINY))
+    sizes = np.maximum(sizes, MIN_SIZE_PER_EXTENT * max(extent, MIN_EXTENT))
     return np.asarray(sizes[place_of.reshape(-1)])
 
 

@@ -33,8 +33,8 @@ def parse_products(text: str) -> tuple[str, ...]:
     asked = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in asked if name not in NEEDS]
     if unknown or not asked:
-        told = f'There is no product "{unknown[0][:40]}".' if unknown else "No product is given."
-        raise UsageError(told, hint=f"Choose from: {', '.join(NEEDS)}.")
+        message = f'There is no product "{unknown[0][:40]}".' if unknown else "No product is given."
+        raise UsageError(message, hint=f"Choose from: {', '.join(NEEDS)}.")
     return tuple(name for name in NEEDS if name in asked)
 
 

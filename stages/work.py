@@ -30,8 +30,8 @@ from splatpipe.pipeline.train.limits import (
     worthwhile_iterations,
 )
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
-from splatpipe.pipeline.web.options import format_names
-from splatpipe.stages.block_work import BEGINNING_S, LAYOUT_S, BlockLoad, BlockWork
+from splatpipe.pipeline.web.options import parse_formats
+from splatpipe.stages.block_work import LAYOUT_S, START_S, BlockLoad, BlockWork
 from splatpipe.stages.costs import FORMAT_COSTS, IN_LEVELS, LEVELS_CPU, WITH_PHOTOS, Costs
 from splatpipe.stages.options import LineConfig
 
@@ -85,7 +85,7 @@ TRAINING = {"blocks": "train", "train": "train"}
 
 @dataclass(frozen=True)
 class CaptureSize:
-    """What is known of a capture before processing.
+    """What is known about a capture before processing.
 
     Attributes:
         photos: Number of photos.
@@ -214,7 +214,7 @@ class CaptureWork:
         return replace(longer, gaussians=min(self.most_gaussians, longer.grown, fitting))
 
     @property
-    def looked_at(self) -> float:
+    def keypoint_megapixels(self) -> float:
         """Megapixels per photo for keypoint extraction."""
         return min(self.size.megapixels, self.size.shape * self.config.features.max_image_size**2 / MEGA)
 
@@ -223,7 +223,7 @@ class CaptureWork:
         """Keypoints per photo."""
         options = self.config.features
         most = MAX_KEYPOINTS[options.extractor] * options.max_features
-        return min(most, self.costs.keypoints[options.extractor] * self.looked_at)
+        return min(most, self.costs.keypoints[options.extractor] * self.keypoint_megapixels)
 
     @property
     def pairs(self) -> float:
@@ -236,19 +236,19 @@ class CaptureWork:
         return min(every, self.costs.pairs * photos * options.neighbours / NEIGHBOURS)
 
     @property
-    def trained_at(self) -> float:
+    def training_megapixels(self) -> float:
         """Megapixels of a training photo at the finest level."""
-        return min(self.kept_at, self.config.train.max_megapixels or self.kept_at)
+        return min(self.dataset_megapixels, self.config.train.max_megapixels or self.dataset_megapixels)
 
     @property
-    def kept_at(self) -> float:
+    def dataset_megapixels(self) -> float:
         """Megapixels of a photo in the dataset."""
         return min(self.size.megapixels, self.config.undistort.max_megapixels)
 
     @property
     def footage(self) -> PhotoSizes:
         """The photos at training size, and the largest window that memory allows."""
-        height = math.sqrt(MEGA * self.trained_at * self.size.shape)
+        height = math.sqrt(MEGA * self.training_megapixels * self.size.shape)
         window, limit = WINDOW_PIXELS["cpu"], self.config.train.max_memory_bytes
         if limit:
             window = window_within(limit - LIBRARIES_BYTES - FIXED_BYTES, window)
@@ -314,7 +314,7 @@ class CaptureWork:
         pace, turn = (self.config.train.least_iterations, photos) if auto else (self.iterations, 1)
         first, every = max(1, min(500, pace // 5), turn), max(1, min(100, pace // 10), turn)
         steps = max(1.0, 1.0 + (growth_until(self.lengths) - first) // every)
-        longer, larger = steps / PREVIEW_STEPS, self.trained_at / PREVIEW_MEGAPIXELS
+        longer, larger = steps / PREVIEW_STEPS, self.training_megapixels / PREVIEW_MEGAPIXELS
         return float(self.costs.gaussians * self.size.photos * longer**STEPS_POWER * larger**SIZE_POWER)
 
     @property
@@ -324,7 +324,7 @@ class CaptureWork:
         if 0.0 < budget < FILM_FROM_BUDGET_S:
             return 0.0
         size = film.film_size
-        frame = size[0] * size[1] / MEGA if size else min(self.trained_at, MOST_FILM_MEGAPIXELS)
+        frame = size[0] * size[1] / MEGA if size else min(self.training_megapixels, MOST_FILM_MEGAPIXELS)
         return film.seconds * film.fps * frame
 
     def units(self) -> dict[str, WorkUnits]:
@@ -332,9 +332,9 @@ class CaptureWork:
         size, train = self.size, self.config.train
         photos, pixels = float(size.photos), size.photos * size.megapixels
         keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
-        judged = photos * min(self.kept_at, JUDGED_MEGAPIXELS)
-        depths = photos * min(self.kept_at, self.config.depths.max_megapixels)
-        looked_through = photos * min(self.kept_at, SEEN_MEGAPIXELS)
+        judged = photos * min(self.dataset_megapixels, JUDGED_MEGAPIXELS)
+        depths = photos * min(self.dataset_megapixels, self.config.depths.max_megapixels)
+        looked_through = photos * min(self.dataset_megapixels, SEEN_MEGAPIXELS)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
         done = self.done
@@ -344,8 +344,8 @@ class CaptureWork:
             resident = self.costs.stages["train"].resident
             coarse_load = BlockLoad(self.blocks.coarse_gaussians, 0.0)
             state, coarse_state = (self.block_memory_bytes(load) - resident for load in (self.blocks.load, coarse_load))
-        looked = photos * self.looked_at * SIFT_WORK[extractor]
-        looked_at_once = self.threads * self.looked_at * SIFT_MEMORY[extractor]
+        looked = photos * self.keypoint_megapixels * SIFT_WORK[extractor]
+        looked_at_once = self.threads * self.keypoint_megapixels * SIFT_MEMORY[extractor]
         controlled = float(size.control)
         targets_at_once = self.threads * min(size.megapixels, TARGETS_TILE)
         return {
@@ -356,7 +356,7 @@ class CaptureWork:
             "sparse": WorkUnits(keypoints * mapping, keypoints, keypoints),
             "targets": WorkUnits(controlled * pixels, controlled * targets_at_once, controlled * photos),
             "georef": WorkUnits(photos, keypoints, keypoints),
-            "undistort": WorkUnits(pixels, at_once, photos * self.kept_at),
+            "undistort": WorkUnits(pixels, at_once, photos * self.dataset_megapixels),
             "split": WorkUnits(photos, 0.0, photos),
             "initialize": WorkUnits(photos if self.config.initialize.dense else 0.0, 0.0, START_SHARE * gaussians),
             "blocks": WorkUnits(done * self.coarse_training, coarse_state, 0.0),
@@ -408,33 +408,33 @@ class CaptureWork:
                 memory = min(memory, most)
             found[stage] = Need(
                 int(memory),
-                (cost.cpu * units.cpu + self._beginning_s(stage) + self._formats_s(stage)) / speed,
+                (cost.cpu * units.cpu + self._start_s(stage) + self._formats_s(stage)) / speed,
                 int(cost.disk * units.disk) + self._disk_of_blocks(stage) + self._disk_of_formats(stage),
                 self._scratch(stage, units),
                 PARALLEL.get(stage, 0.0),
             )
         return found
 
-    def _beginning_s(self, stage: str) -> float:
+    def _start_s(self, stage: str) -> float:
         """CPU seconds for laying out blocks and for starting each of them."""
         if self.blocks is None:
             return 0.0
         return {
-            "blocks": LAYOUT_S * self.size.photos * self.blocks.looks,
-            "train": BEGINNING_S * self.blocks.division.blocks,
+            "blocks": LAYOUT_S * self.size.photos * self.blocks.blocks_per_photo,
+            "train": START_S * self.blocks.division.blocks,
         }.get(stage, 0.0)
 
     def _formats_s(self, stage: str) -> float:
         """CPU seconds for writing the export formats."""
-        asked = format_names(self.config.export.formats) if stage == "export" else ()
-        each = sum(FORMAT_COSTS[name].cpu for name in asked if name in FORMAT_COSTS)
-        return self.gaussians * (each + (LEVELS_CPU if IN_LEVELS & set(asked) else 0.0))
+        formats = parse_formats(self.config.export.formats) if stage == "export" else ()
+        each = sum(FORMAT_COSTS[name].cpu for name in formats if name in FORMAT_COSTS)
+        return self.gaussians * (each + (LEVELS_CPU if IN_LEVELS & set(formats) else 0.0))
 
     def _disk_of_formats(self, stage: str) -> int:
         """Bytes on disk of the export formats."""
-        asked = format_names(self.config.export.formats) if stage == "export" else ()
-        photos = self.size.photos * self.kept_at if WITH_PHOTOS & set(asked) else 0.0
-        each = sum(FORMAT_COSTS[name].disk for name in asked if name in FORMAT_COSTS)
+        formats = parse_formats(self.config.export.formats) if stage == "export" else ()
+        photos = self.size.photos * self.dataset_megapixels if WITH_PHOTOS & set(formats) else 0.0
+        each = sum(FORMAT_COSTS[name].disk for name in formats if name in FORMAT_COSTS)
         return int(self.gaussians * each + self.costs.stages["undistort"].disk * photos)
 
     def _disk_of_blocks(self, stage: str) -> int:
@@ -447,7 +447,7 @@ class CaptureWork:
         """Bytes on disk while a stage runs: a copy of the features, or decoded photos and a checkpoint."""
         if stage in ("matches", "sparse"):
             return int(self.costs.stages["features"].disk * units.disk)
-        decoded = PYRAMID * PHOTO_BYTES * MEGA * self.trained_at
+        decoded = PYRAMID * PHOTO_BYTES * MEGA * self.training_megapixels
         if stage == "train" and self.blocks is None:
             return int(decoded * self.size.photos + units.memory)
         if stage == "train" and self.blocks is not None:

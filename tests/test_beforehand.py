@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.session import Request
 from splatpipe.stages.costs import REFERENCE
-from splatpipe.stages.forecast import forecast, least_memory_bytes
+from splatpipe.stages.forecast import forecast, min_memory_bytes
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import CaptureSize, CaptureWork
 
@@ -42,7 +42,7 @@ def test_a_time_budget_may_use_photos_at_full_size_unless_a_smaller_one_is_set(s
 
 
 def test_the_smallest_limit_that_the_message_names_is_accepted(tmp_path: Path) -> None:
-    least = least_memory_bytes(LineConfig())
+    least = min_memory_bytes(LineConfig())
     require_memory(request(tmp_path, "standard"))
     require_memory(request(tmp_path, "standard", max_memory_bytes=least))
     with pytest.raises(MachineError) as raised:
@@ -54,7 +54,7 @@ def test_a_run_states_its_cost_and_what_the_memory_limit_leaves_out(tmp_path: Pa
     told = forecast_text(request(tmp_path, "preview"))
     assert told.startswith("40 photos of 1.1 megapixels take about ") and "1,500 iterations" in told
     assert "GB of memory" in told and "GB of disk" in told and "memory holds" not in told
-    least = least_memory_bytes(LineConfig())
+    least = min_memory_bytes(LineConfig())
     tight = request(tmp_path, "standard", max_memory_bytes=least)
     assert "the memory holds" in forecast_text(tight) and "the photos would support more" in forecast_text(tight)
     assert forecast_text(request(tmp_path, "preview", time_budget_s=600.0)).endswith("GB of disk.")

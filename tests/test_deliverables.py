@@ -21,7 +21,7 @@ from splatpipe.pipeline.survey.frames import Frame, Origin
 from splatpipe.pipeline.survey.handover import facts_of, in_world, pose_in_world
 from splatpipe.pipeline.survey.world import open_world
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
-from splatpipe.pipeline.web.options import ExportConfig, format_names
+from splatpipe.pipeline.web.options import ExportConfig, parse_formats
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -139,6 +139,6 @@ def test_formats_that_need_a_scale_are_left_out_with_a_note(run: RunSplat, tmp_p
 
 def test_names_are_ordered_and_unknown_ones_refused() -> None:
     assert ExportConfig(formats=" laz, ply,model,laz ").formats == "model,laz"
-    assert format_names("") == ()
+    assert parse_formats("") == ()
     with pytest.raises(ValidationError, match="no format 'obj'"):
         ExportConfig(formats="obj")

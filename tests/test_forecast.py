@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.blocks.division import Division, SceneSize
 from splatpipe.pipeline.train.limits import bytes_per_gaussian
 from splatpipe.pipeline.web.options import FORMATS
 from splatpipe.stages import work as work_module
-from splatpipe.stages.block_work import BEGINNING_S
+from splatpipe.stages.block_work import START_S
 from splatpipe.stages.costs import FORMAT_COSTS, REFERENCE, WITH_PHOTOS
 from splatpipe.stages.forecast import (
     CaptureSize,
@@ -149,7 +149,7 @@ def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> 
     assert few.memory_bytes < more.memory_bytes < full.memory_bytes <= limit
     assert more.memory_bytes - few.memory_bytes == pytest.approx(10_000 * 1.25**4 * bytes_per_gaussian(3), rel=0.01)
     assert full.memory_bytes > 0.8 * work.blocks.division.memory_bytes - 240_000_000  # the bound counts more libraries
-    assert 1.9 * few.cpu_seconds < longer.cpu_seconds + BEGINNING_S and longer.scratch_bytes > few.scratch_bytes + 10**8
+    assert 1.9 * few.cpu_seconds < longer.cpu_seconds + START_S and longer.scratch_bytes > few.scratch_bytes + 10**8
     assert few.disk_bytes < more.disk_bytes and needs["train"].memory_bytes == full.memory_bytes
     assert needs["train"].cpu_seconds == pytest.approx(sum(need.cpu_seconds for need in (few, more, full, longer)))
     assert needs_of_blocks(work, {}, 1.0) == {}

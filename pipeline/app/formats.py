@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.web.options import FORMATS, format_names
+from splatpipe.pipeline.web.options import FORMATS, parse_formats
 from splatpipe.stages.line import GEOREF, LINE
 from splatpipe.stages.options import LineConfig
 
@@ -24,7 +24,7 @@ def with_formats(out: Path, formats: str) -> dict[str, Any]:
         UsageError: if there is no such format.
     """
     before = open_run_folder(out, LINE).config(LineConfig)[1].export.formats
-    return {"export": {"formats": ",".join(dict.fromkeys((*format_names(before), *_parse_names(formats))))}}
+    return {"export": {"formats": ",".join(dict.fromkeys((*parse_formats(before), *_parse_names(formats))))}}
 
 
 def check_possible(out: Path, formats: str) -> None:
@@ -49,7 +49,7 @@ def check_possible(out: Path, formats: str) -> None:
 
 def _parse_names(text: str) -> tuple[str, ...]:
     try:
-        names = format_names(text)
+        names = parse_formats(text)
     except ValueError as error:
         raise UsageError(f"--format: {error}.") from error
     if not text.strip(", "):

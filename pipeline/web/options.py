@@ -25,7 +25,7 @@ FORMATS = (
 written."""
 
 
-def format_names(text: str) -> tuple[str, ...]:
+def parse_formats(text: str) -> tuple[str, ...]:
     """The formats of a list like ``spz, glb``, each once, in the order of ``FORMATS``.
 
     Raises:
@@ -39,7 +39,7 @@ def format_names(text: str) -> tuple[str, ...]:
 
 
 def _checked(text: str) -> str:
-    return ",".join(format_names(text))
+    return ",".join(parse_formats(text))
 
 
 class ExportConfig(StageConfig):

@@ -23,7 +23,7 @@ from splatpipe.pipeline.splat.levels import LevelNode
 from splatpipe.pipeline.splat.scene import Axes, Scene, turn_of
 from splatpipe.pipeline.splat.spz import spz_bytes
 from splatpipe.pipeline.web import asset
-from splatpipe.pipeline.web.viewer import PageParts, ViewerCamera, ViewerScene, page_of, scene_facts, thinned
+from splatpipe.pipeline.web.viewer import PageParts, ViewerCamera, ViewerScene, page_points, render_page, scene_facts
 
 INDEX = "index.html"
 LEVELS = "levels.json"
@@ -66,14 +66,14 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
     for shown, address in zip(scene.cameras, thumbs, strict=True):
         if shown.thumb is not None and address is not None:
             (folder / address).write_bytes(shown.thumb)
-    points, colours = thinned(scene)
+    points, colours = page_points(scene)
     facts["points"] = {
         "address": _write(folder, "points.bin", points.astype("<f4").tobytes() + colours.tobytes()),
         "count": len(points),
     }
     levels = _write(folder, LEVELS, _json({"format": FORMAT, "nodes": tree}))
     facts["levels"] = {"tree": levels, "root": tree[0]["file"], "bytes": tree[0]["bytes"]}
-    page = page_of(scene, facts, _page_parts(folder, levels, tree[0]["file"]))
+    page = render_page(scene, facts, _page_parts(folder, levels, tree[0]["file"]))
     (folder / INDEX).write_text(page, encoding="utf-8")
 
 
@@ -93,7 +93,7 @@ def _page_parts(folder: Path, levels: str, first: str) -> PageParts:
 def _write_node(folder: Path, node: LevelNode, antialias: bool) -> dict[str, Any]:
     """Write a node's splat; returns its entry for `levels.json`, without the children."""
     origin = _middle(node.gaussians)
-    data = spz_bytes(_about(node.gaussians, origin), antialias, turn=turn_of(SPZ_AXES, "z up"))
+    data = spz_bytes(_relative_to(node.gaussians, origin), antialias, turn=turn_of(SPZ_AXES, "z up"))
     name = f"nodes/{_digest(data)}.spz"
     (folder / name).write_bytes(data)
     return {
@@ -124,7 +124,7 @@ def _core(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
     return core
 
 
-def _about(gaussians: Gaussians, origin: Float64[np.ndarray, " 3"]) -> Gaussians:
+def _relative_to(gaussians: Gaussians, origin: Float64[np.ndarray, " 3"]) -> Gaussians:
     means = (gaussians.means.detach().to(torch.float64) - torch.from_numpy(origin)).to(torch.float32)
     return Gaussians(means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh)
 

@@ -26,9 +26,9 @@ POLICY = (
     " style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:;"
     " base-uri 'none'; form-action 'none'"
 )
-MAX_POINTS = 150_000  # that the page includes, 15 bytes each; more are thinned evenly
+MAX_POINTS = 150_000  # in the page, 15 bytes each; more are thinned evenly
 SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis; they bound the scene
-NEARLY_ALL = 0.9  # of the points in focus: a few on the far side are no reason to start from far away
+NEARLY_ALL = 0.9  # of the points in focus: the view need not start from far away because of a few on the far side
 NEAR_PER_SIZE = 1e-3  # near plane as a share of the scene's size, if the caller gives none
 
 
@@ -110,13 +110,13 @@ def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
     """
     inlined = isinstance(splat, bytes)
     carried = f'<script type="text/plain" id="splat">{_base64(splat)}</script>' if isinstance(splat, bytes) else ""
-    points, colours = thinned(scene)
+    points, colours = page_points(scene)
     facts = scene_facts(scene, [None if shown.thumb is None else _jpeg_address(shown.thumb) for shown in scene.cameras])
     facts["points"] = {"xyz": _base64(points.astype("<f4").tobytes()), "rgb": _base64(colours.tobytes())}
     facts["splat"] = {"inlined": inlined, "address": "" if inlined else splat}
     script = asset("viewer.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")
     style, script = f"<style>{asset('viewer.css')}</style>", f"{carried}\n<script>{script}</script>"
-    return page_of(scene, facts, PageParts(POLICY, style, script))
+    return render_page(scene, facts, PageParts(POLICY, style, script))
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class PageParts:
     script: str
 
 
-def page_of(scene: ViewerScene, facts: Mapping[str, Any], parts: PageParts) -> str:
+def render_page(scene: ViewerScene, facts: Mapping[str, Any], parts: PageParts) -> str:
     """Render the page's HTML.
 
     Args:
@@ -184,7 +184,7 @@ def scene_facts(scene: ViewerScene, thumbs: Sequence[str | None]) -> dict[str, A
     if not scene.cameras:
         raise ValueError("a viewer needs a camera to begin from")
     centres = np.array([shown.camera.centre() for shown in scene.cameras])
-    shown = thinned(scene)[0] if scene.focus is None or not scene.focus.any() else scene.points[scene.focus]
+    shown = page_points(scene)[0] if scene.focus is None or not scene.focus.any() else scene.points[scene.focus]
     least, most = np.quantile(shown if len(shown) else centres, SIZE_QUANTILES, axis=0)
     size = float(np.linalg.norm(most - least)) or 1.0
     return {
@@ -223,7 +223,7 @@ def _sky(sky: ViewerSky) -> dict[str, Any]:
     }
 
 
-def thinned(scene: ViewerScene) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+def page_points(scene: ViewerScene) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """The sparse points that a page shows, and their colours."""
     usable = np.flatnonzero(np.isfinite(scene.points).all(axis=1))
     step = max(1, -(-len(usable) // MAX_POINTS))

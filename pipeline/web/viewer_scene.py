@@ -34,7 +34,7 @@ THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows;
 MAX_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
 SKY_ROWS = 64  # twice the panorama's, so that the blur of interpolating twice is invisible
-CLEARLY_TILTED = 0.6  # image component of the up direction: in steep views from above, no edge is clearly the top
+CLEARLY_TILTED = 0.6  # of the up direction, in the image: in steep views from above, no edge is clearly the top
 
 
 @dataclass(frozen=True)

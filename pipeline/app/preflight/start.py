@@ -38,10 +38,10 @@ def require_memory(request: Request) -> None:
         MachineError: if the training libraries and the smallest model need more.
     """
     from splatpipe.pipeline.engine.errors import MachineError
-    from splatpipe.stages.forecast import least_memory_bytes
+    from splatpipe.stages.forecast import min_memory_bytes
 
     config = cast("LineConfig", request.config)
-    limit, least = config.train.max_memory_bytes, least_memory_bytes(config)
+    limit, least = config.train.max_memory_bytes, min_memory_bytes(config)
     if 0 < limit < least and not _on_cuda(request):
         raise MachineError(
             f"Training does not fit in {limit / 1e9:.2f} GB: the libraries alone take most of {least / 1e9:.2f} GB.",
