@@ -29,7 +29,7 @@ struct LossJob {
 
 constexpr int kLossTileRows = 128;
 constexpr int kLossTileCols = 256;
-constexpr std::size_t kLossScratch = 116'000;  // floats of working memory per tile
+constexpr std::size_t kLossScratch = 116'000;  // floats a tile works in
 
 // Sums over a tile's counting pixels and channels.
 struct LossSums {
