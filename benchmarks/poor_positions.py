@@ -26,7 +26,7 @@ from tables import Row, print_table
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity, rotation_from_vector, turn_between
 from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.gps import georeference
@@ -178,7 +178,7 @@ def row_of(scene: SimulatedCameras, case: PositionError, seeds: int) -> Row:
         positions, wrong = stated(part, case, seed)
         try:
             frame, _ = georeference(part.model, positions, "auto", photos)
-        except NoPlaceError:
+        except FrameUndeterminedError:
             continue
         told = frame.residuals["uncertainty"]
         keys = ("offset", "north", "up", "scale")

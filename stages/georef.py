@@ -21,9 +21,9 @@ from splatpipe.pipeline.survey.blunders import gsd_m
 from splatpipe.pipeline.survey.boundary import lay_boundary
 from splatpipe.pipeline.survey.control import ControlResult, GeorefInput, place_by_control
 from splatpipe.pipeline.survey.crs import parse_vertical
-from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame, save_frame
-from splatpipe.pipeline.survey.gps import georeference, read_positions, tell
+from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of
 from splatpipe.pipeline.survey.model import SparseModel, copy_model, read_model
@@ -77,7 +77,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         capture = GeorefInput(model, positions, photos, priors, inputs.settings.get("sparse.lens") == "held")
         try:
             controlled = place_by_control(survey, capture, None if isinstance(frame, str) else frame, config, report)
-        except NoPlaceError as error:
+        except FrameUndeterminedError as error:
             frame = str(error) if isinstance(frame, str) else frame
             report.warning(
                 f"Control cannot georeference the model: {error}.", "Mark more control points, each in several photos."
@@ -100,8 +100,8 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     accuracy |= scale_json(targets.wanted.bars, scale, frame)
     for name, value in (("control.json", control), ("accuracy.json", accuracy)):
         write_json(out / name, value)
-    if controlled is not None and controlled.bent is not None:
-        write_model(controlled.bent, out / "sparse" / "0")
+    if controlled is not None and controlled.adjusted is not None:
+        write_model(controlled.adjusted, out / "sparse" / "0")
     else:
         copy_model(source, out / "sparse" / "0", may_link=inputs.photos_dir not in source.parents)
     report.progress(3, 3, "fitting the control", "steps")
@@ -131,9 +131,9 @@ def _by_positions(
     """Return the frame fitted to the positions, or the reason why there is none."""
     try:
         frame, fit = georeference(model, positions, config.max_position_error_m, photos)
-    except NoPlaceError as error:
+    except FrameUndeterminedError as error:
         return str(error)
-    tell(frame, fit, model, positions, report)
+    report_fit(frame, fit, model, positions, report)
     return frame
 
 
@@ -223,7 +223,7 @@ def _summary(frame: Frame, controlled: ControlResult | None, accuracy: JSON) -> 
             "control_points": roles.count("control"),
             "check_points": roles.count("check"),
             "points_left_out": roles.count("left_out"),
-            "model_bent": controlled.bent is not None,
+            "model_bent": controlled.adjusted is not None,
             "moved_px": controlled.moved_px,
             "focal_held": list(controlled.focal_held),
             "control_sigmas_times": controlled.sigma_factor,

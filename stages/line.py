@@ -52,7 +52,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=5,
+    version=6,
     config=SparseConfig,
     reads=(
         "matches.database",
@@ -87,7 +87,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=8,
+    version=9,
     config=GeorefConfig,
     reads=(
         "sparse.model",

@@ -157,7 +157,7 @@ def test_the_window_that_is_timed_is_the_middle_of_its_photo() -> None:
     colour = torch.rand(camera.height, camera.width, 3)
     window = middle_of(TrainingPhoto(camera, colour, None))
     left, top = (camera.width - window.camera.width) // 2, (camera.height - window.camera.height) // 2
-    assert window.camera.whole() == camera and window.share == pytest.approx(0.25, abs=0.01)
+    assert window.camera.uncropped() == camera and window.share == pytest.approx(0.25, abs=0.01)
     assert torch.equal(window.colour, colour[top : top + window.camera.height, left : left + window.camera.width])
 
 

@@ -69,7 +69,7 @@ def photo(width: int = WIDTH, height: int = HEIGHT) -> Tensor:
 def everything(model: Gaussians, where: torch.device, depth: bool, part: Rectangle = WHOLE) -> dict[str, Tensor]:
     """Return images, loss and gradients of a view or a window of it, whose rim does not count; moved to the CPU."""
     left, top, right, bottom = part
-    here, view = (slice(top, bottom), slice(left, right)), camera().cut(left, top, right - left, bottom - top)
+    here, view = (slice(top, bottom), slice(left, right)), camera().crop(left, top, right - left, bottom - top)
     inner = None if part == WHOLE else (SSIM_REACH_PX, SSIM_REACH_PX, view.width - 2, view.height - 2)
     leaves = model.clone().to(where).requires_grad_()
     probe = torch.zeros(len(model), 2, device=where, requires_grad=True)

@@ -44,7 +44,7 @@ def long() -> RenderCase:
     """More tile rows than one thread processes; a window of an image, at the limits of the whole."""
     scene = random_scene(13, 120, 0, size=-1.5)
     scene.log_scales[:, 0] += 2.0
-    return case_of(scene, random_camera(13, 60, 180).cut(15, 10, 20, 150), depths=False, magnitudes=True)
+    return case_of(scene, random_camera(13, 60, 180).crop(15, 10, 20, 150), depths=False, magnitudes=True)
 
 
 def many() -> RenderCase:

@@ -8,7 +8,7 @@ import pytest
 
 from splatpipe.pipeline.geometry.alignment import Correspondences, SharedErrors, robust_similarity
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.survey.flights import Stamp, tell_flights
+from splatpipe.pipeline.survey.flights import Stamp, assign_flights
 
 from .test_georef import Survey, errors_m, georef, grid, survey
 
@@ -21,32 +21,32 @@ def flight(start_s: float, takeoff_m: float, photos: int = 20, noise_m: float = 
 
 
 def test_photos_taken_in_one_go_are_one_flight() -> None:
-    assert tell_flights(flight(0.0, 509.0)) == [0] * 20
-    assert tell_flights(flight(0.0, 509.0, noise_m=4.0, photos=60)) == [0] * 60
-    assert tell_flights([Stamp(("A",)), Stamp(("A",), 5.0), Stamp(("A",), math.nan, 3.0)]) == [0, 0, 0]
-    assert tell_flights([]) == []
+    assert assign_flights(flight(0.0, 509.0)) == [0] * 20
+    assert assign_flights(flight(0.0, 509.0, noise_m=4.0, photos=60)) == [0] * 60
+    assert assign_flights([Stamp(("A",)), Stamp(("A",), 5.0), Stamp(("A",), math.nan, 3.0)]) == [0, 0, 0]
+    assert assign_flights([]) == []
 
 
 def test_a_pause_ends_a_flight_and_slow_photographers_do_not() -> None:
-    assert tell_flights(flight(0.0, 509.0) + flight(600.0, 509.0)) == [0] * 20 + [1] * 20
-    assert tell_flights([Stamp(("A",), 60.0 * i + (400.0 if i > 5 else 0.0)) for i in range(12)]) == [0] * 12
+    assert assign_flights(flight(0.0, 509.0) + flight(600.0, 509.0)) == [0] * 20 + [1] * 20
+    assert assign_flights([Stamp(("A",), 60.0 * i + (400.0 if i > 5 else 0.0)) for i in range(12)]) == [0] * 12
 
 
 def test_another_aircraft_is_another_flight_at_the_same_time() -> None:
     pairs = zip(flight(0.0, 509.0), flight(1.0, 509.0, device="B"), strict=True)
-    assert tell_flights([stamp for pair in pairs for stamp in pair]) == [0, 1] * 20
+    assert assign_flights([stamp for pair in pairs for stamp in pair]) == [0, 1] * 20
 
 
 def test_a_step_of_the_takeoff_altitude_is_another_flight() -> None:
-    assert tell_flights(flight(0.0, 509.0) + flight(62.0, 512.5)) == [0] * 20 + [1] * 20
-    assert tell_flights(flight(0.0, 509.0, noise_m=0.2) + flight(62.0, 556.0, noise_m=0.2)) == [0] * 20 + [1] * 20
-    assert tell_flights(flight(0.0, 509.0, noise_m=3.0) + flight(62.0, 511.0, noise_m=3.0)) == [0] * 40
+    assert assign_flights(flight(0.0, 509.0) + flight(62.0, 512.5)) == [0] * 20 + [1] * 20
+    assert assign_flights(flight(0.0, 509.0, noise_m=0.2) + flight(62.0, 556.0, noise_m=0.2)) == [0] * 20 + [1] * 20
+    assert assign_flights(flight(0.0, 509.0, noise_m=3.0) + flight(62.0, 511.0, noise_m=3.0)) == [0] * 40
 
 
 def test_flights_are_distinguished_whatever_the_order_of_names() -> None:
     stamps = flight(0.0, 509.0) + flight(600.0, 509.0)
     order = np.random.default_rng(0).permutation(len(stamps))
-    told = tell_flights([stamps[index] for index in order])
+    told = assign_flights([stamps[index] for index in order])
     assert len({(number, index >= 20) for number, index in zip(told, order, strict=True)}) == 2
 
 

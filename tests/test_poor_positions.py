@@ -14,10 +14,10 @@ from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.geometry.alignment import robust_similarity
 from splatpipe.pipeline.geometry.correspondences import Correspondences, SharedErrors
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector, turn_between
-from splatpipe.pipeline.survey.fitting import NoPlaceError, PositionFit
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError, PositionFit
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.gps import georeference, tell
+from splatpipe.pipeline.survey.gps import georeference, report_fit
 from splatpipe.pipeline.survey.level import Positions
 from splatpipe.pipeline.survey.local_survey import stations_of
 from splatpipe.pipeline.survey.model import SparseModel
@@ -150,13 +150,13 @@ def test_altitude_that_drifts_does_not_tilt_the_model() -> None:
     assert errors["up"] < 8.0
     assert all(abs(errors[name]) <= bounds[name] for name in errors)
     notes = corner_photos.Recorder()
-    tell(frame, fit, model, stated(model, places), notes)
+    report_fit(frame, fit, model, stated(model, places), notes)
     assert any("positions are inaccurate" in warning for warning in notes.warnings)
 
 
 def test_noise_that_leaves_scale_unknown_is_refused_with_its_size() -> None:
     rng = np.random.default_rng(0)
-    with pytest.raises(NoPlaceError, match="agree with the model: they are off by") as told:
+    with pytest.raises(FrameUndeterminedError, match="agree with the model: they are off by") as told:
         placed(cameras(), CENTRES + 90.0 * rng.normal(size=CENTRES.shape))
     assert "%" in str(told.value)
 

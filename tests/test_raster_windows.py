@@ -85,7 +85,7 @@ def check_part(part: tuple[int, int, int, int], dtype: torch.dtype, options: Ren
     camera, weights = random_camera(4, *SIZE), upstream_of(part)
     whole, gradients = rendered(camera, weights, dtype, options)
     cut = {name: weight[here] for name, weight in weights.items()}
-    made, found = rendered(camera.cut(*part), cut, dtype, options)
+    made, found = rendered(camera.crop(*part), cut, dtype, options)
     for name in PICTURES:
         assert relative(getattr(made, name).detach(), getattr(whole, name).detach()[here]) < RTOL[dtype], name
     for name, gradient in gradients.items():
@@ -126,7 +126,7 @@ def test_variants_of_a_window_match_the_whole(change):
 def test_windows_of_a_window_match_the_whole():
     """A window of a window refers to the whole, not to the window that it was cut from."""
     camera = random_camera(4, *SIZE)
-    at_once, in_two = camera.cut(21, 17, 33, 18), camera.cut(10, 10, 50, 40).cut(11, 7, 33, 18)
+    at_once, in_two = camera.crop(21, 17, 33, 18), camera.crop(10, 10, 50, 40).crop(11, 7, 33, 18)
     weights = {name: weight[17:35, 21:54] for name, weight in upstream_of(PARTS["middle"]).items()}
     (ours, gradients), (theirs, others) = (rendered(each, weights, torch.float32) for each in (at_once, in_two))
     assert torch.equal(ours.colour, theirs.colour)
@@ -136,7 +136,7 @@ def test_windows_of_a_window_match_the_whole():
 @pytest.mark.parametrize("backend", ["reference", "native", "cuda"])
 def test_the_scene_would_reveal_limits_of_the_window_itself(cuda, backend):
     """The scene suits these tests: with the window's own frustum, as of a small photo, the image would differ."""
-    part = random_camera(4, *SIZE).cut(*PARTS["middle"])
+    part = random_camera(4, *SIZE).crop(*PARTS["middle"])
     alone = Camera(part.name, part.width, part.height, part.fx, part.fy, part.cx, part.cy, part.cam_from_world)
     dtype = torch.float64 if backend == "reference" else torch.float32
     weights = {"colour": torch.ones(part.height, part.width, 3, dtype=torch.float64)}
@@ -155,7 +155,7 @@ def test_each_gaussian_that_reaches_a_pixel_is_visible_in_a_window():
     for top, height in ((0, 26), (26, 27)):
         for left, width in ((0, 17), (17, 31), (48, 22)):
             here = {name: weight[top : top + height, left : left + width] for name, weight in weights.items()}
-            made, found = rendered(camera.cut(left, top, width, height), here, torch.float32)
+            made, found = rendered(camera.crop(left, top, width, height), here, torch.float32)
             seen |= made.visible
             for name, gradient in found.items():
                 summed[name] += gradient

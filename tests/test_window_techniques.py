@@ -67,7 +67,7 @@ def windows(whole: TrainingPhoto, pixels: int = WINDOW_PIXELS) -> list[TrainingP
         rows, columns = slice(cut.top, cut.bottom), slice(cut.left, cut.right)
         inner = window.within(cut)
         here = counts[window.top : window.bottom, window.left : window.right].sum()
-        camera = whole.camera.cut(cut.left, cut.top, cut.width, cut.height)
+        camera = whole.camera.crop(cut.left, cut.top, cut.width, cut.height)
         mask = None if whole.mask is None else whole.mask[rows, columns]
         share = float(here / counts.sum())
         found.append(TrainingPhoto(camera, whole.colour[rows, columns], mask, bool(here == 0), inner, share))
@@ -140,7 +140,7 @@ def test_the_sky_of_a_window_is_the_whole_photos_there(size: tuple[int, int]) ->
     bits = torch.from_numpy(found.bits)
     wholes = photo_sky_on_cpu(found, camera), photo_sky_on_device(bits, found.shape, camera)
     for window in windows_of(*size, size[0] * size[1] // 5):
-        part = camera.cut(window.left, window.top, window.width, window.height)
+        part = camera.crop(window.left, window.top, window.width, window.height)
         rows, columns = slice(window.top, window.bottom), slice(window.left, window.right)
         parts = photo_sky_on_cpu(found, part), photo_sky_on_device(bits, found.shape, part)
         for seen, whole in zip(parts, wholes, strict=True):
@@ -241,7 +241,7 @@ def visited(robust: RobustMask, photos: list[TrainingPhoto]) -> list[TrainingPho
 
 def left_out(photos: list[TrainingPhoto]) -> Tensor:
     """Return the pixels inside each window that are left out of the loss."""
-    whole = photos[0].camera.whole()
+    whole = photos[0].camera.uncropped()
     found = torch.zeros(whole.height, whole.width, dtype=torch.bool)
     for photo in photos:
         place, camera = photo.camera.window, photo.camera

@@ -81,7 +81,7 @@ class Camera:
             ValueError: for a crop, whose pixels would not coincide with those of the full image.
         """
         if self.window is not None:
-            raise ValueError(f"{self.name}: a part of a picture cannot be resampled, scale the whole and cut it")
+            raise ValueError(f"{self.name}: a crop cannot be resampled: scale the full image, then crop it")
         by_x, by_y = width / self.width, height / self.height
         return replace(
             self,
@@ -93,7 +93,7 @@ class Camera:
             cy=self.cy * by_y,
         )
 
-    def cut(self, left: int, top: int, width: int, height: int) -> Camera:
+    def crop(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of a crop of the image, pixel for pixel the same view.
 
         Args:
@@ -109,30 +109,30 @@ class Camera:
             ValueError: if the crop is not inside this image.
         """
         if min(left, top) < 0 or min(width, height) < 1 or left + width > self.width or top + height > self.height:
-            raise ValueError(f"{width}×{height} from ({left}, {top}) is no part of {self.width}×{self.height} pixels")
+            raise ValueError(f"{width}×{height} from ({left}, {top}) is not inside {self.width}×{self.height} pixels")
         if (width, height) == (self.width, self.height):
             return self
-        held = self.window or Window(0, 0, self.width, self.height)
+        window = self.window or Window(0, 0, self.width, self.height)
         return replace(
             self,
             width=width,
             height=height,
             cx=self.cx - left,
             cy=self.cy - top,
-            window=replace(held, left=held.left + left, top=held.top + top),
+            window=replace(window, left=window.left + left, top=window.top + top),
         )
 
-    def whole(self) -> Camera:
+    def uncropped(self) -> Camera:
         """The camera of the full image; this camera itself if it is not a crop."""
-        part = self.window
-        if part is None:
+        window = self.window
+        if window is None:
             return self
         return replace(
             self,
-            width=part.whole_width,
-            height=part.whole_height,
-            cx=self.cx + part.left,
-            cy=self.cy + part.top,
+            width=window.whole_width,
+            height=window.whole_height,
+            cx=self.cx + window.left,
+            cy=self.cy + window.top,
             window=None,
         )
 

@@ -103,7 +103,7 @@ def projection_jacobian(points: Float[Tensor, "n 3"], camera: Camera) -> Float[T
         camera: The view; its principal point need not be central. For a window of an image the whole image's frustum
             counts, so that the window renders exactly as in the whole.
     """
-    camera = camera.whole()
+    camera = camera.uncropped()
     fx, fy = camera.fx, camera.fy
     x, y, z = points.unbind(-1)
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * camera.width, FRUSTUM_MARGIN * 0.5 * camera.height

@@ -99,7 +99,7 @@ def strips(camera: Camera) -> list[Camera]:
     if camera.width * rows > STRIP_PIXELS:
         rows = max(STEP_PX, STRIP_PIXELS // camera.width // STEP_PX * STEP_PX)
     tops = range(0, camera.height, rows)
-    return [camera.cut(0, top, camera.width, min(rows, camera.height - top)) for top in tops]
+    return [camera.crop(0, top, camera.width, min(rows, camera.height - top)) for top in tops]
 
 
 def _by_strips(camera: Camera, made: Callable[[Camera], np.ndarray]) -> np.ndarray:

@@ -76,11 +76,11 @@ class Reconstructor:
         chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size, coarseness=wide), **options)
         work = map_incremental if mapper == "incremental" else map_global
 
-        def tell(placed: int, total: int, what: str) -> None:
+        def progress(placed: int, total: int, what: str) -> None:
             self.report.progress(placed, total, what, "photos")
 
-        models = [model for model in work(self.database, self.capture.scratch, chosen, tell) if _has_points(model)]
-        tell(len(self.verified.names), len(self.verified.names), "placing photos")
+        models = [model for model in work(self.database, self.capture.scratch, chosen, progress) if _has_points(model)]
+        progress(len(self.verified.names), len(self.verified.names), "placing photos")
         judgement = judge(models[0], self.verified, self.capture.cameras) if models else None
         answer = MappingAttempt(how, mapper, chosen, models, judgement, time.process_time() - began)
         self.tried.append(answer)
@@ -132,7 +132,7 @@ def _best(work: Reconstructor) -> MappingAttempt:
         work.notes[id(best)] = f"doubtful: {'; '.join(doubts)}"
         best = _better(best, _with_held_focal(work, work.map("global", "global")))
     if best.placed < ENOUGH_SHARE * total and work.config.mapper != "global":
-        relaxed = work.map("incremental", "incremental, lower demands", relaxed=True)
+        relaxed = work.map("incremental", "incremental, relaxed thresholds", relaxed=True)
         best = _better(best, _with_held_focal(work, relaxed))
     return best
 
@@ -144,11 +144,11 @@ def _doubts(answer: MappingAttempt, total: int, verified: ViewGraph) -> list[str
     found = []
     if answer.placed < MAX_SHARE * total:
         found.append(f"{answer.placed} of {total} photos placed")
-    told = {"focal": "the focal length ran away", "bent": "pairs of photos contradict it"}
-    told["unexplained"] = "many matches are not explained"
-    found += sorted({told[reason.kind] for reason in answer.judgement.reasons if reason.kind in told})
+    texts = {"focal": "the focal length diverged", "bent": "pairs of photos contradict it"}
+    texts["unexplained"] = "many matches are unexplained"
+    found += sorted({texts[reason.kind] for reason in answer.judgement.reasons if reason.kind in texts})
     if not any(verified.cameras[number].has_prior_focal_length for number in _used(answer.models[0])):
-        found.append("nothing was known of the focal length")
+        found.append("the focal length was unknown")
     return found
 
 
@@ -176,8 +176,8 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
         found = probe(work.capture, model, (work.database, work.verified), count, work.config.seed, work.report)
         if not found.held:
             break
-        told = f"of {found.tried} pairs that it foretells {found.held} hold, {found.contradicting} of them against it"
-        work.notes[id(answer)] = "; ".join(filter(None, [work.notes.get(id(answer), ""), told]))
+        note = f"{found.held} of {found.tried} predicted pairs were verified, {found.contradicting} contradict it"
+        work.notes[id(answer)] = "; ".join(filter(None, [work.notes.get(id(answer), ""), note]))
         work.database, work.verified = found.database, found.verified
         answer = _judged_again(work, answer)
         if not (thin or found.prove_a_bend):
@@ -237,17 +237,17 @@ def _row(answer: MappingAttempt) -> dict[str, JSON]:
     }
     if answer.judgement is None:
         return row
-    model, told = answer.models[0], answer.judgement
+    model, judgement = answer.models[0], answer.judgement
     return {
         **row,
         "points3d": model.num_points3D(),
         "error_px": round(model.compute_mean_reprojection_error(), 3),
         "focal_px": [round(camera.mean_focal_length(), 1) for _, camera in sorted(model.cameras.items())],
-        "explained": round(told.explained, 4),
-        "held_out": round(told.held_out, 4),
-        "contradicted": [told.contradicted, told.pairs],
-        "score": round(told.score, 4),
-        "level": told.level,
+        "explained": round(judgement.explained, 4),
+        "held_out": round(judgement.held_out, 4),
+        "contradicted": [judgement.contradicted, judgement.pairs],
+        "score": round(judgement.score, 4),
+        "level": judgement.level,
     }
 
 

@@ -143,7 +143,7 @@ class DepthPart:
 
 def _part(number: int, found: PosedDepthMap, window: PhotoWindow) -> DepthPart:
     cut = np.s_[window.top : window.bottom, window.left : window.right]
-    camera = found.camera.cut(window.left, window.top, window.right - window.left, window.bottom - window.top)
+    camera = found.camera.crop(window.left, window.top, window.right - window.left, window.bottom - window.top)
     return DepthPart(number, camera, found.depth[cut].copy(), found.confidence[cut].copy())
 
 

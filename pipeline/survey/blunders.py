@@ -100,7 +100,7 @@ def name_blunders(
         points[a] = points[a].left_out(f"it looks swapped with {points[b].name}")
         points[b] = points[b].left_out(f"it looks swapped with {points[a].name}")
     for k in sorted(suspects.difference(*swapped)):
-        points[k] = _told_off(points[k], offset_of(points[k], site, k, fit.similarity), report)
+        points[k] = _left_out_blunder(points[k], offset_of(points[k], site, k, fit.similarity), report)
     return survey.with_points(points)
 
 
@@ -145,7 +145,7 @@ def is_off(
     return studentised(residual, sigmas, known) > critical(fit.degrees) and float(np.linalg.norm(residual)) > least_m
 
 
-def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Reporter) -> None:
+def warn_of_datum_offset(fit: JointFit, survey: Survey, stations: Stations, report: Reporter) -> None:
     """Warn if the control is offset from the positions by more than their accuracy allows."""
     if len(stations) == 0:
         return
@@ -166,7 +166,7 @@ def tell_datum(fit: JointFit, survey: Survey, stations: Stations, report: Report
         )
 
 
-def tell_weak(fit: JointFit, observed: JointObservations, model: SparseModel, report: Reporter) -> None:
+def warn_of_weak_control(fit: JointFit, observed: JointObservations, model: SparseModel, report: Reporter) -> None:
     """Warn if the control's geometry is weak (few points, in one corner or on a line), so that it extrapolates
     badly."""
     control = observed.sigmas[observed.is_control]
@@ -198,7 +198,7 @@ def gsd_m(survey: Survey, model: SparseModel, scale: float) -> float:
     return float(np.median(sizes)) if sizes else 0.0
 
 
-def _told_off(point: SurveyPoint, off: _Offset, report: Reporter) -> SurveyPoint:
+def _left_out_blunder(point: SurveyPoint, off: _Offset, report: Reporter) -> SurveyPoint:
     if point.role == "check":
         report.warning(
             f"Check point {point.name} lies {off.length:.2f} m from its surveyed position ({off}).",

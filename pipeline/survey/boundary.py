@@ -63,7 +63,7 @@ def lay_boundary(
         return {}
     drawing = read_boundary(path)
     boundary = placed(drawing, frame, frame.world_from_model.apply(points))
-    _tell(drawing, boundary, len(points), report)
+    _report_boundary(drawing, boundary, len(points), report)
     value = {
         "format": FORMAT,
         "world": boundary.area.facts(),
@@ -167,7 +167,7 @@ def _elsewhere(
     )
 
 
-def _tell(drawing: BoundaryFile, boundary: Boundary, points: int, report: Reporter) -> None:
+def _report_boundary(drawing: BoundaryFile, boundary: Boundary, points: int, report: Reporter) -> None:
     if drawing.crossing:
         x, y = drawing.crossing
         report.warning(

@@ -15,7 +15,7 @@ from splatpipe.pipeline.geometry.joint_fit import SIMILARITY, JointFit, fit_join
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel
 from splatpipe.pipeline.survey.adjustment import ControlAdjustment, Target, adjust, can_adjust, moved_px
-from splatpipe.pipeline.survey.blunders import name_blunders, require_near, tell_datum, tell_weak
+from splatpipe.pipeline.survey.blunders import name_blunders, require_near, warn_of_datum_offset, warn_of_weak_control
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.level import Positions
@@ -33,7 +33,7 @@ from splatpipe.pipeline.survey.model import SparseModel, model_of
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.surveyed_points import Survey, locate
 
-BENT_PX = 0.5  # least RMS shift in the images by which control must deform the model for the adjusted one to be used
+MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if control deforms the model by less, it is not adjusted
 QUIET = 2.0  # times the stated sigmas; control with residuals up to this keeps its sigmas
 STRAY = 0.1  # relative deviation of a focal length from its prior that is worth a warning
 SUSPICIOUS = 1.0  # noise over sigmas; sound control with realistic sigmas stays well below
@@ -71,7 +71,7 @@ class ControlResult:
         survey: The points with their final roles, triangulated in the resulting model.
         site: The survey in the world frame.
         placed: The resulting model in the world frame.
-        bent: The resulting model if the adjustment changed it; None if it is unchanged.
+        adjusted: The resulting model if the adjustment changed it; None if it is unchanged.
         moved_px: How far the adjustment moved the images' content, RMS; None if nothing was adjusted.
         sigma_factor: Factor applied to the control's stated or assumed sigmas.
         focal_held: COLMAP ids of cameras whose focal length neither photos nor control determine.
@@ -81,7 +81,7 @@ class ControlResult:
     survey: Survey
     site: LocalSurvey
     placed: GeoreferencedModel
-    bent: pycolmap.Reconstruction | None
+    adjusted: pycolmap.Reconstruction | None
     moved_px: float | None
     sigma_factor: float
     focal_held: tuple[int, ...] = ()
@@ -100,7 +100,7 @@ def place_by_control(
         report: Receives warnings.
 
     Raises:
-        NoPlaceError: if there are neither positions nor enough control.
+        FrameUndeterminedError: if there are neither positions nor enough control.
         SplatpipeError: if the control is elsewhere, or its geometry contradicts the model's.
     """
     model = capture.model
@@ -112,8 +112,8 @@ def place_by_control(
     fit = fit_jointly(start[0], observed, start[1])
     require_fit(fit, observed, survey)
     factor = fit.noise if fit.noise > QUIET else 1.0
-    tell_datum(fit, survey, stations, report)
-    tell_weak(fit, observed, model, report)
+    warn_of_datum_offset(fit, survey, stations, report)
+    warn_of_weak_control(fit, observed, model, report)
     placed = GeoreferencedModel(model, fit.similarity, fit.offsets)
     result = ControlResult(_frame(frame, survey, site, fit, config), survey, site, placed, None, None, factor)
     if config.adjust == "auto" and int(observed.is_control.sum()) >= MIN_CONTROL:
@@ -121,7 +121,7 @@ def place_by_control(
             result = _adjusted(result, capture, config, report)
         else:
             report.warning("A model with camera rigs is georeferenced by control, but not adjusted to it.")
-    if result.bent is None:  # refit with the adjustment's roles and sigmas of control
+    if result.adjusted is None:  # refit with the adjustment's roles and sigmas of control
         observed = observed_in(site, result.survey, model, start[0].scale, config.mark_sigma_px)
         observed = with_sigmas_times(observed, result.sigma_factor)
         fit = fit_jointly(fit.similarity, observed, start[1])
@@ -228,28 +228,28 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
             "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… sets their standard "
             "deviation.",
         )
-    _tell_lens(done, capture, report)
+    _warn_of_focal_lengths(done, capture, report)
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
     result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held)
-    if moved < BENT_PX:
+    if moved < MIN_DEFORMATION_PX:
         return result
     report.note(
         f"Control moves what the photos show by {moved:.1f} px: the model is adjusted to it, and trained again."
     )
     world_from_model = result.placed.world_from_model
-    bent = pycolmap.Reconstruction(done.reconstruction)
+    adjusted = pycolmap.Reconstruction(done.reconstruction)
     back = world_from_model.inverse()
-    bent.transform(pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation))
-    model = model_of(bent, capture.photos)
+    adjusted.transform(pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation))
+    model = model_of(adjusted, capture.photos)
     points = [
         locate(point, model, capture.photos, config.mark_sigma_px) if point.found is not None else point
         for point in survey.points
     ]
     placed = GeoreferencedModel(model, world_from_model, done.offsets)
-    return replace(result, survey=survey.with_points(points), placed=placed, bent=bent)
+    return replace(result, survey=survey.with_points(points), placed=placed, adjusted=adjusted)
 
 
-def _tell_lens(done: ControlAdjustment, capture: GeorefInput, report: Reporter) -> None:
+def _warn_of_focal_lengths(done: ControlAdjustment, capture: GeorefInput, report: Reporter) -> None:
     """Warn of undetermined focal lengths, and of those that control moves far from the value in the metadata."""
     for number, camera in sorted(done.reconstruction.cameras.items()):
         prior = capture.focal_priors.get(number)

@@ -12,7 +12,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
-from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame, Origin
 from splatpipe.pipeline.survey.gps import georeference
 from splatpipe.pipeline.survey.level import Positions
@@ -51,7 +51,7 @@ def expected_windows(
         limit = settings["georef.max_position_error_m"]
         frame, _ = georeference(model, positions, limit, photos)
         places = expected_enu(wanted, frame, model, bool(settings["georef.approximate_crs"]))
-    except (NoPlaceError, SplatpipeError):  # without positions, or with a CRS that georef will report
+    except (FrameUndeterminedError, SplatpipeError):  # without positions, or with a CRS that georef will report
         return whole
     stated = [r.get("sigma_horizontal_m") for r in positions.by_name.values()]
     sigmas = [float(sigma) for sigma in stated if sigma is not None]

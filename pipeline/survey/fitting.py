@@ -32,7 +32,7 @@ ROUNDS = 4
 COLLAPSE = math.log(1.5)  # of the scale from the robust fit's, which noise of half of that cannot make
 
 
-class NoPlaceError(Exception):
+class FrameUndeterminedError(Exception):
     """The positions do not determine the frame; the text is the reason, a sentence without its full stop."""
 
 
@@ -94,7 +94,7 @@ def fit_positions(
         places: Positions of the model's points.
 
     Raises:
-        NoPlaceError: if scale or rotation is too poorly determined.
+        FrameUndeterminedError: if scale or rotation is too poorly determined.
     """
     inliers = robust.inliers if robust.inliers.sum() >= MIN_POSITIONS else np.ones(len(points), dtype=bool)
     fit = _fitted(points, flights, inliers, robust.similarity, directions, places)
@@ -110,29 +110,31 @@ def require_determined(fit: PositionFit, points: Correspondences) -> None:
     """Reject a frame whose scale or directions are practically unknown.
 
     Raises:
-        NoPlaceError: with the reason.
+        FrameUndeterminedError: with the reason.
     """
-    told = fit.uncertainty
+    uncertainty = fit.uncertainty
     stated = np.median(points.sigmas, axis=0)[[0, 2]]
-    noise_m = float(np.sqrt(((told.noise.factors * stated)[[0, 0, 1]] ** 2).mean()))
+    noise_m = float(np.sqrt(((uncertainty.noise.factors * stated)[[0, 0, 1]] ** 2).mean()))
     span_m = float(np.linalg.norm(np.ptp(fit.noisy.similarity.apply(points.source), axis=0)))
-    if told.scale > MAX_SIGMA_SCALE:
+    if uncertainty.scale > MAX_SIGMA_SCALE:
         if noise_m > 2.0 * float(stated.max()):
-            raise NoPlaceError(
-                f"the photo positions do not agree with the model: they are off by {noise_m:,.0f} m or so, where it "
-                f"spans {span_m:,.0f} m, which tells its scale to {100.0 * min(told.scale, 9.99):.0f} % only"
+            raise FrameUndeterminedError(
+                f"the photo positions do not agree with the model: they are off by {noise_m:,.0f} m or so, and it "
+                f"spans {span_m:,.0f} m, so its scale is known only to {100.0 * min(uncertainty.scale, 9.99):.0f} %"
             )
-        raise NoPlaceError("the photos were taken too close together for the accuracy of their positions")
-    if told.weakest_rad > MAX_SIGMA_ROTATION_RAD:
-        if told.weakest_rad > 4.0 * MAX_SIGMA_ROTATION_RAD or noise_m <= 2.0 * float(stated.max()):
-            raise NoPlaceError("the photos were taken along a line, and nothing tells how the model is turned about it")
-        raise NoPlaceError(
-            f"the photo positions, off by {noise_m:,.0f} m or so, tell how the model is turned only to"
-            f" {math.degrees(told.weakest_rad):.0f}°"
+        raise FrameUndeterminedError("the photos were taken too close together for the accuracy of their positions")
+    if uncertainty.weakest_rad > MAX_SIGMA_ROTATION_RAD:
+        if uncertainty.weakest_rad > 4.0 * MAX_SIGMA_ROTATION_RAD or noise_m <= 2.0 * float(stated.max()):
+            raise FrameUndeterminedError(
+                "the photos were taken along a line, and the model's rotation about that line is unknown"
+            )
+        raise FrameUndeterminedError(
+            f"the photo positions, off by {noise_m:,.0f} m or so, determine the model's rotation only to"
+            f" {math.degrees(uncertainty.weakest_rad):.0f}°"
         )
 
 
-def taken_order(
+def capture_order(
     names: Sequence[str], records: Mapping[str, Mapping[str, Any]], times: Mapping[str, str | None]
 ) -> list[str]:
     """Photos in the order in which they were taken, flight by flight; those with equal or no times by name."""
@@ -177,9 +179,9 @@ def _fitted(
         with_prior = contradicted = False
     stated = np.median(chosen.sigmas, axis=0)[[0, 2]] if points.shared is None else np.zeros(2)
     residuals = noisy.similarity.apply(points.source) - points.without(noisy.offsets).target
-    told = uncertainty_of(noisy, chosen.source, places, stated)
+    uncertainty = uncertainty_of(noisy, chosen.source, places, stated)
     held_by = directions.source if with_prior else ""
-    return PositionFit(noisy, inliers, residuals, told, held_by, weakest, off if contradicted else 0.0)
+    return PositionFit(noisy, inliers, residuals, uncertainty, held_by, weakest, off if contradicted else 0.0)
 
 
 def _contradiction(alone: NoisyFit, directions: Directions) -> tuple[float, float]:

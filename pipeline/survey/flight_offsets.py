@@ -115,7 +115,7 @@ def flights_json(
     return flights
 
 
-def tell_flights_apart(flights: Sequence[Mapping[str, Any]], report: Reporter) -> None:
+def warn_of_flight_offsets(flights: Sequence[Mapping[str, Any]], report: Reporter) -> None:
     """Warn about flights whose offset far exceeds the accuracy of their positions."""
     for flight in flights:
         name = f"flight {flight['flight'] + 1} ({flight['photos']} photos, from {flight['first']} on)"

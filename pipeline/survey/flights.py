@@ -39,7 +39,7 @@ class Stamp:
     takeoff_m: float = math.nan
 
 
-def tell_flights(stamps: Sequence[Stamp]) -> list[int]:
+def assign_flights(stamps: Sequence[Stamp]) -> list[int]:
     """The number of each photo's flight, counted from 0 in the order of the photos.
 
     Args:

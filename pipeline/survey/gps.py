@@ -21,19 +21,19 @@ from splatpipe.pipeline.survey.fitting import (
     MAX_SIGMA_ROTATION_RAD,
     MAX_SIGMA_SCALE,
     MIN_POSITIONS,
-    NoPlaceError,
+    FrameUndeterminedError,
     PositionFit,
+    capture_order,
     fit_positions,
     require_determined,
-    taken_order,
 )
 from splatpipe.pipeline.survey.flight_offsets import (
     bound,
     declared_datum,
     flights_json,
     shared_errors,
-    tell_flights_apart,
     unbound,
+    warn_of_flight_offsets,
 )
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
@@ -60,14 +60,14 @@ def georeference(
         photos: All photos of the capture by name; their times give the order in which they were taken.
 
     Raises:
-        NoPlaceError: if the positions do not determine a frame.
+        FrameUndeterminedError: if the positions do not determine a frame.
     """
     limit = None if max_error_m == "auto" else max_error_m
     usable = [name for name in model.names if _altitude(positions.by_name.get(name)) is not None]
     if len(usable) < MIN_POSITIONS:
-        raise NoPlaceError(_why_few(model, positions, len(usable)))
+        raise FrameUndeterminedError(_why_few(model, positions, len(usable)))
     times = {name: photos[name].time if name in photos else None for name in usable}
-    names = taken_order(usable, positions.by_name, times)
+    names = capture_order(usable, positions.by_name, times)
     records = [positions.by_name[name] for name in names]
     index = {name: i for i, name in enumerate(model.names)}
     geodetic = np.array([[r["latitude"], r["longitude"], r["altitude_m"]] for r in records], dtype=np.float64)
@@ -86,7 +86,7 @@ def georeference(
         noise = robust.noise
         fit = fit_positions(points, flights, robust, limit, directions, model.points)
         require_determined(fit, points)
-    except NoPlaceError:
+    except FrameUndeterminedError:
         _require_unswapped(points, geodetic, limit, noise)
         raise
     if noise > 1.0:
@@ -112,7 +112,7 @@ def _robust(points: Correspondences, limit: float | None, prior: DirectionPrior)
     try:
         fit = robust_similarity(points, limit, prior)
     except ValueError as error:
-        raise NoPlaceError(f"the positions do not fit the model ({error})") from error
+        raise FrameUndeterminedError(f"the positions do not fit the model ({error})") from error
     _require_agreement(fit, len(points))
     return fit
 
@@ -137,17 +137,17 @@ def _require_unswapped(
     try:
         fit = robust_similarity(replace(points, target=target), limit)
         _require_agreement(fit, len(points))
-    except (ValueError, NoPlaceError):
+    except (ValueError, FrameUndeterminedError):
         return
     determined = fit.sigma_scale <= MAX_SIGMA_SCALE and fit.sigma_rotation_rad <= MAX_SIGMA_ROTATION_RAD
     if determined and fit.noise < SWAPPED_NOISE * noise:
-        raise NoPlaceError("the photo positions fit only with latitude and longitude swapped: correct them")
+        raise FrameUndeterminedError("the photo positions fit only with latitude and longitude swapped: correct them")
 
 
 def _require_agreement(fit: SimilarityFit, positions: int) -> None:
     inliers = int(fit.inliers.sum())
     if inliers < MIN_POSITIONS or 2 * inliers < positions:
-        raise NoPlaceError(f"only {inliers} of {positions} photo positions agree with the model")
+        raise FrameUndeterminedError(f"only {inliers} of {positions} photo positions agree with the model")
 
 
 def _why_few(model: SparseModel, positions: Positions, usable: int) -> str:
@@ -191,12 +191,12 @@ def _rms(residuals: Float64[np.ndarray, "n k"]) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
-def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Positions, report: Reporter) -> None:
+def report_fit(frame: Frame, fit: PositionFit, model: SparseModel, positions: Positions, report: Reporter) -> None:
     """Report how well the positions place the model; warn about wrong positions or a weak fit."""
     report.note(f"Placed by the photos' positions: {fit.uncertainty.sentence()}.")
-    _tell_noise(fit, frame, positions, report)
-    _tell_directions(fit, report)
-    tell_flights_apart(frame.residuals["flights"], report)
+    _warn_of_noise(fit, frame, positions, report)
+    _warn_of_directions(fit, report)
+    warn_of_flight_offsets(frame.residuals["flights"], report)
     if frame.left_out:
         report.warning(
             f"The stated position of {len(frame.left_out)} photos is wrong and is left out of the fit: "
@@ -214,7 +214,7 @@ def tell(frame: Frame, fit: PositionFit, model: SparseModel, positions: Position
         )
 
 
-def _tell_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Reporter) -> None:
+def _warn_of_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Reporter) -> None:
     """Warn about positions that scatter by far more than their stated sigmas."""
     used = [positions.by_name[name] for name in frame.residuals["photos"]]
     factors = fit.uncertainty.noise.factors
@@ -231,7 +231,7 @@ def _tell_noise(fit: PositionFit, frame: Frame, positions: Positions, report: Re
         )
 
 
-def _tell_directions(fit: PositionFit, report: Reporter) -> None:
+def _warn_of_directions(fit: PositionFit, report: Reporter) -> None:
     """Warn if the model's orientation comes from other directions than the positions."""
     if fit.contradicted_rad > 0.0:
         report.warning(

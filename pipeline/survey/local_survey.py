@@ -14,7 +14,7 @@ from splatpipe.pipeline.geometry.joint_fit import JointFit, JointObservations, P
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 from splatpipe.pipeline.survey.crs import to_geodetic
-from splatpipe.pipeline.survey.fitting import MIN_POSITIONS, NoPlaceError
+from splatpipe.pipeline.survey.fitting import MIN_POSITIONS, FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.gps import ORIGIN_DIGITS
@@ -193,7 +193,7 @@ def start_similarity(
     """An initial world-from-model similarity, and what else constrains the fit.
 
     Raises:
-        NoPlaceError: if there are neither positions nor enough control.
+        FrameUndeterminedError: if there are neither positions nor enough control.
         SplatpipeError: if the control does not fit the model at all.
     """
     offsets = site.stations.offset_sigmas()
@@ -210,7 +210,7 @@ def start_similarity(
         lifted = start.translation + np.array([0.0, 0.0, float(lift)])
         return Similarity(start.scale, start.rotation, lifted), Priors(offsets)
     if len(control) < MIN_CONTROL:
-        raise NoPlaceError(
+        raise FrameUndeterminedError(
             f"only {len(control)} of the control points can be used, where without positions it takes {MIN_CONTROL}"
         )
     up = upright_cameras(model, positions).up
@@ -221,7 +221,7 @@ def start_similarity(
         try:
             found = robust_similarity(points, max(1.0, START_SHARE * extent), prior)
         except ValueError as error:
-            raise NoPlaceError(f"the control points do not determine the frame ({error})") from error
+            raise FrameUndeterminedError(f"the control points do not determine the frame ({error})") from error
         return found.similarity, Priors(offsets, prior if found.used_prior else None)
     return _levelled(source, target, up), Priors(offsets, prior)
 

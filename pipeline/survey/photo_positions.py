@@ -22,7 +22,7 @@ from splatpipe.pipeline.photos.doubts import find_misplaced
 from splatpipe.pipeline.photos.exif import Gps
 from splatpipe.pipeline.photos.xmp import xmp_number
 from splatpipe.pipeline.survey.crs_names import ELLIPSOIDAL, UNKNOWN, parse_vertical
-from splatpipe.pipeline.survey.flights import Stamp, tell_flights
+from splatpipe.pipeline.survey.flights import Stamp, assign_flights
 from splatpipe.pipeline.survey.stated_positions import FilePlace
 
 ALTITUDE_BOUNDS_M = (-1000.0, 20_000.0)
@@ -138,7 +138,7 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
         if exif_altitude is not None and xmp_altitude is not None:
             steps.append(exif_altitude - xmp_altitude)
     wrong |= find_misplaced({each.name: (each.latitude, each.longitude) for each in found})
-    flights = tell_flights(stamps)
+    flights = assign_flights(stamps)
     numbered = [replace(each, flight=flight) for each, flight in zip(found, flights, strict=True)]
     return PositionList(
         tuple(each for each in numbered if each.name not in wrong),

@@ -121,7 +121,7 @@ def fit_with_noise(
         extent = float(np.ptp(points.target, axis=0).max())
         if np.abs(step[:4]).max() < SETTLED and np.abs(step[4:]).max() < SETTLED * extent:
             break
-    return _told(points, before, similarity, offsets, noise, prior)
+    return _with_covariance(points, before, similarity, offsets, noise, prior)
 
 
 def _mean_residual(
@@ -147,7 +147,7 @@ def _variance_of_mean(
     return total
 
 
-def _told(
+def _with_covariance(
     points: Correspondences,
     before: Int64[np.ndarray, " n"],
     similarity: Similarity,

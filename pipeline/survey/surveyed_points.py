@@ -148,9 +148,9 @@ def load_survey(
             f"A height of 0.0 is treated as unknown: {list_names(file.zero_heights)} of {path.name} "
             f"{'controls' if len(file.zero_heights) == 1 else 'control'} horizontally only."
         )
-    _tell_unusable(points, path.name, model, photos, report)
+    _warn_of_unusable(points, path.name, model, photos, report)
     roled = with_roles(points, config.check_points)
-    _tell_overruled(roled, path.name, config.check_points, report)
+    _report_overruled_roles(roled, path.name, config.check_points, report)
     return Survey(file, crs, path.name, tuple(roled))
 
 
@@ -247,11 +247,11 @@ def _sightings(
             else:
                 outside.append(f"{point.name} in {photo}")
         result.append([seen[photo] for photo in sorted(seen)])
-    _tell_marks(name, len(marks), missing, outside, report, all_missing=all(photo is None for _, photo in marks))
+    _check_marks(name, len(marks), missing, outside, report, all_missing=all(photo is None for _, photo in marks))
     return result
 
 
-def _tell_marks(
+def _check_marks(
     name: str, marks: int, missing: Sequence[str], outside: Sequence[str], report: Reporter, all_missing: bool
 ) -> None:
     if marks == 0:
@@ -285,7 +285,7 @@ def missing_photos(names: Sequence[str]) -> str:
     return f"{many} not in this capture: {list_names(names)}"
 
 
-def _tell_overruled(points: Sequence[SurveyPoint], name: str, setting: str, report: Reporter) -> None:
+def _report_overruled_roles(points: Sequence[SurveyPoint], name: str, setting: str, report: Reporter) -> None:
     """Report that the option, possibly left from an earlier call, overrides the roles that the file states."""
     usable = [point for point in points if point.role != "left_out"]
     stated = {point.name for point in usable if point.surveyed.role == "check"}
@@ -306,7 +306,7 @@ def _why_unseen(point: SurveyPoint, placed: int) -> str:
     return "it is marked in one photo only" if placed else "the photo that it is marked in could not be placed"
 
 
-def _tell_unusable(
+def _warn_of_unusable(
     points: Sequence[SurveyPoint], name: str, model: SparseModel, photos: Mapping[str, Photo], report: Reporter
 ) -> None:
     for point in points:

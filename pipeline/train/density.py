@@ -81,7 +81,7 @@ class Density:
             schedule: The density-control schedule.
             photo: The photo trained on.
         """
-        whole = photo.camera.whole()
+        whole = photo.camera.uncropped()
         size = (photo.share * whole.width, photo.share * whole.height)
         if gradient_px.is_sparse:
             self.statistics.observe_rows(gradient_px.indices()[0], gradient_px.values(), *size)

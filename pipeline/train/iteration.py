@@ -108,5 +108,5 @@ def curve_facts(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> 
     return {
         "gaussians": len(state.gaussians),
         "sh_degree": plan.schedule.sh_degree_at(state.iteration),
-        "width": photo.camera.whole().width,
+        "width": photo.camera.uncropped().width,
     }

@@ -178,7 +178,7 @@ def middle_of(photo: TrainingPhoto) -> TrainingPhoto:
     mask = None if photo.mask is None else photo.mask[rows, columns].contiguous()
     share = width * height / (camera.width * camera.height)
     colour = photo.colour[rows, columns].contiguous()
-    return TrainingPhoto(camera.cut(left, top, width, height), colour, mask, photo.is_empty, None, share)
+    return TrainingPhoto(camera.crop(left, top, width, height), colour, mask, photo.is_empty, None, share)
 
 
 def _timed(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto, step: Step, device: Device) -> Timing:
@@ -187,7 +187,7 @@ def _timed(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto, step: S
     step(state, trial, photo)
     device.wait()
     seconds = time.monotonic() - began
-    pixels, whole = photo.camera.width * photo.camera.height, photo.camera.whole()
+    pixels, whole = photo.camera.width * photo.camera.height, photo.camera.uncropped()
     return Timing(len(state.gaussians), pixels, max(seconds, 1e-6), pixels / (whole.width * whole.height))
 
 

@@ -42,7 +42,7 @@ class PhotoCells:
         """The cells of which enough is shown; None if that is all of them."""
         if self.camera.window is None:
             return None
-        whole, found = self.camera.whole(), like.new_zeros(self.rows, self.columns)
+        whole, found = self.camera.uncropped(), like.new_zeros(self.rows, self.columns)
         (rows, down), (columns, across) = self._sides(like)
         tall = _belongs(range(whole.height), whole.height, self.rows, like).sum(dim=1)[rows]
         wide = _belongs(range(whole.width), whole.width, self.columns, like).sum(dim=1)[columns]

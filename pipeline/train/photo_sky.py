@@ -69,7 +69,7 @@ class PhotoSkies:
 def photo_sky_on_cpu(found: SkyMask, camera: Camera) -> PhotoSky:
     """A photo's sky at the size of ``camera``, or in its window."""
     share = found.unpacked()
-    if camera.window is not None and camera.whole().height >= share.shape[0]:
+    if camera.window is not None and camera.uncropped().height >= share.shape[0]:
         return _seen_in_window(share, camera)
     wider = _widened(share)
     return PhotoSky(_surely(share, camera), _surely(wider, camera))
@@ -123,7 +123,7 @@ def photo_sky_on_device(bits: UInt8[Tensor, " n"], shape: tuple[int, int], camer
 
 def _sides(camera: Camera) -> tuple[tuple[int, slice], tuple[int, slice]]:
     """The whole image's height and the camera's rows of it; its width and the camera's columns."""
-    whole, part = camera.whole(), camera.window
+    whole, part = camera.uncropped(), camera.window
     top, left = (0, 0) if part is None else (part.top, part.left)
     return (whole.height, slice(top, top + camera.height)), (whole.width, slice(left, left + camera.width))
 

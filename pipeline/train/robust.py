@@ -223,7 +223,7 @@ def cell_residuals(
         The residuals, ``UNKNOWN`` where less than half of a cell counts; and the cells that the window judges, None for
         all.
     """
-    whole = camera.whole()
+    whole = camera.uncropped()
     size = (min(GRID, max(1, whole.height // LEAST_CELL_PX)), min(GRID, max(1, whole.width // LEAST_CELL_PX)))
     cells = PhotoCells(camera, *size)
     weight, judged = cells.means(counts[None].float()), cells.judged(shown)

@@ -206,7 +206,7 @@ class PhotoStream:
         left, top, right, bottom = inner = window.within(cut)
         here = window.pixels if mask is None else int(np.count_nonzero(mask[top:bottom, left:right]))
         return _PendingPhoto(
-            whole.cut(cut.left, cut.top, cut.width, cut.height),
+            whole.crop(cut.left, cut.top, cut.width, cut.height),
             self._uploader.begin(pixels, mask),
             here == 0,
             None if cut == window else inner,

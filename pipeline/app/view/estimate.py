@@ -20,7 +20,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json
 from splatpipe.pipeline.survey.blunders import name_blunders, require_near
 from splatpipe.pipeline.survey.control_file import ControlFile
-from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.local_survey import (
     LocalSurvey,
     make_site,
@@ -132,7 +132,7 @@ class Estimator:
         survey = self._survey(points)
         try:
             fitted = self._fit(survey, collector)
-        except (NoPlaceError, SplatpipeError) as error:
+        except (FrameUndeterminedError, SplatpipeError) as error:
             if has_enough_marks(points):
                 collector.warnings.append(
                     str(error) if isinstance(error, SplatpipeError) else f"No frame yet: {error}."

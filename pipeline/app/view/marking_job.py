@@ -18,7 +18,7 @@ from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
 from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.control_file import SAME_PLACE_M, SurveyedPoint, read_control_file, read_points_file
 from splatpipe.pipeline.survey.crs import Crs, parse_crs
-from splatpipe.pipeline.survey.fitting import NoPlaceError
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.gps import georeference, read_positions
 from splatpipe.pipeline.survey.level import Positions
@@ -138,7 +138,7 @@ def _without_missing_control(config: LineConfig) -> LineConfig:
 def _frame(model: SparseModel, positions: Positions, config: GeorefConfig, photos: Mapping[str, Photo]) -> Frame | None:
     try:
         return georeference(model, positions, config.max_position_error_m, photos)[0]
-    except NoPlaceError:
+    except FrameUndeterminedError:
         return None
 
 
