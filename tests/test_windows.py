@@ -200,5 +200,5 @@ def test_windows_of_a_large_photo_need_no_more_memory(tmp_path: Path, window_pix
 def test_windows_are_refused_where_a_photo_is_resampled(views: list[View], tmp_path: Path) -> None:
     photo = streamed(views, tmp_path, [TrainingSize(0, PIXELS)])[0]
     assert isinstance(photo.camera, Camera) and photo.camera.uncropped().window is None
-    with pytest.raises(ValueError, match="scale the whole"):
+    with pytest.raises(ValueError, match="scale the full image"):
         photo.camera.scaled(10, 10)
