@@ -362,13 +362,13 @@ def test_broken_archives_are_refused(tmp_path: Path) -> None:
 def test_archives_that_unpack_to_too_much_are_refused(tmp_path: Path) -> None:
     files, path = encode_sog(some_gaussians(60, 0)).files(), tmp_path / "a.sog"
     bundle(path, {**files, "means_l.webp": files["means_l.webp"] + b"\0" * 50_000_000}, zipfile.ZIP_DEFLATED)
-    with pytest.raises(SplatpipeError, match="larger"):
+    with pytest.raises(SplatpipeError, match="too large"):
         read(path)
     bundle(path, {**files, **{f"{i}.webp": b"" for i in range(3000)}})
-    with pytest.raises(SplatpipeError, match="more than a SOG"):
+    with pytest.raises(SplatpipeError, match="far larger directory"):
         read(path)
     bundle(path, files, zipfile.ZIP_BZIP2)
-    with pytest.raises(SplatpipeError, match="unusual"):
+    with pytest.raises(SplatpipeError, match="unsupported"):
         read(path)
     with zipfile.ZipFile(path, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
         for name, data in [*files.items(), ("quats.webp", files["quats.webp"])]:

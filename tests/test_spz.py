@@ -267,15 +267,15 @@ def test_false_gzip_files_are_an_error(tmp_path: Path) -> None:
     def lying(at: int, layout: str, value: int) -> bytes:
         return gzip.compress(raw[:at] + struct.pack(layout, value) + raw[at + struct.calcsize(layout) :], mtime=0)
 
-    attacked(tmp_path, lying(0, "<I", 7), "no SPZ")
+    attacked(tmp_path, lying(0, "<I", 7), "not an SPZ")
     attacked(tmp_path, lying(4, "<I", 9), "version 9")
     attacked(tmp_path, lying(8, "<I", 0xFFFFFFFF), "promised")
-    attacked(tmp_path, lying(8, "<I", 301), "ends early")
+    attacked(tmp_path, lying(8, "<I", 301), "end early")
     attacked(tmp_path, lying(12, "<B", 4), "degree 4")
     attacked(tmp_path, gzip.compress(raw + bytes(70_000), mtime=0), "more than")
     attacked(tmp_path, gzip.compress(raw + bytes(10), mtime=0)[:-4], "cut off")
     attacked(tmp_path, gzip.compress(raw, mtime=0)[:-6] + bytes(6), "damaged")
-    attacked(tmp_path, b"", "no SPZ")
+    attacked(tmp_path, b"", "not an SPZ")
     bomb = struct.pack("<IIIBBBB", 0x5053474E, 3, 60_000_000, 0, 12, 0, 0) + bytes(20_000_000)
     attacked(tmp_path, gzip.compress(bomb, mtime=0), "promised")
 
@@ -288,14 +288,14 @@ def test_false_zstd_files_are_an_error(tmp_path: Path) -> None:
 
     attacked(tmp_path, lying(4, "<I", 5), "version 5")
     attacked(tmp_path, lying(8, "<I", 0xFFFFFFFF), "promised")
-    attacked(tmp_path, lying(8, "<I", 299), "streams are not")
-    attacked(tmp_path, lying(15, "<B", 5), "fits no SPZ")
-    attacked(tmp_path, lying(16, "<I", 0xFFFFFFFF), "fits no SPZ")
-    attacked(tmp_path, lying(16, "<I", 0), "fits no SPZ")
-    attacked(tmp_path, lying(32, "<Q", 1 << 63), "do not fill")
-    attacked(tmp_path, lying(40, "<Q", 1 << 63), "streams are not")
+    attacked(tmp_path, lying(8, "<I", 299), "streams do not hold")
+    attacked(tmp_path, lying(15, "<B", 5), "is not valid")
+    attacked(tmp_path, lying(16, "<I", 0xFFFFFFFF), "is not valid")
+    attacked(tmp_path, lying(16, "<I", 0), "is not valid")
+    attacked(tmp_path, lying(32, "<Q", 1 << 63), "do not end with")
+    attacked(tmp_path, lying(40, "<Q", 1 << 63), "streams do not hold")
     attacked(tmp_path, lying(128, "<I", 0), "zstd")
-    attacked(tmp_path, whole[:-1], "do not fill")
+    attacked(tmp_path, whole[:-1], "do not end with")
     attacked(tmp_path, whole[:20], "cut off")
 
 
@@ -311,7 +311,7 @@ def test_files_with_other_axes_are_refused_and_unknown_extensions_skipped(tmp_pa
                 (tmp_path / "a.spz").write_bytes(kind)
                 assert len(spz.read(tmp_path / "a.spz").gaussians) == 300
             else:
-                attacked(tmp_path, kind, "other axes")
+                attacked(tmp_path, kind, "axes other")
 
 
 @given(data=st.data())

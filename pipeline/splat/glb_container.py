@@ -57,7 +57,7 @@ def write_head(file: BufferedIOBase, document: Mapping[str, Any], binary_bytes: 
     total = _HEADER.size + 2 * _CHUNK_HEADER.size + len(text) + binary_bytes
     if total > MOST_BYTES:
         raise SplatpipeError(
-            f"A GLB cannot have {total / 1e9:.1f} GB: its 32-bit length ends at 4.3 GB.",
+            f"A GLB cannot have {total / 1e9:.1f} GB: its length is a 32-bit number, at most 4.3 GB.",
             hint="Reduce the splat, crop it, or choose another format: ply, spz or 3dtiles.",
         )
     file.write(_HEADER.pack(MAGIC, VERSION, total))
@@ -145,10 +145,10 @@ class Container:
         """
         entries = self.document.get(name)
         if not isinstance(entries, list) or not _is_whole(index) or index >= len(entries):
-            self.refuse(f"it has none of its {name} numbered {str(index)[:40]}")
+            self.refuse(f"its {name} have no number {str(index)[:40]}")
         entry = entries[index]
         if not isinstance(entry, dict):
-            self.refuse(f"one of its {name} is no object")
+            self.refuse(f"one of its {name} is not an object")
         return entry
 
     def view(self, index: Any) -> tuple[int, int, int | None]:
@@ -161,17 +161,19 @@ class Container:
         buffer = self.entry("buffers", view.get("buffer"))
         if "uri" in buffer or view["buffer"] != 0:
             raise SplatpipeError(
-                f"{self.path} keeps its data in other files, which are not read.",
+                f"{self.path} keeps its data in other files, which cannot be read.",
                 hint="Export it as one GLB file that holds everything.",
             )
         extensions = view.get("extensions")
         if isinstance(extensions, dict) and "EXT_meshopt_compression" in extensions:
-            raise SplatpipeError(f"{self.path} is packed by meshopt, which is not read.", hint="Export it without.")
+            raise SplatpipeError(
+                f"{self.path} is in meshopt's compression, which cannot be read.", hint="Export it without."
+            )
         offset, length, stride = view.get("byteOffset", 0), view.get("byteLength"), view.get("byteStride")
         if not _is_whole(offset) or not _is_whole(length) or offset + length > self.length:
-            self.refuse("a buffer view lies outside of its data")
+            self.refuse("a buffer view lies outside its data")
         if stride is not None and not (_is_whole(stride) and _LEAST_STRIDE <= stride <= _MOST_STRIDE):
-            self.refuse("a buffer view's stride is none")
+            self.refuse("a buffer view's stride is not valid")
         return self.start + offset, length, stride
 
     def accessor(self, index: Any, kinds: tuple[str, ...]) -> Accessor:
@@ -186,18 +188,18 @@ class Container:
         """
         found = self.entry("accessors", index)
         if "bufferView" not in found or "sparse" in found:
-            raise SplatpipeError(f"{self.path} has data that are left out or sparse: that is not read.", hint=_AGAIN)
+            raise SplatpipeError(f"{self.path} has sparse or missing data, which cannot be read.", hint=_AGAIN)
         kind, component = found.get("type"), found.get("componentType")
         if kind not in kinds or not _is_whole(component) or component not in _NUMBERS:
-            self.refuse(f"an accessor is of {str(kind)[:20]} and {str(component)[:20]}")
+            self.refuse(f"an accessor has the type {str(kind)[:20]} of {str(component)[:20]}, which is not valid")
         number, components = np.dtype(_NUMBERS[component]), _COMPONENTS[kind]
         start, length, stride = self.view(found["bufferView"])
         offset, count, size = found.get("byteOffset", 0), found.get("count"), components * number.itemsize
         stride = size if stride is None else stride
         if not _is_whole(count) or count < 1 or not _is_whole(offset) or stride < size:
-            self.refuse("an accessor's rows cannot be")
+            self.refuse("an accessor's rows are not valid")
         if offset + (count - 1) * stride + size > length:
-            self.refuse(f"an accessor of {str(count)[:20]} rows lies outside of its data")
+            self.refuse(f"an accessor of {str(count)[:20]} rows lies outside its data")
         return Accessor(count, components, number, found.get("normalized") is True, start + offset, stride)
 
 
@@ -213,7 +215,7 @@ def open_container(path: Path, file: BufferedIOBase) -> Container:
     """
     magic, version, total = _HEADER.unpack(read_exactly(path, file, _HEADER.size))
     if magic != MAGIC:
-        raise SplatpipeError(f"{path} is no GLB.", hint="Of a .gltf and its files make one .glb first.")
+        raise SplatpipeError(f"{path} is not a GLB.", hint="Convert a .gltf and its files to one .glb first.")
     if version != VERSION:
         raise SplatpipeError(f"{path} is a GLB of version {version}, not {VERSION}.", hint=_AGAIN)
     if total > file_bytes(file):
@@ -221,16 +223,16 @@ def open_container(path: Path, file: BufferedIOBase) -> Container:
     length, kind = _CHUNK_HEADER.unpack(read_exactly(path, file, _CHUNK_HEADER.size))
     start = _HEADER.size + _CHUNK_HEADER.size
     if kind != JSON_CHUNK or start + length > total:
-        raise SplatpipeError(f"{path} is damaged: its first chunk is no JSON inside of it.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} is damaged: its first chunk is not JSON within the file.", hint=_AGAIN)
     if length > MOST_JSON_BYTES:
-        raise SplatpipeError(f"{path} describes itself in {length:,} bytes: no splat's file does.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} has {length:,} bytes of JSON, more than any splat needs.", hint=_AGAIN)
     document = _parsed(path, read_exactly(path, file, length))
     start, length = start + length, 0
     if start + _CHUNK_HEADER.size <= total:
         length, kind = _CHUNK_HEADER.unpack(read_exactly(path, file, _CHUNK_HEADER.size))
         start += _CHUNK_HEADER.size
         if kind != BINARY_CHUNK or start + length > total:
-            raise SplatpipeError(f"{path} is damaged: its second chunk is no data inside of it.", hint=_AGAIN)
+            raise SplatpipeError(f"{path} is damaged: its second chunk is not data within the file.", hint=_AGAIN)
     return Container(path, file, document, start, length)
 
 
@@ -240,7 +242,7 @@ def _parsed(path: Path, text: bytes) -> Mapping[str, Any]:
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError, and integers of thousands of digits, too
         raise SplatpipeError(f"{path} is damaged: its JSON cannot be read.", hint=_AGAIN) from error
     if not isinstance(document, dict):
-        raise SplatpipeError(f"{path} is damaged: its JSON is no object.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} is damaged: its JSON is not an object.", hint=_AGAIN)
     return document
 
 

@@ -42,7 +42,7 @@ def drawn_primitives(container: Container, extension: str) -> list[Drawn]:
         index, parent = waiting.pop()
         node = container.entry("nodes", index)
         if index in visited:
-            container.refuse("its nodes are tangled: one is drawn in two places")
+            container.refuse("its nodes are not a tree: one is drawn in two places")
         visited.add(index)
         matrix = parent @ _matrix(container, node)
         if "mesh" in node:
@@ -72,7 +72,7 @@ def _roots(container: Container) -> list[Any]:
 def _listed(container: Container, holder: Mapping[str, Any], name: str) -> list[Any]:
     values = holder.get(name, [])
     if not isinstance(values, list):
-        container.refuse(f"its {name} are no list")
+        container.refuse(f"its {name} are not a list")
     return values
 
 
@@ -82,7 +82,7 @@ def _matrix(container: Container, node: Mapping[str, Any]) -> Float64[np.ndarray
         return _numbers(container, node["matrix"], 16).reshape(4, 4).T  # column by column
     parts = {name: _numbers(container, node.get(name, rest), len(rest)) for name, rest in _IDENTITY.items()}
     if not np.linalg.norm(parts["rotation"]) > 0.0:
-        container.refuse("a node's rotation is none")
+        container.refuse("a node's rotation is not valid")
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat(parts["rotation"]).as_matrix() * parts["scale"]
     matrix[:3, 3] = parts["translation"]
@@ -92,7 +92,7 @@ def _matrix(container: Container, node: Mapping[str, Any]) -> Float64[np.ndarray
 def _numbers(container: Container, values: Sequence[Any], count: int) -> Float64[np.ndarray, " n"]:
     fine = isinstance(values, list | tuple) and len(values) == count
     if not fine or not all(_is_number(value) for value in values):
-        container.refuse("a node is placed by what are no numbers")
+        container.refuse("a node's transformation is not made of numbers")
     return np.array(values, np.float64)
 
 

@@ -67,13 +67,13 @@ def read_splats(container: Container) -> Gaussians:
     required = container.document.get("extensionsRequired", [])
     unknown = [name for name in required if name not in _KNOWN] if isinstance(required, list) else [required]
     if unknown:
-        raise SplatpipeError(f"{container.path} needs {str(unknown[0])[:60]}, which is not read.", hint=_HINT)
+        raise SplatpipeError(f"{container.path} needs {str(unknown[0])[:60]}, which cannot be read.", hint=_HINT)
     drawn = drawn_primitives(container, EXTENSION)
     if not drawn:
-        raise SplatpipeError(f"{container.path} draws no splat.", hint=_HINT)
+        raise SplatpipeError(f"{container.path} contains no splat.", hint=_HINT)
     splats = [_splat(container, primitive) for primitive, _ in drawn]
     if sum(splat.least_bytes for splat in splats) > container.length:
-        container.refuse("it draws more Gaussians than it holds")
+        container.refuse("it draws more Gaussians than it contains")
     matrices = [matrix for _, matrix in drawn]
     parts = [_placed(container, one.read(container), at) for one, at in zip(splats, matrices, strict=True)]
     degree = max(part.sh_degree for part in parts)
@@ -107,7 +107,7 @@ class _SpzSplat:
         """Read its Gaussians through the SPZ reader, which needs a file."""
         reader = next((each for each in SPLAT_FORMATS if each.name == "spz" and each.reads), None)
         if reader is None:
-            raise SplatpipeError(f"{container.path} holds an SPZ file, which is not read.", hint=_HINT)
+            raise SplatpipeError(f"{container.path} contains an SPZ file, which cannot be read.", hint=_HINT)
         container.file.seek(self.start)
         data = read_exactly(container.path, container.file, self.length)
         with tempfile.TemporaryDirectory(prefix="splatpipe-") as folder:
@@ -159,7 +159,7 @@ class _Splat:
         opacity = self.columns["opacity"]
         opacities = rows(opacity)[:, -1].double()  # a colour's last component
         if bool(((opacities < -_ROUNDING) | (opacities > 1.0 + _ROUNDING)).any()):
-            container.refuse("opacities are not within 0 and 1")
+            container.refuse("opacities are not between 0 and 1")
         logits = torch.logit(opacities.clamp(0.0, 1.0))
         gaussians.opacity_logits[part] = logits.clamp(-_INFINITY_LOGIT, _INFINITY_LOGIT).float()
         if not self.harmonics:
@@ -179,8 +179,10 @@ def _splat(container: Container, primitive: Mapping[str, Any]) -> _Splat | _SpzS
         container.refuse("a splat has no attributes")
     for key, taken in (("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")):
         if extension.get(key, taken) != taken:
-            told = str(extension[key])[:40]
-            raise SplatpipeError(f"{container.path}: splats of {key} {told} are not read, only {taken}.", hint=_HINT)
+            found = str(extension[key])[:40]
+            raise SplatpipeError(
+                f"{container.path}: splats with {key} {found} cannot be read, only {taken}.", hint=_HINT
+            )
     inside = extension.get("extensions")
     packed = inside.get(SPZ_EXTENSION) if isinstance(inside, dict) else None
     if isinstance(packed, dict):
@@ -198,11 +200,11 @@ def _splat(container: Container, primitive: Mapping[str, Any]) -> _Splat | _SpzS
         wanted["color"] = ("COLOR_0", ("VEC3", "VEC4"))
     missing = [name for name, _ in wanted.values() if name not in names]
     if missing:
-        raise SplatpipeError(f"{container.path}: a splat lacks {', '.join(missing)}.", hint=_HINT)
+        raise SplatpipeError(f"{container.path}: a splat has no {', '.join(missing)}.", hint=_HINT)
     columns = {short: container.accessor(names[name], kinds) for short, (name, kinds) in wanted.items()}
     harmonics = tuple(container.accessor(names[name], ("VEC3",)) for name in found)
     if len({accessor.count for accessor in (*columns.values(), *harmonics)}) != 1:
-        container.refuse("a splat's attributes are of different lengths")
+        container.refuse("a splat's attributes have different lengths")
     return _Splat(columns, harmonics)
 
 
@@ -214,7 +216,7 @@ def _harmonics(container: Container, names: Mapping[str, Any]) -> list[str]:
         if told == set(wanted):
             return wanted
     if told:
-        container.refuse("its spherical harmonics are of no whole degrees 0 to 3")
+        container.refuse("its spherical harmonics are not complete to a degree of 0 to 3")
     return []
 
 
@@ -231,7 +233,7 @@ def _placed(container: Container, gaussians: Gaussians, matrix: Float64[np.ndarr
     straight = np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0))
     if not straight or not np.abs(rotation.T @ rotation - np.eye(3)).max() < _SIMILAR:
         raise SplatpipeError(
-            f"{container.path} stretches, shears or mirrors a splat, which is not read.",
+            f"{container.path} stretches, shears or mirrors a splat, which cannot be read.",
             hint="Apply its transformation in the program that made it.",
         )
     turn, move = torch.from_numpy(rotation.copy()), torch.from_numpy(matrix[:3, 3].copy())

@@ -193,16 +193,16 @@ def _check_vertex(path: Path, vertex: PlyElement, has_chunks: bool) -> int:
     missing = [name for name in _REQUIRED if name not in kinds]
     if missing:
         what = "a point cloud or a mesh" if "f_dc_0" in missing and "x" not in missing else "incomplete"
-        raise SplatpipeError(f"{path} is no splat but {what}: it lacks {', '.join(missing)}.", hint=PLY_HINT)
+        raise SplatpipeError(f"{path} is not a splat but {what}: it has no {', '.join(missing)}.", hint=PLY_HINT)
     rest = [name for name in kinds if name.startswith("f_rest_")]
     degrees = {3 * (coefficient_count(degree) - 1): degree for degree in range(MAX_DEGREE + 1)}
     if len(rest) not in degrees or {f"f_rest_{i}" for i in range(len(rest))} != set(rest):
         raise SplatpipeError(
-            f"{path}: {len(rest)} f_rest properties are no spherical harmonics of degree 0 to {MAX_DEGREE}.",
+            f"{path}: {len(rest)} f_rest properties are not spherical harmonics of degree 0 to {MAX_DEGREE}.",
             hint=PLY_HINT,
         )
     if vertex.has_list or any(kinds[name] not in ("f4", "f8") for name in [*_REQUIRED, *rest]):
-        raise SplatpipeError(f"{path}: a splat's properties are floats.", hint=PLY_HINT)
+        raise SplatpipeError(f"{path}: a splat's properties must be floats.", hint=PLY_HINT)
     return degrees[len(rest)]
 
 

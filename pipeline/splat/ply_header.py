@@ -99,7 +99,7 @@ class PlyHeader:
             what = {"vertex": "Gaussians"}.get(element.name, f"rows of {element.name[:40]}")
             room = max(0, self.size_bytes - offset) // max(row_bytes, 1)
             raise SplatpipeError(
-                f"{path} is cut off: its header promises {element.count} {what}, it has room for {room}.",
+                f"{path} is cut off: its header declares {element.count} {what}, but it has room for {room}.",
                 hint="Copy or export it again.",
             )
         return offset
@@ -174,14 +174,14 @@ def _parse_lines(path: Path, lines: Sequence[str]) -> tuple[str, list[str], tupl
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1][2].append((name, _TYPES[kind]))
             case _:
-                raise SplatpipeError(f"{path}: {line[:80]!r} is no line of a PLY header.", hint=PLY_HINT)
+                raise SplatpipeError(f"{path}: {line[:80]!r} is not a valid line of a PLY header.", hint=PLY_HINT)
     if not byte_order:
-        raise SplatpipeError(f"{path}: its PLY header names no format.", hint=PLY_HINT)
+        raise SplatpipeError(f"{path}: its PLY header does not name a format.", hint=PLY_HINT)
     found = tuple(
         PlyElement(name, count, tuple(field for field in fields if field is not None), None in fields)
         for name, count, fields in elements
     )
     for named in ([each.name for each in found], *([name for name, _ in each.fields] for each in found)):
         if len(set(named)) != len(named):
-            raise SplatpipeError(f"{path}: its PLY header names one thing twice.", hint=PLY_HINT)
+            raise SplatpipeError(f"{path}: its PLY header declares a name twice.", hint=PLY_HINT)
     return byte_order, comments, found

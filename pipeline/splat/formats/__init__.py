@@ -73,5 +73,5 @@ def format_named(name: str) -> SplatFormat:
     found = next((each for each in SPLAT_FORMATS if each.name == name), None)
     if found is None:
         names = ", ".join(each.name for each in SPLAT_FORMATS)
-        raise UsageError(f'There is no format "{name[:40]}".', hint=f"Choose of: {names}.")
+        raise UsageError(f'There is no format "{name[:40]}".', hint=f"Choose from: {names}.")
     return found

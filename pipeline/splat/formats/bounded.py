@@ -141,7 +141,7 @@ class InflatedFile:
         """
         data = self.at_most(count)
         if len(data) != count:
-            raise SplatpipeError(f"{self._path} is cut off: what it holds ends early.", hint=_AGAIN)
+            raise SplatpipeError(f"{self._path} is cut off: its data end early.", hint=_AGAIN)
         return data
 
     def at_most(self, count: int) -> bytes:

@@ -155,13 +155,13 @@ def _layout(path: Path, header: PlyHeader) -> _Layout:
     found = {element.name: element for element in header.elements}
     chunk, vertex, sh = (found.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
-        raise SplatpipeError(f"{path} is no compressed PLY: it has no chunks of vertices.", hint=PLY_HINT)
+        raise SplatpipeError(f"{path} is not a compressed PLY: it has no chunks of vertices.", hint=PLY_HINT)
     ranges = _RANGES if ("min_r", "f4") in chunk.fields else _WITHOUT_COLOURS
     for element, names, kind in ((chunk, ranges, "f4"), (vertex, _PACKED, "u4")):
         if element.has_list or not {(name, kind) for name in names} <= set(element.fields):
-            raise SplatpipeError(f"{path} is no compressed PLY: its {element.name} lacks something.", hint=PLY_HINT)
+            raise SplatpipeError(f"{path} is not a compressed PLY: its {element.name} is incomplete.", hint=PLY_HINT)
     if chunk.count != -(-vertex.count // CHUNK):
-        raise SplatpipeError(f"{path}: {chunk.count} chunks are none of {vertex.count} Gaussians.", hint=PLY_HINT)
+        raise SplatpipeError(f"{path}: {chunk.count} chunks do not match {vertex.count} Gaussians.", hint=PLY_HINT)
     degree = 0 if sh is None else _degree_of(path, sh, vertex.count)
     parts = (chunk, vertex) if sh is None else (chunk, vertex, sh)
     return _Layout(
@@ -177,7 +177,7 @@ def _degree_of(path: Path, sh: PlyElement, count: int) -> int:
     degree = next((d for d in range(1, MAX_DEGREE + 1) if names == set(_rest_names(d))), None)
     if degree is None or sh.has_list or len(sh.fields) != len(names) or sh.count != count:
         raise SplatpipeError(
-            f"{path}: its sh is no harmonics of degree 1 to {MAX_DEGREE} of {count} Gaussians.", hint=PLY_HINT
+            f"{path}: its sh does not hold degrees 1 to {MAX_DEGREE} of {count} Gaussians.", hint=PLY_HINT
         )
     return degree
 

@@ -42,7 +42,7 @@ def write(path: Path, scene: Scene) -> None:
     gaussians = scene.gaussians
     count = len(gaussians)
     if not count:
-        raise SplatpipeError("A splat without Gaussians cannot be a GLB.", hint="Crop less.")
+        raise SplatpipeError("A GLB needs at least one Gaussian.", hint="Crop less.")
     if not bool(gaussians.finite().all()):
         raise ValueError("a GLB holds finite numbers only")
     facts = replace(scene.facts, axes="y up")

@@ -38,7 +38,7 @@ def pixels_of_picture(path: Path, name: str, data: bytes, least: int, most: int)
     """
     size = _size(data)
     if size is None:
-        raise SplatpipeError(f"{path}: {name[:60]} is no WebP or PNG picture.", hint=_AGAIN)
+        raise SplatpipeError(f"{path}: {name[:60]} is not a WebP or PNG image.", hint=_AGAIN)
     if not least <= size[0] * size[1] <= most:
         raise SplatpipeError(
             f"{path}: {name[:60]} has {size[0]} × {size[1]} pixels; {least:,} are needed.", hint=_AGAIN

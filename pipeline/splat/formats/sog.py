@@ -78,10 +78,10 @@ def _read_bundle(path: Path) -> Scene:
 
             def load(name: str, most_bytes: int) -> bytes:
                 if names.count(name) != 1:
-                    raise SplatpipeError(f"{path}: there is not one {name[:60]} in it.", hint=_HINT)
+                    raise SplatpipeError(f"{path}: it does not contain exactly one {name[:60]}.", hint=_HINT)
                 info = archive.getinfo(name)
                 if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    raise SplatpipeError(f"{path}: {name[:60]} is packed in an unusual way.", hint=_AGAIN)
+                    raise SplatpipeError(f"{path}: {name[:60]} is compressed in an unsupported way.", hint=_AGAIN)
                 with archive.open(info) as file:
                     return _at_most(path, name, file.read(most_bytes + 1), most_bytes)
 
@@ -91,7 +91,7 @@ def _read_bundle(path: Path) -> Scene:
         raise
     except Exception as error:  # zipfile raises almost anything on broken archives
         reason = " ".join(str(error).split())[:120]
-        raise SplatpipeError(f"{path} is damaged or no ZIP: {reason}.", hint=_AGAIN) from error
+        raise SplatpipeError(f"{path} is damaged or not a ZIP: {reason}.", hint=_AGAIN) from error
 
 
 def _check_directory(path: Path) -> None:
@@ -102,16 +102,16 @@ def _check_directory(path: Path) -> None:
         end = file.read()
     at = end.rfind(_END)
     if at < 0 or at + _END_BYTES > len(end):
-        raise SplatpipeError(f"{path} is cut off: its ZIP does not end.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} is cut off: its ZIP directory is missing.", hint=_AGAIN)
     listed = int.from_bytes(end[at + 12 : at + 16], "little")
     if listed > _MOST_DIRECTORY_BYTES or _END_OF_LARGE in end[max(0, at - 20) : at]:
-        raise SplatpipeError(f"{path} is a ZIP of far more than a SOG.", hint=_HINT)
+        raise SplatpipeError(f"{path} is a ZIP with a far larger directory than a SOG's.", hint=_HINT)
 
 
 def _read_folder(path: Path) -> Scene:
     def load(name: str, most_bytes: int) -> bytes:
         if not _is_plain(name):
-            raise SplatpipeError(f"{path}: {name[:60]!r} is no name of a picture beside it.", hint=_AGAIN)
+            raise SplatpipeError(f"{path}: {name[:60]!r} is not the name of an image beside it.", hint=_AGAIN)
         beside = path.with_name(name)
         if not beside.is_file():
             raise SplatpipeError(f"{path}: there is no {name[:60]} beside it.", hint=_HINT)
@@ -147,13 +147,13 @@ def _meta(path: Path, data: bytes) -> dict[str, Any]:
     try:
         meta = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise SplatpipeError(f"{path}: its {META} is no JSON.", hint=_HINT) from error
+        raise SplatpipeError(f"{path}: its {META} is not JSON.", hint=_HINT) from error
     if not isinstance(meta, dict):
-        raise SplatpipeError(f"{path}: its {META} is not one of a SOG.", hint=_HINT)
+        raise SplatpipeError(f"{path}: its {META} does not describe a SOG.", hint=_HINT)
     return meta
 
 
 def _at_most(path: Path, name: str, data: bytes, most_bytes: int) -> bytes:
     if len(data) > most_bytes:
-        raise SplatpipeError(f"{path}: {name[:60]} is larger than it can be.", hint=_AGAIN)
+        raise SplatpipeError(f"{path}: {name[:60]} is too large.", hint=_AGAIN)
     return data

@@ -171,4 +171,4 @@ class SogDecoder:
         return value
 
     def _wrong(self, what: str) -> SplatpipeError:
-        return SplatpipeError(f"{self.path} is no whole SOG: {what}.", hint=_AGAIN)
+        return SplatpipeError(f"{self.path} is not a complete SOG: {what}.", hint=_AGAIN)

@@ -107,7 +107,7 @@ def read(path: Path) -> Scene:
         elif start.startswith(b"\x1f\x8b"):
             packed, record = _gzip_stream(path, file), _record(start)
         else:
-            raise SplatpipeError(f"{path} is no SPZ file.", hint=_AGAIN)
+            raise SplatpipeError(f"{path} is not an SPZ file.", hint=_AGAIN)
         gaussians = _decoded(packed)
         _check_end(path, packed)
     check_values(path, gaussians)
@@ -135,7 +135,7 @@ class _ZstdStream:
         """
         data = self.at_most(count)
         if len(data) != count:
-            raise SplatpipeError(f"{self._path} is cut off: what it holds ends early.", hint=_AGAIN)
+            raise SplatpipeError(f"{self._path} is cut off: its data end early.", hint=_AGAIN)
         return data
 
     def at_most(self, count: int) -> bytes:
@@ -198,7 +198,7 @@ def _gzip_stream(path: Path, file: BufferedReader) -> _Packed:
     stream = InflatedFile(path, file)
     magic, version, count, degree, bits, flags, _ = _HEADER.unpack(stream.exactly(_HEADER.size))
     if magic != MAGIC:
-        raise SplatpipeError(f"{path} is no SPZ file.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} is not an SPZ file.", hint=_AGAIN)
     if not HALF_VERSION <= version <= VERSION:
         raise SplatpipeError(f"{path}: version {version} of SPZ cannot be read.", hint="Export it as version 3.")
     return _checked(path, _Packed(version, count, degree, bits, flags, [stream] * ARRAYS), file_bytes(file))
@@ -212,20 +212,20 @@ def _zstd_streams(path: Path, file: BufferedReader) -> _Packed:
     packed = _checked(path, _Packed(version, count, degree, bits, flags), file_bytes(file))
     expected = [width * count for width in packed.widths() if width * count]
     if not _ZSTD_HEADER.size <= table <= _ZSTD_HEADER.size + _MOST_EXTENSION_BYTES or stream_count != len(expected):
-        raise SplatpipeError(f"{path} is damaged: its header fits no SPZ file.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} is damaged: its header is not valid.", hint=_AGAIN)
     if flags & HAS_EXTENSIONS:
         _check_coordinates(path, read_exactly(path, file, table - _ZSTD_HEADER.size))
     file.seek(table)
     entries = [_TABLE_ENTRY.unpack(read_exactly(path, file, _TABLE_ENTRY.size)) for _ in expected]
     if [size for _, size in entries] != expected:
-        raise SplatpipeError(f"{path} is damaged: its streams are not of {count} Gaussians.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} is damaged: its streams do not hold {count} Gaussians.", hint=_AGAIN)
     offset = file.tell()
     streams = []
     for stored, _ in entries:
         streams.append(_ZstdStream(path, file, offset))
         offset += stored
     if offset != file_bytes(file):
-        raise SplatpipeError(f"{path} is damaged or cut off: its streams do not fill it.", hint=_AGAIN)
+        raise SplatpipeError(f"{path} is damaged or cut off: its streams do not end with the file.", hint=_AGAIN)
     return replace(packed, streams=streams)
 
 
@@ -245,7 +245,7 @@ def _check_coordinates(path: Path, extensions: bytes) -> None:
         kind, size = struct.unpack_from("<II", extensions, at)
         value = extensions[at + 8 : at + 8 + size]
         if kind == COORDINATES_EXTENSION and value[:4] not in (bytes(4), struct.pack("<I", RIGHT_UP_BACK)):
-            raise SplatpipeError(f"{path} has other axes than SPZ's y up.", hint="Export it right, up, back (RUB).")
+            raise SplatpipeError(f"{path} has axes other than SPZ's (y up).", hint="Export it right, up, back (RUB).")
         at += 8 + size
 
 
