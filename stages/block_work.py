@@ -125,7 +125,7 @@ class BlockWork:
 
     def memory_bytes(self, load: BlockLoad) -> int:
         """Memory of a block's process beyond the fixed share of any training, bytes; `load` respects its limits."""
-        window = max(self.footage.largest(stretch.look) for stretch in stretches(self.footage, self.finer))
+        window = max(self.footage.largest(stretch.training_size) for stretch in stretches(self.footage, self.finer))
         taken = load.trained * bytes_per_gaussian(self.sh_degree) + load.frozen * frozen_bytes(self.sh_degree)
         return int(PIXEL_BYTES * window + taken + SITE_PHOTO_BYTES * self.footage.photos)
 

@@ -130,7 +130,7 @@ def _memory_bytes(device: Device) -> int:
 
 
 def _scene(train: TrainConfig, plan: TrainingPlan) -> SceneSize:
-    window = max(plan.footage.largest(stretch.look) for stretch in plan.schedule.stretches)
+    window = max(plan.footage.largest(stretch.training_size) for stretch in plan.schedule.stretches)
     photos = sum(count for _width, _height, count in plan.sizes)
     pixels = sum(width * height * count for width, height, count in plan.sizes) / max(photos, 1)
     size = CaptureSize(photos, pixels / MEGA, True, _shape(plan))

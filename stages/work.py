@@ -194,7 +194,7 @@ class CaptureWork:
         """Return the division into blocks that follows from the options and the expected number of Gaussians."""
         train = self.config.train
         footage = replace(self.footage, window_pixels=WINDOW_PIXELS["cpu"])
-        window = max(footage.largest(stretch.look) for stretch in stretches(footage, self.lengths))
+        window = max(footage.largest(stretch.training_size) for stretch in stretches(footage, self.lengths))
         scene = SceneSize(train.max_gaussians, self.grown, window, train.sh_degree, self.size.photos)
         if train.time_budget_s:
             return divided(scene, 0)
@@ -258,7 +258,7 @@ class CaptureWork:
     def window(self) -> float:
         """Largest number of megapixels in one iteration."""
         footage = self.footage
-        return max(footage.pixels(each.look) for each in stretches(footage, self.lengths)) / MEGA
+        return max(footage.pixels(each.training_size) for each in stretches(footage, self.lengths)) / MEGA
 
     @property
     def iterations(self) -> int:
@@ -290,10 +290,10 @@ class CaptureWork:
     def _training(footage: PhotoSizes, lengths: Sequence[Length], gaussians: float, frozen: float = 0.0) -> float:
         done, total = 0, 0.0
         for stretch in stretches(footage, lengths):
-            count, share = stretch.until - done, footage.share(stretch.look)
+            count, share = stretch.until - done, footage.share(stretch.training_size)
             cost = GAUSSIAN_MEGAPIXELS * (UNSEEN_SHARE + (1.0 - UNSEEN_SHARE) * share)
             there = gaussians * _mean_growth(lengths, done, stretch.until) + frozen
-            total += count * (footage.pixels(stretch.look) / MEGA + cost * there)
+            total += count * (footage.pixels(stretch.training_size) / MEGA + cost * there)
             done = stretch.until
         return total
 

@@ -193,7 +193,7 @@ def test_windows_that_show_the_cell_are_each_used_as_often_as_without_blocks(sit
         block = Block.of(config, other, replace(TASK, number=number, window_pixels=400), cpu())
         prospect = block.surveyor.prospect()
         plan = block.plan(prospect.windows)
-        visits = block.course(plan, prospect, tmp_path).visits(plan.schedule.looks_to(plan.last_iteration))
+        visits = block.course(plan, prospect, tmp_path).visits(plan.schedule.training_sizes_until(plan.last_iteration))
         each = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
         times = Counter((visit.view, visit.level, visit.window) for visit in each)
         assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from splatpipe.pipeline.edit.cleaning import CleaningResult, clean_scene
 from splatpipe.pipeline.edit.depth_islands import without_islands
-from splatpipe.pipeline.edit.visibility import TrainingPhotos, look_through
+from splatpipe.pipeline.edit.visibility import TrainingPhotos, measure_visibility
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
@@ -176,7 +176,7 @@ def test_weights_are_those_of_the_definition() -> None:
     """Two Gaussians, one before the other: the sums of α T by the slow definition, rendered in white on black."""
     two = made_of(np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 1.0]]), 0.2, 0.5, opacity=0.6)
     above = camera((0.01, 0.0, 7.0), "above")
-    found = look_through(two, TrainingPhotos([above], OPTIONS), lambda _done: None)
+    found = measure_visibility(two, TrainingPhotos([above], OPTIONS), lambda _done: None)
     for row in range(2):
         colours = torch.zeros(2, 3)
         colours[row] = 1.0
@@ -190,7 +190,7 @@ def test_weights_are_those_of_the_definition() -> None:
 def test_the_angle_between_photos_is_correct() -> None:
     one = made_of(np.array([[0.0, 0.0, 0.7]]), 0.2, 0.5)
     pair = [camera((5.0 * np.sin(a), 0.0, 0.7 + 5.0 * np.cos(a)), str(a)) for a in (-0.2, 0.2)]
-    found = look_through(one, TrainingPhotos(pair, OPTIONS), lambda _done: None)
+    found = measure_visibility(one, TrainingPhotos(pair, OPTIONS), lambda _done: None)
     assert found.photos[0] == pytest.approx(2.0, abs=0.01)
     assert found.angle_deg[0] == pytest.approx(np.rad2deg(0.2), rel=0.02)
 

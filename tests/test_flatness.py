@@ -105,7 +105,7 @@ def test_iterations_saved_at_a_size_go_to_the_finest_by_its_pixels() -> None:
     twice = plan.after([2000, 3000])
     assert twice.schedule.stretches[1:] == (Stretch(1, 0, 3000), Stretch(0, 0, 7375))
     assert twice.schedule.density.reset_until == 2000
-    assert twice.schedule.looks_to(3000) == sooner.schedule.looks_to(3000)
+    assert twice.schedule.training_sizes_until(3000) == sooner.schedule.training_sizes_until(3000)
 
 
 def test_the_tail_runs_through_the_rest_of_the_schedule_without_a_jump() -> None:

@@ -119,7 +119,7 @@ def test_a_schedule_grows_gaussians_into_the_finest_size_and_resets_none_there()
     assert schedule.look_at(1) == TrainingSize(2) and schedule.look_at(schedule.iterations + 5) == TrainingSize(
         0, WINDOW
     )
-    assert [schedule.looks_to(each[0][1] + 1)[index] for index in (0, -2, -1)] == [
+    assert [schedule.training_sizes_until(each[0][1] + 1)[index] for index in (0, -2, -1)] == [
         TrainingSize(2),
         TrainingSize(2),
         TrainingSize(1, WINDOW),

@@ -70,7 +70,7 @@ def of_block(camera: Camera, block: tuple[int, int, int, int]) -> torch.Tensor:
 def looked(robust: RobustMask, camera: Camera, colour: torch.Tensor, mask: torch.Tensor | None = None) -> TrainingPhoto:
     """A visit of a model that is the truth."""
     rendered = true_render(camera)
-    return robust.look(TrainingPhoto(camera, colour, mask), rendered, rendered.colour)
+    return robust.leave_out_contradicted(TrainingPhoto(camera, colour, mask), rendered, rendered.colour)
 
 
 def an_epoch(robust: RobustMask, share: float = 0.05, cars: tuple[int, ...] = (2,)) -> dict[int, TrainingPhoto]:
@@ -122,7 +122,7 @@ def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(rob
         for camera in cameras():
             rendered, missing = true_render(camera), true_photo(camera)
             missing[20:88, 20:124] = torch.tensor(YELLOW)
-            photo = robust.look(TrainingPhoto(camera, missing, None), rendered, rendered.colour)
+            photo = robust.leave_out_contradicted(TrainingPhoto(camera, missing, None), rendered, rendered.colour)
         robust.end_epoch(0.5)
         robust.threshold.clamp_(max=LEAST_RESIDUAL)  # however many are above it
     assert bool((robust.scores[3] > LEAST_RESIDUAL).any())
@@ -163,7 +163,8 @@ def test_holes_of_the_model_contradict_nothing(robust: RobustMask) -> None:
     camera = cameras()[2]
     rendered, hole = true_render(camera), of_block(camera, CARS[2])
     rendered.alpha[hole], rendered.colour[hole] = 0.3, 0.0
-    assert robust.look(TrainingPhoto(camera, true_photo(camera), None), rendered, rendered.colour).mask is None
+    photo = TrainingPhoto(camera, true_photo(camera), None)
+    assert robust.leave_out_contradicted(photo, rendered, rendered.colour).mask is None
 
 
 def test_no_more_than_a_quarter_of_a_photo_is_left_out(robust: RobustMask) -> None:

@@ -33,7 +33,7 @@ class Clean:
         Raises:
             SplatpipeError: if nothing is left.
         """
-        gaussians = piece.settled()
+        gaussians = piece.with_motion_applied()
         photos = None
         if self.cameras and not piece.merged:
             options = rasterizer.RenderOptions(sh_degree=gaussians.sh_degree, antialias=piece.facts.antialias)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.edit.floaters import LOOKS, LOOSE, Suspects, likely_floaters
 from splatpipe.pipeline.edit.isolation import GaussianShapes, far_groups, held
-from splatpipe.pipeline.edit.visibility import GaussianVisibility, TrainingPhotos, look_through
+from splatpipe.pipeline.edit.visibility import GaussianVisibility, TrainingPhotos, measure_visibility
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 Flags = Bool[np.ndarray, " n"]
@@ -69,7 +69,7 @@ def clean_scene(gaussians: Gaussians, photos: TrainingPhotos | None = None, told
     if not bool(gaussians.finite().all()):
         raise ValueError("Gaussians that are not finite are to be left out before")
     keep, removed = np.ones(len(gaussians), np.bool_), {}
-    for reason, flags in _found(gaussians, photos, told or _untold):
+    for reason, flags in _found(gaussians, photos, told or _ignore_progress):
         removed[reason] = int((flags & keep).sum())
         keep &= ~flags
     return CleaningResult(torch.from_numpy(keep), removed)
@@ -85,7 +85,7 @@ def removals_in_words(cleaned: CleaningResult) -> str:
     return f"Removed {count:,} of {total:,} Gaussians: {why}."
 
 
-def _untold(_done: int, _total: int) -> None:
+def _ignore_progress(_done: int, _total: int) -> None:
     """Ignore progress."""
 
 
@@ -100,7 +100,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> I
         return
     looks = len(photos.cameras)
     steps = looks * (1 if photos.picture is None else 1 + LOOKS)
-    found = look_through(gaussians, photos, lambda done: told(done, steps))
+    found = measure_visibility(gaussians, photos, lambda done: told(done, steps))
     seen = found.weight >= SEEN_PIXELS
     floats = seen & (found.floating > FLOATING)
     ground = seen & ~floats & solid

@@ -49,7 +49,7 @@ class Merge:
                 "small Gaussians of the other will look too thin or too thick."
             )
         count = len(other.gaussians)
-        piece.take(_joined(ours, other, moved))
+        piece.replace_gaussians(_joined(ours, other, moved))
         piece.merged = True
         return {"step": "merge", "file": source.name[:80], "sha256": digest[:DIGEST_CHARACTERS], "added": count}
 

@@ -83,9 +83,11 @@ class Reduce:
         """
         if self.count:
             if len(piece) > self.count:
-                piece.take(reduce_further(Reduction.none_yet(piece.settled()), self.count).gaussians)
+                piece.replace_gaussians(
+                    reduce_further(Reduction.none_yet(piece.with_motion_applied()), self.count).gaussians
+                )
             return {"step": "reduce", "to": self.count}
-        piece.take(self._fitting(piece.scene()))
+        piece.replace_gaussians(self._fitting(piece.scene()))
         return {"step": "reduce", "bytes": self.size_bytes, "format": self.output.kind.name}
 
     def _fitting(self, scene: Scene) -> Gaussians:

@@ -90,7 +90,7 @@ class _VisibilitySums:
         return GaussianVisibility(self.weight, photos, angle, border, before, gap)
 
 
-def look_through(gaussians: Gaussians, photos: TrainingPhotos, told: Callable[[int], None]) -> GaussianVisibility:
+def measure_visibility(gaussians: Gaussians, photos: TrainingPhotos, told: Callable[[int], None]) -> GaussianVisibility:
     """Compute the visibility of each Gaussian in the photos.
 
     Args:

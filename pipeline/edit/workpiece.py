@@ -96,12 +96,12 @@ class Workpiece:
         self._moved = similarity.compose(self._moved)
         self.travelled = similarity.compose(self.travelled)
 
-    def take(self, gaussians: Gaussians) -> None:
+    def replace_gaussians(self, gaussians: Gaussians) -> None:
         """Replace the Gaussians by others, given in the splat's own axes."""
-        self.settled()
+        self.with_motion_applied()
         self._gaussians = gaussians
 
-    def settled(self) -> Gaussians:
+    def with_motion_applied(self) -> Gaussians:
         """Apply the pending motion and return the Gaussians in the splat's own axes; not copied.
 
         Raises:
@@ -122,7 +122,7 @@ class Workpiece:
 
     def scene(self) -> Scene:
         """The edited scene; not copied."""
-        gaussians = self.settled()
+        gaussians = self.with_motion_applied()
         return Scene(gaussians, self.facts)
 
     def _near_zero(self) -> None:

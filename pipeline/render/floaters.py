@@ -61,7 +61,7 @@ def measure_floaters(
     small = {place: reduced_camera(cameras[place], LARGEST_MEGAPIXELS) for place in places}
     flagged, depths, light = _flagged(gaussians, chosen), {}, np.zeros(2)
     for place in places:
-        depths[place], of_view = _look(flagged, small[place], options)
+        depths[place], of_view = _depth_and_light(flagged, small[place], options)
         light += of_view
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
     apart = depth_disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
@@ -89,7 +89,7 @@ def _flagged(gaussians: Gaussians, chosen: Bool[Tensor, " n"]) -> Gaussians:
     return replace(gaussians, sh=colours[:, None].contiguous())
 
 
-def _look(
+def _depth_and_light(
     flagged: Gaussians, camera: Camera, options: rasterizer.RenderOptions
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, " 2"]]:
     """A view's median depth, and the total light that it gets from the chosen Gaussians and from all."""

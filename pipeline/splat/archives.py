@@ -23,4 +23,4 @@ def read_archive(path: Path) -> dict[str, npt.NDArray[Any]]:
         except OSError:
             raise
         except Exception as error:  # the zip, header and array readers raise almost anything on broken files
-            raise ValueError(f"no whole archive: {' '.join(str(error).split())[:120]}") from error
+            raise ValueError(f"incomplete or damaged archive: {' '.join(str(error).split())[:120]}") from error

@@ -45,9 +45,9 @@ class Panorama:
             camera: The camera.
             background: Red, green, blue, 0..1.
         """
-        return self.look(camera).behind(self.colours, background)
+        return self.view_from(camera).behind(self.colours, background)
 
-    def look(self, camera: Camera) -> PanoramaView:
+    def view_from(self, camera: Camera) -> PanoramaView:
         """The lookup of a camera's nodes in this panorama."""
         if self.colours.device.type == "cpu":
             return gather_view(camera, self.up, self.colours)
@@ -266,7 +266,7 @@ def read_panorama(path: Path) -> Panorama | None:
         return panorama_of(up, colours)
     except (OSError, ValueError, KeyError) as error:
         raise StageError(
-            f"The sky of the training cannot be read: {error}.", hint="Run again with --rerun-from train."
+            f"The trained sky cannot be read: {error}.", hint="Run again with --rerun-from train."
         ) from error
 
 
@@ -277,7 +277,7 @@ def panorama_of(up: np.ndarray, colours: np.ndarray) -> Panorama:
         ValueError: if the arrays are not a panorama's.
     """
     if up.shape != (3,) or up.dtype != np.float64 or not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
-        raise ValueError("its pole is no direction")
+        raise ValueError("its pole is not a direction")
     if colours.shape != (ROWS * COLUMNS, 3) or colours.dtype != np.float32 or not np.isfinite(colours).all():
         raise ValueError("its colours are not those of its cells")
     return Panorama(up, torch.from_numpy(colours))

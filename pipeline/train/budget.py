@@ -114,7 +114,7 @@ def forecast(speed: Speed, schedule: Schedule, initial: int, footage: PhotoSizes
     for stretch in schedule.stretches:
         count = stretch.until - start
         steps = min(SAMPLES, count)
-        pixels, share = footage.pixels(stretch.look), footage.share(stretch.look)
+        pixels, share = footage.pixels(stretch.training_size), footage.share(stretch.training_size)
         middles = [start + int((step + 0.5) * count / steps) + 1 for step in range(steps)]
         each = [speed.seconds(room_at(schedule.density, initial, middle), pixels, share) for middle in middles]
         total += sum(each) * count / steps

@@ -50,7 +50,7 @@ class Stretch:
     until: int
 
     @property
-    def look(self) -> TrainingSize:
+    def training_size(self) -> TrainingSize:
         """The training size of its iterations."""
         return TrainingSize(self.level, self.window_pixels)
 

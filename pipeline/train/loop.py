@@ -219,7 +219,7 @@ def training_sizes(plan: TrainingPlan, history: History) -> list[TrainingSize]:
         history: The training's history.
     """
     now = plan.after(history.sizes_ended)
-    return now.schedule.looks_to(ends_at(now, history.flat_at))
+    return now.schedule.training_sizes_until(ends_at(now, history.flat_at))
 
 
 def budgeted(plan: TrainingPlan) -> bool:
@@ -290,7 +290,7 @@ class Training:
         """The last iteration, as far as it is known now."""
         return ends_at(self.now, self.state.history.flat_at)
 
-    def is_told(self) -> bool:
+    def report_due(self) -> bool:
         """Whether progress is reported after this iteration."""
         every = REPORT_EVERY if self.course.device.name == "cpu" else CUDA_REPORT_EVERY
         return self.state.iteration % every == 0 or self.state.iteration == self.last
@@ -339,22 +339,22 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
             iterate_within_memory(iterate, state, plan, photo, report)
             state.seconds = clock.seconds()
             if state.history.growth_ended == state.iteration:
-                tell_growth_ended(state, plan, report)
+                report_growth_ended(state, plan, report)
             if state.iteration in state.history.sizes_ended[-1:]:
                 plan = training.now
                 visits = training.course.visits(training_sizes(training.course.plan, state.history))
                 photos.go_on(visits, state.iteration + 1)
-                tell_larger_photos(state, plan, report)
+                report_larger_photos(state, plan, report)
             if interrupt.requested:
                 break
             if clock.is_up(plan):
-                end_now(state, plan, photo, report)
+                end_early(state, plan, photo, report)
                 break
             if clock.checkpoint_due() and state.iteration < training.last:
                 with clock.checkpointing():
                     training.save()
-            if training.is_told():
-                tell(state, plan, report)
+            if training.report_due():
+                report_progress(state, plan, report)
             if state.iteration == training.last:
                 break
     if interrupt.requested:  # checked again: the request may have come after the last iteration's check
@@ -362,7 +362,7 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
         raise KeyboardInterrupt
 
 
-def tell_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
+def report_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
     """Warn that memory stops the model from growing."""
     limited = plan.options.max_memory_bytes > 0
     report.warning(
@@ -373,7 +373,7 @@ def tell_growth_ended(state: TrainState, plan: TrainingPlan, report: Reporter) -
     )
 
 
-def tell_larger_photos(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
+def report_larger_photos(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
     """Report that a photo size ended early, and how many iterations there are now in total."""
     report.note(
         f"flat after {state.iteration:,} iterations: continuing with larger photos, to "
@@ -381,10 +381,10 @@ def tell_larger_photos(state: TrainState, plan: TrainingPlan, report: Reporter) 
     )
 
 
-def end_now(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter) -> None:
+def end_early(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter) -> None:
     """Close the history of a training whose time is up, and report where the schedule was cut."""
     state.history.end_iteration(state.iteration, True, curve_facts(state, plan, photo))
-    tell(state, plan, report)
+    report_progress(state, plan, report)
     if state.iteration < plan.schedule.iterations:
         report.note(
             f"time budget used up after {state.iteration:,} of {plan.schedule.iterations:,} planned iterations; "
@@ -392,7 +392,7 @@ def end_now(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report:
         )
 
 
-def tell(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
+def report_progress(state: TrainState, plan: TrainingPlan, report: Reporter) -> None:
     """Report the training's progress."""
     planned = min(plan.schedule.iterations, ends_at(plan, state.history.flat_at))
     report.progress(state.iteration, max(state.iteration, planned), "training", "iterations")

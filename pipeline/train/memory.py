@@ -44,7 +44,7 @@ def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bo
         taken, of_one = 0, device_bytes_per_gaussian(plan.options.sh_degree)
     room = limit - taken - FIXED_BYTES
     plan = plan.within_windows(window_within(room, plan.window_pixels))
-    pixels = max(plan.footage.largest(stretch.look) for stretch in plan.schedule.stretches)
+    pixels = max(plan.footage.largest(stretch.training_size) for stretch in plan.schedule.stretches)
     most = (room - PIXEL_BYTES * pixels) // of_one
     if most < min(FEWEST_GAUSSIANS, sparse):
         least = limit - room + PIXEL_BYTES * pixels + FEWEST_GAUSSIANS * of_one

@@ -109,7 +109,7 @@ class RobustMask(Technique):
 
     def counted(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
         """The photo without what the other photos contradict."""
-        return self.look(photo, shot.rendered, picture)
+        return self.leave_out_contradicted(photo, shot.rendered, picture)
 
     def after_epoch(self, iteration: int) -> None:
         """Set the threshold for the next epoch."""
@@ -119,7 +119,9 @@ class RobustMask(Technique):
         """The share that the last visits left out."""
         return {"robust_left_out": round(self.share_left_out(), 5)}
 
-    def look(self, photo: TrainingPhoto, rendered: Render, shown: Float[Tensor, "h w 3"]) -> TrainingPhoto:
+    def leave_out_contradicted(
+        self, photo: TrainingPhoto, rendered: Render, shown: Float[Tensor, "h w 3"]
+    ) -> TrainingPhoto:
         """Record a photo's residuals and return it without what the other photos contradict, or unchanged.
 
         Args:

@@ -128,7 +128,7 @@ class Schedule:
 
     def look_at(self, iteration: int) -> TrainingSize:
         """The training size of an iteration (from 1)."""
-        return self.stretches[self.stretch_at(iteration)].look
+        return self.stretches[self.stretch_at(iteration)].training_size
 
     def stretch_at(self, iteration: int) -> int:
         """The index of the stretch that contains an iteration (from 1)."""
@@ -158,14 +158,14 @@ class Schedule:
         )
         return replace(self, iterations=total, stretches=tuple(changed), density=density)
 
-    def looks_to(self, last: int) -> list[TrainingSize]:
+    def training_sizes_until(self, last: int) -> list[TrainingSize]:
         """``look_at`` for every iteration from 1 to ``last``."""
         return [self.look_at(iteration) for iteration in range(1, last + 1)]
 
     @property
     def finest(self) -> TrainingSize:
         """The training size at the end."""
-        return self.stretches[-1].look
+        return self.stretches[-1].training_size
 
     @property
     def finest_from(self) -> int:

@@ -160,7 +160,7 @@ class SkyModel(SideModel, Technique):
             background: Stays behind everything below the horizon.
             elsewhere: A different colour each time, so that only an opaque wall can match the photo.
         """
-        look = self.panorama.look(camera)
+        look = self.panorama.view_from(camera)
         nodes, how = look.at_nodes(self.panorama.colours, background), SkyLayer(background)
         if seen is not None:
             how = SkyLayer(background, look.flat_at_nodes(elsewhere, background), seen.around, seen.mask)
