@@ -34,7 +34,7 @@ def test_a_stream_is_read_as_it_was_written_in_any_steps() -> None:
         assert b"".join(parts) == CONTENT
     stream = InflatedFile(PATH, io.BytesIO(gzip.compress(CONTENT)))
     assert stream.exactly(300) == CONTENT[:300]
-    with pytest.raises(SplatpipeError, match="ends early"):
+    with pytest.raises(SplatpipeError, match="end early"):
         stream.exactly(len(CONTENT))
 
 

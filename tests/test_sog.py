@@ -373,7 +373,7 @@ def test_archives_that_unpack_to_too_much_are_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
         for name, data in [*files.items(), ("quats.webp", files["quats.webp"])]:
             archive.writestr(name, data)
-    with pytest.raises(SplatpipeError, match="not one quats"):
+    with pytest.raises(SplatpipeError, match="exactly one quats"):
         read(path)
 
 

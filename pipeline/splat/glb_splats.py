@@ -179,9 +179,9 @@ def _splat(container: Container, primitive: Mapping[str, Any]) -> _Splat | _SpzS
         container.refuse("a splat has no attributes")
     for key, taken in (("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")):
         if extension.get(key, taken) != taken:
-            found = str(extension[key])[:40]
+            given = str(extension[key])[:40]
             raise SplatpipeError(
-                f"{container.path}: splats with {key} {found} cannot be read, only {taken}.", hint=_HINT
+                f"{container.path}: splats with {key} {given} cannot be read, only {taken}.", hint=_HINT
             )
     inside = extension.get("extensions")
     packed = inside.get(SPZ_EXTENSION) if isinstance(inside, dict) else None
