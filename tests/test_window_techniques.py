@@ -235,7 +235,7 @@ def visited(robust: RobustMask, photos: list[TrainingPhoto]) -> list[TrainingPho
     for photo in photos:
         with torch.no_grad():
             rendered = rasterizer.render(tiny_scene.true_model(), photo.camera, RenderOptions(3))
-        found.append(robust.look(photo, rendered, rendered.colour))
+        found.append(robust.leave_out_contradicted(photo, rendered, rendered.colour))
     return found
 
 

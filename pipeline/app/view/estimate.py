@@ -297,7 +297,10 @@ class Projector:
         return Projection(pixels, radius, depth, doubtful)
 
     def line(self, sighting: Sighting) -> Float64[np.ndarray, "steps m 2"]:
-        """Project the ray of a mark in one photo into the others (the epipolar curve); NaN where not visible."""
+        """Project the ray of a mark in one photo into the others (the epipolar curve); NaN where not visible.
+
+        A curve ends with the first position outside the photo, so that it reaches the photo's edge.
+        """
         assert sighting.index is not None
         view = self._job.model.view(sighting.index, self._job.photos[sighting.photo].width)
         pose = view.cam_from_model
@@ -306,7 +309,14 @@ class Projector:
         ray = np.append(view.ray(np.array(sighting.pixel)), 1.0)
         near, far = np.maximum(reach, 1e-9).tolist()
         places = (np.geomspace(near, far, LINE_STEPS)[:, None] * ray - pose[:, 3]) @ pose[:, :3]
-        return self.project(places, np.zeros(LINE_STEPS)).pixels
+        pixels = self.project(places, np.full(LINE_STEPS, np.inf)).pixels
+        photos = [self._job.photos.get(name) for name in self._job.model.names]
+        sizes = np.array([(0, 0) if photo is None else (photo.width, photo.height) for photo in photos])
+        inside = np.all((pixels >= 0.0) & (pixels <= sizes), axis=2)
+        near_inside = inside.copy()
+        near_inside[1:] |= inside[:-1]
+        near_inside[:-1] |= inside[1:]
+        return np.where(near_inside[..., None], pixels, np.nan)
 
     def _witnessed(self, places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n m"]:
         """Which photos show a sparse point close to each position, so that it is probably not occluded there."""
