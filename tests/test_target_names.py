@@ -87,7 +87,7 @@ def test_a_quadrant_without_a_point_gets_no_name() -> None:
     expected = ExpectedPoints(tuple(known), PLACES[rows], MISPLACED)
     marks = named_tracks(finds(), known, (model(), PHOTOS), expected, {})
     assert_true(marks, len(known) - 1)
-    assert set(marks.pixels()) <= set(known) and marks.refused["targets where no point is"] >= 2
+    assert set(marks.pixels()) <= set(known) and marks.refused["targets at no surveyed point"] >= 2
 
 
 def test_a_coded_target_away_from_its_point_is_rejected() -> None:
@@ -97,7 +97,7 @@ def test_a_coded_target_away_from_its_point_is_rejected() -> None:
     marks = named(swapped, MISPLACED)
     assert "P01" not in marks.pixels() and "P06" not in marks.pixels()
     assert_true(marks, len(NAMES) - 2)
-    assert marks.refused["coded targets elsewhere than their points"] == 2
+    assert marks.refused["coded targets far from the points of their numbers"] == 2
 
 
 def test_one_false_detection_of_a_target_is_rejected_by_geometry() -> None:

@@ -193,7 +193,7 @@ def _rms(residuals: Float64[np.ndarray, "n k"]) -> float:
 
 def report_fit(frame: Frame, fit: PositionFit, model: SparseModel, positions: Positions, report: Reporter) -> None:
     """Report how well the positions place the model; warn about wrong positions or a weak fit."""
-    report.note(f"Placed by the photos' positions: {fit.uncertainty.sentence()}.")
+    report.note(f"By the photos' positions alone: {fit.uncertainty.sentence()}.")
     _warn_of_noise(fit, frame, positions, report)
     _warn_of_directions(fit, report)
     warn_of_flight_offsets(frame.residuals["flights"], report)

@@ -96,15 +96,15 @@ def named_tracks(
     coded = coded_tracks(finds, *scene)
     by_number, refused = _by_number(coded, names)
     if expected is None:
-        refused["quadrants that no coordinates name"] += sum(find.number is None for find in finds)
+        refused["quadrants without coordinates to identify them"] += sum(find.number is None for find in finds)
         return TargetMarks(tuple(by_number), +refused)
     taken = {id(each.track) for each in by_number}
     unnamed = unnamed_tracks([find for find in finds if find.number is None], *scene)
     unnamed += [track for track in coded if id(track) not in taken]
     by_place, wrong = _by_place(unnamed, by_number, expected, seeds)
     kept = [each for each in by_number if each.name not in wrong]
-    refused["coded targets elsewhere than their points"] += len(by_number) - len(kept)
-    refused["targets where no point is"] += len(unnamed) - len(by_place)
+    refused["coded targets far from the points of their numbers"] += len(by_number) - len(kept)
+    refused["targets at no surveyed point"] += len(unnamed) - len(by_place)
     found = kept + [NamedTrack(name, unnamed[k]) for name, k in sorted(by_place.items())]
     return TargetMarks(tuple(found), +refused)
 
@@ -170,7 +170,7 @@ def _by_number(coded: Sequence[Track], names: Sequence[str]) -> tuple[list[Named
         if len(chosen) == 1:
             result.append(NamedTrack(name, chosen[0]))
         else:
-            refused["coded targets of which two have a point's number"] += len(chosen)
+            refused["coded targets that share a point's number"] += len(chosen)
     return result, refused
 
 
