@@ -13,7 +13,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "versions"))
 import record
-from sources import PACKAGE
+from sources import PACKAGE, data_digests
 from stage_comparison import Comparison
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -93,6 +93,24 @@ def test_comments_docstrings_and_formatting_do_not_count(copy: Path) -> None:
         tree = ast.parse(file.read_text(encoding="utf-8"))
         file.write_text(f'"""Another docstring."""\n# A comment.\n{ast.unparse(tree)}\n', encoding="utf-8")
     assert record.complaint(copy) == ""
+
+
+@pytest.mark.parametrize(
+    ("code", "is_counted"),
+    [
+        ("int floats = 116'000;  // a {}\nchar c = 'x';", False),
+        ("int bits = 0xff'ffu;  /* a {} */ char c = u8'\\'';  // another {}", False),
+        ("char c = L'\"';  // a {}", False),
+        ("int floats = 1'000; char text[] = \"// a {}\";", True),
+        ("int floats = 1'000, {} = 2;", True),
+    ],
+)
+def test_apostrophes_between_digits_are_not_quotes(tmp_path: Path, code: str, is_counted: bool) -> None:
+    digests = []
+    for word in ("tile", "block"):
+        (tmp_path / "loss.h").write_text(code.format(word, word), encoding="utf-8")
+        digests.append(data_digests(tmp_path)["loss.h"])
+    assert (digests[0] != digests[1]) == is_counted
 
 
 def test_a_version_is_recorded_with_its_sources(copy: Path) -> None:

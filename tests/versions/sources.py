@@ -23,7 +23,10 @@ UNCOUNTED = (".py", ".pyi", ".so", ".pyc", ".typed")  # read as modules, or irre
 RECORD = "versions.toml"  # in a package that all stages reach, and contains the digests
 UNSAID = ("ctx", "kind", "type_comment")  # of a syntax tree: redundant, or formatting
 CPP = (".cpp", ".h", ".cu", ".cuh")
-CPP_PIECES = re.compile(r"""(?P<text>"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|//[^\n]*|/\*.*?\*/""", re.DOTALL)
+CPP_NUMBER = r"(?<!\w)\d(?:'?\w)*"  # an apostrophe between digits does not begin a character literal
+CPP_PIECES = re.compile(
+    rf"""(?P<text>{CPP_NUMBER}|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|//[^\n]*|/\*.*?\*/""", re.DOTALL
+)
 BLANKS = re.compile(r"(?<=\w)\s+(?=\w)|(?P<needless>\s+)")
 
 
