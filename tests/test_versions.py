@@ -101,7 +101,7 @@ def test_comments_docstrings_and_formatting_do_not_count(copy: Path) -> None:
         ("int floats = 116'000;  // a {}\nchar c = 'x';", False),
         ("int bits = 0xff'ffu;  /* a {} */ char c = u8'\\'';  // another {}", False),
         ("char c = L'\"';  // a {}", False),
-        ("int floats = 1'000; char text[] = \"// a {}\";", True),
+        ('int floats = 1\'000; char text[] = "// a {}";', True),
         ("int floats = 1'000, {} = 2;", True),
     ],
 )
