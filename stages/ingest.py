@@ -21,7 +21,6 @@ from splatpipe.pipeline.photos.camera_groups import (
     report_cameras,
 )
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import FAR_M, median_distance_m
 from splatpipe.pipeline.photos.duplicates import split_duplicates
 from splatpipe.pipeline.photos.names import NAMES_SHOWN, list_names, printable
 from splatpipe.pipeline.photos.options import IngestConfig
@@ -33,6 +32,7 @@ from splatpipe.pipeline.photos.photo_list import (
     photo_root,
     save_photo_list,
 )
+from splatpipe.pipeline.photos.position_outliers import FAR_M, median_distance_m
 from splatpipe.pipeline.photos.preparation import (
     MASKS,
     SKIES,
@@ -52,7 +52,7 @@ from splatpipe.pipeline.survey.photo_positions import (
     positions_json,
     read_positions,
 )
-from splatpipe.pipeline.survey.position_doubts import position_doubts
+from splatpipe.pipeline.survey.position_issues import find_position_issues
 from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 
 MIN_PHOTOS = 2
@@ -85,9 +85,9 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         skies = prepare_masks(SKIES, root, photos, others, {}, work)
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places)
-    for doubt in position_doubts(photos, positions):
-        if doubt.weight == "warning":
-            report.warning(doubt.message, doubt.hint)
+    for issue in find_position_issues(photos, positions):
+        if issue.severity == "warning":
+            report.warning(issue.message, issue.hint)
     described = describe_cameras(photos, groups, camera_of)
     report_cameras(described, report)
     if find_model(inputs.photos_dir) is None:  # a given model comes with its calibration

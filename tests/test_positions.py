@@ -10,8 +10,8 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.upright import enu_from_gimbal
 from splatpipe.pipeline.photos.camera_angles import detect_convention, gimbal_from_nadir
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import find_misplaced
 from splatpipe.pipeline.photos.exif import Exif, Gps
+from splatpipe.pipeline.photos.position_outliers import find_misplaced
 from splatpipe.pipeline.survey.photo_positions import Position, PositionList, positions_json, read_positions
 from splatpipe.pipeline.survey.stated_positions import read_places
 

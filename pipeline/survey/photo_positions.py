@@ -18,8 +18,8 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.camera_angles import Convention, detect_convention, gimbal_from_nadir
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import find_misplaced
 from splatpipe.pipeline.photos.exif import Gps
+from splatpipe.pipeline.photos.position_outliers import find_misplaced
 from splatpipe.pipeline.photos.xmp import xmp_number
 from splatpipe.pipeline.survey.crs_names import ELLIPSOIDAL, UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.flights import Stamp, assign_flights

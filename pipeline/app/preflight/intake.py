@@ -14,10 +14,10 @@ from splatpipe.pipeline.app.preflight.findings import Finding, LeftOutPhoto
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.source import RunSource
 from splatpipe.pipeline.engine.stage import JSON, Reporter
-from splatpipe.pipeline.photos.camera_doubts import camera_doubts
 from splatpipe.pipeline.photos.camera_groups import CameraGroup, group_cameras
+from splatpipe.pipeline.photos.camera_issues import find_camera_issues
+from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import Doubt
 from splatpipe.pipeline.photos.duplicates import split_duplicates
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.photo_list import Photo, photo_root
@@ -26,7 +26,7 @@ from splatpipe.pipeline.photos.scan import ExcludedPhoto, scan_folder
 from splatpipe.pipeline.sfm.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairs import Layout
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
-from splatpipe.pipeline.survey.position_doubts import position_doubts
+from splatpipe.pipeline.survey.position_issues import find_position_issues
 from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 
 if TYPE_CHECKING:
@@ -76,10 +76,10 @@ def read_capture(source: RunSource, config: LineConfig, threads: int, report: Re
     if len(photos) < MIN_PHOTOS:
         findings.append(_too_few(len(photos)))
     groups, camera_of = group_cameras(photos)
-    findings += [from_doubt(doubt) for doubt in camera_doubts(photos, groups, camera_of)]
+    findings += [finding_from_issue(issue) for issue in find_camera_issues(photos, groups, camera_of)]
     places, troubles = _file_places(source, config, photos)
     positions = read_positions(photos, places)
-    findings += [*troubles, *(from_doubt(doubt) for doubt in position_doubts(photos, positions))]
+    findings += [*troubles, *(finding_from_issue(issue) for issue in find_position_issues(photos, positions))]
     left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
     intake = Intake(
         tuple(photos),
@@ -92,9 +92,9 @@ def read_capture(source: RunSource, config: LineConfig, threads: int, report: Re
     return intake, findings
 
 
-def from_doubt(doubt: Doubt) -> Finding:
-    """Convert a doubt to a finding."""
-    return Finding(doubt.code, doubt.weight, doubt.message, doubt.hint, doubt.photos)
+def finding_from_issue(issue: CaptureIssue) -> Finding:
+    """Convert an issue to a finding."""
+    return Finding(issue.code, issue.severity, issue.message, issue.hint, issue.photos)
 
 
 def ingest_photos(photos: Sequence[CheckedPhoto], camera_of: Mapping[str, int]) -> list[Photo]:

@@ -17,7 +17,7 @@ from splatpipe.pipeline.sfm.footprints import FURTHEST, MIN_HEIGHT_M, StatedPose
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
-from splatpipe.pipeline.survey.position_doubts import WELL_KNOWN_M
+from splatpipe.pipeline.survey.position_issues import WELL_KNOWN_M
 from splatpipe.pipeline.survey.scale_bars import read_scale_bars
 from splatpipe.pipeline.survey.surveyed_points import missing_photos
 

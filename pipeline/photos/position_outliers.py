@@ -1,10 +1,8 @@
-"""Doubts about a capture's photos, as reported; detection of positions that cannot be right, given the others."""
+"""Detection of photo positions that cannot be right, given the others."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,25 +11,6 @@ METRES_PER_DEGREE = 111_195.0  # on a sphere: accurate enough to detect distant 
 FAR_M = 500.0  # nobody photographs one building with a drone from farther away
 FAR_SPREADS = 20.0  # times the median distance from the middle: long corridors are valid captures, too
 MIN_POSITIONS = 3  # with two, there is no telling which one is wrong
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """Something that may be wrong with a capture: a warning of a run, or a finding of the preflight.
-
-    Attributes:
-        code: What it is, for programs.
-        message: One sentence.
-        hint: What to do about it.
-        photos: Names of the photos concerned; empty if it concerns the whole capture.
-        weight: A ``note`` costs neither photos nor accuracy.
-    """
-
-    code: str
-    message: str
-    hint: str = ""
-    photos: tuple[str, ...] = ()
-    weight: Literal["warning", "note"] = "warning"
 
 
 def find_misplaced(places: Mapping[str, tuple[float, float]]) -> dict[str, str]:

@@ -6,16 +6,16 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from splatpipe.pipeline.photos.camera_groups import CameraGroup, camera_name, picture_scale
+from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import Doubt
 from splatpipe.pipeline.photos.names import list_names
 
 MINORITY = 0.25  # of the photos: a camera that took more of them was used on purpose
 
 
-def camera_doubts(
+def find_camera_issues(
     photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int]
-) -> list[Doubt]:
+) -> list[CaptureIssue]:
     """Report mixed cameras, mixed zoom settings, and photos that were resized or cropped.
 
     Args:
@@ -27,25 +27,25 @@ def camera_doubts(
     sizes = Counter(resized.values())
     common = sizes.most_common(1)[0][0] if sizes else ""
     odd = [name for name, what in resized.items() if what and what != common]
-    doubts = _mixed_cameras(photos, groups, camera_of, set(odd))
+    issues = _mixed_cameras(photos, groups, camera_of, set(odd))
     if common:
         which = "All photos" if sizes[common] == len(photos) else f"{sizes[common]} of {len(photos)} photos"
-        doubts.append(
-            Doubt(
+        issues.append(
+            CaptureIssue(
                 "resized",
                 f"{which} are {common}.",
                 "These are treated as reduced. Original photos have more detail, and metadata that match.",
-                weight="note",
+                severity="note",
             )
         )
     for what in sorted({resized[name] for name in odd}):
         names = sorted(name for name in odd if resized[name] == what)
-        doubts.append(
-            Doubt(
+        issues.append(
+            CaptureIssue(
                 "resized", f"{list_names(names)}: {what}, unlike the others.", "Take the original files.", tuple(names)
             )
         )
-    return doubts
+    return issues
 
 
 def _resizing(photo: CheckedPhoto) -> str:
@@ -62,7 +62,7 @@ def _resizing(photo: CheckedPhoto) -> str:
 
 def _mixed_cameras(
     photos: Sequence[CheckedPhoto], groups: Sequence[CameraGroup], camera_of: Mapping[str, int], resized: set[str]
-) -> list[Doubt]:
+) -> list[CaptureIssue]:
     """Report cameras with few photos one by one, and those with many photos together."""
     if len(groups) < 2:
         return []
@@ -70,27 +70,29 @@ def _mixed_cameras(
     for photo in photos:
         members.setdefault(camera_of[photo.name], []).append(photo)
     main = max(members, key=lambda number: len(members[number]))
-    doubts = []
+    issues = []
     many = [number for number, own in members.items() if len(own) > MINORITY * len(photos)]
     if len(many) > 1:
         listed = "; ".join(f"{len(members[number])} photos of {_describe(members[number][0])}" for number in many)
-        doubts.append(
-            Doubt("cameras", f"The capture mixes cameras: {listed}.", "Each is calibrated separately.", weight="note")
+        issues.append(
+            CaptureIssue(
+                "cameras", f"The capture mixes cameras: {listed}.", "Each is calibrated separately.", severity="note"
+            )
         )
     for number, own in sorted(members.items()):
         names = tuple(photo.name for photo in own if photo.name not in resized)
         if number in many or number == main or not names:
             continue
         code, what = _difference(own[0], members[main][0])
-        doubts.append(
-            Doubt(
+        issues.append(
+            CaptureIssue(
                 code,
                 f"{list_names(names)}: {what}.",
                 "A camera with few photos cannot be calibrated well: leave them out, or fly again with one camera.",
                 names,
             )
         )
-    return doubts
+    return issues
 
 
 def _difference(photo: CheckedPhoto, other: CheckedPhoto) -> tuple[str, str]:

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.doubts import Doubt, median_distance_m
 from splatpipe.pipeline.photos.names import list_names, printable
+from splatpipe.pipeline.photos.position_outliers import median_distance_m
 from splatpipe.pipeline.survey.photo_positions import (
     DATUM_STEP_M,
     NOWHERE,
@@ -28,7 +29,7 @@ ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
 MIN_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
 
 
-def position_doubts(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Doubt]:
+def find_position_issues(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
     """List what is doubtful, one entry per kind.
 
     Args:
@@ -45,11 +46,11 @@ def position_doubts(photos: Sequence[CheckedPhoto], positions: PositionList) -> 
     ]
 
 
-def _none_on_earth(positions: PositionList) -> list[Doubt]:
-    doubts = []
+def _none_on_earth(positions: PositionList) -> list[CaptureIssue]:
+    issues = []
     if positions.impossible:
-        doubts.append(
-            Doubt(
+        issues.append(
+            CaptureIssue(
                 "position-impossible",
                 f"Impossible positions: {list_names(positions.impossible)}.",
                 "These photos are used without their positions.",
@@ -58,40 +59,40 @@ def _none_on_earth(positions: PositionList) -> list[Doubt]:
         )
     elsewhere = {name: why for name, why in positions.wrong.items() if why != NOWHERE}
     if elsewhere:
-        told = [f"{printable(name)} {why}" for name, why in elsewhere.items()]
-        more = f"; and {len(told) - 10} more" if len(told) > 10 else ""
-        doubts.append(
-            Doubt(
+        reasons = [f"{printable(name)} {why}" for name, why in elsewhere.items()]
+        more = f"; and {len(reasons) - 10} more" if len(reasons) > 10 else ""
+        issues.append(
+            CaptureIssue(
                 "position-far",
-                f"Implausible positions: {'; '.join(told[:10])}{more}.",
+                f"Implausible positions: {'; '.join(reasons[:10])}{more}.",
                 "These photos are used without their positions.",
                 tuple(sorted(elsewhere)),
             )
         )
-    return doubts
+    return issues
 
 
-def _missing(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Doubt]:
+def _missing(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
     stated = {position.name for position in positions.positions} | set(positions.wrong)
     without = tuple(photo.name for photo in photos if photo.name not in stated)
     if not without:
         return []
     if len(without) == len(photos):
         return [
-            Doubt(
+            CaptureIssue(
                 "position-missing",
                 "No photo has a position: the result will have neither scale nor georeference.",
                 "Control points give both, scale bars the scale. Was the receiver off, or the EXIF lost in a copy?",
-                weight="note",
+                severity="note",
             )
         ]
     which = list_names(without) if len(without) <= len(photos) / 2 else f"{len(without)} of {len(photos)} photos"
     single = without if len(without) <= len(photos) / 2 else ()
     hint = "Was the receiver's fix lost, or the EXIF in a copy? They are used without it."
-    return [Doubt("position-missing", f"Without a position: {which}.", hint, single)]
+    return [CaptureIssue("position-missing", f"Without a position: {which}.", hint, single)]
 
 
-def _contradicting(photos: Sequence[CheckedPhoto]) -> list[Doubt]:
+def _contradicting(photos: Sequence[CheckedPhoto]) -> list[CaptureIssue]:
     """Photos whose EXIF and XMP state different positions, where most photos' agree."""
     apart: dict[str, float] = {}
     for photo in photos:
@@ -106,56 +107,58 @@ def _contradicting(photos: Sequence[CheckedPhoto]) -> list[Doubt]:
     names = tuple(sorted(name for name, metres in apart.items() if metres > limit))
     if step > ANOTHER_PLACE_M:
         text = f"EXIF and the drone's XMP place the photos {step:,.0f} m apart."
-        return [Doubt("position-contradiction", text, "EXIF's positions are used; were they rewritten?")]
+        return [CaptureIssue("position-contradiction", text, "EXIF's positions are used; were they rewritten?")]
     if not names:
         return []
     furthest = max(names, key=apart.__getitem__)
     text = f"EXIF and XMP state different positions: {list_names(names)} (up to {apart[furthest]:,.0f} m apart)."
-    return [Doubt("position-contradiction", text, "EXIF's are used: correct them, or restore the originals.", names)]
+    return [
+        CaptureIssue("position-contradiction", text, "EXIF's are used: correct them, or restore the originals.", names)
+    ]
 
 
-def _altitudes(positions: Sequence[Position]) -> list[Doubt]:
+def _altitudes(positions: Sequence[Position]) -> list[CaptureIssue]:
     """Altitudes far off the others'."""
     stated = {each.name: each.altitude_m for each in positions if each.altitude_m is not None}
-    doubts = []
+    issues = []
     without = tuple(each.name for each in positions if each.altitude_m is None)
     if stated and without and len(without) <= len(positions) / 2:
         text = f"Without an altitude: {list_names(without)}."
-        doubts.append(Doubt("altitude-missing", text, "Their heights are treated as unknown.", without))
+        issues.append(CaptureIssue("altitude-missing", text, "Their heights are treated as unknown.", without))
     if len(stated) < 3:
-        return doubts
+        return issues
     values = np.array(list(stated.values()), dtype=np.float64)
     off = np.abs(values - np.median(values))
     limit = max(MIN_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
     odd = tuple(name for name, metres in zip(stated, off.tolist(), strict=True) if metres > limit)
     if odd:
         text = f"Altitudes far from the others' ({np.median(values):.0f} m): {list_names(odd)}."
-        doubts.append(Doubt("altitude-far", text, "Correct them, or leave the photos out.", odd))
-    return doubts
+        issues.append(CaptureIssue("altitude-far", text, "Correct them, or leave the photos out.", odd))
+    return issues
 
 
-def _datums(positions: PositionList) -> list[Doubt]:
+def _datums(positions: PositionList) -> list[CaptureIssue]:
     kinds = Counter((each.vertical, each.altitude_source) for each in positions.positions if each.altitude_source)
-    doubts = []
+    issues = []
     if len(kinds) > 1:
-        told = ", ".join(f"{count} {_datum(*kind)}" for kind, count in kinds.most_common())
-        doubts.append(
-            Doubt(
+        references = ", ".join(f"{count} {_datum(*kind)}" for kind, count in kinds.most_common())
+        issues.append(
+            CaptureIssue(
                 "altitude-datums",
-                f"Altitudes have different references: {told}.",
+                f"Altitudes have different references: {references}.",
                 "Heights of different datums differ by up to a hundred metres: give positions in one datum in geo.txt.",
             )
         )
     step = positions.altitude_step_m
     if step is not None and abs(step) > DATUM_STEP_M:
-        doubts.append(
-            Doubt(
+        issues.append(
+            CaptureIssue(
                 "altitude-datums",
                 f"The altitudes in EXIF and in the drone's XMP differ by {step:.1f} m: they have different datums.",
                 "EXIF's are used.",
             )
         )
-    return doubts
+    return issues
 
 
 def _datum(vertical: str, source: str | None) -> str:
@@ -163,7 +166,7 @@ def _datum(vertical: str, source: str | None) -> str:
     return f"{where} ({vertical if vertical != 'unknown' else 'datum not stated'})"
 
 
-def _lost_fix(positions: Sequence[Position]) -> list[Doubt]:
+def _lost_fix(positions: Sequence[Position]) -> list[CaptureIssue]:
     """Photos without the fix that most have, by the receiver's RTK flag, else by its standard deviations."""
     if not positions:
         return []
@@ -175,7 +178,9 @@ def _lost_fix(positions: Sequence[Position]) -> list[Doubt]:
     worst = max(sigmas[name] for name in lost)
     text = f"RTK was lost: {list_names(lost)} (their positions are accurate to {worst:.2g} m; the others' to "
     text += f"{np.median([sigmas[name] for name in fixed if fixed[name]]):.2g} m)."
-    return [Doubt("rtk-lost", text, "They get less weight; PPK, or flying them again with a fix, would help.", lost)]
+    return [
+        CaptureIssue("rtk-lost", text, "They get less weight; PPK, or flying them again with a fix, would help.", lost)
+    ]
 
 
 def _is_fixed(position: Position) -> bool:
