@@ -132,7 +132,7 @@ def placed(
     failures = []
     with closing(run_all(commands, 1)) as ends:
         for end in ends:
-            tell(f"{end.command.name}: {end.failure or 'dataset made'}, {end.wall_s:.0f} s")
+            print_progress(f"{end.command.name}: {end.failure or 'dataset made'}, {end.wall_s:.0f} s")
             front = datasets.pop(end.command.name)
             if end.failure:
                 failures.append({"capture": end.command.name, "message": end.failure})
@@ -230,7 +230,9 @@ def run_cases(cases: Sequence[AblationCase], finished: ResultLog, arguments: arg
                 walls.append(end.wall_s)
                 left = sum(walls) / len(walls) * (len(wanted) - len(walls)) / arguments.jobs
                 what = f"{case.capture} {case.variant} seed {case.seed}: {outcome or 'done'}"
-                tell(f"{len(walls)}/{len(wanted)}  {what}, {end.wall_s:.0f} s; about {left / 60.0:.0f} min left")
+                print_progress(
+                    f"{len(walls)}/{len(wanted)}  {what}, {end.wall_s:.0f} s; about {left / 60.0:.0f} min left"
+                )
     finally:
         for case in wanted.values():
             leave(case.out)
@@ -263,7 +265,7 @@ def ablate(arguments: argparse.Namespace) -> int:
     variants = choose(arguments.variants, arguments.variant, arguments.only, base_sets(arguments))
     captures = captures_of(arguments.data)
     with work_folder(arguments.work) as work:
-        tell(f"What is finished is kept in {work}")
+        print_progress(f"What is finished is kept in {work}")
         facts = machine(arguments.threads) | {"jobs": arguments.jobs, "seeds": arguments.seeds}
         datasets, lost = placed(captures, work, arguments, front_sets(arguments), photos_only=True)
         reduced: dict[str, Path] = {}
@@ -296,7 +298,7 @@ def rows_of(cases: Sequence[AblationCase], finished: Mapping[str, Row]) -> list[
     ]
 
 
-def tell(text: str) -> None:
+def print_progress(text: str) -> None:
     """Print progress."""
     print(text, file=sys.stderr, flush=True)
 
@@ -337,10 +339,10 @@ def main(words: Sequence[str] | None = None) -> int:
     except UsageError as error:
         options.error(f"{error.message} {error.hint}")
     except SplatpipeError as error:
-        tell(f"{error.message} {error.hint}")
+        print_progress(f"{error.message} {error.hint}")
         return error.exit_code
     except KeyboardInterrupt:
-        tell("Stopped. The same command with --work and that folder goes on.")
+        print_progress("Stopped. The same command with --work and that folder goes on.")
         return 130
 
 

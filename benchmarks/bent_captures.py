@@ -35,7 +35,7 @@ from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import MappingInput
 from splatpipe.pipeline.sfm.judging import judge
-from splatpipe.pipeline.sfm.ladder import climb
+from splatpipe.pipeline.sfm.ladder import run_ladder
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
@@ -193,7 +193,7 @@ def answer(capture: MappingInput) -> tuple[pycolmap.Reconstruction, Row]:
     """Return the pipeline's reconstruction and its verdict."""
     began = time.process_time()
     config, report = SparseConfig(), SilentReporter()
-    found = climb(capture, reconstruct(capture, config, report), config, report)
+    found = run_ladder(capture, reconstruct(capture, config, report), config, report)
     took = time.process_time() - began
     told = judge(found.model, found.verified, capture.cameras)
     chosen = next(row["how"] for row in found.tried if row["chosen"])

@@ -57,7 +57,7 @@ def main(data: Path, pack: Path, lines: list[str], peers: list[Path]) -> None:
     fetch_wheels(pack / "wheels")
     for source in peers:
         shutil.copytree(source, pack / "peers" / source.name, dirs_exist_ok=True)
-    tell_size(pack)
+    report_size(pack)
 
 
 def pack_bench(dataset: Path, points: str, megapixels: float, target: Path) -> None:
@@ -130,7 +130,7 @@ def fetch_wheels(folder: Path) -> None:
         print(f"== wheel {one}: {'there' if done.returncode == 0 else 'not to be had'}", flush=True)
 
 
-def tell_size(pack: Path) -> None:
+def report_size(pack: Path) -> None:
     """Report what each call carries beside the tree, and the limit.
 
     Raises:

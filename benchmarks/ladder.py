@@ -20,7 +20,7 @@ from tables import Row, print_table
 
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.ladder import climb
+from splatpipe.pipeline.sfm.ladder import run_ladder
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 
@@ -100,7 +100,7 @@ def measured(name: str, capture: MappingInput, mapper: str) -> list[Row]:
     """Return the rows of one capture."""
     began = time.process_time()
     config = SparseConfig(mapper=mapper)  # type: ignore[arg-type]
-    found = climb(capture, reconstruct(capture, config, SilentReporter()), config, SilentReporter())
+    found = run_ladder(capture, reconstruct(capture, config, SilentReporter()), config, SilentReporter())
     total = time.process_time() - began
     rows: list[Row] = []
     for told in found.tried:

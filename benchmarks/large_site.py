@@ -201,7 +201,7 @@ def main() -> None:
     if work.blocks is None:
         options.exit(2, "That much memory holds the site in one: lower --max-memory, or raise --gaussians.\n")
     print(f"{tiling.photos:,} photos in {len(tiling.offsets)} tiles, {blocks_text(work.blocks)}; machine {speed:.2f}")
-    _tell_whole(needs)
+    _report_whole(needs)
     if arguments.told_only:
         return
 
@@ -230,7 +230,7 @@ def main() -> None:
         print_table("told against measured", rows, COLUMNS)
 
 
-def _tell_whole(needs: dict[str, Need]) -> None:
+def _report_whole(needs: dict[str, Need]) -> None:
     blocks, train, all_of_it = needs["blocks"], needs["train"], whole(needs)
     for name, need in (("coarse pass", blocks), ("blocks", train), ("the line", all_of_it)):
         print(

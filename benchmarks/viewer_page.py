@@ -80,9 +80,9 @@ def measure(page: Page, path: Path) -> None:
     page.goto(path.as_uri())
     page.evaluate("() => splatpipe.ready")
     print(f"first complete frame: {time.perf_counter() - began:.1f} s")
-    tell("answers at rest", page, lambda _: page.evaluate("() => splatpipe.cameraState()"))
+    measure_responses("answers at rest", page, lambda _: page.evaluate("() => splatpipe.cameraState()"))
     page.evaluate("() => splatpipe.pick(1, 1)")
-    tell("points under the cursor", page, lambda i: page.evaluate("i => splatpipe.pick(100 + i, 200)", i))
+    measure_responses("points under the cursor", page, lambda i: page.evaluate("i => splatpipe.pick(100 + i, 200)", i))
     position = page.evaluate("() => splatpipe.cameraState().position")
     target = page.evaluate("() => splatpipe.facts.centre")
 
@@ -90,13 +90,13 @@ def measure(page: Page, path: Path) -> None:
         moved = {"position": [position[0] + 0.02 * i, *position[1:]], "target": target}
         page.evaluate("to => { splatpipe.setCamera(to); return splatpipe.cameraState(); }", moved)
 
-    tell("answers while moving", page, move)
+    measure_responses("answers while moving", page, move)
     began = time.perf_counter()
     page.evaluate("() => splatpipe.complete()")
     print(f"complete frame after the last movement: {time.perf_counter() - began:.1f} s")
 
 
-def tell(what: str, page: Page, ask: Callable[[int], object]) -> None:
+def measure_responses(what: str, page: Page, ask: Callable[[int], object]) -> None:
     """Send many requests, with pauses, and print the response times."""
     times = []
     for i in range(QUESTIONS):

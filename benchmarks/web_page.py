@@ -149,21 +149,21 @@ class PageVisit:
         print(f"\n{name} at {self._size}: script after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
         page.evaluate("() => splatpipe.ready")
         print(f"  first whole picture after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
-        self._tell_memory()
+        self._print_memory()
         page.screenshot(path=pictures / f"{name}-{self._size}-first.png")
         if options.first_only:
             return
         page.evaluate("() => splatpipe.complete()")
         print(f"  in full after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
-        self._tell_memory()
+        self._print_memory()
         page.screenshot(path=pictures / f"{name}-{self._size}-full.png")
         nearer(page)
         page.evaluate("() => splatpipe.complete()")
         print(f"  nearer in full after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
-        self._tell_memory()
+        self._print_memory()
         page.screenshot(path=pictures / f"{name}-{self._size}-near.png")
 
-    def _tell_memory(self) -> None:
+    def _print_memory(self) -> None:
         """Print the memory of the browser's processes: the page's own, and the renderer's, in place of GPU memory."""
         session = self._browser.new_browser_cdp_session()
         told = {}

@@ -16,13 +16,13 @@ import pycolmap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
+from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, report_cameras
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.external_evidence import outside_reasons
 from splatpipe.pipeline.sfm.judging import judge
-from splatpipe.pipeline.sfm.ladder import climb
+from splatpipe.pipeline.sfm.ladder import run_ladder
 from splatpipe.pipeline.sfm.lens_model import stated_lenses
-from splatpipe.pipeline.sfm.lenses import calibrate, tell_lenses
+from splatpipe.pipeline.sfm.lenses import calibrate, report_lenses
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.sparse_model import write_model
@@ -39,7 +39,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     """
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         capture = _capture(inputs, Path(scratch))
-        found = climb(capture, reconstruct(capture, config, report), config, report)
+        found = run_ladder(capture, reconstruct(capture, config, report), config, report)
         hold_few(found.model, found.verified, capture.cameras)
         stated = stated_lenses(json.loads(inputs["ingest.lenses"].read_text(encoding="utf-8"))["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
@@ -52,8 +52,8 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     text = json.dumps(_without_times(summary), ensure_ascii=False, indent=1) + "\n"
     (out / "models.json").write_text(text, encoding="utf-8")
     _warn(summary, report)
-    tell_cameras(summary["cameras"], report)
-    tell_lenses(summary, report)
+    report_cameras(summary["cameras"], report)
+    report_lenses(summary, report)
     return {**summary, "unregistered": len(summary["unregistered"]), "other_models": len(summary["other_models"])}
 
 

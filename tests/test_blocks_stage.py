@@ -260,7 +260,7 @@ def test_a_coarse_pass_is_reported_as_done_once_its_files_are_on_disk(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flushed: list[Path] = []
-    flush, tell = os.fsync, blocks.write_durably
+    flush, write_durably = os.fsync, blocks.write_durably
 
     def noted(descriptor: int) -> None:
         flushed.append(Path(f"/proc/self/fd/{descriptor}").readlink())
@@ -271,15 +271,15 @@ def test_a_coarse_pass_is_reported_as_done_once_its_files_are_on_disk(
         flushed.clear()
         return {"iterations": 1}
 
-    def told(path: Path, content: str) -> None:
+    def checked_write(path: Path, content: str) -> None:
         if path.name == "coarse.json":
             assert {tmp_path / "coarse", tmp_path / "coarse" / "model.ply"} <= set(flushed)
-        tell(path, content)
+        write_durably(path, content)
 
     def killed(*_arguments: object) -> None:
         raise Kill
 
-    for name, stand_in in (("train_coarse", coarse), ("write_durably", told), ("lay_out", killed)):
+    for name, stand_in in (("train_coarse", coarse), ("write_durably", checked_write), ("lay_out", killed)):
         monkeypatch.setattr(blocks, name, stand_in)
     monkeypatch.setattr(os, "fsync", noted)
     with pytest.raises(Kill):

@@ -13,7 +13,7 @@ import pytest
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.ladder import LadderContext, climb, settle, without
+from splatpipe.pipeline.sfm.ladder import LadderContext, run_ladder, settle, without
 from splatpipe.pipeline.sfm.ladder_joins import join
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs
 from splatpipe.pipeline.sfm.mapping import MappingOptions, map_incremental
@@ -136,7 +136,7 @@ def assert_all_right(found: MappingResult, rung: str) -> None:
 def test_photos_are_registered_to_the_finished_model(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
-    found = climb(room, found_without(room, whole, {1, 5}), SparseConfig(), corner_photos.Recorder())
+    found = run_ladder(room, found_without(room, whole, {1, 5}), SparseConfig(), corner_photos.Recorder())
     assert_all_right(found, "registration")
     assert found.model.num_points3D() > 0.9 * whole[0].num_points3D()
 
@@ -145,7 +145,7 @@ def test_a_photo_without_pairs_gets_new_ones(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     capture = thinned(room, lambda i, j: 8 not in (i, j), "no pairs")
-    found = climb(capture, found_without(capture, whole, {8}), SparseConfig(), corner_photos.Recorder())
+    found = run_ladder(capture, found_without(capture, whole, {8}), SparseConfig(), corner_photos.Recorder())
     assert_all_right(found, "more pairs")
     assert any(8 in pair for pair in found.verified.matches)
 
@@ -159,7 +159,7 @@ def test_weak_keypoints_are_made_stronger(room: MappingInput, whole: tuple[pycol
     every = frozenset((i, j) for i in range(1, COUNT + 1) for j in range(i + 1, COUNT + 1))
     capture = replace(weak, tried=every, colours=room.colours[:-lost])
     before = found_without(capture, whole, {8})
-    found = climb(capture, before, SparseConfig(), corner_photos.Recorder())
+    found = run_ladder(capture, before, SparseConfig(), corner_photos.Recorder())
     assert_all_right(found, "stronger keypoints")
     assert found.rungs[-1]["keypoints_added"] == len(found.colours) - len(before.colours) > 0
 
@@ -177,7 +177,7 @@ def test_sub_models_are_joined_by_common_points(
     assert max(centre_errors(united).values()) < 0.01
     apart = without(model, verified, {1, 2, 3, 4})
     apart.transform(pycolmap.Sim3d(0.4, turn, np.array([3.0, -7.0, 11.0])))
-    found = climb(
+    found = run_ladder(
         room,
         MappingResult(first, (apart,), room.database, verified, room.colours),
         SparseConfig(),
@@ -223,6 +223,6 @@ def test_if_all_photos_are_registered_nothing_changes(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     complete = MappingResult(whole[0], (), room.database, whole[1], room.colours)
-    assert climb(room, complete, SparseConfig(), corner_photos.Recorder()) is complete
+    assert run_ladder(room, complete, SparseConfig(), corner_photos.Recorder()) is complete
     lacking = found_without(room, whole, {2})
-    assert climb(room, lacking, SparseConfig(ladder=False), corner_photos.Recorder()) is lacking
+    assert run_ladder(room, lacking, SparseConfig(ladder=False), corner_photos.Recorder()) is lacking

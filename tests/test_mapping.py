@@ -119,12 +119,12 @@ def test_the_same_seed_gives_the_same_bits(mapper: object, tmp_path: Path) -> No
 
 
 def test_progress_is_reported_and_an_interruption_ends_it(database: Path, tmp_path: Path) -> None:
-    told = []
+    reports: list[tuple[int, int, str]] = []
 
     def tell(placed: int, total: int, what: str) -> None:
-        told.append((placed, total, what))
+        reports.append((placed, total, what))
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         map_incremental(database, tmp_path, MappingOptions(), tell)
-    assert told[0][1] == PHOTOS
+    assert reports[0][1] == PHOTOS

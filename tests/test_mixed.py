@@ -11,7 +11,7 @@ from splatpipe.pipeline.photos import camera_groups as ingest_cameras
 from splatpipe.pipeline.photos.camera_groups import CameraGroup, describe_cameras, group_cameras
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import Exif
-from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, tell_cameras
+from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, report_cameras
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -149,6 +149,6 @@ def test_every_camera_is_reported_with_its_photos_focal_length_and_error() -> No
     assert rows[0]["error_px"] == pytest.approx(0.37, abs=0.05)  # of 0.3 px noise in each coordinate
     assert rows[1]["error_px"] == pytest.approx(rows[0]["error_px"] / 2, rel=0.3)
     notes = Notes()
-    tell_cameras(rows, notes)
+    report_cameras(rows, notes)
     assert len(notes.notes) == 2
     assert "39 of 39 photos" in notes.notes[0]

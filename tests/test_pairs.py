@@ -15,7 +15,7 @@ from splatpipe.pipeline.sfm.pairs import (
     choose_pairing,
     components,
     connect,
-    positions_tell,
+    has_informative_positions,
     select_pairs,
     sequences,
 )
@@ -91,14 +91,14 @@ def test_distant_groups_are_joined_by_the_nearest_photos() -> None:
 
 def test_positions_no_wider_than_their_noise_are_not_used() -> None:
     photos = layout(strips(5, 8, step_m=1.0), sigma_m=5.0)
-    assert not positions_tell(photos)
+    assert not has_informative_positions(photos)
     assert choose_pairing(photos, 30) == "retrieval"
-    assert positions_tell(layout(strips(5, 8, step_m=1.0), sigma_m=0.02))
+    assert has_informative_positions(layout(strips(5, 8, step_m=1.0), sigma_m=0.02))
 
 
 def test_identical_positions_are_not_used() -> None:
     positions = np.repeat([[0.0, 0.0, 10.0], [500.0, 0, 10.0]], 20, axis=0)
-    assert not positions_tell(layout(positions))
+    assert not has_informative_positions(layout(positions))
 
 
 def test_photos_without_position_are_paired_by_similarity() -> None:

@@ -254,7 +254,7 @@ def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_with_a_note(
         monkeypatch.setattr(photo_cache, "SHARE_OF_FREE", room / free)
         recorder = tiny_scene.Recorder()
         with PhotoStream.over(views, [TrainingSize()] * 30, 0, 1, cache) as photos:
-            photos.tell(recorder)
+            photos.warn_if_disk_full(recorder)
             assert all(same(one, other) for one, other in zip(photos, usual, strict=True))
         assert len(recorder.warnings) == warnings
 

@@ -15,7 +15,7 @@ from splatpipe.pipeline.sfm.focal import adjust_within
 from splatpipe.pipeline.sfm.judging import TRUSTED_SOURCES
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
-CAMERAS_TOLD = 10  # on the console; the report lists them all
+MAX_CAMERAS_REPORTED = 10  # on the console; the report lists them all
 FEW_PHOTOS = 3  # of a camera: with fewer, focal length and distance are not separable
 STATED_STRAY = 0.05  # maximum relative deviation from a trusted focal length
 KIN_STRAY = 0.02  # the same, from one calibrated with other photos of the same body and zoom
@@ -103,9 +103,9 @@ def camera_rows(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Se
     return rows
 
 
-def tell_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None:
+def report_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None:
     """Report the result for each camera if there are several."""
-    for row in rows[:CAMERAS_TOLD] if len(rows) > 1 else ():
+    for row in rows[:MAX_CAMERAS_REPORTED] if len(rows) > 1 else ():
         focal = f"{row['focal_px']:.0f} px ({row['focal_source'] or 'stated'}: {row['prior_focal_px']:.0f})"
         placed = f"{row['placed']} of {row['photos']} photos"
         error = "" if row["error_px"] is None else f", error {row['error_px']:.2f} px"

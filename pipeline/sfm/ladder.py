@@ -59,11 +59,11 @@ class LadderContext:
     options: MappingOptions
     report: Reporter
 
-    def tell(self, done: int, total: int, what: str) -> None:
+    def report_progress(self, done: int, total: int, what: str) -> None:
         self.report.progress(done, total, what, "photos")
 
 
-def climb(capture: MappingInput, found: MappingResult, config: SparseConfig, report: Reporter) -> MappingResult:
+def run_ladder(capture: MappingInput, found: MappingResult, config: SparseConfig, report: Reporter) -> MappingResult:
     """Place the photos that mapping did not, where that is certain.
 
     Args:
@@ -119,7 +119,7 @@ def settle(work: LadderContext, found: MappingResult) -> MappingResult:
 def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
     """Match leftover photos with their likely partners, then place them."""
     left = unplaced(found)
-    work.tell(0, len(left), "looking for matches of the remaining photos")
+    work.report_progress(0, len(left), "looking for matches of the remaining photos")
     tried = work.capture.tried | tried_pairs(found.database)
     pairs = choose_pairs(rank_partners(work.capture, found, left, work.options.seed), tried, PAIRS_A_PHOTO)
     if not pairs:
@@ -132,7 +132,7 @@ def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
 def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> MappingResult:
     """Extract new keypoints in leftover photos and their likely partners, then place them."""
     left = unplaced(found)
-    work.tell(0, len(left), "looking for matches of the remaining photos")
+    work.report_progress(0, len(left), "looking for matches of the remaining photos")
     ranked = rank_partners(work.capture, found, left, work.options.seed)
     photos = _worth_another_look(found, ranked, max(MAX_STRONGER, int(MAX_STRONGER_SHARE * len(work.capture.photos))))
     pairs = _among(found, ranked, photos)
@@ -205,7 +205,7 @@ def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
         added.update(fresh)
     if not added:
         return found
-    work.tell(len(added), len(unplaced(found)), "adjusting with the newly placed photos")
+    work.report_progress(len(added), len(unplaced(found)), "adjusting with the newly placed photos")
     return _adjusted(work, found, model, added)
 
 
@@ -218,7 +218,7 @@ def _placements(
     cameras = cameras_of(model)
     placements = {}
     for done, number in enumerate(sorted(left)):
-        work.tell(done, len(left), "placing the remaining photos")
+        work.report_progress(done, len(left), "placing the remaining photos")
         camera = verified.camera_of[number]
         placement = place(
             sightings(verified, rows, number),
@@ -255,7 +255,7 @@ def _joined(work: LadderContext, found: MappingResult) -> MappingResult:
         fresh = set(other.reg_image_ids()) - set(found.model.reg_image_ids())
         if not fresh:
             continue
-        work.tell(0, len(fresh), "joining models")
+        work.report_progress(0, len(fresh), "joining models")
         model = join(found.model, other, found.verified, work.options.seed)
         if model is None:
             remaining.append(other)

@@ -12,7 +12,7 @@ from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.ladder_poses import partners_of
 from splatpipe.pipeline.sfm.layout import make_layout
 from splatpipe.pipeline.sfm.matching import look_alike
-from splatpipe.pipeline.sfm.pairs import Costs, Pair, positions_tell, spatial_costs
+from splatpipe.pipeline.sfm.pairs import Costs, Pair, has_informative_positions, spatial_costs
 from splatpipe.pipeline.sfm.structure import read_structure
 
 Ranked = dict[int, list[int]]
@@ -34,7 +34,7 @@ def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[
     groups = [set(other.reg_image_ids()) for other in found.others]
     hints = [by_matches(found, left, placed), by_model(found, left, placed)]
     layout = make_layout(capture.photos.photos, capture.positions)
-    if positions_tell(layout):
+    if has_informative_positions(layout):
         hints.append(_by_costs(left, spatial_costs(layout)))
     hints.append(_by_costs(left, look_alike(capture.features, seed)))
     ranked: Ranked = {}

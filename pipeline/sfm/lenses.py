@@ -221,7 +221,7 @@ def _rms(distances: Float64[np.ndarray, " n"]) -> float | None:
     return round(float(np.sqrt(np.mean(known**2))), 3) if len(known) else None
 
 
-def tell_lenses(summary: Mapping[str, JSON], report: Reporter) -> None:
+def report_lenses(summary: Mapping[str, JSON], report: Reporter) -> None:
     """Report the outcome of the lens calibration."""
     for row in summary["lenses"]:
         if row["freed"]:

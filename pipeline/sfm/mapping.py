@@ -19,7 +19,7 @@ from splatpipe.pipeline.sfm.reduction import best_keypoints, write_reduced
 from splatpipe.pipeline.sfm.view_graph import read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
-Tell: TypeAlias = Callable[[int, int, str], None]
+Progress: TypeAlias = Callable[[int, int, str], None]
 """Called a few times a second with the photos placed, their total, and the current step."""
 
 
@@ -49,7 +49,7 @@ class MappingOptions:
     coarseness: float = 1.0
 
 
-def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
+def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_progress: Progress) -> list[Model]:
     """Run COLMAP's incremental mapper.
 
     Cameras are estimated from each photo's best keypoints; then all verified matches are added and everything is
@@ -59,7 +59,7 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell
         database: Cameras, images, keypoints and verified two-view geometries; only read.
         scratch: An existing folder for temporary files.
         options: Mapping options.
-        tell: Progress callback, called from the calling thread.
+        on_progress: Callback, called from the calling thread.
 
     Returns:
         All sub-models, the largest first.
@@ -97,10 +97,10 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, tell
             complete(model, database, settings, stop)
         return largest_first(found)
 
-    return run_in_thread(work, lambda: tell(min(placed, total), total, doing), stop.cancel)
+    return run_in_thread(work, lambda: on_progress(min(placed, total), total, doing), stop.cancel)
 
 
-def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tell) -> list[Model]:
+def map_global(database: Path, scratch: Path, options: MappingOptions, on_progress: Progress) -> list[Model]:
     """Run COLMAP's global mapper (GLOMAP; Pan et al., ECCV 2024).
 
     COLMAP cannot be stopped here: if the calling thread is interrupted, the mapper runs on in the background.
@@ -109,7 +109,7 @@ def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tel
         database: Cameras, images, keypoints and verified two-view geometries; only read.
         scratch: An existing folder for temporary files.
         options: Mapping options.
-        tell: Progress callback, called from the calling thread.
+        on_progress: Callback, called from the calling thread.
 
     Returns:
         All sub-models, the largest first.
@@ -121,7 +121,7 @@ def map_global(database: Path, scratch: Path, options: MappingOptions, tell: Tel
         with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
             return largest_first(pycolmap.global_mapping(database, folder, folder, global_options(options)))
 
-    return run_in_thread(work, lambda: tell(0, total, "placing all photos at once"), lambda: None)
+    return run_in_thread(work, lambda: on_progress(0, total, "placing all photos at once"), lambda: None)
 
 
 def _reduced(database: Path, folder: Path) -> Path:

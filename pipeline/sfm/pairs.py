@@ -63,16 +63,16 @@ class Layout:
 
 def choose_pairing(layout: Layout, exhaustive_up_to: int) -> str:
     """Resolve `auto` for these photos: ``exhaustive``, ``spatial``, ``sequential`` or ``retrieval``."""
-    tell = positions_tell(layout)
+    informative = has_informative_positions(layout)
     overlap_is_known = layout.views is not None and bool(layout.views.known().all())
-    if len(layout) <= exhaustive_up_to and not (tell and overlap_is_known):
+    if len(layout) <= exhaustive_up_to and not (informative and overlap_is_known):
         return "exhaustive"
-    if tell:
+    if informative:
         return "spatial"
     return "sequential" if sequences(layout) else "retrieval"
 
 
-def positions_tell(layout: Layout) -> bool:
+def has_informative_positions(layout: Layout) -> bool:
     """Whether most photos have positions that spread wider than their noise."""
     located = layout.located()
     if np.count_nonzero(located) < LOCATED_SHARE * len(layout):

@@ -172,7 +172,7 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
         first, history, seconds = state.iteration + 1, state.history, state.seconds
     clock, visits = Clock(seconds), course.visits(training_sizes(plan, history))
     with PhotoStream(course.views, visits, first, out).to(device.tensors) as photos:
-        photos.tell(report)
+        photos.warn_if_disk_full(report)
         photos.fill(report)  # before the model exists, unless it was resumed: both need memory
         if state is None:
             begun = course.start().to(device.tensors)

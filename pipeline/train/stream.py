@@ -75,8 +75,8 @@ class PhotoStream:
 
     Photos are decoded once, for all levels needed, into an unnamed file that disappears with the stream or its process;
     memory holds only the windows in flight. A photo that is needed only once is not stored. If the disk has no room for
-    all, those that fit are stored and the others are decoded each time: slower, with the same result, and ``tell``
-    warns about it. Photos that ``fill`` has not stored are decoded on first use.
+    all, those that fit are stored and the others are decoded each time: slower, with the same result, and
+    ``warn_if_disk_full`` warns about it. Photos that ``fill`` has not stored are decoded on first use.
 
     Args:
         views: The photos to train on.
@@ -177,7 +177,7 @@ class PhotoStream:
             for level in levels
         )
 
-    def tell(self, report: Reporter) -> None:
+    def warn_if_disk_full(self, report: Reporter) -> None:
         """Warn if the disk has no room for all decoded photos."""
         wanted, room = self.wanted_bytes(), self._cache.room_bytes
         if wanted > room:

@@ -62,7 +62,7 @@ def make(
             executor.stop()
 
 
-def tell(event: Event) -> None:
+def show_event(event: Event) -> None:
     """Print when a training is running, then wait for the caller: no shard finishes before it is killed."""
     if event.kind == "progress" and "training" in str(event.data["what"]):
         print(event.stage, event.data["done"], flush=True)
@@ -71,4 +71,4 @@ def tell(event: Event) -> None:
 
 if __name__ == "__main__":
     scene, out, shard, given, *threads = sys.argv[1:]
-    make(Path(scene), Path(out), json.loads(given), shard, int(threads[0]) if threads else 1, show=tell)
+    make(Path(scene), Path(out), json.loads(given), shard, int(threads[0]) if threads else 1, show=show_event)

@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.pairs import (
     choose_pairing,
     components,
     nearest,
-    positions_tell,
+    has_informative_positions,
     select_pairs,
 )
 from splatpipe.pipeline.sfm.quick_match import InlierMatches, QuickFeatures, match_glimpses
@@ -130,7 +130,7 @@ def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]
 
 def flight_of(layout: Layout, overlap: MatchGraph) -> PositionEvidence:
     """The flight path; without positions if these scatter no more than their errors."""
-    places = layout.positions_m if positions_tell(layout) else np.full_like(layout.positions_m, np.nan)
+    places = layout.positions_m if has_informative_positions(layout) else np.full_like(layout.positions_m, np.nan)
     return PositionEvidence(places, layout.times, overlap.matches)
 
 
