@@ -71,7 +71,7 @@ class FloaterScene:
     building: Bool[np.ndarray, " t"]
 
 
-def sights_of(model: Gaussians, cameras: Sequence[Camera], options: rasterizer.RenderOptions) -> list[FloaterView]:
+def render_depths(model: Gaussians, cameras: Sequence[Camera], options: rasterizer.RenderOptions) -> list[FloaterView]:
     """Render depths of a model from some cameras, spread evenly."""
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(CAMERAS, len(cameras))).round().astype(int))
     found = []
@@ -84,7 +84,7 @@ def sights_of(model: Gaussians, cameras: Sequence[Camera], options: rasterizer.R
 
 def plant(
     model: Gaussians,
-    sights: Sequence[FloaterView],
+    views: Sequence[FloaterView],
     options: rasterizer.RenderOptions,
     per_kind: int,
     generator: np.random.Generator,
@@ -97,14 +97,14 @@ def plant(
     surface's Gaussian, with a size of its kind and a realistic opacity. A floater that is visible in no photo
     is planted again elsewhere.
     """
-    building = on_surfaces(model, sights)
+    building = on_surfaces(model, views)
     donors = _donors(model, building)
     parts, kinds = [], []
     for kind in range(len(KINDS)):
         left = round(SHARES[kind] * per_kind)
         while left > 0:
-            part = _attempt(model, donors, sights[generator.integers(len(sights))], kind, options, generator)
-            part = part.select(torch.from_numpy(~_at_surfaces(part, sights, TOUCHING)))
+            part = _attempt(model, donors, views[generator.integers(len(views))], kind, options, generator)
+            part = part.select(torch.from_numpy(~_at_surfaces(part, views, TOUCHING)))
             part = part.first(min(left, len(part)))
             left -= len(part)
             parts.append(part)
@@ -112,17 +112,17 @@ def plant(
     return FloaterScene(Gaussians.concat([model, *parts]), np.array(kinds), len(model), building)
 
 
-def on_surfaces(model: Gaussians, sights: Sequence[FloaterView]) -> Bool[np.ndarray, " n"]:
+def on_surfaces(model: Gaussians, views: Sequence[FloaterView]) -> Bool[np.ndarray, " n"]:
     """Return which Gaussians lie where at least two cameras see a surface."""
     opaque = torch.sigmoid(model.opacity_logits).numpy() > SEEN_ALPHA
-    return np.asarray(_at_surfaces(model, sights, DEPTH_MARGIN) & opaque)
+    return np.asarray(_at_surfaces(model, views, DEPTH_MARGIN) & opaque)
 
 
-def _at_surfaces(gaussians: Gaussians, sights: Sequence[FloaterView], margin: float) -> Bool[np.ndarray, " n"]:
+def _at_surfaces(gaussians: Gaussians, views: Sequence[FloaterView], margin: float) -> Bool[np.ndarray, " n"]:
     means, agreeing = gaussians.means.double().numpy(), np.zeros(len(gaussians), int)
-    for sight in sights:
-        agreeing += np.abs(sight.gaps(means)) < margin  # NaN is not near
-    return np.asarray(agreeing >= min(SURE_VIEWS, len(sights)))
+    for view in views:
+        agreeing += np.abs(view.gaps(means)) < margin  # NaN is not near
+    return np.asarray(agreeing >= min(SURE_VIEWS, len(views)))
 
 
 def _donors(model: Gaussians, building: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " d"]:
@@ -133,19 +133,19 @@ def _donors(model: Gaussians, building: Bool[np.ndarray, " n"]) -> Int64[np.ndar
 def _attempt(
     model: Gaussians,
     donors: Int64[np.ndarray, " d"],
-    sight: FloaterView,
+    view: FloaterView,
     kind: int,
     options: rasterizer.RenderOptions,
     generator: np.random.Generator,
 ) -> Gaussians:
     """Create some floaters of a kind in front of one camera; fewer, or none, where they do not meet the conditions."""
     count = CLUSTER if KINDS[kind] == "cluster" else 8
-    rows, columns = np.nonzero((sight.depth > 0.0) & (sight.depth < FAR * np.median(sight.depth[sight.depth > 0.0])))
+    rows, columns = np.nonzero((view.depth > 0.0) & (view.depth < FAR * np.median(view.depth[view.depth > 0.0])))
     pick = generator.integers(len(rows), size=1 if KINDS[kind] == "cluster" else count)
     pixels = np.stack([columns[pick], rows[pick]], axis=1) + generator.random((len(pick), 2))
-    surface = sight.depth[rows[pick], columns[pick]]
+    surface = view.depth[rows[pick], columns[pick]]
     share = _share_of_way(kind, len(pick), generator)
-    centres = sight.camera.unproject(pixels, share * surface)
+    centres = view.camera.unproject(pixels, share * surface)
     centres = np.repeat(centres, count // len(pick), axis=0)
     surface = np.repeat(surface, count // len(pick))
     if KINDS[kind] == "cluster":
@@ -157,7 +157,7 @@ def _attempt(
         log_scales=_sizes(found, kind, surface, generator),
         opacity_logits=_logits(kind, count, generator),
     )
-    return found.select(torch.from_numpy(_stands(found, sight, options)))
+    return found.select(torch.from_numpy(_stands(found, view, options)))
 
 
 def _share_of_way(kind: int, count: int, generator: np.random.Generator) -> Float64[np.ndarray, " n"]:
@@ -188,13 +188,13 @@ def _logits(kind: int, count: int, generator: np.random.Generator) -> Float[torc
     return torch.from_numpy(np.log(opacity / (1.0 - opacity))).float()
 
 
-def _stands(found: Gaussians, sight: FloaterView, options: rasterizer.RenderOptions) -> Bool[np.ndarray, " n"]:
+def _stands(found: Gaussians, view: FloaterView, options: rasterizer.RenderOptions) -> Bool[np.ndarray, " n"]:
     """Return which are clear of the surface, in front of the camera, and visible."""
     means = found.means.double().numpy()
-    depth = sight.camera.depths(means)
+    depth = view.camera.depths(means)
     reach = SIGMAS * np.exp(found.log_scales.max(dim=1).values.double().numpy()) / np.maximum(depth, 1e-9)
     with np.errstate(invalid="ignore"):
-        clear = sight.gaps(means) > np.minimum(reach, 0.5)
-    splats = project(found, sight.camera, options)
+        clear = view.gaps(means) > np.minimum(reach, 0.5)
+    splats = project(found, view.camera, options)
     shown = splats.usable & (splats.opacities >= SEEN_ALPHA)
     return np.asarray(clear & shown.numpy() & (depth > 0.0))

@@ -39,10 +39,10 @@ from splatpipe.pipeline.raster import _native, rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import iteration
-from splatpipe.pipeline.train.draws import permutation
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.random_numbers import permutation
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import make_techniques

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from floater_planting import KINDS, FloaterScene, plant, sights_of
+from floater_planting import KINDS, FloaterScene, plant, render_depths
 from jaxtyping import Bool
 from opened_run import OpenedRun, open_run
 from tables import Row, print_table
@@ -123,9 +123,9 @@ def main() -> None:
     run = open_run(options.out)
     model, sky = run.model
     training = [view for view in run.views if view.camera.name not in run.held_out]
-    sights = sights_of(model, [reduced_camera(view.camera, DEPTH_MEGAPIXELS) for view in training], run.options)
+    views = render_depths(model, [reduced_camera(view.camera, DEPTH_MEGAPIXELS) for view in training], run.options)
     per_kind = max(40, math.ceil(options.share * len(model) / 40) * 40)
-    planted = plant(model, sights, run.options, per_kind, np.random.default_rng(options.seed))
+    planted = plant(model, views, run.options, per_kind, np.random.default_rng(options.seed))
     photos = None if options.without_photos else photos_of(run)
     start = time.process_time()
     kept = kept_by_cleaner(planted.model, photos)

@@ -30,7 +30,7 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.train.blocks.cutting import cut, site, work_map
 from splatpipe.pipeline.train.blocks.partition import Border, Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import sights
+from splatpipe.pipeline.train.blocks.photo_coverage import photo_coverages
 
 GRADES = {  # what is planted: pixels empty, pixels higher, of the colour's range
     "gap": (1.0, 2.0, 4.0, 8.0),
@@ -96,7 +96,7 @@ def open_site(arguments: argparse.Namespace) -> SeamScene:
             raise UsageError(f"{arguments.partition} is no partition: {error}") from error
     else:
         points, tracks = load_points_and_tracks(run.parts["undistort.dataset"].path)
-        seen = sights(cameras, [tracks[camera.name] for camera in cameras], run.median_depth)
+        seen = photo_coverages(cameras, [tracks[camera.name] for camera in cameras], run.median_depth)
         plan = GroundPlan.across(frame.rotation[2])
         partition = cut(work_map(plan, site(plan, seen, points.xyz), seen, points.xyz), arguments.blocks)
     return SeamScene(run, partition, cameras, read_splat(arguments.coarse), frame.scale)

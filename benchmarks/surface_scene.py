@@ -19,7 +19,7 @@ from splatpipe.demo.orthographic import ParallelView
 from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED, parts_of, unit_normals
 from splatpipe.demo.relief import Relief, surface_model
 from splatpipe.demo.truth import Triangles, centre, true_poses, true_surface
-from splatpipe.demo.visibility import FEWEST, TrueView, photos_that_see, true_sights
+from splatpipe.demo.visibility import FEWEST, TrueView, photos_that_see, true_views
 
 GSD_M = 0.028  # of the original photos, at the house
 STEP_M = 4.0 * GSD_M  # more than roofs (slope 0.9) rise between cells of 2 GSD; chimneys, dormers and walls are higher
@@ -41,12 +41,12 @@ class SceneTruth:
     Attributes:
         triangles: Triangles of the whole scene.
         parts: The part that each triangle belongs to.
-        sights: What the photos truly see.
+        true_views: What the photos truly see.
     """
 
     triangles: Triangles
     parts: Int8[np.ndarray, " m"]
-    sights: list[TrueView]
+    true_views: list[TrueView]
 
     @cached_property
     def normals(self) -> Float64[np.ndarray, "m 3"]:
@@ -68,9 +68,9 @@ class SceneTruth:
 
 
 def load_truth(depths: Path | None = None) -> SceneTruth:
-    """Load the capture's truth; for the depths see ``true_sights``."""
+    """Load the capture's truth; for the depths see ``true_views``."""
     triangles = true_surface()
-    return SceneTruth(triangles, parts_of(triangles), true_sights(triangles, depths))
+    return SceneTruth(triangles, parts_of(triangles), true_views(triangles, depths))
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ def _seen(
     places = way.back(np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5, heights]))
     below = truth.flown_over(places) & (hit >= 0)
     count = np.zeros(len(places), np.uint8)
-    count[below] = photos_that_see(places[below], truth.normals[hit[below]], truth.sights)
+    count[below] = photos_that_see(places[below], truth.normals[hit[below]], truth.true_views)
     pair = ((count >= FEWEST).reshape(row.shape), below.reshape(row.shape))
     seen, flown = (np.kron(each, np.ones((every, every), bool))[:height, :width] for each in pair)
     return seen, flown

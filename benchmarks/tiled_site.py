@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.blocks.coarse import SKIES
 from splatpipe.pipeline.train.blocks.cutting import site
 from splatpipe.pipeline.train.blocks.layout import upward
 from splatpipe.pipeline.train.blocks.partition import Cell
-from splatpipe.pipeline.train.blocks.photo_coverage import sights
+from splatpipe.pipeline.train.blocks.photo_coverage import photo_coverages
 from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.sky_file import write_skies
@@ -59,7 +59,9 @@ class Tiling:
         points, tracks = load_points_and_tracks(dataset)
         cameras = [view.camera for view in run.views]
         plan = GroundPlan.across(upward(run.views, points.xyz, 1))
-        cell = site(plan, sights(cameras, [tracks[each.name] for each in cameras], run.median_depth), points.xyz)
+        cell = site(
+            plan, photo_coverages(cameras, [tracks[each.name] for each in cameras], run.median_depth), points.xyz
+        )
         width, height = (high - low for low, high in zip(cell.low, cell.high, strict=True))
         tiles = -(-photos // len(run.views))
         columns = max(1, min(tiles, round(math.sqrt(tiles * height / width))))

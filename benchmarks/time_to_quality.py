@@ -46,7 +46,7 @@ from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
 from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
-from splatpipe.pipeline.train.visits import PhotoVisits
+from splatpipe.pipeline.train.training_order import PhotoOrder
 from splatpipe.stages.options import LineConfig
 
 COLUMNS = {
@@ -109,8 +109,8 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
     room = start.within(options.max_gaussians)
     whole = plan = make_plan(options, views, split, len(room))
 
-    def visits(history: History) -> PhotoVisits:
-        return PhotoVisits(
+    def order_of(history: History) -> PhotoOrder:
+        return PhotoOrder(
             [view.camera for view in trained_on], training_sizes(whole, history), whole.options.seed, whole.megapixels
         )
 
@@ -118,13 +118,13 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
         clocks.start()
         sky = begin_sky(options, trained_on, dataset, arguments.threads, SilentReporter())
         state = TrainState.begin(room, plan, make_techniques(plan, sky, trained_on, dataset))
-        with PhotoStream(trained_on, visits(state.history), 1, dataset) as photos:
+        with PhotoStream(trained_on, order_of(state.history), 1, dataset) as photos:
             for photo in photos:
                 iterate(state, plan, photo)
                 ended = state.history.sizes_ended
                 if state.iteration in ended[-1:]:
                     plan = whole.after(ended)
-                    photos.go_on(visits(state.history), state.iteration + 1)
+                    photos.go_on(order_of(state.history), state.iteration + 1)
                 last = state.iteration == ends_at(plan, state.history.flat_at)
                 if clocks.cpu_now() < due and not last:
                     continue

@@ -28,7 +28,7 @@ class TrueView:
     depth: Float32[np.ndarray, "h w"]
 
 
-def true_sights(surface: Triangles, folder: Path | None = None) -> list[TrueView]:
+def true_views(surface: Triangles, folder: Path | None = None) -> list[TrueView]:
     """Load or compute the true views of all photos of the capture.
 
     Args:
@@ -43,21 +43,21 @@ def true_sights(surface: Triangles, folder: Path | None = None) -> list[TrueView
 
 
 def photos_that_see(
-    places: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"], sights: Iterable[TrueView]
+    places: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"], views: Iterable[TrueView]
 ) -> UInt8[np.ndarray, " n"]:
     """Count the photos that see each place of a surface.
 
     Args:
         places: East, north, up in metres.
         normals: Unit normals there, to either side.
-        sights: The photos.
+        views: The photos.
     """
     count = np.zeros(len(places), np.uint8)
-    for sight in sights:
-        rows, pixels, depths = sight.camera.in_view(places)
-        rays = sight.camera.centre() - places[rows]
+    for view in views:
+        rows, pixels, depths = view.camera.in_view(places)
+        rays = view.camera.centre() - places[rows]
         facing = np.abs((rays * normals[rows]).sum(axis=1)) > LEAST_COSINE * np.linalg.norm(rays, axis=1)
-        count[rows[facing & _is_first(sight.depth, pixels, depths)]] += 1
+        count[rows[facing & _is_first(view.depth, pixels, depths)]] += 1
     return count
 
 

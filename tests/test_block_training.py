@@ -30,7 +30,7 @@ from splatpipe.pipeline.splat.gaussians import PARAMETERS
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train import loop, memory
 from splatpipe.pipeline.train.blocks.coarse import TrainingLimits, train_coarse
-from splatpipe.pipeline.train.blocks.forecast import WindowScheme, block_outlooks, coarse_sights, footage_on
+from splatpipe.pipeline.train.blocks.forecast import WindowScheme, block_forecasts, coarse_coverages, footage_on
 from splatpipe.pipeline.train.blocks.needs import block_need
 from splatpipe.pipeline.train.blocks.partition import Cell, Partition
 from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
@@ -86,13 +86,13 @@ def surveyed(site: SiteParts, config: TrainConfig = CONFIG, window: int = WINDOW
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     points, tracks = load_points_and_tracks(site.dataset)
-    cameras, seen = [view.camera for view in views], sights_of(site)
-    outlooks = block_outlooks(config, views, seen, points.xyz, site.partition, window)
+    cameras, seen = [view.camera for view in views], coverages_of(site)
+    forecasts = block_forecasts(config, views, seen, points.xyz, site.partition, window)
     cut = WindowScheme.of(config, *footage_on(config, cameras, window))
     site.prospects.mkdir(exist_ok=True)
-    for number, outlook in enumerate(outlooks):
+    for number, forecast in enumerate(forecasts):
         scene = (read_splat(site.coarse / "model.ply"), seen, points.xyz)
-        BlockScope.of(site.partition, number, outlook.windows, cut, scene).write(site.prospects, number)
+        BlockScope.of(site.partition, number, forecast.windows, cut, scene).write(site.prospects, number)
     write_free_space(site.prospects, free_space(cameras, points.xyz, [tracks[each.name] for each in cameras]))
     return site
 
@@ -191,10 +191,10 @@ def test_windows_that_show_the_cell_are_each_used_as_often_as_without_blocks(sit
     looked = []
     for number in range(2):
         block = Block.of(config, other, replace(TASK, number=number, window_pixels=400), cpu())
-        prospect = block.surveyor.prospect()
-        plan = block.plan(prospect.windows)
-        visits = block.course(plan, prospect, tmp_path).visits(plan.schedule.training_sizes_until(plan.last_iteration))
-        each = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
+        scope = block.scope_reader.scope()
+        plan = block.plan(scope.windows)
+        order = block.course(plan, scope, tmp_path).order_of(plan.schedule.training_sizes_until(plan.last_iteration))
+        each = [order.at(iteration) for iteration in range(1, len(order) + 1)]
         times = Counter((visit.view, visit.level, visit.window) for visit in each)
         assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2
         assert {view for view, *_ in times} == set(range(len(plan.train_views)))
@@ -267,12 +267,12 @@ def test_interrupt_leaves_a_checkpoint(site: SiteParts, tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts["iteration"] == 10
 
 
-def sights_of(site: SiteParts) -> list[PhotoCoverage]:
+def coverages_of(site: SiteParts) -> list[PhotoCoverage]:
     """Return what the training photos see."""
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     _, tracks = load_points_and_tracks(site.dataset)
-    return coarse_sights(site.coarse, views, [tracks[view.camera.name] for view in views], Machine("cpu", 1))
+    return coarse_coverages(site.coarse, views, [tracks[view.camera.name] for view in views], Machine("cpu", 1))
 
 
 def test_pixels_that_count_are_near_the_cell_or_have_no_depth(site: SiteParts) -> None:
@@ -283,23 +283,23 @@ def test_pixels_that_count_are_near_the_cell_or_have_no_depth(site: SiteParts) -
     around = ((-end, -end, x0, end), (x1, -end, end, end), (x0, -end, x1, y0), (x0, y1, x1, end))
     cells = (CELLS[0], *(Cell((left, low), (right, high)) for left, low, right, high in around))
     enclosed = replace(PARTITION, cells=cells)  # whose first cell is not an outer one
-    for sight in sights_of(site):
-        assert sight.depth is not None
-        rows, columns = np.indices(sight.depth.shape).reshape(2, -1)
-        depth = np.where(sight.depth > 0.0, sight.depth, 9.0)
-        places = sight.grid.unproject(np.stack([columns, rows], axis=1) + 0.5, depth.ravel().astype(np.float64))
+    for coverage in coverages_of(site):
+        assert coverage.depth is not None
+        rows, columns = np.indices(coverage.depth.shape).reshape(2, -1)
+        depth = np.where(coverage.depth > 0.0, coverage.depth, 9.0)
+        places = coverage.grid.unproject(np.stack([columns, rows], axis=1) + 0.5, depth.ravel().astype(np.float64))
         distances = CELLS[0].distance(PARTITION.places(places)).reshape(depth.shape)
         depth[:4, :4] = 0.0
         distances[:4, :4] = 0.0
-        blind = replace(sight, depth=depth, observed=np.zeros(0, np.int64))
+        blind = replace(coverage, depth=depth, observed=np.zeros(0, np.int64))
         found = counted_samples(PARTITION, 0, blind, points.xyz)
         near = distances <= (MARGINS - 0.01) * PARTITION.margin
         far = distances > MARGINS * PARTITION.margin * 2**0.5
         assert found[near].all() and not found[cv2.erode(far.astype(np.uint8), beside) > 0].any()
         assert 0.1 < found.mean() < 1.0
         # Thin objects missing from the depth: only pixels near a point count.
-        lost = counted_samples(enclosed, 0, replace(sight, depth=np.full_like(depth, 500.0)), points.xyz)
-        observed = sight.of_points(points.xyz)
+        lost = counted_samples(enclosed, 0, replace(coverage, depth=np.full_like(depth, 500.0)), points.xyz)
+        observed = coverage.of_points(points.xyz)
         inside = CELLS[0].contains(PARTITION.plan.places(observed.places))
         across, down = observed.pixels[inside].astype(int).T
         assert len(down) and lost[down, across].all() and lost.sum() <= 9 * len(observed.pixels)
@@ -335,13 +335,13 @@ def test_outlook_matches_a_blocks_training(site: SiteParts, undisturbed: Path) -
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     points, _ = load_points_and_tracks(site.dataset)
-    outlook, _ = block_outlooks(CONFIG, views, sights_of(site), points.xyz, PARTITION, WINDOW)
+    forecast, _ = block_forecasts(CONFIG, views, coverages_of(site), points.xyz, PARTITION, WINDOW)
     plan = TrainingPlan.from_json((undisturbed / "plan.json").read_text())
-    assert (outlook.photos, outlook.iterations) == (len(plan.train_views), plan.schedule.iterations)
-    assert outlook.parts == (len(BlockScope.read(site.prospects, 0).windows[0]),)
+    assert (forecast.photos, forecast.iterations) == (len(plan.train_views), plan.schedule.iterations)
+    assert forecast.parts == (len(BlockScope.read(site.prospects, 0).windows[0]),)
     density = plan.schedule.density
-    assert outlook.steps == sum(map(density.is_step, range(1, plan.schedule.iterations + 1))) > 0
-    assert outlook.pixels[0] <= WINDOW * outlook.parts[0]
+    assert forecast.steps == sum(map(density.is_step, range(1, plan.schedule.iterations + 1))) > 0
+    assert forecast.pixels[0] <= WINDOW * forecast.parts[0]
 
 
 def test_positions_move_as_fast_as_in_the_whole_with_as_many_gaussians() -> None:

@@ -31,7 +31,7 @@ from splatpipe.pipeline.train.blocks.needs import (
     with_margin,
 )
 from splatpipe.pipeline.train.blocks.partition import NOBODY, Border, Cell, Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, sights
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.surroundings import visible_around
 from splatpipe.pipeline.train.blocks.thinning import thinned
 from splatpipe.pipeline.train.blocks.visibility import block_views, windows
@@ -62,7 +62,7 @@ def sparse(surface: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "p 3"]:
 
 @pytest.fixture(scope="module")
 def seen(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> list[PhotoCoverage]:
-    return building_site.site_sights(coarse, sparse)
+    return building_site.site_coverages(coarse, sparse)
 
 
 def divided(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"], cells: int) -> Partition:
@@ -175,11 +175,11 @@ def test_background_and_wrong_depths_do_not_widen_the_site(
     for low, high, size in zip(extent.low, extent.high, (building_site.LENGTH, building_site.WIDTH), strict=True):
         assert -0.5 < low < 1.0 and size - 1.0 < high < size + 0.5
     changed = []
-    for sight in seen:
-        depth = sight.depth.copy()
+    for coverage in seen:
+        depth = coverage.depth.copy()
         depth[:12] *= 40.0  # a seventh of each photo shows hills
         depth[40, ::29] *= 0.4  # and a few pixels something that is not there
-        changed.append(PhotoCoverage(sight.camera, sight.grid, depth, None, sight.observed))
+        changed.append(PhotoCoverage(coverage.camera, coverage.grid, depth, None, coverage.observed))
     assert np.allclose(site(PLAN, changed, sparse).low, extent.low, atol=1.5)
     assert np.allclose(site(PLAN, changed, sparse).high, extent.high, atol=1.5)
     ring = np.array([[10.0, 0.0], [20.0, 0.0], [20.0, 24.0], [10.0, 24.0]])
@@ -190,7 +190,7 @@ def test_background_and_wrong_depths_do_not_widen_the_site(
 def test_a_flat_cloud_of_points_without_a_model_is_divided(seen: list[PhotoCoverage]) -> None:
     line = np.column_stack([np.linspace(0.0, 10.0, 400), np.full(400, 3.0), np.zeros(400)])
     rows = np.arange(400)
-    flat = [PhotoCoverage(sight.camera, sight.grid, None, None, rows) for sight in seen]
+    flat = [PhotoCoverage(coverage.camera, coverage.grid, None, None, rows) for coverage in seen]
     partition = divided(flat, line, 4)
     assert np.bincount(partition.owners(line) + 1, minlength=5)[1:].min() >= 60
     with pytest.raises(ValueError, match="sees"):
@@ -202,7 +202,7 @@ def test_a_flat_cloud_of_points_without_a_model_is_divided(seen: list[PhotoCover
 def test_a_blocks_photos_show_all_of_its_cell(seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]) -> None:
     partition = divided(seen, sparse, 4)
     views = block_views(partition, seen, sparse, building_site.quarters)
-    whole = sum(sight.camera.width * sight.camera.height for sight in seen)
+    whole = sum(coverage.camera.width * coverage.camera.height for coverage in seen)
     for block, view in enumerate(views):
         assert view.covered >= 0.98
         assert 0 < view.pixels < 0.75 * whole
@@ -219,7 +219,7 @@ def test_a_blocks_photos_show_all_of_its_cell(seen: list[PhotoCoverage], sparse:
 def test_work_of_a_block_is_forecast_before_anything_is_divided(
     seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
-    pixels = sum(sight.pixels for sight in seen)
+    pixels = sum(coverage.pixels for coverage in seen)
     window = math.sqrt(80 * 60) * building_site.HEIGHT / building_site.FOCAL
     area = building_site.LENGTH * building_site.WIDTH
     for blocks in (2, 4, 7):
@@ -246,10 +246,10 @@ def test_a_building_hides_the_ground_behind_it(coarse: Gaussians, sparse: Float6
     x0, y0, x1, y1, _ = building_site.BUILDINGS[0]
     before = building_site.camera("low", np.array([10.0, y0 - 5.0, 1.5]), np.array([0.0, 1.0, 0.0]))
     rows = building_site.observed(sparse, [before], coarse)
-    sight = sights([before], rows, lambda grid: building_site.depth_of(coarse, grid))
+    coverage = photo_coverages([before], rows, lambda grid: building_site.depth_of(coarse, grid))
     behind = Cell((x0 + 2.0, y1 + 0.5), (x1 - 2.0, y1 + 6.0))
     partition = Partition(PLAN, (Cell((x0, y0 - 1.0), (x1, y1)), behind), 0.5)
-    views = block_views(partition, sight, sparse, building_site.quarters)
+    views = block_views(partition, coverage, sparse, building_site.quarters)
     assert [photo.photo for photo in views[0].photos] == [0] and views[1].photos == ()
     _, pixels, _ = before.in_view(np.array([[10.0, y1 + 3.0, 0.0]]))
     assert len(pixels) == 1  # although it is inside its image
@@ -258,7 +258,7 @@ def test_a_building_hides_the_ground_behind_it(coarse: Gaussians, sparse: Float6
 def test_without_a_coarse_model_points_determine_visibility(
     coarse: Gaussians, seen: list[PhotoCoverage], sparse: Float64[np.ndarray, "p 3"]
 ) -> None:
-    by_points = building_site.site_sights(coarse, sparse, by_depth=False)
+    by_points = building_site.site_coverages(coarse, sparse, by_depth=False)
     assert math.isclose(sum(by_points[0].samples(sparse).weights), by_points[0].pixels)
     partition = divided(seen, sparse, 4)
     both = [block_views(partition, kind, sparse, building_site.quarters) for kind in (seen, by_points)]
@@ -276,11 +276,11 @@ def test_masked_pixels_do_not_count_as_work(coarse: Gaussians, sparse: Float64[n
         half[:, : half.shape[1] // 2] = True
         return half
 
-    (sight,) = sights([view], rows, lambda grid: np.full((86, 115), 20.0, np.float32), counted)
-    samples = sight.samples(sparse)
+    (coverage,) = photo_coverages([view], rows, lambda grid: np.full((86, 115), 20.0, np.float32), counted)
+    samples = coverage.samples(sparse)
     assert abs(samples.weights.sum() / (view.width * view.height) - 57 / 115) < 0.01
     assert samples.pixels[:, 0].max() <= view.width / 2 and math.isclose(
-        sight.pixels, samples.weights.sum(), rel_tol=0.02
+        coverage.pixels, samples.weights.sum(), rel_tol=0.02
     )
 
 
@@ -290,7 +290,7 @@ def test_surroundings_leave_a_blocks_photos_unchanged(
     """A block's Gaussians, trained and frozen, look like the whole in its photos; thinned, nearly so."""
     partition = divided(seen, sparse, 4)
     views = block_views(partition, seen, sparse, building_site.quarters)
-    cuts = [building_site.quarters(sight.camera) for sight in seen]
+    cuts = [building_site.quarters(coverage.camera) for coverage in seen]
     for block in (0, 3):
         view, worst = (views[block], seen, cuts), []
         found = visible_around(partition, block, coarse, view)
@@ -308,8 +308,8 @@ def test_surroundings_leave_a_blocks_photos_unchanged(
         assert worst[0] > 45.0 and worst[1] > 24.0 and worst[1] > worst[2] + 3.0
 
 
-def _likeness(whole: Gaussians, drawn: Gaussians, sight: PhotoCoverage, parts: np.ndarray) -> float:
-    pictures = [render(model, sight.camera, building_site.OPTIONS).colour for model in (whole, drawn)]
+def _likeness(whole: Gaussians, drawn: Gaussians, coverage: PhotoCoverage, parts: np.ndarray) -> float:
+    pictures = [render(model, coverage.camera, building_site.OPTIONS).colour for model in (whole, drawn)]
     square = np.square((pictures[0] - pictures[1]).numpy())
     shown = [square[top:bottom, left:right].ravel() for left, top, right, bottom in parts.tolist()]
     return -10.0 * math.log10(max(float(np.concatenate(shown).mean()), 1e-12))
@@ -465,7 +465,7 @@ def test_demo_is_divided_assigned_to_photos_and_merged(demo_run: Path) -> None:
     cameras = [view.camera for view in load_views(dataset)]
     up = -np.mean([camera.cam_from_world[1, :3] for camera in cameras], axis=0)
     plan = GroundPlan.across(up)
-    seen = sights(cameras, [tracks[c.name] for c in cameras], lambda grid: render_depth(coarse, grid, options))
+    seen = photo_coverages(cameras, [tracks[c.name] for c in cameras], lambda grid: render_depth(coarse, grid, options))
     work = work_map(plan, site(plan, seen, points.xyz), seen, points.xyz)
     partition = cut(work, 4)
     found = shares(work, partition)

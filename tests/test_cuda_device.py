@@ -183,7 +183,7 @@ def test_insufficient_memory_is_reported(device: torch.device) -> None:
 
 
 def test_draws_are_those_of_train_draws(device: torch.device) -> None:
-    from splatpipe.pipeline.train.draws import uniform
+    from splatpipe.pipeline.train.random_numbers import uniform
 
     kernels = cuda.kernels_of(device)
     assert kernels is not None

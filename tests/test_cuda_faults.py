@@ -14,7 +14,7 @@ import torch
 
 from splatpipe.pipeline.raster.loss import photo_loss_reference
 from splatpipe.pipeline.train.densify import _split_offsets
-from splatpipe.pipeline.train.draws import SPLIT_POSITION, uniform
+from splatpipe.pipeline.train.random_numbers import SPLIT_POSITION, uniform
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

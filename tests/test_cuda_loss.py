@@ -17,9 +17,9 @@ from splatpipe.pipeline.raster.loss import Rectangle, photo_loss, photo_loss_ref
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.morton import morton_keys
 from splatpipe.pipeline.train.densify import _split_offsets
-from splatpipe.pipeline.train.draws import DROPOUT, SPLIT_POSITION, uniform
 from splatpipe.pipeline.train.dropout import dropped
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.random_numbers import DROPOUT, SPLIT_POSITION, uniform
 from splatpipe.pipeline.train.schedule import resolve_schedule
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))

@@ -28,8 +28,8 @@ from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, RenderOptions, isa_name, kernels_name, render
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import _split_offsets
-from splatpipe.pipeline.train.draws import SPLIT_POSITION, uniform
 from splatpipe.pipeline.train.dropout import _DropoutLogits
+from splatpipe.pipeline.train.random_numbers import SPLIT_POSITION, uniform
 
 sys.path.insert(0, str(Path(__file__).parent / "harness"))
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))

@@ -17,8 +17,8 @@ from splatpipe.pipeline.train.densify import (
     reset_opacity,
     room_at,
 )
-from splatpipe.pipeline.train.draws import normal, permutation, uniform
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.random_numbers import normal, permutation, uniform
 from splatpipe.pipeline.train.schedule import resolve_schedule
 
 SCHEDULE = replace(resolve_schedule(TrainConfig()).density, reset_every=100)

@@ -18,11 +18,11 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
 from splatpipe.pipeline.splat.sky_mask import SkyMask
 from splatpipe.pipeline.train.distortion_loss import CENTRE_EVERY, DistortionLoss
-from splatpipe.pipeline.train.draws import ELSEWHERE
 from splatpipe.pipeline.train.dropout import Dropout
 from splatpipe.pipeline.train.exposure import Exposure
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.random_numbers import ELSEWHERE
 from splatpipe.pipeline.train.robust import RobustMask
 from splatpipe.pipeline.train.schedule import ScheduleStep, resolve_schedule
 from splatpipe.pipeline.train.sky import SkyModel

@@ -13,8 +13,8 @@ from splatpipe.pipeline.app.report.verdict import VEIL
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
+from splatpipe.pipeline.render.blocked_light import blocked_shares
 from splatpipe.pipeline.render.floaters import measure_floaters
-from splatpipe.pipeline.render.veil import light_stopped
 from splatpipe.pipeline.splat.free_space import free_space, near_or_free
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
@@ -156,12 +156,12 @@ def test_light_absorbed_by_a_veil_is_that_of_its_gaussian(dataset: Path) -> None
     camera, sigma_px = cameras()[1], 0.6 * 130.0 / 2.0
     veil = blob(camera.centre()[None] + (0.0, 0.0, 2.0), 0.6, 0.3)
     xyz = np.array([[x, y, WALL] for x in (-0.8, 0.1, 1.3) for y in (-0.6, 0.4)])
-    stopped = light_stopped(Gaussians.concat([wall(), veil]), camera, xyz, OPTIONS)
+    stopped = blocked_shares(Gaussians.concat([wall(), veil]), camera, xyz, OPTIONS)
     pixels = np.floor(camera.project(xyz)) + 0.5
     squares = ((pixels - [72.0, 54.0]) ** 2).sum(axis=1) / (sigma_px**2 + 0.3)
     np.testing.assert_allclose(stopped, 0.3 * np.exp(-0.5 * squares), rtol=1e-4)
     beside = blob(camera.centre()[None] + (0.0, 0.0, 0.95 * WALL), 0.6, 0.3)
-    assert not light_stopped(Gaussians.concat([wall(), beside]), camera, xyz, OPTIONS).any()  # is the surface itself
+    assert not blocked_shares(Gaussians.concat([wall(), beside]), camera, xyz, OPTIONS).any()  # is the surface itself
 
 
 def test_veil_excludes_what_is_nearer_than_the_near_plane(dataset: Path) -> None:

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import tiny_scene
 from captures import CaptureRun, decibels, likely_frame
-from floater_planting import KINDS, SEEN_ALPHA, plant, sights_of
+from floater_planting import KINDS, SEEN_ALPHA, plant, render_depths
 from position_errors import SITE_M, position_row, site_of
 
 UP_FROM_DOWN = SceneFacts("y down")  # the tiny scene's −y is up
@@ -79,16 +79,16 @@ def test_floaters_are_planted_in_front_of_surfaces_and_visible(scene):
     wall.opacity_logits = torch.full((1200,), 4.0)
     model = Gaussians.concat([model, wall])
     options = RenderOptions(sh_degree=3)
-    sights = sights_of(model, tiny_scene.cameras(), options)
-    planted = plant(model, sights, options, 40, np.random.default_rng(3))
+    views = render_depths(model, tiny_scene.cameras(), options)
+    planted = plant(model, views, options, 40, np.random.default_rng(3))
     assert np.bincount(planted.kinds).tolist() == [40, 40, 40, 20, 8]
     assert planted.building[len(scene.gaussians) :].mean() > 0.3
     floaters = planted.model.after(planted.trained)
-    gaps = np.stack([sight.gaps(floaters.means.double().numpy()) for sight in sights])
+    gaps = np.stack([view.gaps(floaters.means.double().numpy()) for view in views])
     before = (np.nan_to_num(gaps, nan=-1.0) > 0.0).any(axis=0)
     assert before.all()
     assert bool((torch.sigmoid(floaters.opacity_logits) >= SEEN_ALPHA).all())
     size = [float(floaters.log_scales[planted.kinds == kind].max(dim=1).values.mean()) for kind in range(len(KINDS))]
     assert size[KINDS.index("oversized")] > size[KINDS.index("haze")]
-    again = plant(model, sights, options, 40, np.random.default_rng(3))
+    again = plant(model, views, options, 40, np.random.default_rng(3))
     assert torch.equal(again.model.means, planted.model.means)

@@ -21,7 +21,7 @@ from splatpipe.pipeline.photos.dataset import View, load_views
 from splatpipe.pipeline.photos.images import load_colour, load_mask, reduced_camera, reduced_view
 from splatpipe.pipeline.train import photo_cache
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.visits import PhotoVisits
+from splatpipe.pipeline.train.training_order import PhotoOrder
 from splatpipe.pipeline.train.windows import TrainingSize
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -177,7 +177,7 @@ def test_a_stream_continued_with_another_sequence_equals_one_begun_with_it(
     with PhotoStream.over(views, [TrainingSize(level) for level in planned], 0, begun, cache) as photos:
         photos.fill(tiny_scene.Recorder())
         seen = [next(photos) for _ in range(begun, 13)]
-        photos.go_on(PhotoVisits([view.camera for view in views], [TrainingSize(level) for level in later], 0), 13)
+        photos.go_on(PhotoOrder([view.camera for view in views], [TrainingSize(level) for level in later], 0), 13)
         seen += photos
     assert len(seen) == len(expected[begun - 1 :])
     assert all(same(one, other) for one, other in zip(seen, expected[begun - 1 :], strict=True))

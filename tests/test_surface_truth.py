@@ -47,8 +47,8 @@ def surface() -> Triangles:
 def truth(surface: Triangles) -> SceneTruth:
     """The truth with photos that see through everything, which is fast: occlusion is covered by other tests."""
     cameras = [camera.scaled(118, 88) for camera in depth_maps.true_cameras()[1]]
-    sights = [TrueView(camera, np.full((88, 118), np.inf, np.float32)) for camera in cameras]
-    return SceneTruth(surface, parts.parts_of(surface), sights)
+    true_views = [TrueView(camera, np.full((88, 118), np.inf, np.float32)) for camera in cameras]
+    return SceneTruth(surface, parts.parts_of(surface), true_views)
 
 
 def grid_of(cell: float) -> Raster:
@@ -198,28 +198,28 @@ def plate(size: float = 16.0) -> tuple[Triangles, list[TrueView]]:
     """A level square about the house's place, and nine photos of it from above."""
     a, b, c, d = (np.array([x * size / 2, y * size / 2, 0.0]) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
     triangles = np.array([[a, b, c], [a, c, d]])
-    sights = []
+    true_views = []
     for x in (-4.0, 0.0, 4.0):
         for y in (-4.0, 0.0, 4.0):
             pose = np.array([[1.0, 0, 0, -x], [0, -1, 0, y], [0, 0, -1, 20.0], [0, 0, 0, 1]])
             camera = Camera(f"{x}{y}", 120, 90, 60.0, 60.0, 60.0, 45.0, pose)
-            sights.append(TrueView(camera, depth_map(camera, triangles).astype(np.float32)))
-    return triangles, sights
+            true_views.append(TrueView(camera, depth_map(camera, triangles).astype(np.float32)))
+    return triangles, true_views
 
 
 def test_photos_see_what_is_not_occluded() -> None:
-    sights = plate()[1]
+    true_views = plate()[1]
     places = np.array([[0.0, 0, 0], [3.0, 1, 0], [0, 0, -0.5], [500.0, 0, 0]])
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
-    assert photos_that_see(places, up, sights).tolist() == [9, 9, 0, 0]
+    assert photos_that_see(places, up, true_views).tolist() == [9, 9, 0, 0]
     level = np.tile([1.0, 0.0, 0.0], (4, 1))
-    assert photos_that_see(places, level, sights)[0] == 6  # three are straight above: seen as a line
+    assert photos_that_see(places, level, true_views)[0] == 6  # three are straight above: seen as a line
 
 
 def test_clouds_and_meshes_are_judged_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surface_checks, "SAMPLES", 8_000)
-    triangles, sights = plate()
-    scene = SceneTruth(triangles, np.full(2, parts.GROUND, np.int8), sights)
+    triangles, true_views = plate()
+    scene = SceneTruth(triangles, np.full(2, parts.GROUND, np.int8), true_views)
     rng = np.random.default_rng(0)
     true = surface_of(triangles, 0.1, rng)
     points = spread(triangles, 40_000, rng)[0]
@@ -298,9 +298,9 @@ def test_files_are_measured_and_missing_ones_fail(
     write_products(tmp_path, perfect[0], truth.triangles)
     folder = tmp_path / "depths"
     folder.mkdir()
-    for sight in truth.sights:
-        depth = np.where(np.isfinite(sight.depth), sight.depth, 0.0).astype(np.float32)
-        depth_maps.save(folder / f"{sight.camera.name}.npz", sight.camera, depth, np.zeros(depth.shape, np.uint8))
+    for view in truth.true_views:
+        depth = np.where(np.isfinite(view.depth), view.depth, 0.0).astype(np.float32)
+        depth_maps.save(folder / f"{view.camera.name}.npz", view.camera, depth, np.zeros(depth.shape, np.uint8))
     tables = measure(tmp_path, ["dsm", "ortho", "facades"], "none", None, folder)
     assert set(tables) == {"dsm", "facades"}
     rows = {row["what"]: row for row in tables["dsm"]}
@@ -382,9 +382,9 @@ def test_noisy_depths_have_the_stated_errors() -> None:
 
 
 def test_depth_maps_read_back_from_their_files(tmp_path: Path) -> None:
-    sights = plate()[1]
-    cameras = [sight.camera for sight in sights]
-    depths = [np.where(np.isfinite(sight.depth), sight.depth, 0.0).astype(np.float32) for sight in sights]
+    true_views = plate()[1]
+    cameras = [view.camera for view in true_views]
+    depths = [np.where(np.isfinite(view.depth), view.depth, 0.0).astype(np.float32) for view in true_views]
     confidence = depth_maps.confirmations(cameras, depths, 4)
     assert confidence[45, 60] == 8 and confidence[0, 0] == 0 == depths[4][0, 0]
     depth_maps.save(tmp_path / "a.npz", cameras[4], depths[4], confidence)

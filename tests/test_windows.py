@@ -16,7 +16,7 @@ from splatpipe.pipeline.splat.metrics import SSIM_WINDOW
 from splatpipe.pipeline.splat.panorama import STEP_PX
 from splatpipe.pipeline.train import windows
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.visits import PartVisits, PhotoVisits, Visits
+from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder, WindowOrder
 from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize, windows_of
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
@@ -78,19 +78,19 @@ def test_photos_that_fit_are_whole_and_others_are_divided_as_far_as_possible() -
 def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own() -> None:
     cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
     rounds, windows = 6, len(windows_of(720, 540, 70_000))
-    visits = PhotoVisits(cameras, [TrainingSize(1)] * 9 + [TrainingSize(0, 70_000)] * (9 * windows * rounds), 0)
+    order = PhotoOrder(cameras, [TrainingSize(1)] * 9 + [TrainingSize(0, 70_000)] * (9 * windows * rounds), 0)
     seen: dict[int, list[PixelRectangle]] = {view: [] for view in range(9)}
-    for iteration in range(10, len(visits) + 1):
-        visit = visits.at(iteration)
-        seen[visit.view].append(visit.window)
+    for iteration in range(10, len(order) + 1):
+        crop = order.at(iteration)
+        seen[crop.view].append(crop.window)
     orders = set()
     for frames in seen.values():
         for begin in range(0, len(frames), windows):
             assert sorted(map(str, frames[begin : begin + windows])) == sorted(map(str, windows_of(720, 540, 70_000)))
             orders.add(tuple(map(str, frames[begin : begin + windows])))
     assert len(orders) > 0.9 * 9 * rounds
-    other = PhotoVisits(cameras, [TrainingSize(0, 70_000)] * 90, 1)
-    assert [visits.at(number + 9).window for number in range(1, 91)] != [other.at(n).window for n in range(1, 91)]
+    other = PhotoOrder(cameras, [TrainingSize(0, 70_000)] * 90, 1)
+    assert [order.at(number + 9).window for number in range(1, 91)] != [other.at(n).window for n in range(1, 91)]
 
 
 def test_windows_of_photos_of_several_sizes_are_seen_equally_often() -> None:
@@ -99,30 +99,30 @@ def test_windows_of_photos_of_several_sizes_are_seen_equally_often() -> None:
     look = TrainingSize(0, 100_000)
     cells = [len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras]
     assert len(set(cells)) > 1
-    visits = PhotoVisits(cameras, [TrainingSize(2)] * 6 + [look] * (3 * sum(cells) + 1), 0)
-    seen = [visits.at(iteration) for iteration in range(1, len(visits) + 1)]
+    order = PhotoOrder(cameras, [TrainingSize(2)] * 6 + [look] * (3 * sum(cells) + 1), 0)
+    seen = [order.at(iteration) for iteration in range(1, len(order) + 1)]
     rounds = [seen[6 + start : 6 + start + sum(cells)] for start in range(0, 3 * sum(cells), sum(cells))]
-    shown = [[(visit.view, visit.window) for visit in each] for each in rounds]
+    shown = [[(crop.view, crop.window) for crop in each] for each in rounds]
     assert all(len(set(each)) == sum(cells) for each in shown) and len({tuple(each) for each in shown}) == 3
 
 
-def rounds_of(visits: Visits) -> dict[int, int]:
+def rounds_of(order: TrainingOrder) -> dict[int, int]:
     """Return the number of visits in each round, by the iteration that ends it."""
-    seen = {iteration: visits.at(iteration).round for iteration in range(1, len(visits) + 1)}
+    seen = {iteration: order.at(iteration).round for iteration in range(1, len(order) + 1)}
     return {iteration: count for iteration, count in seen.items() if count}
 
 
 def test_a_round_ends_when_every_photo_has_been_seen_and_of_larger_ones_every_window() -> None:
     cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
     look, windows = TrainingSize(0, 70_000), len(windows_of(720, 540, 70_000))
-    whole = PhotoVisits(
+    whole = PhotoOrder(
         cameras, [TrainingSize(2)] * 12 + [TrainingSize(1)] * 17, 0
     )  # epochs of photos, whatever their size
     assert rounds_of(whole) == {9: 9, 18: 9, 27: 9}
-    visits = PhotoVisits(cameras, [TrainingSize(1)] * 12 + [look] * (18 * windows + 10), 0)
+    order = PhotoOrder(cameras, [TrainingSize(1)] * 12 + [look] * (18 * windows + 10), 0)
     ends = [9, 18, 18 + 9 * windows, 18 + 18 * windows]
-    assert rounds_of(visits) == dict(zip(ends, (9, 9, 9 * windows, 9 * windows), strict=True))
-    seen = Counter(visits.at(iteration).view for iteration in range(ends[1] + 1, ends[2] + 1))
+    assert rounds_of(order) == dict(zip(ends, (9, 9, 9 * windows, 9 * windows), strict=True))
+    seen = Counter(order.at(iteration).view for iteration in range(ends[1] + 1, ends[2] + 1))
     assert set(seen.values()) == {windows}
 
 
@@ -130,10 +130,10 @@ def test_rounds_of_windows_that_are_mixed_or_chosen_begin_with_their_size() -> N
     small, large = tiny_scene.cameras()[:2]
     cameras, look = [small.scaled(640, 480), large.scaled(2000, 1500)], TrainingSize(0, 100_000)
     count = sum(len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras)
-    mixed = PhotoVisits(cameras, [TrainingSize(2)] * 5 + [look] * (2 * count + 1), 0)
+    mixed = PhotoOrder(cameras, [TrainingSize(2)] * 5 + [look] * (2 * count + 1), 0)
     assert rounds_of(mixed) == {2: 2, 4: 2, 5: 1, 5 + count: count, 5 + 2 * count: count}
     parts = {1: [(0, PixelRectangle(0, 0, 9, 9))], 0: [(view, PixelRectangle(0, 0, 9, 9)) for view in (0, 1, 1)]}
-    chosen = PartVisits(cameras, [TrainingSize(1)] * 2 + [look] * 7, 0, None, parts)
+    chosen = WindowOrder(cameras, [TrainingSize(1)] * 2 + [look] * 7, 0, None, parts)
     assert rounds_of(chosen) == {1: 1, 2: 1, 5: 3, 8: 3}
 
 

@@ -164,7 +164,7 @@ class CudaKernels:
         self.call("splat_adam", ctypes.byref(given))
 
     def uniform(self, seed: int, step: int, stream: int, count: int) -> Float64[Tensor, " n"]:
-        """``train.draws.uniform`` of the indices 0 to count - 1."""
+        """``train.random_numbers.uniform`` of the indices 0 to count - 1."""
         out = torch.empty(count, dtype=torch.float64, device=self.device)
         self.call("splat_uniform", *_words(seed, step, stream), count, self.at(out))
         return out
@@ -179,7 +179,7 @@ class CudaKernels:
         """Two positions within each parent, relative to its mean: all first ones, then all second ones.
 
         Args:
-            draw: Seed, step and stream, as in ``train.draws``.
+            draw: Seed, step and stream, as in ``train.random_numbers``.
             rows: The parents' rows in the model.
             log_scales: The model's log-scales.
             quats: The model's quaternions.
@@ -254,5 +254,5 @@ def cuda_device(device: torch.device) -> CudaDevice | None:
 
 
 def _words(*numbers: int) -> tuple[int, ...]:
-    """Each number reduced to 64 bits, as in ``train.draws``."""
+    """Each number reduced to 64 bits, as in ``train.random_numbers``."""
     return tuple(number & (1 << 64) - 1 for number in numbers)

@@ -17,8 +17,8 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks
 from splatpipe.pipeline.photos.images import reduced_camera
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.render.blocked_light import measure_blocked_light
 from splatpipe.pipeline.render.consistency import depth_differences, depth_disagreement, neighbouring_pairs
-from splatpipe.pipeline.render.veil import measure_veil
 from splatpipe.pipeline.splat.free_space import free_space, near_or_free, share_of_opacity
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import rgb_to_dc
@@ -66,7 +66,7 @@ def measure_floaters(
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
     apart = depth_disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
     return {
-        "veil": measure_veil(gaussians, cameras, (points.xyz, counted), held_out, options),
+        "veil": measure_blocked_light(gaussians, cameras, (points.xyz, counted), held_out, options),
         "free_space_opacity": _rounded(floating) if space.known else None,
         "free_space_gaussians": int(chosen.sum()) if space.known else None,
         "free_space_rendered": _rounded(light[0] / light[1]) if space.known and light[1] > 0.0 else None,

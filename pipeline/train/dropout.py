@@ -15,8 +15,8 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda import kernels_of
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.draws import DROPOUT, uniform
 from splatpipe.pipeline.train.hooks import Technique
+from splatpipe.pipeline.train.random_numbers import DROPOUT, uniform
 from splatpipe.pipeline.train.schedule import Schedule, ScheduleStep
 
 DROPPED_LOGIT = -30.0  # an opacity of 1e-13: the projection culls it, so it costs nothing and learns nothing

@@ -20,8 +20,8 @@ from torch import Tensor
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.raster.colour import affine_colour
+from splatpipe.pipeline.train.auxiliary_model import AuxiliaryModel
 from splatpipe.pipeline.train.hooks import Shot, Technique
-from splatpipe.pipeline.train.side import SideModel
 
 FIRST_RATE = 1e-3  # learning rate: a photo has about a hundred visits, which change its exposure by at most a tenth
 LAST_RATE = 0.1  # of the first; exponential in between
@@ -29,7 +29,7 @@ DECAY = 1e-3  # weight decay towards the identity: unconstrained coefficients st
 _NAME = "deviations"
 
 
-class Exposure(SideModel, Technique):
+class Exposure(AuxiliaryModel, Technique):
     """An affine map of the colours for each photo.
 
     Args:

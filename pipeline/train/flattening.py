@@ -32,7 +32,7 @@ from splatpipe.pipeline.train.rates import Rates
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.smoothness_loss import SmoothnessLoss
 from splatpipe.pipeline.train.techniques import Techniques, make_techniques
-from splatpipe.pipeline.train.visits import PhotoVisits, Visits
+from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder
 from splatpipe.pipeline.train.windows import TrainingSize
 
 VISITS = 8  # of every photo
@@ -106,8 +106,8 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetu
     trained_on = [view for view in views if view.camera.name in kept]
     sky = _sky(trained, trained_on, threads)
 
-    def visits(looks: Sequence[TrainingSize]) -> Visits:
-        return PhotoVisits([view.camera for view in trained_on], looks, options.seed, plan.megapixels)
+    def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
+        return PhotoOrder([view.camera for view in trained_on], looks, options.seed, plan.megapixels)
 
     def techniques() -> Techniques:
         made = make_techniques(plan, sky, device=device.tensors)
@@ -117,7 +117,7 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetu
             made = made.with_given(given)
         return Techniques((*made, DistortionLoss(SPREAD_WEIGHT, 0, about_median=True), SmoothnessLoss(EVENNESS_WEIGHT)))
 
-    return TrainingSetup(plan, device, trained_on, visits, techniques, start=lambda: gaussians)
+    return TrainingSetup(plan, device, trained_on, order_of, techniques, start=lambda: gaussians)
 
 
 def _sky(trained: TrainedParts, views: Sequence[View], threads: int) -> SkyModel | None:

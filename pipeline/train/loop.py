@@ -36,7 +36,7 @@ from splatpipe.pipeline.train.start import read_start
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
-from splatpipe.pipeline.train.visits import PhotoVisits, Visits
+from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder
 from splatpipe.pipeline.train.windows import TrainingSize
 
 CHECKPOINT = "checkpoint.npz"
@@ -54,7 +54,7 @@ class TrainingSetup:
         plan: The training plan.
         device: The compute device.
         views: Views to train on.
-        visits: Makes the visits of the views from the training size of each iteration.
+        order_of: Makes the order of training from the training size of each iteration.
         techniques: Makes the plan's techniques, untrained.
         start: Makes the initial Gaussians.
         frozen: Makes the Gaussians that are rendered too but not trained; None for none.
@@ -63,7 +63,7 @@ class TrainingSetup:
     plan: TrainingPlan
     device: Device
     views: Sequence[View]
-    visits: Callable[[Sequence[TrainingSize]], Visits]
+    order_of: Callable[[Sequence[TrainingSize]], TrainingOrder]
     techniques: Callable[[], Techniques]
     start: Callable[[], Gaussians]
     frozen: Callable[[], Gaussians | None] = lambda: None
@@ -134,15 +134,15 @@ def train_whole(
         if budgeted(plan) or plan.options.iterations == "auto":
             report.note(plan.described())
 
-        def visits(looks: Sequence[TrainingSize]) -> Visits:
+        def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
             cameras = [view.camera for view in trained_on]
-            return PhotoVisits(cameras, looks, plan.options.seed, plan.megapixels)
+            return PhotoOrder(cameras, looks, plan.options.seed, plan.megapixels)
 
         course = TrainingSetup(
             plan,
             device,
             trained_on,
-            visits,
+            order_of,
             techniques=lambda: make_techniques(plan, sky, trained_on, dataset, device.tensors, area),
             start=lambda: start.within(plan.options.max_gaussians),
         )
@@ -170,8 +170,8 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
     first, history, seconds = 1, History(), 0.0
     if state is not None:
         first, history, seconds = state.iteration + 1, state.history, state.seconds
-    clock, visits = Clock(seconds), course.visits(training_sizes(plan, history))
-    with PhotoStream(course.views, visits, first, out).to(device.tensors) as photos:
+    clock, order = Clock(seconds), course.order_of(training_sizes(plan, history))
+    with PhotoStream(course.views, order, first, out).to(device.tensors) as photos:
         photos.warn_if_disk_full(report)
         photos.fill(report)  # before the model exists, unless it was resumed: both need memory
         if state is None:
@@ -342,8 +342,8 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
                 report_growth_ended(state, plan, report)
             if state.iteration in state.history.sizes_ended[-1:]:
                 plan = training.now
-                visits = training.course.visits(training_sizes(training.course.plan, state.history))
-                photos.go_on(visits, state.iteration + 1)
+                order = training.course.order_of(training_sizes(training.course.plan, state.history))
+                photos.go_on(order, state.iteration + 1)
                 report_larger_photos(state, plan, report)
             if interrupt.requested:
                 break

@@ -30,8 +30,8 @@ class Rates:
         boost: Factor on all rates but opacity's; the final rate of positions is multiplied by its square; ours.
         sparse: Step only the Gaussians that the photo saw; otherwise all, as published, so that unseen ones move on by
             momentum. Ours.
-        by_distance: Positions far from the photo's camera take longer steps (see `paces.py`) instead of equal ones, as
-            published. Ours.
+        by_distance: Positions far from the photo's camera take longer steps (see `step_lengths.py`) instead of equal
+            ones, as published. Ours.
     """
 
     means: float = 1.6e-4

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
-from splatpipe.pipeline.train.draws import BACKGROUND, uniform
 from splatpipe.pipeline.train.lengths import UNTIL, Length, PhotoSizes, Stretch, growth_until, lengths_of, stretches
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.random_numbers import BACKGROUND, uniform
 from splatpipe.pipeline.train.rates import PUBLISHED, Rates, rates_of
 from splatpipe.pipeline.train.windows import TrainingSize
 

@@ -27,10 +27,10 @@ from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, cells_of
 from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
-from splatpipe.pipeline.train.draws import ELSEWHERE
+from splatpipe.pipeline.train.auxiliary_model import AuxiliaryModel
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.photo_sky import PhotoSkies, PhotoSky
-from splatpipe.pipeline.train.side import SideModel
+from splatpipe.pipeline.train.random_numbers import ELSEWHERE
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
 LEAST_TRACK = 3  # minimum track length of points used in sky detection
@@ -47,7 +47,7 @@ RGB = tuple[float, float, float]
 _COLOURS = "colours"
 
 
-class SkyModel(SideModel, Technique):
+class SkyModel(AuxiliaryModel, Technique):
     """The trained panorama and the photos' sky masks.
 
     Attributes:

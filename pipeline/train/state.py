@@ -30,9 +30,9 @@ from splatpipe.pipeline.train.densify import (
 from splatpipe.pipeline.train.density import Density, DensityStep
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.memory import within_room
-from splatpipe.pipeline.train.paces import by_distance
 from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import ScheduleStep
+from splatpipe.pipeline.train.step_lengths import lengthen_far_steps
 from splatpipe.pipeline.train.techniques import Techniques
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian, relative to the scene's extent: float32 covariances stay non-singular
@@ -152,8 +152,10 @@ class TrainState:
         limits = {"log_scales": (math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))}
         self._hand_gradients()
         tensors, rows = self.gaussians.tensors(), gradient_rows if given.sparse else None
-        pace = by_distance(tensors["means"].detach(), rows, camera, extent) if given.by_distance else nullcontext()
-        with pace:
+        steps = (
+            lengthen_far_steps(tensors["means"].detach(), rows, camera, extent) if given.by_distance else nullcontext()
+        )
+        with steps:
             self.adam.step(tensors, rates, rows, buffers=self.buffers, limits=limits)
         self._drop_gradients()
 

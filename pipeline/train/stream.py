@@ -18,8 +18,8 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_view, reduced_views
 from splatpipe.pipeline.train.photo_cache import PhotoCache, stored_bytes
+from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingCrop, TrainingOrder
 from splatpipe.pipeline.train.upload import Upload, Uploader
-from splatpipe.pipeline.train.visits import PhotoVisits, Visit, Visits
 from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize
 
 EVERYWHERE = (slice(None), slice(None))  # rows and columns
@@ -38,7 +38,7 @@ class TrainingPhoto:
         inner: Left, top, right and bottom of the part that counts, in pixels of ``colour``; around it is the margin for
             SSIM. None if everything is inside.
         share: Share of the whole photo's counting pixels that are inside: the window's part in the photo's loss.
-        round: Number of visits in the round that ends with this photo, as in ``Visit``; 0 if none ends.
+        round: Number of visits in the round that ends with this photo, as in ``TrainingCrop``; 0 if none ends.
     """
 
     camera: Camera
@@ -80,7 +80,7 @@ class PhotoStream:
 
     Args:
         views: The photos to train on.
-        visits: The visits of all iterations.
+        order: What each iteration trains on.
         first: The first iteration, from 1.
         cache: Folder on whose disk the decoded photos are kept.
 
@@ -92,7 +92,7 @@ class PhotoStream:
     def __init__(
         self,
         views: Sequence[View],
-        visits: Visits,
+        order: TrainingOrder,
         first: int,
         cache: Path,
     ) -> None:
@@ -101,21 +101,21 @@ class PhotoStream:
         self._pending: deque[Future[_PendingPhoto]] = deque()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
-        self.go_on(visits, first)
+        self.go_on(order, first)
 
-    def go_on(self, visits: Visits, first: int) -> None:
-        """Switch to other visits, as if the stream had started with them; photos read ahead are dropped.
+    def go_on(self, order: TrainingOrder, first: int) -> None:
+        """Switch to another order, as if the stream had started with them; photos read ahead are dropped.
 
         Args:
-            visits: The visits of all iterations, from 1.
+            order: What each iteration trains on, from 1.
             first: The next iteration.
         """
         for each in self._pending:
             each.cancel()
         wait(self._pending)  # the reader uses the fields changed below
         self._pending.clear()
-        self._visits, self._next = visits, first
-        wanted = visits.levels_wanted(first).items()
+        self._order, self._next = order, first
+        wanted = order.levels_wanted(first).items()
         unread = {view: [level for level in levels if (view, level) not in self._cache] for view, levels in wanted}
         self._unread = {view: levels for view, levels in unread.items() if levels}
 
@@ -128,9 +128,9 @@ class PhotoStream:
         cache: Path,
         max_megapixels: float | None = None,
     ) -> PhotoStream:
-        """A stream over whole photos; arguments as for the class and ``PhotoVisits``."""
-        visits = PhotoVisits([view.camera for view in views], looks, seed, max_megapixels)
-        return PhotoStream(views, visits, first, cache)
+        """A stream over whole photos; arguments as for the class and ``PhotoOrder``."""
+        order = PhotoOrder([view.camera for view in views], looks, seed, max_megapixels)
+        return PhotoStream(views, order, first, cache)
 
     def to(self, device: torch.device) -> PhotoStream:
         """Return itself, set to put photos on a device; call it before taking the first photo."""
@@ -148,7 +148,7 @@ class PhotoStream:
         return self
 
     def __next__(self) -> TrainingPhoto:
-        while len(self._pending) < READ_AHEAD and self._next <= len(self._visits):
+        while len(self._pending) < READ_AHEAD and self._next <= len(self._order):
             self._pending.append(self._reader.submit(self._photo, self._next))
             self._next += 1
         if not self._pending:
@@ -172,7 +172,7 @@ class PhotoStream:
     def wanted_bytes(self) -> int:
         """Disk space for all photos that are needed more than once and not stored yet, bytes."""
         return sum(
-            stored_bytes(self._visits.camera(view, level), self._views[view].mask_path is not None)
+            stored_bytes(self._order.camera(view, level), self._views[view].mask_path is not None)
             for view, levels in self._unread.items()
             for level in levels
         )
@@ -191,18 +191,18 @@ class PhotoStream:
         """Store a photo at all needed levels that fit."""
         view, levels = self._views[index], self._unread.pop(index, [])
         has_mask = view.mask_path is not None
-        fitting = [level for level in levels if self._cache.has_room(self._visits.camera(index, level), has_mask)]
+        fitting = [level for level in levels if self._cache.has_room(self._order.camera(index, level), has_mask)]
         if not fitting:
             return
-        for level, decoded in zip(fitting, reduced_views(view, self._visits.max_megapixels, fitting), strict=True):
+        for level, decoded in zip(fitting, reduced_views(view, self._order.max_megapixels, fitting), strict=True):
             self._cache.put((index, level), *decoded)
 
     def _photo(self, iteration: int) -> _PendingPhoto:
-        visit = self._visits.at(iteration)
-        window, whole = visit.window, visit.camera
+        crop = self._order.at(iteration)
+        window, whole = crop.window, crop.camera
         cut = window.grown(whole.width, whole.height)
-        pixels, mask, of_whole = self._decoded(visit, cut)
-        mask = visit.counted(mask, cut)
+        pixels, mask, of_whole = self._decoded(crop, cut)
+        mask = crop.counted(mask, cut)
         left, top, right, bottom = inner = window.within(cut)
         here = window.pixels if mask is None else int(np.count_nonzero(mask[top:bottom, left:right]))
         return _PendingPhoto(
@@ -211,17 +211,17 @@ class PhotoStream:
             here == 0,
             None if cut == window else inner,
             here / max(1, of_whole),
-            visit.round,
+            crop.round,
         )
 
-    def _decoded(self, visit: Visit, cut: PixelRectangle) -> tuple[Pixels, Mask | None, int]:
+    def _decoded(self, crop: TrainingCrop, cut: PixelRectangle) -> tuple[Pixels, Mask | None, int]:
         """A part of a photo, its mask, and the number of the whole photo's pixels that count."""
-        if visit.view in self._unread:
-            self._store(visit.view)
-        key = (visit.view, visit.level)
+        if crop.view in self._unread:
+            self._store(crop.view)
+        key = (crop.view, crop.level)
         if key in self._cache:
             return *self._cache.get(key, cut), self._cache.counted(key)
-        _, pixels, mask = reduced_view(self._views[visit.view], self._visits.max_megapixels, visit.level)
+        _, pixels, mask = reduced_view(self._views[crop.view], self._order.max_megapixels, crop.level)
         part = (slice(cut.top, cut.bottom), slice(cut.left, cut.right))
         if mask is None:
             return pixels[part], None, pixels.shape[0] * pixels.shape[1]

@@ -16,7 +16,7 @@ from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.rendering import render_depth
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, sights
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.visibility import Windows
 
 LENGTH, WIDTH = 48.0, 24.0  # of the ground, metres, its corner at the origin, up is +z
@@ -102,11 +102,11 @@ def quarters(view: Camera) -> Windows:
     return np.array([[x[i], y[j], x[i + 1], y[j + 1]] for j in (0, 1) for i in (0, 1)])
 
 
-def site_sights(coarse: Gaussians, points: Float64[np.ndarray, "p 3"], by_depth: bool = True) -> list[PhotoCoverage]:
+def site_coverages(coarse: Gaussians, points: Float64[np.ndarray, "p 3"], by_depth: bool = True) -> list[PhotoCoverage]:
     """Return what the flight sees, by the coarse model's depth or by points alone."""
     cameras = flight()
     rows = observed(points, cameras, coarse)
-    return sights(cameras, rows, (lambda grid: depth_of(coarse, grid)) if by_depth else None)
+    return photo_coverages(cameras, rows, (lambda grid: depth_of(coarse, grid)) if by_depth else None)
 
 
 def write_dataset(folder: Path) -> Path:

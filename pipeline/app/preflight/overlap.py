@@ -17,8 +17,8 @@ from splatpipe.pipeline.sfm.pairs import (
     Pair,
     choose_pairing,
     components,
-    nearest,
     has_informative_positions,
+    nearest,
     select_pairs,
 )
 from splatpipe.pipeline.sfm.quick_match import InlierMatches, QuickFeatures, match_glimpses

@@ -63,7 +63,7 @@ def site(
     Raises:
         ValueError: if no photo sees anything.
     """
-    every = [_evenly(sight, xyz, max(1, MOST_SAMPLES // len(seen))) for sight in seen]
+    every = [_evenly(coverage, xyz, max(1, MOST_SAMPLES // len(seen))) for coverage in seen]
     places = np.concatenate([found for found, _ in every] or [np.zeros((0, 3))])
     sizes = np.concatenate([found for _, found in every] or [np.zeros(0)])
     if area is not None and (inside := area.contains(places)).any():
@@ -77,13 +77,13 @@ def site(
 
 
 def _evenly(
-    sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], most: int
+    coverage: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], most: int
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
     """About ``most`` of the places that a photo sees, and the size of a pixel (GSD) there."""
-    samples = sight.samples(xyz)
+    samples = coverage.samples(xyz)
     rows = np.flatnonzero(np.isfinite(samples.places).all(axis=1))
     rows = rows[:: max(1, -(-len(rows) // most))]
-    return samples.places[rows], samples.distances[rows] / math.sqrt(sight.camera.fx * sight.camera.fy)
+    return samples.places[rows], samples.distances[rows] / math.sqrt(coverage.camera.fx * coverage.camera.fy)
 
 
 def work_map(plan: GroundPlan, extent: Cell, seen: Sequence[PhotoCoverage], xyz: Float64[np.ndarray, "p 3"]) -> WorkMap:
@@ -101,8 +101,8 @@ def work_map(plan: GroundPlan, extent: Cell, seen: Sequence[PhotoCoverage], xyz:
     found = WorkMap(plan, extent.low, size, np.zeros((2, *shape), np.int64))
     bins, _ = found.bins(plan.places(xyz[np.isfinite(xyz).all(axis=1)]))
     np.add.at(found.measures[0], tuple(bins.T), 1)
-    for sight in seen:
-        samples = sight.samples(xyz)
+    for coverage in seen:
+        samples = coverage.samples(xyz)
         bins, inside = found.bins(plan.places(samples.places))
         np.add.at(found.measures[1], tuple(bins.T), np.rint(samples.weights[inside]).astype(np.int64))
     return found

@@ -21,7 +21,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.blocks.lengths import finer_lengths
 from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, sights
+from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.schedules import block_lengths, block_schedule
 from splatpipe.pipeline.train.blocks.visibility import Windows, block_views
 from splatpipe.pipeline.train.lengths import PhotoSizes
@@ -102,21 +102,21 @@ class BlockForecast:
 
 
 def visible_windows(
-    partition: Partition, sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], cut: WindowScheme
+    partition: Partition, coverage: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"], cut: WindowScheme
 ) -> dict[int, Bool[np.ndarray, "cells w"]]:
     """Which windows of a photo show each cell, by level.
 
     Args:
         partition: The cells.
-        sight: The photo's coverage.
+        coverage: The photo's coverage.
         xyz: All sparse points.
         cut: How it is cut into windows.
     """
     found = {}
     for level in cut.levels:
-        windows = cut.windows(sight.camera, level)
+        windows = cut.windows(coverage.camera, level)
         shown = np.zeros((len(partition.cells), len(windows)), np.bool_)
-        for block, views in enumerate(block_views(partition, [sight], xyz, lambda _, cut=windows: cut)):  # type: ignore[misc]
+        for block, views in enumerate(block_views(partition, [coverage], xyz, lambda _, cut=windows: cut)):  # type: ignore[misc]
             for photo in views.photos:
                 shown[block] = photo.windows
         found[level] = shown
@@ -137,7 +137,7 @@ def parts_of(shown: Iterable[Mapping[int, Bool[np.ndarray, "cells w"]]], block: 
     return {level: np.array(pairs, np.int64).reshape(-1, 2) for level, pairs in found.items()}
 
 
-def block_outlooks(
+def block_forecasts(
     config: TrainConfig,
     views: Sequence[View],
     seen: Sequence[PhotoCoverage],
@@ -157,7 +157,7 @@ def block_outlooks(
     """
     footage, most = footage_on(config, [view.camera for view in views], window_pixels)
     cut = WindowScheme.of(config, footage, most)
-    shown = [visible_windows(partition, sight, xyz, cut) for sight in seen]
+    shown = [visible_windows(partition, coverage, xyz, cut) for coverage in seen]
     return [_outlook(config, footage, cut, views, parts_of(shown, block)) for block in range(len(partition.cells))]
 
 
@@ -200,7 +200,7 @@ def _steps(config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: S
     return sum(density.is_step(iteration) for iteration in range(density.first, density.last + 1))
 
 
-def coarse_sights(
+def coarse_coverages(
     coarse: Path, views: Sequence[View], observed: Sequence[Int64[np.ndarray, " _"]], machine: Machine
 ) -> list[PhotoCoverage]:
     """The photos' coverages by the depth of a coarse model; 40 kB per photo.
@@ -217,10 +217,10 @@ def coarse_sights(
     """
     device = choose_device(machine.device)
     with same_bits(machine.threads), device.one_order():
-        return list(each_sight(coarse, read_splat(coarse / "model.ply"), views, observed, device))
+        return list(iterate_coverages(coarse, read_splat(coarse / "model.ply"), views, observed, device))
 
 
-def each_sight(
+def iterate_coverages(
     coarse: Path,
     gaussians: Gaussians,
     views: Sequence[View],
@@ -232,7 +232,7 @@ def each_sight(
     drawn = gaussians.to(device.tensors)
     for view, rows in zip(views, observed, strict=True):
         counted = partial(_counted, view)
-        yield from sights([view.camera], [rows], lambda camera: render_depth(drawn, camera, options), counted)
+        yield from photo_coverages([view.camera], [rows], lambda camera: render_depth(drawn, camera, options), counted)
 
 
 def _counted(view: View, grid: Camera) -> Mask | None:

@@ -23,8 +23,8 @@ from splatpipe.pipeline.train.blocks.division import Division
 from splatpipe.pipeline.train.blocks.forecast import (
     BlockForecast,
     WindowScheme,
-    block_outlooks,
-    coarse_sights,
+    block_forecasts,
+    coarse_coverages,
     footage_on,
 )
 from splatpipe.pipeline.train.blocks.partition import Partition
@@ -58,7 +58,7 @@ def lay_out(
     xyz, observed = points.xyz, [tracks[view.camera.name] for view in views]
     area = read_model_area(inputs.parts.get("georef.boundary"))
     report.progress(0, 1, "cutting the site into blocks")
-    seen = coarse_sights(coarse, views, observed, inputs.machine)
+    seen = coarse_coverages(coarse, views, observed, inputs.machine)
     with same_bits(threads):
         plan = GroundPlan.across(upward(views, xyz, threads))
         work = work_map(plan, site(plan, seen, xyz, area), seen, xyz)
@@ -67,25 +67,25 @@ def lay_out(
         means = gaussians.means.double().numpy()
         weights = shares(work, partition).mean(axis=0).tolist()
         counted = [(weight, *_counted(partition, k, means)) for k, weight in enumerate(weights)]
-        outlooks = block_outlooks(train, views, seen, xyz, partition, division.window_pixels)
+        forecasts = block_forecasts(train, views, seen, xyz, partition, division.window_pixels)
         limits = block_limits(division, train.sh_degree, counted)
         cameras = [view.camera for view in views]
         parts = WindowScheme.of(train, *footage_on(train, cameras, division.window_pixels))
         scene = (gaussians, seen, xyz)
-        around = _look_around(partition, parts, outlooks, scene, out / PROSPECTS, report)
+        around = _look_around(partition, parts, forecasts, scene, out / PROSPECTS, report)
         if train.prune_free_space:
             write_free_space(out / PROSPECTS, free_space(cameras, xyz, observed))
     told: Mapping[str, JSON] = {
         "limit_bytes": division.limit_bytes,
         "margin": partition.margin,
-        "photos": [outlook.photos for outlook in outlooks],
-        "iterations": [outlook.iterations for outlook in outlooks],
+        "photos": [forecast.photos for forecast in forecasts],
+        "iterations": [forecast.iterations for forecast in forecasts],
         "gaussians": [limit.share for limit in limits],
         "trained": [limit.trained for limit in limits],
         "start": [min(limit.trained, inside) for limit, (_, _, inside) in zip(limits, counted, strict=True)],
-        "steps": [outlook.steps for outlook in outlooks],
+        "steps": [forecast.steps for forecast in forecasts],
         "frozen": [min(limit.frozen, count) for limit, count in zip(limits, around, strict=True)],
-        "disk_bytes": [outlook.disk_bytes for outlook in outlooks],
+        "disk_bytes": [forecast.disk_bytes for forecast in forecasts],
     }
     return SitePlan(partition, tuple(limits), division.window_pixels, division.limit_bytes), {"of_blocks": told}
 
@@ -93,7 +93,7 @@ def lay_out(
 def _look_around(
     partition: Partition,
     parts: WindowScheme,
-    outlooks: Sequence[BlockForecast],
+    forecasts: Sequence[BlockForecast],
     scene: tuple[Gaussians, Sequence[PhotoCoverage], Float64[np.ndarray, "p 3"]],
     folder: Path,
     report: Reporter,
@@ -103,17 +103,17 @@ def _look_around(
     Args:
         partition: The cells.
         parts: How photos are cut into windows.
-        outlooks: The blocks' forecasts.
+        forecasts: The blocks' forecasts.
         scene: The coarse model, all photos' coverages and all sparse points.
         folder: Output folder.
         report: Receives progress.
     """
     found = []
-    for number, outlook in enumerate(outlooks):
-        report.progress(number, len(outlooks), "choosing the photos of blocks", "blocks")
-        prospect = BlockScope.of(partition, number, outlook.windows, parts, scene)
-        prospect.write(folder, number)
-        found.append(len(prospect.around.rows))
+    for number, forecast in enumerate(forecasts):
+        report.progress(number, len(forecasts), "choosing the photos of blocks", "blocks")
+        scope = BlockScope.of(partition, number, forecast.windows, parts, scene)
+        scope.write(folder, number)
+        found.append(len(scope.around.rows))
     return found
 
 

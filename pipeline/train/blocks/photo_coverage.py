@@ -87,7 +87,7 @@ class PhotoCoverage:
         return Samples(pixels * scale, self.grid.unproject(pixels, distances), weights, distances)
 
 
-def sights(
+def photo_coverages(
     cameras: Sequence[Camera],
     observed: Sequence[Int64[np.ndarray, " _"]],
     depth_of: Callable[[Camera], Float32[np.ndarray, "h w"]] | None,

@@ -20,7 +20,7 @@ SampleMask = Bool[np.ndarray, "rows columns"]
 
 
 def counted_samples(
-    partition: Partition, block: int, sight: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"]
+    partition: Partition, block: int, coverage: PhotoCoverage, xyz: Float64[np.ndarray, "p 3"]
 ) -> SampleMask:
     """The part of a photo that counts for a block, by the samples of its depth.
 
@@ -31,21 +31,21 @@ def counted_samples(
     Args:
         partition: The cells.
         block: The block's number.
-        sight: The photo's coverage.
+        coverage: The photo's coverage.
         xyz: All sparse points.
     """
-    shape = (sight.grid.height, sight.grid.width)
-    if sight.depth is None:
+    shape = (coverage.grid.height, coverage.grid.width)
+    if coverage.depth is None:
         return np.ones(shape, np.bool_)
     reach = MARGINS * partition.margin
-    there = (sight.depth > 0.0) & np.isfinite(sight.depth)
+    there = (coverage.depth > 0.0) & np.isfinite(coverage.depth)
     rows, columns = np.nonzero(there)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
-    places = sight.grid.unproject(pixels, sight.depth[rows, columns].astype(np.float64))
+    places = coverage.grid.unproject(pixels, coverage.depth[rows, columns].astype(np.float64))
     found = ~there
     found[rows, columns] = partition.near(block, reach, places)
-    points = sight.of_points(xyz)
-    scale = np.array([shape[1] / sight.camera.width, shape[0] / sight.camera.height])
+    points = coverage.of_points(xyz)
+    scale = np.array([shape[1] / coverage.camera.width, shape[0] / coverage.camera.height])
     inside = partition.near(block, reach, points.places)
     across, down = np.clip((points.pixels[inside] * scale).astype(np.int64), 0, np.array(shape[::-1]) - 1).T
     found[down, across] = True

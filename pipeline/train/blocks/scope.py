@@ -135,7 +135,7 @@ class ScopeReader:
     cut: WindowScheme
     most_frozen: int
 
-    def prospect(self) -> BlockScope:
+    def scope(self) -> BlockScope:
         """The block's scope.
 
         Raises:
@@ -152,7 +152,7 @@ class ScopeReader:
         try:
             return read_splat(out / FROZEN)
         except (OSError, SplatpipeError):
-            made = self.prospect().around.within(read_splat(self.coarse / "model.ply"), self.most_frozen)
+            made = self.scope().around.within(read_splat(self.coarse / "model.ply"), self.most_frozen)
             write_splat(out / FROZEN, made)
             return read_splat(out / FROZEN)
 

@@ -84,10 +84,10 @@ def _within(gaussians: Gaussians, unit: Float64[np.ndarray, " n"], most: int) ->
 
 
 def _seen_in(
-    gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], sight: PhotoCoverage, windows: Windows
+    gaussians: Gaussians, means: Float64[np.ndarray, "n 3"], coverage: PhotoCoverage, windows: Windows
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
     """The Gaussians that reach into windows of a photo and are not behind its surface, and the GSD at each."""
-    camera = sight.camera
+    camera = coverage.camera
     depths = camera.depths(means)
     rows = np.flatnonzero((depths > 0.0) & np.isfinite(depths))
     pixels, depths = camera.project(means[rows]), depths[rows]
@@ -98,13 +98,13 @@ def _seen_in(
     for left, top, right, bottom in windows.tolist():
         x, y = pixels.T
         into |= (x > left - radius) & (x < right + radius) & (y > top - radius) & (y < bottom + radius)
-    if sight.depth is not None:
-        into &= ~_hidden(sight, sight.depth, pixels, (depths, reach, radius))
+    if coverage.depth is not None:
+        into &= ~_hidden(coverage, coverage.depth, pixels, (depths, reach, radius))
     return rows[into], depths[into] / focal
 
 
 def _hidden(
-    sight: PhotoCoverage,
+    coverage: PhotoCoverage,
     depth: Float32[np.ndarray, "h w"],
     pixels: Float64[np.ndarray, "n 2"],
     size: tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]],
@@ -112,7 +112,7 @@ def _hidden(
     """Which Gaussians lie behind all of the surface around their centre; those larger than that neighbourhood never do.
 
     Args:
-        sight: The photo's coverage.
+        coverage: The photo's coverage.
         depth: Its depth.
         pixels: Positions of the Gaussians in the dataset's photo.
         size: Their depths, and their reach in world units and in pixels.
@@ -120,7 +120,7 @@ def _hidden(
     depths, reach, radius = size
     surface = np.where((depth > 0.0) & np.isfinite(depth), depth, np.inf).astype(np.float32)
     farthest = cv2.dilate(surface, np.ones((3, 3), np.uint8))
-    step = sight.camera.width / sight.grid.width
-    places = np.clip(pixels / step, 0.0, [sight.grid.width - 1, sight.grid.height - 1])
+    step = coverage.camera.width / coverage.grid.width
+    places = np.clip(pixels / step, 0.0, [coverage.grid.width - 1, coverage.grid.height - 1])
     columns, rows = np.nan_to_num(places).astype(np.int64).T
     return np.asarray((depths - reach > BEHIND * farthest[rows, columns]) & (radius < step))

@@ -34,7 +34,7 @@ from splatpipe.pipeline.train.plan import TrainingPlan, footage_of, load_or_writ
 from splatpipe.pipeline.train.sky import SkyModel
 from splatpipe.pipeline.train.sky_file import read_skies
 from splatpipe.pipeline.train.techniques import Techniques, make_techniques
-from splatpipe.pipeline.train.visits import PartVisits, Visits
+from splatpipe.pipeline.train.training_order import TrainingOrder, WindowOrder
 from splatpipe.pipeline.train.windows import TrainingSize
 
 
@@ -99,14 +99,14 @@ def train_block(
     device = choose_device(machine.device, config.unfit_for_cuda(), report.note)
     with same_bits(machine.threads), device.one_order(), device.memory_limit(config.max_memory_bytes):
         block = Block.of(config, parts, task, device)
-        prospect = block.surveyor.prospect()
-        windows = prospect.windows
+        scope = block.scope_reader.scope()
+        windows = scope.windows
         plan = load_or_write_plan(out / "plan.json", lambda: block.plan(windows))
         if plan.schedule.iterations == 0:
             report.note("there is nothing to train")
             return _leave(block, plan, out, (block.start(), History())) | device.facts()
         report.note(f"{len(plan.train_views)} photos, {plan.described()}")
-        state = go_through(block.course(plan, prospect, out), out, report)
+        state = go_through(block.course(plan, scope, out), out, report)
         left = _leave(block, plan, out, (state.finished(), state.whole_history()))
     return summary_of(state, plan) | left | device.facts()
 
@@ -120,7 +120,7 @@ class Block:
         task: Which block.
         device: The compute device.
         whole: The plan of the whole scene, with the block's options.
-        surveyor: Reads its windows and surroundings.
+        scope_reader: Reads its windows and surroundings.
         exposures: The photos' colour maps, as in `exposures.json`.
     """
 
@@ -128,7 +128,7 @@ class Block:
     task: BlockTask
     device: Device
     whole: TrainingPlan
-    surveyor: ScopeReader
+    scope_reader: ScopeReader
     exposures: Mapping[str, list[list[float]]]
 
     @staticmethod
@@ -152,18 +152,18 @@ class Block:
         }
         whole = make_plan(config.model_copy(update=decided), views, split, 0, task.window_pixels)
         cut = WindowScheme.of(whole.options, whole.footage, whole.megapixels)
-        surveyor = ScopeReader(
+        scope_reader = ScopeReader(
             parts.prospects, parts.coarse, parts.partition, task.number, trained_on, cut, task.frozen
         )
-        return Block(parts, task, device, whole, surveyor, exposures)
+        return Block(parts, task, device, whole, scope_reader, exposures)
 
     def start(self) -> Gaussians:
         """The initial Gaussians."""
-        return self.surveyor.start(self.task.trained)
+        return self.scope_reader.start(self.task.trained)
 
     def views(self, windows: Parts) -> list[View]:
         """The photos of its windows, in dataset order."""
-        return [self.surveyor.views[row] for row in rows_of(windows)]
+        return [self.scope_reader.views[row] for row in rows_of(windows)]
 
     def plan(self, windows: Parts) -> TrainingPlan:
         """The block's plan; without iterations if it has no photos or nothing to train."""
@@ -185,35 +185,35 @@ class Block:
         size = round(1e-6 * seen.pixels(TrainingSize(schedule.finest.level)), 4)
         return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
 
-    def course(self, plan: TrainingPlan, prospect: BlockScope, out: Path) -> TrainingSetup:
+    def course(self, plan: TrainingPlan, scope: BlockScope, out: Path) -> TrainingSetup:
         """The block's training setup.
 
         Args:
             plan: The block's plan.
-            prospect: The block's scope.
+            scope: The block's scope.
             out: Folder of its frozen Gaussians.
         """
-        windows = prospect.windows
+        windows = scope.windows
         views, place = self.views(windows), {row: place for place, row in enumerate(rows_of(windows))}
-        cut, every = self.surveyor.cut, self.surveyor.views
-        cells = {place[row]: grid for row, grid in prospect.counted.items()}
+        cut, every = self.scope_reader.cut, self.scope_reader.views
+        cells = {place[row]: grid for row, grid in scope.counted.items()}
         pieces = {
             level: [(place[row], cut.frames(every[row].camera, level)[window]) for row, window in pairs.tolist()]
             for level, pairs in windows.items()
         }
 
-        def visits(looks: Sequence[TrainingSize]) -> Visits:
+        def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
             cameras = [view.camera for view in views]
-            return PartVisits(cameras, looks, plan.options.seed, plan.megapixels, pieces, cells)
+            return WindowOrder(cameras, looks, plan.options.seed, plan.megapixels, pieces, cells)
 
         return TrainingSetup(
             plan,
             self.device,
             views,
-            visits,
+            order_of,
             techniques=lambda: self.techniques(plan, views),
             start=self.start,
-            frozen=lambda: self.surveyor.frozen(out),
+            frozen=lambda: self.scope_reader.frozen(out),
         )
 
     def techniques(self, plan: TrainingPlan, views: Sequence[View]) -> Techniques:
@@ -233,7 +233,7 @@ class Block:
             made = made.with_given(exposure)
         more: list[Technique] = [self.fence(plan)]
         if plan.options.prune_free_space:
-            cameras = [view.camera for view in self.surveyor.views]
+            cameras = [view.camera for view in self.scope_reader.views]
             more.append(FloaterPruning(read_free_space(self.parts.prospects, cameras), plan.schedule))
         return Techniques((*made, *more))
 

@@ -92,10 +92,10 @@ def block_views(
         cut: Cuts a photo into windows at the finest size (``windows``); they cover it without overlap.
     """
     found: list[list[BlockPhoto]] = [[] for _ in partition.cells]
-    for number, sight in enumerate(seen):
-        parts = cut(sight.camera)
-        weights = _counted(partition, sight.samples(xyz), parts)
-        points = sight.of_points(xyz)
+    for number, coverage in enumerate(seen):
+        parts = cut(coverage.camera)
+        weights = _counted(partition, coverage.samples(xyz), parts)
+        points = coverage.of_points(xyz)
         points = Samples(points.pixels, points.places, np.ones(len(points.places)), points.distances)
         observed = _counted(partition, points, parts)
         sizes = (parts[:, 2] - parts[:, 0]) * (parts[:, 3] - parts[:, 1])

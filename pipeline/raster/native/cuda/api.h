@@ -184,7 +184,7 @@ SPLAT_API int32_t splat_sky_backward(const SplatSky* sky, const float* upstream,
 
 SPLAT_API int32_t splat_adam(const SplatAdam* adam, SplatStream stream);
 
-/* Density control. Random numbers are those of train/draws.py. */
+/* Density control. Random numbers are those of train/random_numbers.py. */
 SPLAT_API int32_t splat_uniform(uint64_t seed, uint64_t step, uint64_t stream_of_use, int64_t count, double* out,
                                 SplatStream stream);
 /* Two positions within each parent, relative to its mean, (2 k, 3): all first ones, then all second ones. */

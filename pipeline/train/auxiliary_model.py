@@ -13,7 +13,7 @@ from splatpipe.pipeline.raster.optim import Adam, Rate
 _MOMENTS = "adam."
 
 
-class SideModel:
+class AuxiliaryModel:
     """Named tensors (autograd leaves) with a common row index, and their Adam moments.
 
     Args:

@@ -13,15 +13,15 @@ from jaxtyping import Bool, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Mask, reduced_camera
-from splatpipe.pipeline.train.draws import WINDOW_ORDER, permutation, random_bits
+from splatpipe.pipeline.train.random_numbers import WINDOW_ORDER, permutation, random_bits
 from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize, windows_of
 
-MOST_WINDOWS = 1 << 20  # per photo: offset of the next photo's random numbers
+MAX_WINDOWS = 1 << 20  # per photo: offset of the next photo's random numbers
 
 
 @dataclass(frozen=True)
-class Visit:
-    """What an iteration trains on.
+class TrainingCrop:
+    """What an iteration trains on: a window of a photo.
 
     Attributes:
         view: Index of the photo.
@@ -29,7 +29,7 @@ class Visit:
         camera: Camera of the whole photo at that size.
         window: The window that counts.
         cells: The part of the whole photo that counts besides its mask, as a grid of cells; None for all of it.
-        round: If this visit completes a round (everything at this size seen once), the round's number of visits; 0
+        round: If this iteration completes a round (everything at this size seen once), the round's length; 0
             otherwise. A round cut short by a change of size also counts.
     """
 
@@ -59,8 +59,8 @@ class Visit:
 
 
 @runtime_checkable
-class Visits(Protocol):
-    """The visits of a training.
+class TrainingOrder(Protocol):
+    """The order in which a training goes through its photos.
 
     Attributes:
         max_megapixels: The photos are first reduced to this size; None keeps the dataset's size.
@@ -71,8 +71,8 @@ class Visits(Protocol):
     def __len__(self) -> int:
         """How many iterations there are."""
 
-    def at(self, iteration: int) -> Visit:
-        """The visit of an iteration, from 1."""
+    def at(self, iteration: int) -> TrainingCrop:
+        """What an iteration, from 1, trains on."""
 
     def camera(self, view: int, level: int) -> Camera:
         """A photo's camera at a level."""
@@ -81,8 +81,8 @@ class Visits(Protocol):
         """The levels of each photo visited more than once from an iteration onward, finest first."""
 
 
-class PhotoVisits(Visits):
-    """Visits of whole photos: they depend only on the cameras, the training sizes, the seed and the iteration.
+class PhotoOrder(TrainingOrder):
+    """Order of a training on whole photos: it depends only on the cameras, the training sizes, the seed and the iteration.
 
     An epoch visits each photo once; a round visits each window of a photo at a level once; every epoch and round is
     shuffled anew. If photos have different numbers of windows, rounds run over the windows of all photos; otherwise
@@ -148,16 +148,18 @@ class PhotoVisits(Visits):
         """How many iterations there are."""
         return len(self._looks)
 
-    def at(self, iteration: int) -> Visit:
-        """The visit of an iteration, from 1."""
+    def at(self, iteration: int) -> TrainingCrop:
+        """What an iteration, from 1, trains on."""
         view, look = int(self._views[iteration - 1]), self._looks[iteration - 1]
         camera, ended = self.camera(view, look.level), int(self._rounds[iteration - 1])
         windows, given = self._windows_at(view, look), int(self._given[iteration - 1])
         if len(windows) == 1 or given >= 0:
-            return Visit(view, look.level, camera, windows[max(0, given)], round=ended)
+            return TrainingCrop(view, look.level, camera, windows[max(0, given)], round=ended)
         past, place = divmod(int(self._turns[iteration - 1]), len(windows))
-        drawn = random_bits(self._seed, past, WINDOW_ORDER, view * MOST_WINDOWS + np.arange(len(windows)))
-        return Visit(view, look.level, camera, windows[int(np.argsort(drawn, kind="stable")[place])], round=ended)
+        drawn = random_bits(self._seed, past, WINDOW_ORDER, view * MAX_WINDOWS + np.arange(len(windows)))
+        return TrainingCrop(
+            view, look.level, camera, windows[int(np.argsort(drawn, kind="stable")[place])], round=ended
+        )
 
     def camera(self, view: int, level: int) -> Camera:
         """A photo's camera at a level."""
@@ -168,8 +170,8 @@ class PhotoVisits(Visits):
         return _wanted_again(self._views[first - 1 :].tolist(), self._looks[first - 1 :])
 
 
-class PartVisits(Visits):
-    """Visits of given windows of photos: they depend only on these, the training sizes, the seed and the iteration.
+class WindowOrder(TrainingOrder):
+    """Order of a training on given windows of photos: it depends only on these, the training sizes and the seed.
 
     A round visits each window of a level once, whichever photo it is from; every round is shuffled anew.
 
@@ -177,9 +179,9 @@ class PartVisits(Visits):
         cameras: The photos' cameras.
         looks: Training size of each iteration, ``looks[i]`` for iteration ``i`` + 1.
         seed: Seed of the random order.
-        max_megapixels: As for ``PhotoVisits``.
+        max_megapixels: As for ``PhotoOrder``.
         parts: By level: pairs of a photo's index and a window at that level; at least one for each level in ``looks``.
-        cells: The part of each photo that counts, by photo index, as in ``Visit``; photos not listed count whole.
+        cells: The part of each photo that counts, by photo index, as in ``TrainingCrop``; others count whole.
     """
 
     def __init__(
@@ -205,12 +207,12 @@ class PartVisits(Visits):
         """How many iterations there are."""
         return len(self._looks)
 
-    def at(self, iteration: int) -> Visit:
-        """The visit of an iteration, from 1."""
+    def at(self, iteration: int) -> TrainingCrop:
+        """What an iteration, from 1, trains on."""
         level = self._looks[iteration - 1].level
         view, window = self._parts[level][int(self._rows[iteration - 1])]
         ended = int(self._rounds[iteration - 1])
-        return Visit(view, level, self.camera(view, level), window, self._cells.get(view), ended)
+        return TrainingCrop(view, level, self.camera(view, level), window, self._cells.get(view), ended)
 
     def camera(self, view: int, level: int) -> Camera:
         """A photo's camera at a level."""

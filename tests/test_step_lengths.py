@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.train.paces import by_distance
+from splatpipe.pipeline.train.step_lengths import lengthen_far_steps
 
 UNIT = 10.0
 
@@ -20,7 +20,7 @@ def camera_at(centre: tuple[float, float, float]) -> Camera:
 def stepped(means: torch.Tensor, step: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
     """Return how far each Gaussian moves for a given step."""
     moved = means.clone()
-    with by_distance(moved, rows, camera_at((1.0, 2.0, 3.0)), UNIT):
+    with lengthen_far_steps(moved, rows, camera_at((1.0, 2.0, 3.0)), UNIT):
         moved += step
     return moved - means
 

@@ -31,7 +31,7 @@ MOST_TRAINED = (
 )
 
 
-def measure_veil(
+def measure_blocked_light(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     observed: tuple[Float64[np.ndarray, "p 3"], Sequence[Int64[np.ndarray, " _"]]],
@@ -58,7 +58,7 @@ def measure_veil(
     points = 0
     for place in asked:
         small, rows = reduced_camera(cameras[place], LARGEST_MEGAPIXELS), seen[place]
-        stopped = light_stopped(gaussians, small, xyz[rows[sure[rows]]], options)
+        stopped = blocked_shares(gaussians, small, xyz[rows[sure[rows]]], options)
         if len(stopped) >= LEAST_POINTS:
             veils[small.name] = float(stopped.mean())
             points += len(stopped)
@@ -73,7 +73,7 @@ def measure_veil(
     }
 
 
-def light_stopped(
+def blocked_shares(
     gaussians: Gaussians, camera: Camera, xyz: Float64[np.ndarray, "n 3"], options: rasterizer.RenderOptions
 ) -> Float64[np.ndarray, " k"]:
     """The share of light, 0 to 1, that is stopped on its way from points to a camera.

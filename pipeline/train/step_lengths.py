@@ -22,7 +22,7 @@ from splatpipe.pipeline.raster.cuda import kernels_of
 
 
 @contextmanager
-def by_distance(
+def lengthen_far_steps(
     means: Float[Tensor, "n 3"], rows: Bool[Tensor, " n"] | None, camera: Camera, unit: float
 ) -> Iterator[None]:
     """Lengthen the steps taken in the body for positions farther than ``unit`` from the camera.
@@ -45,7 +45,7 @@ def by_distance(
     before = means[chosen].clone()
     yield
     ray.div_(distance.clamp(min=1e-30))
-    pace = distance.div_(unit).clamp_(min=1.0)
-    moved = (means[chosen] - before).mul_(pace)
-    along = (moved * ray).sum(dim=1, keepdim=True).mul_(pace - 1.0)
+    factor = distance.div_(unit).clamp_(min=1.0)
+    moved = (means[chosen] - before).mul_(factor)
+    along = (moved * ray).sum(dim=1, keepdim=True).mul_(factor - 1.0)
     means[chosen] = before.add_(moved).addcmul_(ray, along)
