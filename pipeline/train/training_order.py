@@ -82,7 +82,7 @@ class TrainingOrder(Protocol):
 
 
 class PhotoOrder(TrainingOrder):
-    """Order of a training on whole photos: it depends only on the cameras, the training sizes, the seed and the iteration.
+    """Order of a training on whole photos: it depends only on the cameras, the training sizes and the seed.
 
     An epoch visits each photo once; a round visits each window of a photo at a level once; every epoch and round is
     shuffled anew. If photos have different numbers of windows, rounds run over the windows of all photos; otherwise
