@@ -219,14 +219,12 @@ def _warn_of_noise(fit: PositionFit, frame: Frame, positions: Positions, report:
     used = [positions.by_name[name] for name in frame.residuals["photos"]]
     factors = fit.uncertainty.noise.factors
     if float(factors.max()) > POOR_NOISES:
-        stated = [
-            float(np.median([record[f"sigma_{axis}_m"] for record in used])) for axis in ("horizontal", "vertical")
-        ]
-        across, height = (factor * sigma for factor, sigma in zip(factors.tolist(), stated, strict=True))
+        axes = ("horizontal", "vertical")
+        stated = [float(np.median([record[f"sigma_{axis}_m"] for record in used])) for axis in axes]
+        across, height = (frame.residuals[f"rmse_{axis}_m"] for axis in axes)  # as in the report's table
         report.warning(
-            f"The photos' positions are inaccurate: off by about {across:.1f} m horizontally and {height:.1f} m in "
-            "height,"
-            f" where {stated[0]:g} and {stated[1]:g} m were expected. Result: {fit.uncertainty.sentence()}.",
+            f"The photos' positions are inaccurate: off by {across:.1f} m horizontally and {height:.1f} m in height "
+            f"(RMS), where {stated[0]:g} and {stated[1]:g} m were expected. Result: {fit.uncertainty.sentence()}.",
             "Control points (gcp_list.txt), or better positions (positions.csv), would improve the georeference.",
         )
 
