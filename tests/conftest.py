@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +17,8 @@ import pytest
 import torch  # noqa: F401
 from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
+
+from splatpipe.pipeline.engine.heap import importing
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from timeouts import TIMEOUT_S
@@ -58,6 +60,13 @@ def pytest_configure() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if WORKER in os.environ:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: the other cores belong to other workers
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Import the tests' modules and what they test without garbage collection."""
+    with importing():
+        return (yield)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

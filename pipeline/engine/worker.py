@@ -26,7 +26,7 @@ from typing import IO
 from splatpipe.pipeline.engine.children import CHILDREN_MEMORY, die_with_parent
 from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, SplatpipeError, StageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
-from splatpipe.pipeline.engine.heap import return_free_heap
+from splatpipe.pipeline.engine.heap import importing, return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Shard, StageConfig, load_body
 
 NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # in libraries' error messages, lower case
@@ -108,9 +108,10 @@ def execute(task: Task, send: IO[str]) -> None:
     started = _Usage.now()
     try:
         module, _, name = task.config_type.partition(":")
-        config_type: type[StageConfig] = getattr(__import__(module, fromlist=[name]), name)
+        with importing():
+            config_type: type[StageConfig] = getattr(__import__(module, fromlist=[name]), name)
+            body = load_body(task.entry)
         config = config_type.model_validate(task.config)
-        body = load_body(task.entry)
         _install_handlers()  # again: importing pycolmap replaces our handlers
         summary = body(config, task.inputs(), Path(task.out), EventReporter(task.stage, sink))
     except KeyboardInterrupt:

@@ -15,6 +15,7 @@ from typing import IO
 
 from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.heap import importing
 
 REPORT_FILE = "report.html"
 PATIENCE_S = 600.0  # far more than hundreds of photos take
@@ -36,8 +37,9 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
         OSError: if it cannot be written.
         MachineError: if this installation lacks the page's script or style.
     """
-    from splatpipe.pipeline.app.report.page import report_page
-    from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
+    with importing():
+        from splatpipe.pipeline.app.report.page import report_page
+        from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 
     path = out / REPORT_FILE
     write_durably(path, report_page(read_report_inputs(out), drawn=drawn))
