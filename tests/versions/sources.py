@@ -31,7 +31,7 @@ BLANKS = re.compile(r"(?<=\w)\s+(?=\w)|(?P<needless>\s+)")
 
 
 class Sources:
-    """The Python modules below a folder with ``pipeline`` and ``stages``.
+    """The Python modules below a folder with ``pipeline`` and ``stages``, which must not change meanwhile.
 
     Args:
         root: The folder: a checkout, or an export of one.
@@ -39,6 +39,7 @@ class Sources:
 
     def __init__(self, root: Path) -> None:
         self._root = root
+        self._files: dict[str, Path | None] = {}
 
     def digest(self, *entries: str) -> str:
         """Return the sha256 (hex) of everything that a stage's bodies reach.
@@ -68,6 +69,11 @@ class Sources:
         return found
 
     def _file(self, module: str) -> Path | None:
+        if module not in self._files:
+            self._files[module] = self._find(module)
+        return self._files[module]
+
+    def _find(self, module: str) -> Path | None:
         package, *rest = module.split(".")
         path = self._root.joinpath(*rest)
         if package != PACKAGE or not rest:
@@ -150,7 +156,12 @@ def _data(folder: Path) -> Iterator[tuple[str, Path]]:
 def _data_digest(path: Path) -> str:
     if path.suffix not in CPP:
         return hashlib.sha256(path.read_bytes()).hexdigest()
-    bare = CPP_PIECES.sub(lambda piece: piece["text"] or " ", path.read_text(encoding="utf-8"))
+    return _cpp_digest(path.read_text(encoding="utf-8"))
+
+
+@cache
+def _cpp_digest(text: str) -> str:
+    bare = CPP_PIECES.sub(lambda piece: piece["text"] or " ", text)
     return sha(BLANKS.sub(lambda blank: "" if blank["needless"] else " ", bare))
 
 
