@@ -44,7 +44,7 @@ from splatpipe.stages.line import LINE, MATCHES
 GUESS = 1.2  # of the longer side: COLMAP's guess if nothing is known
 PLACED = 0.9  # share of the photos
 TIMES = 3.0  # times the sound run's error
-LEAST_MATCHES = 15  # of a pair that is kept
+MIN_MATCHES = 15  # of a pair that is kept
 
 Pair = tuple[int, int]
 Truth = Mapping[str, np.ndarray]
@@ -123,7 +123,7 @@ def thin(source: Path, target: Path, variant: ThinnedGraph) -> None:
             geometry = old.read_two_view_geometry(i, j)
             rows = np.asarray(geometry.inlier_matches)
             rows = rows[_in_middle(verified, i, rows[:, 0], variant) & _in_middle(verified, j, rows[:, 1], variant)]
-            if len(rows) >= LEAST_MATCHES:
+            if len(rows) >= MIN_MATCHES:
                 geometry.inlier_matches = rows
                 new.write_two_view_geometry(i, j, geometry)
 

@@ -20,7 +20,7 @@ from splatpipe.pipeline.splat.scene import Axes, Scene
 
 Picture = Float[np.ndarray, "h w 3"]
 NEAR_M = 0.1
-MOST_PIXELS = 500_000  # of an image that is compared
+MAX_PIXELS = 500_000  # of an image that is compared
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
 AXES: tuple[Axes, ...] = ("z up", "y up", "y down")
 
@@ -75,7 +75,7 @@ def _camera(row: dict[str, object]) -> Camera:
     pose[:3, 3] = -pose[:3, :3] @ np.array(row["position"], float)
     fx, fy = float(row["fx"]), float(row["fy"])  # type: ignore[arg-type]
     camera = Camera(str(row["img_name"]), width, height, fx, fy, width / 2.0, height / 2.0, pose)
-    shrink = math.sqrt(min(1.0, MOST_PIXELS / (width * height)))
+    shrink = math.sqrt(min(1.0, MAX_PIXELS / (width * height)))
     return camera.scaled(round(width * shrink), round(height * shrink))
 
 

@@ -44,7 +44,7 @@ FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 PLACE = SplatOrigin(52.2, 21.0, 150.0, "ellipsoidal", "EPSG:32634")
 WIDTH, HEIGHT = 640, 420
 NEAR_PX = 12  # a bright spot within this distance of a point's expected pixel is the point
-MOST_OFF_PX = 2.0
+MAX_ERROR_PX = 2.0
 SIGMA_M = 0.15
 CORNERS_M = 1500.0
 SPACING_M = 12.0
@@ -88,7 +88,7 @@ def main() -> None:
         far = check_site(Path(folder) / "site", options.modules, options.pictures)
         if options.splat:
             check_splat(Path(folder) / "splat", options.splat, options.modules, options.pictures)
-    if far > MOST_OFF_PX:
+    if far > MAX_ERROR_PX:
         raise SystemExit(f"A point is {far:.2f} pixels from where it should be.")
 
 

@@ -34,7 +34,7 @@ WRONG = 0.2  # share of the verified matches
 EPIPOLAR_PX = 4.0  # distance from the epipolar line that COLMAP's two-view verification accepts
 FOCAL_OFF = 1.03
 POSITION_NOISE_M = 2.0
-LEAST_MATCHES = 15
+MIN_MATCHES = 15
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def matches(
         fundamental = _fundamental(flight, i, j, pinhole)
         wrong = _wrong(flight, rows, true, fundamental, round(len(true) * WRONG / (1.0 - WRONG)), rng)
         found = np.concatenate([true, wrong])
-        if len(found) >= LEAST_MATCHES:
+        if len(found) >= MIN_MATCHES:
             yield (i, j), found[np.lexsort((found[:, 1], found[:, 0]))], fundamental
 
 

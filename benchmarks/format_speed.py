@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from others import READERS, THEIR_AXES, OtherPrograms, ProgramEnd, find_others
-from round_trips import MOST_LARGER, bytes_of, working_folder, written
+from round_trips import MAX_GROWTH, bytes_of, working_folder, written
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -29,7 +29,7 @@ from splatpipe.pipeline.splat.scene import Scene
 
 ASKED_S = {"sog": 120.0, "streamed-sog": 120.0}
 OTHERS_ASKED_S = 5.0
-LEAST_SHRUNK = {"sog": 15.0}
+MIN_SHRUNK = {"sog": 15.0}
 JITTER = (0.02, 0.02, 0.05, 0.02)  # of positions in units, colours, opacity logits and logarithms of scales
 SEED = 19
 
@@ -116,11 +116,11 @@ def row_of(kind: SplatFormat, source: Path, folder: Path, theirs: tuple[int, Pro
     missed = []
     if row["write_s"] > ASKED_S.get(kind.name, OTHERS_ASKED_S):
         missed.append("time")
-    if row["shrunk"] < LEAST_SHRUNK.get(kind.name, 0.0):
+    if row["shrunk"] < MIN_SHRUNK.get(kind.name, 0.0):
         missed.append("a fifteenth")
     if theirs is not None:
         row |= {"their_bytes": theirs[0], "their_s": theirs[1].cpu_s, "of_theirs": row["bytes"] / theirs[0]}
-        if row["of_theirs"] > MOST_LARGER:
+        if row["of_theirs"] > MAX_GROWTH:
             missed.append("bytes")
     return row | {"bars": f"missed: {', '.join(missed)}" if missed else "met"}
 

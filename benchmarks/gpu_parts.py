@@ -21,7 +21,7 @@ from typing import Any
 
 Row = dict[str, Any]
 
-LEAST_S = 10.0  # a part with less time left is not started: loading torch takes half of it
+MIN_S = 10.0  # a part with less time left is not started: loading torch takes half of it
 LONGEST_ERROR = 1200  # characters of a failed part's last output
 GRACE_S = 3.0  # from SIGTERM to SIGKILL
 
@@ -118,7 +118,7 @@ def run_parts(
     beside: list[PartProcess] = []
     try:
         for part in parts:
-            if deadline - time.monotonic() < LEAST_S:
+            if deadline - time.monotonic() < MIN_S:
                 outcomes.append(PartOutcome(part.name, "not begun", 0.0, [], "no time was left"))
             elif part.beside:
                 beside.append(PartProcess(part, folder, environment))

@@ -29,7 +29,7 @@ BENCHES = {  # name: dataset, its points, megapixels
 LINES = {"demo": None, "ochota": "ochota/photos"}  # run up to initialize; None: the bundled demo capture
 QUALITY = 90  # of the transferred JPEGs: a third of PNG's size, and both devices train on the same
 MEBIBYTE = 1 << 20
-MOST_MEBIBYTES = 64  # limit for the tree and everything carried
+MAX_MEBIBYTES = 64  # limit for the tree and everything carried
 WHEELS = ("pydantic", "pydantic-core", "annotated-types", "typing-inspection", "beartype")  # missing on that machine
 PEERS = ("gsplat==1.5.3",)
 PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014", "manylinux1")
@@ -146,6 +146,6 @@ def report_size(pack: Path) -> None:
     ):
         carried = [*shared, *mine]
         size = tree + sum(file.stat().st_size for path in carried for file in path.rglob("*") if file.is_file())
-        print(f"== {call}: {size / MEBIBYTE:.1f} of {MOST_MEBIBYTES} MiB with", *carried)
-        if size > MOST_MEBIBYTES * MEBIBYTE:
+        print(f"== {call}: {size / MEBIBYTE:.1f} of {MAX_MEBIBYTES} MiB with", *carried)
+        if size > MAX_MEBIBYTES * MEBIBYTE:
             raise SystemExit(f"That is too much for {call}: take fewer --lines.")

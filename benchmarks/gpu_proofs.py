@@ -38,8 +38,8 @@ from splatpipe.stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = tuple(f"tests/test_cuda_{what}.py" for what in ("device", "iterations", "sky", "trainer"))
-LEAST_DB = 60.0  # between the CPU's render and the device's
-MOST_RELATIVE = 1e-3  # difference of a gradient, relative to its norm
+MIN_DB = 60.0  # between the CPU's render and the device's
+MAX_RELATIVE = 1e-3  # difference of a gradient, relative to its norm
 SHORT = 300  # iterations after which a model counts as trained
 SSIM_WEIGHT = 0.2
 THREADS = 2  # of a training on the CPU: several run concurrently
@@ -119,7 +119,7 @@ def agreement(megapixels: float = 0.4, views: int = 4, iterations: int = SHORT) 
                 here = _gradients(model, camera, photo, torch.device("cpu"))
             row = _compared(here, there)
             yield {"view": camera.name} | row
-            if row["psnr_db"] < LEAST_DB or max(row["gradients"].values()) > MOST_RELATIVE:
+            if row["psnr_db"] < MIN_DB or max(row["gradients"].values()) > MAX_RELATIVE:
                 worst.append(camera.name)
         if worst:
             raise SystemExit(f"these views do not agree: {', '.join(worst)}")

@@ -31,7 +31,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import MOST_PER_NODE, LevelNode, box_distance, build_levels, select_nodes
+from splatpipe.pipeline.splat.levels import MAX_PER_NODE, LevelNode, box_distance, build_levels, select_nodes
 from splatpipe.pipeline.splat.reduction import reduce_to
 from splatpipe.pipeline.splat.scene import Scene
 
@@ -40,7 +40,7 @@ ERROR_PX = 16.0
 GREY = (0.5, 0.5, 0.5)
 SIDE, FOCAL = 384, 800.0  # of the nodes' images, pixels
 FINER = 4  # times as many pixels along each side: nearly the true scene
-LEAST_COVERED = 60  # pixels: fewer say nothing
+MIN_COVERED = 60  # pixels: fewer say nothing
 FRAMES = 48
 FARTHEST = 60.0  # times the photos' distance: the start of the path
 
@@ -50,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="OUT of a finished run")
     parser.add_argument("--splat-transform", default="", help="command that runs it")
-    sizes = f"{MOST_PER_NODE},15000,6000"
+    sizes = f"{MAX_PER_NODE},15000,6000"
     parser.add_argument("--most-per-node", default=sizes, help="small ones, so that a small model has levels")
     parser.add_argument("--every", type=int, default=8, help="of the photos, one in so many is looked from")
     parser.add_argument("--large", type=int, default=0, help="Gaussians to measure time and memory with")
@@ -164,7 +164,7 @@ def node_errors(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> Non
             view = look(place, middle, FOCAL, SIDE, SIDE)
             picture, ours = (drawn(gaussians, view, antialias) for gaussians in (full, node.gaussians))
             covered = picture.alpha > 0.5
-            if int(covered.sum()) >= LEAST_COVERED:
+            if int(covered.sum()) >= MIN_COVERED:
                 as_drawn = decibels(picture.colour[covered], ours.colour[covered])
                 finely = decibels(
                     finer(full, view, antialias)[covered], finer(node.gaussians, view, antialias)[covered]

@@ -34,7 +34,7 @@ from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
 SLOW_S = 5.0  # of CPU time
 WORKER = Path(__file__).with_name("read_worker.py")
 HANG_S = 60.0  # wall-clock time, on a shared machine
-MOST_BYTES = 500_000_000
+MAX_BYTES = 500_000_000
 LARGEST_SAMPLE = 8 << 20  # a larger file is not used as a sample: reading thousands of it takes hours
 BY_CONTENT = 4  # every n-th file must first be recognised by its content
 ENDS = ("read", "refused", "crashed", "unsound", "slow", "memory")
@@ -203,7 +203,7 @@ def end_of(answer: dict[str, Any]) -> str:
     if answer["outcome"] == "read" and answer["detail"]:
         return "unsound"
     if answer["outcome"] in ("read", "refused"):
-        if answer["peak_bytes"] > MOST_BYTES:
+        if answer["peak_bytes"] > MAX_BYTES:
             return "memory"
         if answer["cpu_s"] > SLOW_S:
             return "slow"

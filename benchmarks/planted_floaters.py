@@ -29,7 +29,7 @@ from splatpipe.pipeline.render.rendering import Model, render_pixels
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.metrics import psnr, psnr_cc
 
-ASKED_FOUND, MOST_LOST, MOST_WORSE_DB = 0.95, 0.005, 0.05
+ASKED_FOUND, MAX_LOST, MAX_LOSS_DB = 0.95, 0.005, 0.05
 DEPTH_MEGAPIXELS = 0.07  # of the renders that locate surfaces
 
 KIND_COLUMNS = {"kind": "kind:", "planted": "planted:,", "found": "found:,", "share": "share:.4f", "bars": "bars:"}
@@ -84,7 +84,7 @@ def loss_row(planted: FloaterScene, kept: Bool[np.ndarray, " n"], model: str) ->
     gone = ~kept[: planted.trained]
     lost = float(gone[planted.building].mean())
     row: Row = {"model": model, "gaussians": planted.trained, "taken": int(gone.sum()), "lost": lost}
-    return row | {"bars": "met" if lost <= MOST_LOST else "missed"}
+    return row | {"bars": "met" if lost <= MAX_LOST else "missed"}
 
 
 def picture_rows(run: OpenedRun, models: dict[str, Model]) -> list[Row]:
@@ -104,7 +104,7 @@ def picture_rows(run: OpenedRun, models: dict[str, Model]) -> list[Row]:
     means: Row = {"photo": "mean"}
     means |= {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "photo"}
     worse = means["trained"] - means["cleaned"]
-    return [*rows, means | {"bars": "met" if worse <= MOST_WORSE_DB else "missed"}]
+    return [*rows, means | {"bars": "met" if worse <= MAX_LOSS_DB else "missed"}]
 
 
 def _render(run: OpenedRun, model: Model, camera: Camera) -> torch.Tensor:

@@ -18,7 +18,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.scene import Scene
 
 SITE_M = 3000.0
-MOST_POINTS = 30_000  # number that are matched
+MAX_POINTS = 30_000  # number that are matched
 BESIDE = 20.0  # steps: a larger distance means another Gaussian, or an error of the format
 HALF = 0.5 + 1e-3  # of a step: rounding to nearest, plus float32 along the way
 
@@ -28,7 +28,7 @@ Points = Float64[np.ndarray, "n 3"]
 def site_of(scene: Scene) -> Scene:
     """Spread the Gaussians that are matched over a site of 3 km, with unchanged sizes."""
     found = scene.gaussians
-    index = torch.linspace(0, len(found) - 1, min(len(found), MOST_POINTS)).long()
+    index = torch.linspace(0, len(found) - 1, min(len(found), MAX_POINTS)).long()
     part = found.select(index)
     means = part.means.double()
     low, high = (torch.quantile(means, q, dim=0) for q in (0.01, 0.99))
@@ -70,7 +70,7 @@ def _partners(truth: Gaussians, found: Gaussians) -> tuple[Int64[np.ndarray, " m
     Matching uses colour, opacity and scales as well as position; these are kept precisely enough to tell neighbours
     apart.
     """
-    index = np.linspace(0, len(truth) - 1, min(len(truth), MOST_POINTS)).astype(np.int64)
+    index = np.linspace(0, len(truth) - 1, min(len(truth), MAX_POINTS)).astype(np.int64)
 
     def features(gaussians: Gaussians) -> Float64[np.ndarray, "n 10"]:
         columns = (

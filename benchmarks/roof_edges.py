@@ -16,8 +16,8 @@ STEPS_A_PX = 4
 SMOOTH_PX = 0.7  # sigma of the blur before edges are searched: suppresses the noise of single pixels
 ALONG_PX = 2.0  # between places on the outline
 TRUE_WITHIN_PX = 0.75  # largest distance of the true image's strongest edge from the outline
-LEAST_STEP = 12.0  # grey levels per pixel: a roof that looks like its surroundings has no measurable edge
-LEAST_SHARE = 0.3  # of the true edge's strength: anything weaker counts as missing
+MIN_STEP = 12.0  # grey levels per pixel: a roof that looks like its surroundings has no measurable edge
+MIN_SHARE = 0.3  # of the true edge's strength: anything weaker counts as missing
 OUTSTANDING = 1.5  # times the strongest other true edge along the line
 SAME_PX = 2.5  # within this distance it is the same edge
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
@@ -67,7 +67,7 @@ def visible_edges(strength: Float32[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"
     peak = strength.max(axis=1)
     other = np.where(np.abs(offsets[None] - offsets[best][:, None]) > SAME_PX, strength, 0.0).max(axis=1)
     on_line = np.abs(offsets[best]) <= TRUE_WITHIN_PX
-    return np.asarray(on_line & (peak >= LEAST_STEP) & (peak >= OUTSTANDING * other))
+    return np.asarray(on_line & (peak >= MIN_STEP) & (peak >= OUTSTANDING * other))
 
 
 def edge_distances(
@@ -96,7 +96,7 @@ def edge_distances(
     offsets = _offsets()
     shift = offsets[true[visible].argmax(axis=1)]  # the true image's own edge, to a quarter pixel
     apart = np.abs(offsets[found.argmax(axis=1)] - shift)
-    lost = found.max(axis=1) < LEAST_SHARE * true[visible].max(axis=1)
+    lost = found.max(axis=1) < MIN_SHARE * true[visible].max(axis=1)
     return np.asarray(np.where(lost, np.inf, apart))
 
 

@@ -32,8 +32,8 @@ from splatpipe.pipeline.splat.ply import write_splat
 from splatpipe.pipeline.splat.scene import Scene
 
 ASKED_DB = {"ply": math.inf, "model": math.inf, "glb": 70.0, "spz": 38.0, "sog": 38.0, "compressed-ply": 38.0}
-MOST_BELOW_DB = 0.3  # splat-transform's
-MOST_LARGER = 1.05  # times splat-transform's
+MAX_LOSS_DB = 0.3  # splat-transform's
+MAX_GROWTH = 1.05  # times splat-transform's
 LIKE = {"model": "ply"}  # formats that store positions as another one does
 
 COLUMNS = {
@@ -113,9 +113,9 @@ def round_trip(capture: CaptureRun, originals: Sequence[Picture], kind: SplatFor
     if theirs is not None:
         row |= _their_file(capture, originals, kind, theirs, work)
         row["of_theirs"] = row["bytes"] / bytes_of(theirs)
-        if row["of_theirs"] > MOST_LARGER:
+        if row["of_theirs"] > MAX_GROWTH:
             missed.append("bytes")
-        if row.get("ours_db", math.inf) < row.get("theirs_db", 0.0) - MOST_BELOW_DB:
+        if row.get("ours_db", math.inf) < row.get("theirs_db", 0.0) - MAX_LOSS_DB:
             missed.append("splat-transform's dB")
         if row.get("theirs_by_us_db", math.inf) < row.get("theirs_db", 0.0) - 0.1:
             missed.append("its file read as it does")

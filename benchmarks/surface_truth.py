@@ -46,7 +46,7 @@ from triangle_distances import areas, spread, surface_of
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 
 CRS = "EPSG:32633"  # the demo's, if no product states another
-MOST_MESH_PLACES = 4_000_000
+MAX_MESH_PLACES = 4_000_000
 PRODUCTS = ("dsm", "ortho", "facades", "cloud", "mesh")
 
 FIGURES = {
@@ -206,7 +206,7 @@ def _measure_cloud_or_mesh(name: str, path: Path, truth: SceneTruth, frames: Pro
         distances_to = surface_of_points(points)
     else:
         corners = frames.true_from_local(read_mesh(path).reshape(-1, 3)).reshape(-1, 3, 3)
-        spacing = max(GSD_M, float(np.sqrt(areas(corners).sum() / MOST_MESH_PLACES)))
+        spacing = max(GSD_M, float(np.sqrt(areas(corners).sum() / MAX_MESH_PLACES)))
         points, _ = spread(corners, round(float(areas(corners).sum()) / spacing**2), rng)
         distances_to = surface_of(corners, spacing, rng).distances
     return {"what": name} | measure_points(truth, surface, points, distances_to)

@@ -15,7 +15,7 @@ from splatpipe.demo.truth import Triangles, depth_map
 from splatpipe.pipeline.geometry.camera import Camera
 
 BEHIND_M = 0.03  # tolerance by which a photo's depth may be less than a visible place's: less than half a pixel's slant
-LEAST_COSINE = 0.087  # of 85°: at flatter angles, a surface is seen as a line
+MIN_COSINE = 0.087  # of 85°: at flatter angles, a surface is seen as a line
 HALF = 2  # divisor of the photos' size for computed depths
 FEWEST = 3  # photos that determine a place's position with redundancy
 
@@ -56,7 +56,7 @@ def photos_that_see(
     for view in views:
         rows, pixels, depths = view.camera.in_view(places)
         rays = view.camera.centre() - places[rows]
-        facing = np.abs((rays * normals[rows]).sum(axis=1)) > LEAST_COSINE * np.linalg.norm(rays, axis=1)
+        facing = np.abs((rays * normals[rows]).sum(axis=1)) > MIN_COSINE * np.linalg.norm(rays, axis=1)
         count[rows[facing & _is_first(view.depth, pixels, depths)]] += 1
     return count
 

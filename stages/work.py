@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
 from splatpipe.pipeline.engine.needs import Need
-from splatpipe.pipeline.film.options import MOST_FILM_MEGAPIXELS
+from splatpipe.pipeline.film.options import MAX_FILM_MEGAPIXELS
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divided, memory_limit
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths, finer_lengths
@@ -324,7 +324,7 @@ class CaptureWork:
         if 0.0 < budget < FILM_FROM_BUDGET_S:
             return 0.0
         size = film.film_size
-        frame = size[0] * size[1] / MEGA if size else min(self.training_megapixels, MOST_FILM_MEGAPIXELS)
+        frame = size[0] * size[1] / MEGA if size else min(self.training_megapixels, MAX_FILM_MEGAPIXELS)
         return film.seconds * film.fps * frame
 
     def units(self) -> dict[str, WorkUnits]:

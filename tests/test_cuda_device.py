@@ -32,8 +32,8 @@ CPU = torch.device("cpu")
 COUNT = 20_000
 WIDTH, HEIGHT = 403, 299  # no whole tiles
 WHOLE = (0, 0, WIDTH, HEIGHT)
-LEAST_DB = 60.0  # between renders: single pixels lie on a threshold of alpha
-MOST_RELATIVE = 1e-3  # of a gradient's norm: the same, and other orders of sums
+MIN_DB = 60.0  # between renders: single pixels lie on a threshold of alpha
+MAX_RELATIVE = 1e-3  # of a gradient's norm: the same, and other orders of sums
 SSIM_WEIGHT = 0.2
 
 
@@ -113,14 +113,14 @@ def stepped(where: torch.device, steps: int = 3) -> dict[str, Tensor]:
 @pytest.mark.parametrize("depth", [False, True])
 def test_pictures_losses_and_gradients_are_the_cpus(device: torch.device, depth: bool, part: Rectangle) -> None:
     here, there = everything(scene(), CPU, depth, part), everything(scene(), device, depth, part)
-    assert metrics.psnr(there.pop("colour"), here.pop("colour")) > LEAST_DB
-    assert (there.pop("alpha") - here.pop("alpha")).square().mean() < 10 ** (-LEAST_DB / 10)
+    assert metrics.psnr(there.pop("colour"), here.pop("colour")) > MIN_DB
+    assert (there.pop("alpha") - here.pop("alpha")).square().mean() < 10 ** (-MIN_DB / 10)
     seen_by_one = here.pop("visible") != there.pop("visible")
     assert seen_by_one.float().mean() < 1e-4  # ellipses that touch the image's edge
     assert set(here) == set(there)
     for name, expected in here.items():
         assert torch.isfinite(there[name]).all(), name
-        assert (there[name] - expected).norm() <= MOST_RELATIVE * expected.norm(), name
+        assert (there[name] - expected).norm() <= MAX_RELATIVE * expected.norm(), name
 
 
 def test_steps_are_the_cpus(device: torch.device) -> None:

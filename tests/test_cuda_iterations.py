@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 from on_cpu import kernels_on_cpu
 from random_scene import random_camera, random_scene
 
-LEAST_PSNR = 60.0  # of a device's render beside the CPU's, dB: an eighth of a step of eight bits
+MIN_PSNR = 60.0  # of a device's render beside the CPU's, dB: an eighth of a step of eight bits
 GRADIENT_RTOL = 1e-3  # L2; the device's exponential and reciprocals are faster and less exact
 RATES = {"means": 1e-4, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": sh_rates(16, 2.5e-3, 1.25e-4)}
 STEPS = 3
@@ -100,7 +100,7 @@ def test_renders_and_gradients_agree_with_the_cpus(place, options):
     expected, gradients = backward_at(None, place, options)
     picture, ours = backward_at(place, place, options)
     assert float(expected.std()) > 0.1
-    assert -10.0 * torch.log10((picture - expected).square().mean().double()) >= LEAST_PSNR
+    assert -10.0 * torch.log10((picture - expected).square().mean().double()) >= MIN_PSNR
     for name, gradient in gradients.items():
         assert (ours[name] - gradient).norm() <= GRADIENT_RTOL * gradient.norm(), name
 

@@ -30,7 +30,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.formats import format_named, plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import MOST_EDITS, Scene, SceneFacts, SplatOrigin, turn_of
+from splatpipe.pipeline.splat.scene import MAX_EDITS, Scene, SceneFacts, SplatOrigin, turn_of
 from splatpipe.pipeline.survey.frames import Origin
 from splatpipe.pipeline.survey.handover import frame_of
 from splatpipe.pipeline.survey.world import open_world
@@ -392,11 +392,11 @@ def test_it_is_reduced_to_a_count_or_a_size_in_bytes(tmp_path: Path):
 
 def test_a_record_keeps_the_newest_edits_and_counts_the_others():
     facts = SceneFacts()
-    for number in range(MOST_EDITS + 5):
+    for number in range(MAX_EDITS + 5):
         facts = with_edits(facts, [{"step": "move", "by": [number, 0, 0]}])
-    assert len(facts.edits) == MOST_EDITS
+    assert len(facts.edits) == MAX_EDITS
     assert facts.edits[0] == {"step": "earlier edits", "count": 6}
-    assert facts.edits[-1]["by"] == [MOST_EDITS + 4, 0, 0]
+    assert facts.edits[-1]["by"] == [MAX_EDITS + 4, 0, 0]
     long = with_edits(SceneFacts(), [{"step": "crop", "polygon": "x" * 20_000}] * 6)
     assert long.edits[0]["count"] + len(long.edits) - 1 == 6
     long.record()

@@ -26,7 +26,7 @@ from splatpipe.pipeline.splat.ply import read_splat, write_splat
 from splatpipe.pipeline.train import flattening, loop
 from splatpipe.pipeline.train.distortion_loss import FREE_PX, HALF_PX, depth_origin, spread_loss
 from splatpipe.pipeline.train.exposure import Exposure, exposures_json, read_exposures
-from splatpipe.pipeline.train.flattening import LEAST_ITERATIONS, TrainedParts, flatten, flattening_plan, options_of
+from splatpipe.pipeline.train.flattening import MIN_ITERATIONS, TrainedParts, flatten, flattening_plan, options_of
 from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
 from splatpipe.pipeline.train.options import SplatDepthsConfig
 from splatpipe.pipeline.train.smoothness_loss import unevenness
@@ -112,7 +112,7 @@ def test_spread_about_the_median_does_not_move_the_front_surface() -> None:
 
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(flattening, "LEAST_ITERATIONS", FEW)
+    monkeypatch.setattr(flattening, "MIN_ITERATIONS", FEW)
     monkeypatch.setattr(flattening, "VISITS", 1)
     yield
 
@@ -253,8 +253,8 @@ def test_whole_photos_are_used_and_often_enough(parts: dict[str, Path]) -> None:
     options = options_of(Gaussians.empty(5, 2), Rendering(True, (0.0, 0.0, 0.0), 0.1, None), has_exposures=False)
     assert options.sh_degree == 2 and options.antialias and options.exposure == "off" and not options.densify
     plan = flattening_plan(options, views, split, 5, WINDOW_PIXELS["cpu"])
-    assert plan.schedule.iterations == plan.last_iteration == LEAST_ITERATIONS
+    assert plan.schedule.iterations == plan.last_iteration == MIN_ITERATIONS
     assert [each.level for each in plan.schedule.stretches] == [0]
     smaller = flattening_plan(options, views, split, 5, tiny_scene.WIDTH * tiny_scene.HEIGHT // 4)
     assert [(each.level, each.window_pixels) for each in smaller.schedule.stretches] == [(1, 0)]
-    assert not any(smaller.schedule.density.is_step(each) for each in range(1, LEAST_ITERATIONS))
+    assert not any(smaller.schedule.density.is_step(each) for each in range(1, MIN_ITERATIONS))

@@ -30,7 +30,7 @@ SPLATTING = "KHR_gaussian_splatting"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-MOST_FILE_BYTES = 2**32 - 1
+MAX_FILE_BYTES = 2**32 - 1
 
 
 def attributes(data: bytes) -> dict[str, np.ndarray]:
@@ -127,7 +127,7 @@ def test_opacities_and_scales_at_their_ends_stay_finite(tmp_path: Path):
 
 def test_what_a_glb_cannot_hold_is_refused():
     with pytest.raises(SplatpipeError, match="32-bit number"):
-        write_head(io.BytesIO(), {}, MOST_FILE_BYTES - 3)
+        write_head(io.BytesIO(), {}, MAX_FILE_BYTES - 3)
     with pytest.raises(SplatpipeError, match="at least one Gaussian"):
         glb.write(Path("never"), Scene(Gaussians.empty(0, 0)))
 

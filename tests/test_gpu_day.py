@@ -63,6 +63,6 @@ def test_a_part_that_fails_or_hangs_keeps_its_rows_and_the_others_run(tmp_path: 
 
 
 def test_parts_without_enough_time_are_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gpu_parts, "LEAST_S", 1000.0)
+    monkeypatch.setattr(gpu_parts, "MIN_S", 1000.0)
     (outcome,) = run(tmp_path, [GpuPart("good", "pieces:well", {"count": 1})], 60.0)
     assert (outcome.state, outcome.rows) == ("not begun", [])

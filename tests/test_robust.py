@@ -19,8 +19,8 @@ from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.robust import (
     GRID,
-    LEAST_RESIDUAL,
-    MOST_OF_A_PHOTO,
+    MAX_SHARE_OF_PHOTO,
+    MIN_RESIDUAL,
     UNKNOWN,
     RobustMask,
     cell_residuals,
@@ -124,8 +124,8 @@ def test_place_where_most_photos_disagree_with_the_model_is_not_contradicted(rob
             missing[20:88, 20:124] = torch.tensor(YELLOW)
             photo = robust.leave_out_contradicted(TrainingPhoto(camera, missing, None), rendered, rendered.colour)
         robust.end_epoch(0.5)
-        robust.threshold.clamp_(max=LEAST_RESIDUAL)  # however many are above it
-    assert bool((robust.scores[3] > LEAST_RESIDUAL).any())
+        robust.threshold.clamp_(max=MIN_RESIDUAL)  # however many are above it
+    assert bool((robust.scores[3] > MIN_RESIDUAL).any())
     assert photo.mask is None or float((~photo.mask).float().mean()) < 0.02
 
 
@@ -153,9 +153,9 @@ def test_exposure_and_displaced_detail_are_not_motion_but_a_block_is() -> None:
     model, everywhere = true_photo(camera), torch.ones(camera.height, camera.width, dtype=torch.bool)
     for other in (model, model + 0.2, model.roll((1, 1), (0, 1)), model.roll(-1, 1)):
         residual = cell_residuals(model, other, everywhere, camera)[0][4:-4, 4:-4]  # rolled in at the rim
-        assert float((residual > LEAST_RESIDUAL).float().mean()) < 0.01
+        assert float((residual > MIN_RESIDUAL).float().mean()) < 0.01
     residual, _ = cell_residuals(model, painted(model, CARS[2]), everywhere, camera)
-    assert float((residual > LEAST_RESIDUAL).float().mean()) > 0.02
+    assert float((residual > MIN_RESIDUAL).float().mean()) > 0.02
 
 
 def test_holes_of_the_model_contradict_nothing(robust: RobustMask) -> None:
@@ -175,7 +175,7 @@ def test_no_more_than_a_quarter_of_a_photo_is_left_out(robust: RobustMask) -> No
         patches = torch.rand(9, 12, 3, generator=generator).repeat_interleave(12, 0).repeat_interleave(12, 1)
         photo = looked(robust, camera, patches)
     assert photo.mask is not None
-    assert 0.02 < float((~photo.mask).float().mean()) <= MOST_OF_A_PHOTO + 0.01
+    assert 0.02 < float((~photo.mask).float().mean()) <= MAX_SHARE_OF_PHOTO + 0.01
 
 
 def test_threshold_is_the_quantile_of_all_known_cells() -> None:
@@ -186,7 +186,7 @@ def test_threshold_is_the_quantile_of_all_known_cells() -> None:
     robust.end_epoch(0.1)
     assert float(robust.threshold) == pytest.approx(0.9, abs=1e-3)
     robust.end_epoch(0.99)
-    assert float(robust.threshold) == pytest.approx(LEAST_RESIDUAL)
+    assert float(robust.threshold) == pytest.approx(MIN_RESIDUAL)
     robust.end_epoch(0.0)
     assert torch.isinf(robust.threshold).all()
 

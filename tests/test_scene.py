@@ -11,7 +11,7 @@ import torch
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply import read_splat_header, write_splat
-from splatpipe.pipeline.splat.scene import MOST_RECORD_BYTES, Scene, SceneFacts, SplatOrigin, facts_of_record, turn_of
+from splatpipe.pipeline.splat.scene import MAX_RECORD_BYTES, Scene, SceneFacts, SplatOrigin, facts_of_record, turn_of
 from splatpipe.pipeline.survey.handover import facts_of, frame_of
 
 PLACE = SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
@@ -76,7 +76,7 @@ GOOD = json.loads(FACTS.record())
         json.dumps(GOOD | {"place": {**GOOD["place"], "latitude": 91.0}}),
         json.dumps(GOOD | {"place": {**GOOD["place"], "height_m": float("nan")}}),
         json.dumps(GOOD | {"place": [1, 2]}),
-        json.dumps(GOOD) + " " * MOST_RECORD_BYTES,
+        json.dumps(GOOD) + " " * MAX_RECORD_BYTES,
     ],
 )
 def test_a_foreign_record_is_ignored(record):
@@ -86,4 +86,4 @@ def test_a_foreign_record_is_ignored(record):
 
 def test_a_record_larger_than_files_may_carry_is_refused():
     with pytest.raises(ValueError, match="larger"):
-        replace(FACTS, edits=({"text": "x" * MOST_RECORD_BYTES},)).record()
+        replace(FACTS, edits=({"text": "x" * MAX_RECORD_BYTES},)).record()

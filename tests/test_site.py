@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import tiny_scene
 from timeouts import wait_until
 
-COUNT, MOST_PER_NODE = 1200, 100
+COUNT, MAX_PER_NODE = 1200, 100
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up
 LIKE_OURS_DB = 25.0
 LIKE_THE_PAGE_DB = 40.0
@@ -94,7 +94,7 @@ def model() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def root(model: Gaussians) -> LevelNode:
-    return build_levels(model, MOST_PER_NODE)
+    return build_levels(model, MAX_PER_NODE)
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def test_it_is_complete_at_once_and_becomes_the_full_model(site: Path, scene: Vi
         watched = open_page(f"{host.address}/index.html", WIDTH, HEIGHT)
         page = watched.page
         page.evaluate("() => splatpipe.ready")
-        assert page.evaluate("() => splatpipe.shown()") == {"gaussians": MOST_PER_NODE, "files": [nodes[0]["file"]]}
+        assert page.evaluate("() => splatpipe.shown()") == {"gaussians": MAX_PER_NODE, "files": [nodes[0]["file"]]}
         first = psnr(picture(page), full)
         assert first >= COARSE_DB
         assert page.evaluate("([x, y]) => splatpipe.pick(x, y)", middle)
@@ -202,7 +202,7 @@ def test_no_more_gaussians_are_shown_than_allowed_whatever_was_viewed(site: Path
         for name in page.evaluate("() => splatpipe.facts.cameras.map(({ name }) => name)"):
             page.evaluate("name => splatpipe.goToCamera(name)", name)
             page.evaluate("() => splatpipe.complete()")
-            assert MOST_PER_NODE < page.evaluate("() => splatpipe.shown().gaussians") <= 600
+            assert MAX_PER_NODE < page.evaluate("() => splatpipe.shown().gaussians") <= 600
 
 
 def test_a_missing_file_is_reported_once_and_leaves_no_hole(site: Path, open_page: Callable) -> None:
@@ -273,7 +273,7 @@ def test_a_nodes_positions_keep_millimetres_in_a_site_of_three_kilometres(
 ) -> None:
     wide = model.clone()
     wide.means = torch.rand(COUNT, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([3000.0, 3000.0, 50.0])
-    root = build_levels(wide, MOST_PER_NODE)
+    root = build_levels(wide, MAX_PER_NODE)
     write_site(tmp_path / "web", scene, Scene(wide, SceneFacts("z up")), root)
     found = []
     for node in nodes_of(tmp_path):

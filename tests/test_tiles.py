@@ -30,7 +30,7 @@ PLACE = SplatOrigin(52.2, 21.0, 113.25, "ellipsoidal", "EPSG:32634")
 FACTS = SceneFacts("z up", True, True, PLACE, ({"step": "crop"},))
 BOTH = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
 SITE_M = 3000.0
-MOST_OFF_M = 0.6e-3  # half a step of 1/2048 m along each axis, and float32 at 1.5 km
+MAX_ERROR_M = 0.6e-3  # half a step of 1/2048 m along each axis, and float32 at 1.5 km
 
 
 def two_levels(spread: float = 20.0) -> tuple[Scene, LevelNode]:
@@ -112,7 +112,7 @@ def test_the_tree_has_the_levels_and_only_its_root_is_georeferenced(tmp_path: Pa
         box = corners(tile)
         assert (box[0] <= node.box[0]).all() and (box[1] >= node.box[1]).all()
         np.testing.assert_allclose(box, node.box, atol=0.002)
-        assert apart(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means) < MOST_OFF_M
+        assert apart(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means) < MAX_ERROR_M
 
 
 def test_our_own_reader_finds_each_nodes_gaussians_within_the_files_steps(tmp_path: Path):
@@ -128,7 +128,7 @@ def test_our_own_reader_finds_each_nodes_gaussians_within_the_files_steps(tmp_pa
         order = between.argmin(dim=0)  # a file's order is its own
         assert sorted(order.tolist()) == list(range(len(made)))
         found = read.gaussians.select(order)
-        assert float(between.min(dim=0).values.max()) < MOST_OFF_M
+        assert float(between.min(dim=0).values.max()) < MAX_ERROR_M
         assert float((found.log_scales - made.log_scales).abs().max()) < 0.5 / 16 + 1e-5
         assert float((found.opacity_logits.sigmoid() - made.opacity_logits.sigmoid()).abs().max()) < 0.5 / 255 + 1e-5
         assert float((found.sh[:, 0] - made.sh[:, 0]).abs().max()) < 0.5 / 255 / 0.15 + 1e-5
@@ -172,7 +172,7 @@ def test_a_site_of_three_kilometres_keeps_its_millimetres(tmp_path: Path):
     root = build_levels(gaussians, 200)
     write_tiles(tmp_path, Scene(gaussians, FACTS), root, np.eye(4))
     for node, tile in zip(root.nodes(), tiles(tileset(tmp_path)["root"]), strict=True):
-        assert apart(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means) < MOST_OFF_M
+        assert apart(local_means(tmp_path / tile["content"]["uri"]), node.gaussians.means) < MAX_ERROR_M
 
 
 def test_points_lie_on_the_earth_where_pyproj_says(tmp_path: Path):

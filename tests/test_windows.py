@@ -58,7 +58,7 @@ def test_windows_are_nearly_equal_cells_that_cover_the_picture_once(width: int, 
     for sides in ([window.width for window in found], [window.height for window in found]):
         assert max(sides) - min(sides) <= slack
     window = found[0]
-    assert max(window.width / window.height, window.height / window.width) < windows.MOST_OBLONG + 0.2
+    assert max(window.width / window.height, window.height / window.width) < windows.MAX_OBLONG + 0.2
 
 
 def test_a_window_grown_by_ssims_reach_begins_on_a_node_of_the_sky() -> None:

@@ -19,8 +19,8 @@ from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import FilmCamera, Route, cameras_along
 from splatpipe.pipeline.film.filming import (
-    LEAST_SIDE,
-    MOST_SIDE,
+    MAX_SIDE,
+    MIN_SIDE,
     FilmFile,
     FrameRenderer,
     TrainedScene,
@@ -86,10 +86,10 @@ class RenderRequest:
             return what, None
         match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", self.size)
         size = (int(match[1]), int(match[2])) if match else (0, 0)
-        if not all(LEAST_SIDE <= side <= MOST_SIDE and (self.stills or side % 2 == 0) for side in size):
+        if not all(MIN_SIDE <= side <= MAX_SIDE and (self.stills or side % 2 == 0) for side in size):
             raise UsageError(
                 f'--size "{self.size[:20]}" is not a valid size.',
-                hint=f"Write it like 1280x720: {LEAST_SIDE} to {MOST_SIDE} pixels, even ones for a film.",
+                hint=f"Write it like 1280x720: {MIN_SIDE} to {MAX_SIDE} pixels, even ones for a film.",
             )
         return what, size
 

@@ -33,7 +33,7 @@ LIMITS = ((0.02, 0.05), (0.008, 0.015), (0.003, 0.005))
 worsens the photos by more than the first is left out of later passes, since it makes what is behind it look bad; one
 that improves them by more than the second is cleared and rendered at full opacity."""
 LOOKS = len(LIMITS) + 1  # passes over all photos: likely floaters get one more, by themselves
-LEAST_GAP = 0.003  # share of the depth: the accuracy of the gap
+MIN_GAP = 0.003  # share of the depth: the accuracy of the gap
 NOISE = 1.0 / 30.0  # of one pixel's summed squared errors; it grows with the square root of the number of pixels
 EVIDENCE = {
     "worse on the whole": 1.45,
@@ -116,7 +116,7 @@ def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
     return {
         "worse on the whole": np.log1p(np.maximum(verdicts.worse - verdicts.better, 0.0) / noise),
         "worse in some": np.log1p(verdicts.worse / noise),
-        "gap": np.log(np.maximum(seen.gap, np.float32(LEAST_GAP))),
+        "gap": np.log(np.maximum(seen.gap, np.float32(MIN_GAP))),
         "floating": seen.floating,
         "loose": loose.astype(np.float32),
         "lightly held": light.astype(np.float32),

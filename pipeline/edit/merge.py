@@ -19,7 +19,7 @@ from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, turn_
 from splatpipe.pipeline.survey.crs import UNKNOWN, describe_vertical, parse_vertical, same_datum
 from splatpipe.pipeline.survey.frames import Origin
 
-MOST_APART_M = 30_000.0  # between two splats in one file: float32 has steps of 2 mm there
+MAX_DISTANCE_M = 30_000.0  # between two splats in one file: float32 has steps of 2 mm there
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,10 @@ def _on_earth(ours: SplatOrigin, other: SplatOrigin, name: str) -> Similarity:
         )
     to_ours = between(origin_of(other), origin_of(ours))
     apart = float(np.linalg.norm(to_ours.translation))
-    if apart > MOST_APART_M:
+    if apart > MAX_DISTANCE_M:
         raise SplatpipeError(
             f"{name} lies {apart / 1000.0:,.0f} km from the splat: one file cannot hold both.",
-            hint=f"At most {MOST_APART_M / 1000.0:.0f} km: coordinates in a file are 32-bit numbers.",
+            hint=f"At most {MAX_DISTANCE_M / 1000.0:.0f} km: coordinates in a file are 32-bit numbers.",
         )
     return to_ours
 

@@ -21,7 +21,7 @@ from splatpipe.pipeline.engine.quantities import parse_length
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.survey.frames import Origin
 
-MOST_DEGREES = 36_000.0  # a hundred turns
+MAX_DEGREES = 36_000.0  # a hundred turns
 FACTORS = (1e-6, 1e6)  # from micrometres to metres and back
 AXES = {"up": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 POINT_FORM = "X,Y,Z"
@@ -176,7 +176,7 @@ class Rotate:
         first, _, rest = (part.strip() for part in text.partition(","))
         degrees = parse_numbers(first, option, (1,), form)[0]
         axis = AXES[rest] if rest in AXES else parse_numbers(rest, option, (3,), form) if rest else None
-        if abs(degrees) > MOST_DEGREES or (axis is not None and math.hypot(*axis) == 0.0):
+        if abs(degrees) > MAX_DEGREES or (axis is not None and math.hypot(*axis) == 0.0):
             raise UsageError(f'Cannot rotate by "{text[:60]}".', hint=f"Write it as {option} {form}.")
         return Rotate(degrees, axis, pivot)
 

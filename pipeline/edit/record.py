@@ -11,7 +11,7 @@ from typing import Any
 from splatpipe.pipeline.edit.sources import SplatSource
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.json_file import json_text
-from splatpipe.pipeline.splat.scene import MOST_EDITS, SceneFacts
+from splatpipe.pipeline.splat.scene import MAX_EDITS, SceneFacts
 
 FORMAT = 1
 EARLIER = "earlier edits"
@@ -25,7 +25,7 @@ def with_edits(facts: SceneFacts, edits: Sequence[Edit]) -> SceneFacts:
     dropped = 0
     while True:
         told = replace(facts, edits=tuple([{"step": EARLIER, "count": dropped}, *every] if dropped else every))
-        if len(told.edits) <= MOST_EDITS and _fits(told):
+        if len(told.edits) <= MAX_EDITS and _fits(told):
             return told
         first = every.pop(0)
         dropped += int(first.get("count", 1)) if first.get("step") == EARLIER else 1

@@ -19,7 +19,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.reduction import Reduction, reduce_further, reduce_to
 from splatpipe.pipeline.splat.scene import Scene
 
-MOST = 10**10  # Gaussians: more than any machine holds
+MAX_GAUSSIANS = 10**10  # Gaussians: more than any machine holds
 UNITS = {"KB": 10**3, "MB": 10**6, "GB": 10**9}
 SAMPLE = 50_000  # Gaussians written to estimate the bytes per Gaussian
 ROUNDS = 5  # of writing and measuring: the bytes per Gaussian depend on their number
@@ -66,7 +66,7 @@ class Reduce:
             UsageError: if it is anything else, or zero.
         """
         text = text.strip()
-        if _COUNT.fullmatch(text) and 0 < int(text) <= MOST:
+        if _COUNT.fullmatch(text) and 0 < int(text) <= MAX_GAUSSIANS:
             return Reduce(output, count=int(text))
         match = _BYTES.fullmatch(text)
         size = int(float(match[1]) * UNITS[match[2].upper()]) if match else 0

@@ -15,7 +15,7 @@ from splatpipe.pipeline.edit.size import OutputFile, Reduce
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 
-MOST_STEPS = 100
+MAX_STEPS = 100
 
 
 def parse_steps(
@@ -32,9 +32,9 @@ def parse_steps(
     Raises:
         UsageError: if one is invalid, or there are too many.
     """
-    if len(given) > MOST_STEPS:
+    if len(given) > MAX_STEPS:
         raise UsageError(
-            f"{len(given)} steps are too many.", hint=f"At most {MOST_STEPS}; apply the rest to the edited file."
+            f"{len(given)} steps are too many.", hint=f"At most {MAX_STEPS}; apply the rest to the edited file."
         )
     pivot = Pivot(None, local)
     steps: list[Step] = []

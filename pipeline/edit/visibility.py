@@ -26,7 +26,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama
 from splatpipe.pipeline.splat.sh import C0
 
-LEAST_SEEN = 1e-3  # of a pixel: less is rounding
+MIN_SEEN = 1e-3  # of a pixel: less is rounding
 BORDER_SHARE = 0.08  # width of the border as a share of an image's shorter side: seen only there is hardly covered
 BEFORE_SHARE = 0.005  # of the depth: how far a Gaussian must be in front of the background, the depths' accuracy
 BEFORE_SIGMAS = 2.0  # the same in its own standard deviations along the view axis
@@ -107,7 +107,7 @@ def measure_visibility(gaussians: Gaussians, photos: TrainingPhotos, told: Calla
         behind = without_islands(rendered.median_depth.numpy(force=True))
         picture = np.stack([np.ones_like(behind), _border(camera), behind], axis=2)
         found = weights_of(rendered, grey, picture)
-        rows = np.flatnonzero(found[:, 0] > LEAST_SEEN)
+        rows = np.flatnonzero(found[:, 0] > MIN_SEEN)
         _add(sums, rows, found[rows], camera, (centres[rows], axes[rows]))
         told(done)
     return sums.sightings()

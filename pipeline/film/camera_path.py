@@ -30,7 +30,7 @@ FINE_STEPS, FINE_STEPS_A_PLACE = 4000, 10  # linear steps of a path, at least, a
 START_SHARE, START_S = 0.2, 1.0  # of a film's duration, and maximum seconds, to accelerate; the same to stop
 SLOW = 0.5  # of the median speed: below it the film slows down with the route
 REACH_SIGMAS = 4.0  # of the smoothing Gaussian
-LEAST_LENGTH = 1e-6  # of a path: below it nothing moves
+MIN_LENGTH = 1e-6  # of a path: below it nothing moves
 
 Doubles = Float64[np.ndarray, " n"]
 
@@ -193,7 +193,7 @@ def smoothed(route: Route, distance: float, width: float) -> tuple[Route, Double
         UsageError: if nothing moves.
     """
     along = np.append(0.0, np.cumsum(route.steps(distance)))
-    if not along[-1] > LEAST_LENGTH:
+    if not along[-1] > MIN_LENGTH:
         raise UsageError("All photos were taken from one position, so there is no path between them.")
     count = max(FINE_STEPS, FINE_STEPS_A_PLACE * len(route))
     values = np.column_stack([np.interp(np.linspace(0.0, along[-1], count + 1), along, v) for v in route.values().T])
@@ -296,9 +296,9 @@ def centripetal_knots(route: Route, distance: float) -> Doubles:
         UsageError: if nothing moves.
     """
     gaps = route.steps(distance)
-    if not gaps.sum() > LEAST_LENGTH:
+    if not gaps.sum() > MIN_LENGTH:
         raise UsageError("All keyframes are at one position, so there is no path between them.")
-    return np.append(0.0, np.cumsum(np.sqrt(np.maximum(gaps, LEAST_LENGTH**2))))
+    return np.append(0.0, np.cumsum(np.sqrt(np.maximum(gaps, MIN_LENGTH**2))))
 
 
 def towards(places: Float64[np.ndarray, "n 3"], targets: Float64[np.ndarray, "n 3"]) -> Route:

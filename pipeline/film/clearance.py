@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 OPAQUE = 0.5  # minimum opacity of Gaussians that a camera must not fly through
-MOST_POINTS = 400_000  # used for distances: more do not help at the scale of metres
+MAX_POINTS = 400_000  # used for distances: more do not help at the scale of metres
 WITNESSES = 8  # minimum number of points that near: a few floaters are not a wall
 
 
@@ -24,7 +24,7 @@ class Clearance:
             solid: Solid points, world units; non-finite ones are ignored.
         """
         solid = solid[np.isfinite(solid).all(axis=1)]
-        solid = solid[:: max(1, -(-len(solid) // MOST_POINTS))]
+        solid = solid[:: max(1, -(-len(solid) // MAX_POINTS))]
         self._tree = cKDTree(solid) if len(solid) >= WITNESSES else None
 
     def at(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " m"]:

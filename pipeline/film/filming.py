@@ -15,7 +15,7 @@ from jaxtyping import Float, Float64
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import FilmCamera, angle_of
 from splatpipe.pipeline.film.clearance import Clearance, solid_places
-from splatpipe.pipeline.film.options import MOST_FILM_MEGAPIXELS
+from splatpipe.pipeline.film.options import MAX_FILM_MEGAPIXELS
 from splatpipe.pipeline.film.photo_route import PhotoTrack
 from splatpipe.pipeline.film.video import VideoWriter
 from splatpipe.pipeline.geometry.camera import Camera
@@ -33,7 +33,7 @@ What = Literal["colour", "depth", "normals"]
 ASPECT = 16.0 / 9.0
 SAMPLED = 8  # cameras of a path that determine the depth range
 RANGE = (0.01, 0.99)  # quantiles of depth between which colours run from near to far
-LEAST_SIDE, MOST_SIDE = 16, 8192  # sides of an image, pixels
+MIN_SIDE, MAX_SIDE = 16, 8192  # sides of an image, pixels
 ROWS_AT_ONCE = 256  # rows of an image that are coloured at a time
 
 
@@ -57,13 +57,13 @@ class TrainedScene:
         """A camera of a given size with the photos' field of view; default: 16:9 at training size, at most Full HD."""
         if size is None:
             pixels = float(np.median([camera.width * camera.height for camera in self.cameras]))
-            width = _even(math.sqrt(min(pixels, 1e6 * MOST_FILM_MEGAPIXELS) * ASPECT))
+            width = _even(math.sqrt(min(pixels, 1e6 * MAX_FILM_MEGAPIXELS) * ASPECT))
             size = (width, _even(width / ASPECT))
         return FilmCamera.of_angle(*size, angle_of(self.cameras))
 
 
 def _even(length: float) -> int:
-    return max(LEAST_SIDE, 2 * round(length / 2.0))
+    return max(MIN_SIDE, 2 * round(length / 2.0))
 
 
 def open_scene(parts: Mapping[str, Path], threads: int, device: Device) -> TrainedScene:
@@ -139,7 +139,7 @@ def depth_range(pictures: FrameRenderer, cameras: Sequence[Camera]) -> tuple[flo
     """The range of depths shown by most images of a path, nearest and farthest."""
     found = []
     for index in np.unique(np.linspace(0, len(cameras) - 1, min(SAMPLED, len(cameras))).round().astype(int)):
-        values = pictures.values(reduced_camera(cameras[index], MOST_FILM_MEGAPIXELS))
+        values = pictures.values(reduced_camera(cameras[index], MAX_FILM_MEGAPIXELS))
         if values is not None and (values > 0.0).any():
             found.append(values[values > 0.0])
     if not found:

@@ -49,10 +49,10 @@ KIND = TableKind(
     max_bytes=4 << 20,
     max_lines=10_001,
 )
-MOST_KEYFRAMES = 10_000
+MAX_KEYFRAMES = 10_000
 LONGEST_S = 3600.0
 WIDEST_DEG, NARROWEST_DEG = 150.0, 1.0
-STEEPEST_DEG, LEAST_TILT_DEG = 90.0, 89.999  # keeps a heading defined when looking straight down
+STEEPEST_DEG, MIN_TILT_DEG = 90.0, 89.999  # keeps a heading defined when looking straight down
 FULL_TURNS_DEG = 36_000.0  # largest heading: no path turns more often
 SPELLINGS = {
     "x": ("x", "east", "e"),
@@ -190,8 +190,8 @@ def _of_csv(lines: Sequence[tuple[int, str]]) -> list[tuple[int, Numbers]]:
 
 def _keyframes(items: Sequence[tuple[int, Numbers]]) -> Keyframes:
     """Keyframes from numbers; the first of each pair is the line, or the number in JSON, for messages."""
-    if not 1 <= len(items) <= MOST_KEYFRAMES:
-        raise LineError(0, f"it has {len(items):,} keyframes, and there are 1 to {MOST_KEYFRAMES:,} in a path")
+    if not 1 <= len(items) <= MAX_KEYFRAMES:
+        raise LineError(0, f"it has {len(items):,} keyframes, and there are 1 to {MAX_KEYFRAMES:,} in a path")
     places = np.array([_place(number, item) for number, item in items])
     targets = np.array([_target(number, item) for number, item in items])
     ahead = np.array([_ahead(number, item) for number, item in items])
@@ -232,7 +232,7 @@ def _ahead(number: int, item: Numbers) -> list[float]:
     heading, pitch = math.radians(item["heading"]), math.radians(item["pitch"])
     if abs(item["pitch"]) > STEEPEST_DEG or abs(item["heading"]) > FULL_TURNS_DEG:
         raise LineError(number, "a pitch is not between -90 and 90 degrees, or a heading is out of range")
-    flat = math.cos(min(abs(pitch), math.radians(LEAST_TILT_DEG)))
+    flat = math.cos(min(abs(pitch), math.radians(MIN_TILT_DEG)))
     return [flat * math.sin(heading), flat * math.cos(heading), math.sin(pitch)]
 
 

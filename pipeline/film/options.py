@@ -8,7 +8,7 @@ from pydantic import Field, field_validator
 
 from splatpipe.pipeline.engine.stage import StageConfig
 
-MOST_FILM_MEGAPIXELS = 2.0736
+MAX_FILM_MEGAPIXELS = 2.0736
 """Largest film if no size is given: 1920 × 1080. Few screens show more, and frames of 20 megapixels take a gigabyte of
 memory and all night."""
 

@@ -18,7 +18,7 @@ STEP_DEG = 5.0  # elevation step by which a circle without clearance is raised
 HIGHEST_DEG = 70.0
 WIDER = (1.0, 1.25, 1.5, 2.0)  # times the photos' distance, if no elevation is clear
 OVER_A_MAP_DEG = 50.0  # elevation if all photos are nadir: keeps walls that no photo covers out of view
-LEAST_ELEVATION_DEG = 5.0
+MIN_ELEVATION_DEG = 5.0
 
 
 def orbit(capture: PhotoTrack, frames: int) -> Route:
@@ -47,7 +47,7 @@ def orbit(capture: PhotoTrack, frames: int) -> Route:
     places = (route.places[oblique] if oblique.any() else route.places) - middle
     distance = float(np.median(np.linalg.norm(places, axis=1)))
     elevation = float(np.median(np.arctan2(places[:, 2], np.hypot(places[:, 0], places[:, 1]))))
-    lowest = max(elevation, math.radians(LEAST_ELEVATION_DEG)) if oblique.any() else math.radians(OVER_A_MAP_DEG)
+    lowest = max(elevation, math.radians(MIN_ELEVATION_DEG)) if oblique.any() else math.radians(OVER_A_MAP_DEG)
     distance, elevation = _clear(capture.clearance, (middle, distance, lowest), upright)
     first = math.atan2(places[0, 1], places[0, 0])
     return _circle(middle, distance, elevation, first + 2.0 * math.pi * np.arange(frames) / frames)

@@ -32,7 +32,7 @@ FEWEST_LEGS = 4  # to detect detours
 LONGER = 1.6  # names give the order unless they make the path longer by this factor
 CLEAR = 0.5  # minimum clearance, as a share of the photos' own distance from solid parts
 CLEAR_STEPS = 4.0  # samples per that distance
-MOST_COMPARED = 3000  # photos compared pairwise: tables of 72 MB
+MAX_COMPARED = 3000  # photos compared pairwise: tables of 72 MB
 SOFTER = 5  # halvings of the smoothing width, if a rounded corner comes too near
 
 
@@ -134,7 +134,7 @@ def followed_photos(capture: PhotoTrack) -> tuple[Int64[np.ndarray, " k"], float
     distance = float(np.median(depths[enough]))
     alike = enough & (depths <= ODD_DEPTH * distance) & (depths >= distance / ODD_DEPTH)
     kept = np.flatnonzero(alike)
-    if 2 < len(kept) <= MOST_COMPARED:
+    if 2 < len(kept) <= MAX_COMPARED:
         route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
         table = _table(route, distance)
         np.fill_diagonal(table, np.inf)
@@ -154,7 +154,7 @@ def _table(route: Route, distance: float) -> Float64[np.ndarray, "n n"]:
 def _order(route: Route, distance: float) -> Int64[np.ndarray, " n"]:
     """Name order, or greedy nearest-neighbour order if that is much shorter."""
     named = np.arange(len(route))
-    if len(route) > MOST_COMPARED:
+    if len(route) > MAX_COMPARED:
         return named
     table = _table(route, distance)
     nearest, left = [0], np.ones(len(route), bool)

@@ -9,7 +9,7 @@ from ctypes import c_int32
 from pathlib import Path
 
 ROOT = Path("/")
-MOST_BYTES = 4096  # read of the driver's file: about 200 are usual
+MAX_BYTES = 4096  # read of the driver's file: about 200 are usual
 NVML_VERSION_BYTES = 80  # NVML_SYSTEM_DRIVER_VERSION_BUFFER_SIZE
 RELEASE = re.compile(r"\b\d{3,4}\.\d{1,3}(\.\d{1,3})?\b")  # 580.65.06; years and times in the same line do not match
 CARDS = ("dev/nvidia[0-9]*", "proc/driver/nvidia/gpus/*", "usr/lib/wsl/lib/libcuda.so.1")  # the last: Windows' driver
@@ -54,7 +54,7 @@ def _begin(path: Path) -> str:
     """The first bytes of a system file; "" if it does not exist."""
     try:
         with path.open("rb") as file:
-            return file.read(MOST_BYTES).decode(errors="replace")
+            return file.read(MAX_BYTES).decode(errors="replace")
     except OSError:
         return ""
 

@@ -21,9 +21,9 @@ MARGIN = 1.25  # over the recent maximum: views differ, and the model grows
 WINDOW = 512  # frames after which older maxima start to be forgotten: more than most trainings have photos
 PAIR_BYTES = 64  # per pair, in the frame and its backward pass
 MEMORY_SHARE = 1 / 16  # of the device's memory for pairs: several chunks are binned twice, so prefer a single one
-FEWEST_PAIRS, MOST_PAIRS = 1 << 22, 1 << 28  # at a time: for a small device, filling it; and 17 GB of them
+FEWEST_PAIRS, MAX_PAIRS = 1 << 22, 1 << 28  # at a time: for a small device, filling it; and 17 GB of them
 STEPS_AN_OCTAVE = 8  # sizes that capacities are rounded up to, so that torch's allocator reuses the last frame's memory
-MOST_TILES = 1 << 16  # per chunk, as in frame.h
+MAX_TILES = 1 << 16  # per chunk, as in frame.h
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Forecast:
             pairs = max(FIRST_PAIRS_A_GAUSSIAN * size.count, FIRST_PAIRS_A_TILE * size.tiles)
             passes = FIRST_PASSES
         capacity = max(1, size.count, min(_rounded_up(pairs), self.most_pairs))
-        chunks = max(-(-pairs // capacity), -(-size.tiles // MOST_TILES))
+        chunks = max(-(-pairs // capacity), -(-size.tiles // MAX_TILES))
         if chunks > 1:
             chunks += 1  # chunks end with a tile, so that each has a little less than fits
         as_before = (facts.chunks for facts in known if facts.capacity >= capacity and facts.size.tiles == size.tiles)
@@ -171,7 +171,7 @@ def most_pairs_of(memory_bytes: int) -> int:
     Args:
         memory_bytes: The device's memory.
     """
-    return min(MOST_PAIRS, max(FEWEST_PAIRS, int(MEMORY_SHARE * memory_bytes) // PAIR_BYTES))
+    return min(MAX_PAIRS, max(FEWEST_PAIRS, int(MEMORY_SHARE * memory_bytes) // PAIR_BYTES))
 
 
 def _rounded_up(pairs: int) -> int:

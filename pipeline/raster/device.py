@@ -20,7 +20,7 @@ from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
 DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")
 COLUMNS = 8  # float32 columns moved at a time: a device reads at least that much of a row
-MOST = 0.9  # minimum share of rows kept for moving them in place, which does not free the others' memory
+MIN_IN_PLACE_SHARE = 0.9  # minimum share of rows kept for moving them in place, which does not free the others' memory
 SAME_BITS = "the same bits for one seed"
 CUBLAS_WORKSPACE = ("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # makes cuBLAS deterministic, according to its manual
 
@@ -200,7 +200,7 @@ def taken_in_place(tensor: Float[Tensor, "n ..."], rows: Int[Tensor, " m"]) -> F
 
 def _taken(tensors: dict[str, Tensor], name: str, rows: Tensor) -> Tensor:
     count = len(tensors[name])
-    in_place = tensors[name].is_cuda and rows.dtype == torch.int64 and MOST * count <= len(rows) <= count
+    in_place = tensors[name].is_cuda and rows.dtype == torch.int64 and MIN_IN_PLACE_SHARE * count <= len(rows) <= count
     try:
         return taken_in_place(tensors[name], rows) if in_place else tensors[name][rows]
     except torch.OutOfMemoryError:  # old and new do not fit side by side: move the old one to host memory

@@ -25,8 +25,8 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 
 LARGEST_MEGAPIXELS = 0.5  # of the renders: floaters are larger than their pixels
 SLICES = 8  # of a photo's points by depth, each with a render of everything nearer than its first: 8 renders a photo
-LEAST_POINTS = 20  # of a photo that counts: fewer lie in one corner of it
-MOST_TRAINED = (
+MIN_POINTS = 20  # of a photo that counts: fewer lie in one corner of it
+MAX_TRAINED = (
     64  # training photos, evenly over the capture, where none is held out: as many as a large capture holds out
 )
 
@@ -50,7 +50,7 @@ def measure_blocked_light(
     asked = [place for place, camera in enumerate(cameras) if camera.name in held_out]
     of_held_out = bool(asked)
     if not of_held_out:
-        asked = list(range(0, len(cameras), max(1, math.ceil(len(cameras) / MOST_TRAINED))))
+        asked = list(range(0, len(cameras), max(1, math.ceil(len(cameras) / MAX_TRAINED))))
     xyz, seen = observed
     photos = sum((np.bincount(np.unique(rows), minlength=len(xyz)) for rows in seen), np.zeros(len(xyz), np.int64))
     sure = (photos >= SUPPORT_TRACK) & np.isfinite(xyz).all(axis=1)  # a two-ray point may lie behind the surface
@@ -59,7 +59,7 @@ def measure_blocked_light(
     for place in asked:
         small, rows = reduced_camera(cameras[place], LARGEST_MEGAPIXELS), seen[place]
         stopped = blocked_shares(gaussians, small, xyz[rows[sure[rows]]], options)
-        if len(stopped) >= LEAST_POINTS:
+        if len(stopped) >= MIN_POINTS:
             veils[small.name] = float(stopped.mean())
             points += len(stopped)
     worst = max(veils, key=lambda name: veils[name], default=None)

@@ -36,12 +36,12 @@ KINDS = {"alpha": "gap", "hole": "gap", "bump": "doubled", "spread": "doubled", 
 WIDTHS = (2, 4, 8, 16)  # half widths of a strip, pixels: of a gap, or of a step made by Gaussians of several pixels
 REACH = 160  # columns beside the border that are compared with it
 GUARD = 2  # times the strip's width: nearer columns see the seam themselves
-MOST = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05, "step": 0.08}  # cap per row: a single
+ROW_CAPS = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05, "step": 0.08}  # cap per row: a single
 # edge of a house must not outweigh all others
 STATION = 0.7  # spacing of cameras along the border, as a share of the height above the surface
 FARTHEST = 2.5  # times that height: farther rows are seen at too small an angle
 PIECE = 0.35  # of that height: minimum length of a piece of border that is judged by itself
-LEAST_ROWS = 24  # per piece, over all images
+MIN_ROWS = 24  # per piece, over all images
 TILT = math.radians(45.0)  # of the oblique cameras, below the horizon
 LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks/seams.py` prints what they detect
     "alpha": (5.0, 0.002),
@@ -217,7 +217,7 @@ def responses(
             for name, values in _measured(rows.channels, width).items():
                 added = np.stack([values[:, part].sum(axis=1) for part in chosen])
                 sums[width, name] = sums.get((width, name), 0.0) + added
-    shown = np.flatnonzero(counts >= LEAST_ROWS).tolist()
+    shown = np.flatnonzero(counts >= MIN_ROWS).tolist()
     found = [
         _response(total[piece] / counts[piece], (name, piece - 1, width), int(counts[piece]))
         for (width, name), total in sums.items()
@@ -255,7 +255,7 @@ def _measured(channels: Float64[np.ndarray, "6 r c"], width: int) -> dict[str, F
         "line": apart[3:],
         "step": step,
     }
-    return {name: np.clip(values, -MOST[name], MOST[name]) for name, values in found.items()}
+    return {name: np.clip(values, -ROW_CAPS[name], ROW_CAPS[name]) for name, values in found.items()}
 
 
 def _rows(

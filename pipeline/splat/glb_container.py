@@ -21,14 +21,14 @@ from splatpipe.pipeline.splat.formats.bounded import file_bytes, read_exactly
 
 MAGIC, VERSION = 0x46546C67, 2  # "glTF"
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942  # "JSON", "BIN\0"
-MOST_BYTES = 2**32 - 1
+MAX_BYTES = 2**32 - 1
 """Largest file: its length is stored in 32 bits."""
-MOST_JSON_BYTES = 1 << 22
+MAX_JSON_BYTES = 1 << 22
 """A splat's document has a few kB; parsed into Python objects, it takes twenty times its size."""
 BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5120, 5121, 5122, 5123, 5125, 5126
 _NUMBERS = {BYTE: "<i1", UNSIGNED_BYTE: "<u1", SHORT: "<i2", UNSIGNED_SHORT: "<u2", UNSIGNED_INT: "<u4", FLOAT: "<f4"}
 _COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_LEAST_STRIDE, _MOST_STRIDE = 4, 252
+_MIN_STRIDE, _MAX_STRIDE = 4, 252
 _HEADER, _CHUNK_HEADER = struct.Struct("<III"), struct.Struct("<II")
 _AGAIN = "Export it again."
 
@@ -55,7 +55,7 @@ def write_head(file: BufferedIOBase, document: Mapping[str, Any], binary_bytes: 
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
     text += b" " * (padded(len(text)) - len(text))
     total = _HEADER.size + 2 * _CHUNK_HEADER.size + len(text) + binary_bytes
-    if total > MOST_BYTES:
+    if total > MAX_BYTES:
         raise SplatpipeError(
             f"A GLB cannot have {total / 1e9:.1f} GB: its length is a 32-bit number, at most 4.3 GB.",
             hint="Reduce the splat, crop it, or choose another format: ply, spz or 3dtiles.",
@@ -172,7 +172,7 @@ class Container:
         offset, length, stride = view.get("byteOffset", 0), view.get("byteLength"), view.get("byteStride")
         if not _is_whole(offset) or not _is_whole(length) or offset + length > self.length:
             self.refuse("a buffer view lies outside its data")
-        if stride is not None and not (_is_whole(stride) and _LEAST_STRIDE <= stride <= _MOST_STRIDE):
+        if stride is not None and not (_is_whole(stride) and _MIN_STRIDE <= stride <= _MAX_STRIDE):
             self.refuse("a buffer view's stride is not valid")
         return self.start + offset, length, stride
 
@@ -224,7 +224,7 @@ def open_container(path: Path, file: BufferedIOBase) -> Container:
     start = _HEADER.size + _CHUNK_HEADER.size
     if kind != JSON_CHUNK or start + length > total:
         raise SplatpipeError(f"{path} is damaged: its first chunk is not JSON within the file.", hint=_AGAIN)
-    if length > MOST_JSON_BYTES:
+    if length > MAX_JSON_BYTES:
         raise SplatpipeError(f"{path} has {length:,} bytes of JSON, more than any splat needs.", hint=_AGAIN)
     document = _parsed(path, read_exactly(path, file, length))
     start, length = start + length, 0

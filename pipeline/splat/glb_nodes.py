@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from splatpipe.pipeline.splat.glb_container import Container
 
-MOST_PRIMITIVES = 1000
+MAX_PRIMITIVES = 1000
 """Limit per file: each primitive costs time, however little it draws."""
-_MOST_NUMBER = 1e12
+_MAX_NUMBER = 1e12
 _IDENTITY = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 
 Drawn = tuple[Mapping[str, Any], Float64[np.ndarray, "4 4"]]
@@ -48,8 +48,8 @@ def drawn_primitives(container: Container, extension: str) -> list[Drawn]:
         if "mesh" in node:
             primitives = _listed(container, container.entry("meshes", node["mesh"]), "primitives")
             drawn += [(one, matrix) for one in primitives if _has(one, extension)]
-        if len(drawn) > MOST_PRIMITIVES:
-            container.refuse(f"it draws more than {MOST_PRIMITIVES} splats")
+        if len(drawn) > MAX_PRIMITIVES:
+            container.refuse(f"it draws more than {MAX_PRIMITIVES} splats")
         waiting += [(child, matrix) for child in reversed(_listed(container, node, "children"))]
     return drawn
 
@@ -99,4 +99,4 @@ def _numbers(container: Container, values: Sequence[Any], count: int) -> Float64
 def _is_number(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
-    return abs(value) <= _MOST_NUMBER and not math.isnan(value)
+    return abs(value) <= _MAX_NUMBER and not math.isnan(value)

@@ -38,7 +38,7 @@ KERNEL = {
 """The rendering of 3D Gaussian splatting, in display-referred colours."""
 ROWS_AT_ONCE = 1 << 16
 _KNOWN = (EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit")
-_LEAST_ROW_BYTES = 12
+_MIN_ROW_BYTES = 12
 """Of a Gaussian's colour: bounds how many Gaussians a file can hold without drawing any of them repeatedly."""
 _INFINITY_LOGIT, _INFINITY_LOG_SCALE = 20.0, -20.0
 """Stand for opacities of exactly 0 and 1, and for a scale of 0; equal in float32, and the same as in ``splat.ply``."""
@@ -134,7 +134,7 @@ class _Splat:
 
     @property
     def least_bytes(self) -> int:
-        return _LEAST_ROW_BYTES * self.columns["position"].count
+        return _MIN_ROW_BYTES * self.columns["position"].count
 
     def read(self, container: Container) -> Gaussians:
         """Read its Gaussians, in its own frame."""

@@ -14,7 +14,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.moments import moments_of
 from splatpipe.pipeline.splat.reduction import Reduction, reduce_further
 
-MOST_PER_NODE = 60_000
+MAX_PER_NODE = 60_000
 CHILDREN = 4
 """Maximum per node: a surface twice as coarse has a quarter as many Gaussians. The root may have one more."""
 BOX_SIGMAS = 3.0
@@ -61,7 +61,7 @@ class LevelNode:
             yield from child.nodes()
 
 
-def build_levels(gaussians: Gaussians, most_per_node: int = MOST_PER_NODE) -> LevelNode:
+def build_levels(gaussians: Gaussians, most_per_node: int = MAX_PER_NODE) -> LevelNode:
     """Partition Gaussians into leaves, and merge those of a node's children until they fit into one node.
 
     Gaussians far outside, such as a sky, and enormous ones get a branch of their own, so that other boxes stay small.

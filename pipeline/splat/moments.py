@@ -12,8 +12,8 @@ from scipy.special import expit, logit
 
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-_LOG_SCALE_MOST = 40.0  # the fourth power of e^40 still fits a float64, and no scene is this large
-_OPACITY_LEAST, _OPACITY_MOST = 1e-7, 1.0 - 1e-6  # of a merged Gaussian: their logits are finite in float32
+_MAX_LOG_SCALE = 40.0  # the fourth power of e^40 still fits a float64, and no scene is this large
+_MIN_OPACITY, _MAX_OPACITY = 1e-7, 1.0 - 1e-6  # of a merged Gaussian: their logits are finite in float32
 _AREA_POWER = 1.6075
 """Exponent of Knud Thomsen's formula for an ellipsoid's surface area (2004), accurate to 1.061 %."""
 GROWTH = 0.45
@@ -58,7 +58,7 @@ def moments_of(gaussians: Gaussians) -> Moments:
         tensor.detach().cpu().numpy().astype(np.float64)
         for tensor in (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits)
     )
-    scales = np.exp(np.clip(log_scales, -_LOG_SCALE_MOST, _LOG_SCALE_MOST))
+    scales = np.exp(np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE))
     axes = _rotations(quats) * scales[:, None, :]
     covariances = np.stack([(axes[:, a] * axes[:, b]).sum(1) for a, b in _upper()], axis=1)
     return Moments(means, covariances, expit(logits), ellipsoid_areas(scales))
@@ -106,13 +106,13 @@ def merge_pairs(one: Gaussians, other: Gaussians) -> Gaussians:
     first, second = share[:, None], (1.0 - share)[:, None]
     means = first * ours.means + second * theirs.means
     variances, axes = np.linalg.eigh(joint_covariances(ours, theirs, share)[:, _SYMMETRIC])
-    log_scales = 0.5 * np.log(np.maximum(variances, np.exp(-2.0 * _LOG_SCALE_MOST)))
+    log_scales = 0.5 * np.log(np.maximum(variances, np.exp(-2.0 * _MAX_LOG_SCALE)))
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, not a reflection
     x, y, z, w = Rotation.from_matrix(axes).as_quat(canonical=True).T
     masses, areas = ours.masses() + theirs.masses(), ellipsoid_areas(np.exp(log_scales))
     opacities = masses / areas
     log_scales += 0.5 * GROWTH * np.log(np.maximum(opacities, 1.0))[:, None]
-    opacities = np.clip(opacities, _OPACITY_LEAST, _OPACITY_MOST)
+    opacities = np.clip(opacities, _MIN_OPACITY, _MAX_OPACITY)
     part = torch.from_numpy(share).to(one.sh.dtype)[:, None, None]
     dtype = one.means.dtype
     return Gaussians(

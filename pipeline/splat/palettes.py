@@ -22,9 +22,9 @@ _ENTRIES_A_CELL = 128
 _CANDIDATES = 1024  # entries that a vector is compared with, at least
 _BLOCK = 1 << 20  # numbers in a block of distances: 4 MB, which fit into the cache
 _ROWS_AT_ONCE = 1 << 16
-_LEAST_SHARE = 1e-6  # of the mean error: lets rows without error be chosen, too
+_MIN_SHARE = 1e-6  # of the mean error: lets rows without error be chosen, too
 _HALVINGS = 100  # bisections of a factor's range, which may be wide
-_MOST_FITTED = 1 << 20  # vectors that a palette is fitted to: an evenly spaced subset of more
+_MAX_FITTED = 1 << 20  # vectors that a palette is fitted to: an evenly spaced subset of more
 
 
 def fit_palette(
@@ -42,7 +42,7 @@ def fit_palette(
         The palette, and the index of the (approximately) nearest entry to each row.
     """
     with one_thread():
-        step = max(-(-len(rows) // _MOST_FITTED), 1)
+        step = max(-(-len(rows) // _MAX_FITTED), 1)
         fitted = rows[::step].contiguous()
         weights = torch.ones(len(fitted)) if weights is None else weights[::step].contiguous()
         palette = fitted[_start(fitted, weights, size)]
@@ -74,7 +74,7 @@ def _start(rows: Float[Tensor, "n d"], weights: Float[Tensor, " n"], size: int) 
     if len(rows) <= size:
         return torch.arange(len(rows))
     errors = (weights * ((rows - rows.mean(0)) ** 2).sum(1)).double()
-    errors += errors.mean() * _LEAST_SHARE + torch.finfo(torch.float64).tiny
+    errors += errors.mean() * _MIN_SHARE + torch.finfo(torch.float64).tiny
     low, high = 0.0, size / float(errors.min())
     for _ in range(_HALVINGS):
         middle = (low + high) / 2

@@ -31,7 +31,7 @@ _ROWS_AT_ONCE = 1 << 15
 _CROWD = 1e-9  # of the extent: separates coincident points in the k-d tree, which would be slow with many
 _CROWD_SEED = 1
 _FLAT = 1e-3  # standard deviation of what is flat, as a share of the median of the largest ones
-_LOG_SCALE_LEAST = -30.0
+_MIN_LOG_SCALE = -30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def _least_variance(gaussians: Gaussians, alive: Int64[np.ndarray, " n"]) -> flo
     if not len(alive):
         return 1.0
     largest = gaussians.log_scales[torch.from_numpy(alive)].amax(1).to(torch.float64)
-    return math.exp(2.0 * max(float(largest.median()), _LOG_SCALE_LEAST)) * _FLAT**2
+    return math.exp(2.0 * max(float(largest.median()), _MIN_LOG_SCALE)) * _FLAT**2
 
 
 def _drawn(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:

@@ -19,9 +19,9 @@ Axes = Literal["z up", "y up", "y down"]
 viewers assume for a 3DGS PLY (a COLMAP camera's axes)."""
 
 FORMAT = 1
-MOST_RECORD_BYTES = 60_000  # of the record in a file: gzip's extra field holds 65,535
-MOST_EDITS = 200
-_MOST_TEXT = 4000  # characters of a CRS in WKT, the longest text
+MAX_RECORD_BYTES = 60_000  # of the record in a file: gzip's extra field holds 65,535
+MAX_EDITS = 200
+_MAX_TEXT_LENGTH = 4000  # characters of a CRS in WKT, the longest text
 _Z_UP_FROM: Mapping[Axes, tuple[tuple[float, ...], ...]] = {
     "z up": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "y up": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
@@ -72,11 +72,11 @@ class SceneFacts:
         """One line of ASCII JSON, stored in files under the name ``splatpipe``; ``facts_of_record`` reads it.
 
         Raises:
-            ValueError: if it is longer than ``MOST_RECORD_BYTES``.
+            ValueError: if it is longer than ``MAX_RECORD_BYTES``.
         """
         text = json.dumps({"format": FORMAT, **asdict(self)}, separators=(",", ":"), allow_nan=False)
-        if len(text) > MOST_RECORD_BYTES:
-            raise ValueError(f"a record of {len(text)} bytes is larger than {MOST_RECORD_BYTES}")
+        if len(text) > MAX_RECORD_BYTES:
+            raise ValueError(f"a record of {len(text)} bytes is larger than {MAX_RECORD_BYTES}")
         return text
 
 
@@ -87,7 +87,7 @@ def facts_of_record(text: str | bytes | None, otherwise: SceneFacts) -> SceneFac
         text: The record, untrusted.
         otherwise: The format's defaults.
     """
-    if text is None or len(text) > MOST_RECORD_BYTES:
+    if text is None or len(text) > MAX_RECORD_BYTES:
         return otherwise
     try:
         return _facts(json.loads(text))
@@ -99,7 +99,7 @@ def _facts(value: Mapping[str, Any]) -> SceneFacts:
     if value["format"] != FORMAT or value["axes"] not in get_args(Axes):
         raise ValueError("of another format")
     edits = value["edits"]
-    if not isinstance(edits, list) or len(edits) > MOST_EDITS or not all(isinstance(edit, dict) for edit in edits):
+    if not isinstance(edits, list) or len(edits) > MAX_EDITS or not all(isinstance(edit, dict) for edit in edits):
         raise ValueError("edits")
     place = None if value["place"] is None else _place(value["place"])
     facts = SceneFacts(value["axes"], value["antialias"] is True, value["metres"] is True, place, tuple(edits))
@@ -111,7 +111,7 @@ def _place(value: Mapping[str, Any]) -> SplatOrigin:
     latitude, longitude, height_m = (float(value[name]) for name in ("latitude", "longitude", "height_m"))
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and math.isfinite(height_m)):
         raise ValueError("nowhere on the earth")
-    vertical_datum, crs = (str(value[name])[:_MOST_TEXT] for name in ("vertical_datum", "crs"))
+    vertical_datum, crs = (str(value[name])[:_MAX_TEXT_LENGTH] for name in ("vertical_datum", "crs"))
     return SplatOrigin(latitude, longitude, height_m, vertical_datum, crs, value["approximate_crs"] is True)
 
 

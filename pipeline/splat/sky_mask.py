@@ -24,8 +24,8 @@ WORK_MEGAPIXELS = 0.1  # resolution of the search: noise and distant texture are
 SMOOTH_SLOPE = 0.03  # change of a channel over a pixel, of 1: haze and soft clouds are below, edges and leaves above
 BLUE_STEP = 0.03  # by which a bluish sky's blue is at least above its red and at most below its green
 CLEARLY_BLUE = 0.1  # blue minus red from which it is not just grey made bluish by shade or haze
-LEAST_BLUE_LIGHT = 0.3  # of the blue of a sky, of 1
-LEAST_GREY_LIGHT = 0.75  # of the darkest channel of a grey one: clouds, haze, overexposed
+MIN_BLUE_LIGHT = 0.3  # of the blue of a sky, of 1
+MIN_GREY_LIGHT = 0.75  # of the darkest channel of a grey one: clouds, haze, overexposed
 GREY_OUTSHINES = 0.7  # share of the rest of the picture: walls in the sun stand beside shade
 BLUE_OUTSHINES = 0.4  # a deep blue sky is darker than that wall; bluish haze and shadows are darker still
 HORIZON_MARGIN_DEG = 2.0  # below the horizon: error of the estimated up, dip of the horizon for a drone
@@ -33,22 +33,22 @@ ZENITH_DEG = 85.0
 TOP_COSINE = 0.5  # between up and the way out of the picture over its top border: a corner up has two top borders
 POINT_CLEARANCE_PX = 3  # around a triangulated point nothing is sky
 CORE_PX = 5  # from a region's edge on, points are no longer those of the roof under it
-MOST_SPREAD = 0.2  # of a region's core near points, over the share of the rest: spires, outliers, birds, clouds
-LEAST_SHARE = 0.002  # of the picture: smaller patches are not worth the risk
-LEAST_CONTACT = 0.5  # of a region's width at the top over the root of its area: a sky is open, a road or a wall narrow
+MAX_SPREAD = 0.2  # of a region's core near points, over the share of the rest: spires, outliers, birds, clouds
+MIN_SHARE = 0.002  # of the picture: smaller patches are not worth the risk
+MIN_CONTACT = 0.5  # of a region's width at the top over the root of its area: a sky is open, a road or a wall narrow
 GROW_STEPS = 3  # pixels by which the slope's window keeps regions from edges
 GROW_COLOUR = 0.06  # most distance, in any channel, from the mean of the sky close by
 GROW_WINDOW = 7
 DIRECTION_ROWS = 64  # of the grid of directions, elevation by azimuth: cells of 2.8°
-LEAST_WITNESSES = 2  # other photos that look the same way, before their word counts
-LEAST_AGREEMENT = 0.15  # of what they see that way: buildings rightly hide much of one's sky from another
+MIN_WITNESSES = 2  # other photos that look the same way, before their word counts
+MIN_AGREEMENT = 0.15  # of what they see that way: buildings rightly hide much of one's sky from another
 ROOF_COLUMNS = 72  # sectors of azimuth, 5° each, tested for something above a region
 ROOF_REACH_DEG = 5.0  # of azimuth around a point above: ceilings and lintels are smooth, their points far apart
 ROOF_MARGIN_DEG = 3.0  # from a region's top to such a point: a roof's edge does not cover the sky beside it
 ROOF_POINTS = 3  # points needed: a single one may be wrong, or a bird
-MOST_ROOFED = 0.5  # of a region's pixels: a branch or a wire over the sky does not make it a wall
+MAX_ROOFED_SHARE = 0.5  # of a region's pixels: a branch or a wire over the sky does not make it a wall
 OPEN_FROM_DEG = 5.0  # rays above this elevation pass over low walls and furniture
-LEAST_OPEN = 0.05  # sky's share of all that the photos see above it: most of it outdoors, a few patches in a room
+MIN_OPEN_SHARE = 0.05  # sky's share of all that the photos see above it: most of it outdoors, a few patches in a room
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def roofed(
         for each in np.flatnonzero(pixels):
             top[each] = height[region & (column == each)].max()
         under = roofs > top + ROOF_MARGIN_DEG
-        if pixels[under].sum() > MOST_ROOFED * pixels.sum():
+        if pixels[under].sum() > MAX_ROOFED_SHARE * pixels.sum():
             result |= region
     return result
 
@@ -184,7 +184,7 @@ def is_open(votes: Sequence[SkyVotes]) -> bool:
     """
     lowest = math.ceil((OPEN_FROM_DEG / 180.0 + 0.5) * DIRECTION_ROWS) * 2 * DIRECTION_ROWS
     seen = sum(int((vote.seen >= lowest).sum()) for vote in votes)
-    return sum(int((vote.sky >= lowest).sum()) for vote in votes) >= LEAST_OPEN * seen
+    return sum(int((vote.sky >= lowest).sum()) for vote in votes) >= MIN_OPEN_SHARE * seen
 
 
 def up_of(
@@ -270,9 +270,9 @@ def agreed(votes: Sequence[SkyVotes]) -> list[bool]:
     kept = []
     for vote in votes:
         witnesses, agreeing = seen[vote.sky] - 1.0, sky[vote.sky] - 1.0
-        asked = witnesses >= LEAST_WITNESSES
+        asked = witnesses >= MIN_WITNESSES
         heard = 2 * int(asked.sum()) > len(vote.sky)
-        kept.append(not heard or float(agreeing[asked].sum()) >= LEAST_AGREEMENT * float(witnesses[asked].sum()))
+        kept.append(not heard or float(agreeing[asked].sum()) >= MIN_AGREEMENT * float(witnesses[asked].sum()))
     return kept
 
 
@@ -322,8 +322,8 @@ def _slopes(colour: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
 
 def _sky_coloured(colour: Float32[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     red, green, blue = colour[:, :, 0], colour[:, :, 1], colour[:, :, 2]
-    bluish = (blue > red + BLUE_STEP) & (blue > green - BLUE_STEP) & (blue > LEAST_BLUE_LIGHT)
-    return np.asarray(bluish | (colour.min(axis=2) > LEAST_GREY_LIGHT))
+    bluish = (blue > red + BLUE_STEP) & (blue > green - BLUE_STEP) & (blue > MIN_BLUE_LIGHT)
+    return np.asarray(bluish | (colour.min(axis=2) > MIN_GREY_LIGHT))
 
 
 def _near_points(points_px: Float64[np.ndarray, "n 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
@@ -351,7 +351,7 @@ def _regions(candidates: Bool[np.ndarray, "h w"], top: Bool[np.ndarray, "h w"]) 
     count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates.astype(np.uint8), connectivity=4)
     contact = np.bincount(labels[top & candidates], minlength=count)
     area = stats[:, cv2.CC_STAT_AREA]
-    wide = (contact >= LEAST_CONTACT * np.sqrt(area)) & (area >= LEAST_SHARE * candidates.size)
+    wide = (contact >= MIN_CONTACT * np.sqrt(area)) & (area >= MIN_SHARE * candidates.size)
     return [labels == label for label in range(1, count) if wide[label]]
 
 
@@ -368,7 +368,7 @@ def _is_sky(
     window = np.ones((2 * CORE_PX + 1, 2 * CORE_PX + 1), np.uint8)
     filled = np.pad(cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, window), 1)  # points made holes in it
     core = cv2.distanceTransform(filled, cv2.DIST_L2, 3)[1:-1, 1:-1] > CORE_PX
-    if core.any() and near[core].mean() > MOST_SPREAD * near[~core].mean():
+    if core.any() and near[core].mean() > MAX_SPREAD * near[~core].mean():
         return False
     seen = region if ignored is None else region & ~ignored
     rest = ~region if ignored is None else ~region & ~ignored

@@ -32,19 +32,19 @@ SPZ_FROM_Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 RECORD_FIELD = b"sp"
 """ID of the record in gzip's extra field (RFC 1952, 2.3.1.1), which SPZ readers skip."""
 POSITION_STEPS = 2**23 - 1
-LEAST_FRACTIONAL_BITS, MOST_FRACTIONAL_BITS = 12, 20  # the reference's: a quarter of a millimetre in metres
+MIN_FRACTIONAL_BITS, MAX_FRACTIONAL_BITS = 12, 20  # the reference's: a quarter of a millimetre in metres
 FINEST_QUANTILE, STEPS_PER_SIZE = 0.05, 16.0  # nearly all Gaussians are as many steps large: finer ones are noise
 RANGE_PER_SCENE = 16.0  # of the distances of nearly all Gaussians: what is beyond is brought in
 SCENE_QUANTILE = 0.99
 COLOUR_SCALE = 0.15
-LEAST_LOG_SCALE, LOG_SCALE_STEPS = -10.0, 16.0
+MIN_LOG_SCALE, LOG_SCALE_STEPS = -10.0, 16.0
 ROTATION_STEPS = 511
 SH_STEPS = 128.0
 SH_STEP = 10.0
 """Of a Gaussian of middling weight, in SH_STEPS: files as large as the reference writer's, 2 dB better on the demo."""
-LEAST_SH_DOUBLINGS, MOST_SH_DOUBLINGS = 1, 6
+MIN_SH_DOUBLINGS, MAX_SH_DOUBLINGS = 1, 6
 SH_COUNTS = 8  # coefficients apart that Gaussians of one group have
-LEAST_WEIGHED_OPACITY = 1.0 / 255.0
+MIN_WEIGHED_OPACITY = 1.0 / 255.0
 GZIP_LEVEL = 6
 ARRAYS = 6  # after the header
 
@@ -122,11 +122,11 @@ def _gzip(parts: Iterable[bytes], record: str) -> bytes:
 def _fine_bits(log_scales: Float[torch.Tensor, "n 3"]) -> int:
     """Fractional bits beyond which positions are finer than visible."""
     if not len(log_scales):
-        return LEAST_FRACTIONAL_BITS
+        return MIN_FRACTIONAL_BITS
     middling = np.sort(log_scales.numpy(), axis=1)[:, 1]
     size = float(np.quantile(middling, FINEST_QUANTILE, method="lower"))
     bits = math.ceil((math.log(STEPS_PER_SIZE) - size) / math.log(2.0))
-    return min(max(bits, LEAST_FRACTIONAL_BITS), MOST_FRACTIONAL_BITS)
+    return min(max(bits, MIN_FRACTIONAL_BITS), MAX_FRACTIONAL_BITS)
 
 
 def _sh_doublings(gaussians: Gaussians, sh_step: float | None) -> UInt8[np.ndarray, " n"]:
@@ -138,11 +138,11 @@ def _sh_doublings(gaussians: Gaussians, sh_step: float | None) -> UInt8[np.ndarr
     if sh_step is None or not len(gaussians):
         return np.zeros(len(gaussians), np.uint8)
     log_scales = np.sort(gaussians.log_scales.numpy(), axis=1)
-    opacity = np.maximum(torch.sigmoid(gaussians.opacity_logits).numpy(), np.float32(LEAST_WEIGHED_OPACITY))
+    opacity = np.maximum(torch.sigmoid(gaussians.opacity_logits).numpy(), np.float32(MIN_WEIGHED_OPACITY))
     weight = (np.log(opacity) + 0.5 * (log_scales[:, 1] + log_scales[:, 2])) / math.log(2.0)
     middling = float(np.quantile(weight, 0.5, method="lower"))
     doublings = np.rint(math.log2(sh_step) - 0.5 * (weight - middling))
-    return np.asarray(doublings.clip(LEAST_SH_DOUBLINGS, MOST_SH_DOUBLINGS).astype(np.uint8))
+    return np.asarray(doublings.clip(MIN_SH_DOUBLINGS, MAX_SH_DOUBLINGS).astype(np.uint8))
 
 
 def _order(
@@ -171,7 +171,7 @@ def _coded(
         _fixed_point(gaussians.means.numpy().astype(np.float64) * shrink[:, None], bits),
         _to_byte(torch.sigmoid(gaussians.opacity_logits).numpy() * 255.0),
         _to_byte(gaussians.sh[:, 0].numpy() * (COLOUR_SCALE * 255.0) + 127.5),
-        _to_byte((log_scales - LEAST_LOG_SCALE) * LOG_SCALE_STEPS),
+        _to_byte((log_scales - MIN_LOG_SCALE) * LOG_SCALE_STEPS),
         (_smallest_three if version == VERSION else _first_three)(gaussians.quats.numpy()),
         _harmonics(gaussians.sh[:, 1:].numpy(), doublings),
     )

@@ -33,7 +33,7 @@ TILES = "tiles"
 GLTF_CONTENT = "3DTILES_content_gltf"
 ESRI_CRS = "ESRI_crs"
 _STEP_M = 0.001  # to which boxes are rounded outwards
-_LEAST_HALF_M = 0.001  # half side of a box: a zero one has no inverse
+_MIN_HALF_M = 0.001  # half side of a box: a zero one has no inverse
 _TILE = re.compile(r"[0-9]+\.glb", re.ASCII)  # names of tiles
 _EXTENSIONS = [EXTENSION, SPZ_EXTENSION]
 
@@ -161,7 +161,7 @@ def _box(box: Float64[np.ndarray, "2 3"]) -> list[float]:
     """Centre and half axes of the box, rounded outwards."""
     steps = np.stack([np.floor(box[0] / _STEP_M), np.ceil(box[1] / _STEP_M)])
     centre = np.round(steps.mean(axis=0) * _STEP_M, 6)
-    half = np.round(np.maximum((steps[1] - steps[0]) * (_STEP_M / 2.0), _LEAST_HALF_M), 6)
+    half = np.round(np.maximum((steps[1] - steps[0]) * (_STEP_M / 2.0), _MIN_HALF_M), 6)
     return [*centre.tolist(), *np.diag(half).ravel().tolist()]
 
 

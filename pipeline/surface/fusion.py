@@ -33,7 +33,7 @@ SIGMA_PX = 0.7  # standard deviation of a depth, in pixel footprints on the surf
 ROUNDS = 3  # of the robust mean
 COMPACT_SHARE = 0.3  # of discarded points, at which the arrays are compacted
 BATCH = 1 << 14  # points at a time: takes 16 bytes per point and photo
-MOST = np.iinfo(np.uint8).max
+MAX_COUNT = np.iinfo(np.uint8).max
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def _average_positions(points: DepthPoints, parts: Sequence[DepthPart]) -> Fused
     footprint = points.footprint[kept]
     shift = _robust_mean(along, others.weight[:, kept].astype(np.float64), footprint)
     pieces = SurfacePieces(points.pieces.xyz[:, kept] + normal * shift, normal)
-    return FusedPoints(pieces, footprint, np.minimum(count[kept] - 1, MOST).astype(np.uint8))
+    return FusedPoints(pieces, footprint, np.minimum(count[kept] - 1, MAX_COUNT).astype(np.uint8))
 
 
 def _other_positions(

@@ -27,7 +27,7 @@ FEW = 2  # photos that agree on a height are enough where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
 MAX_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
 MIN_CELLS = 1 << 12  # smaller tiles are not split: they would be mostly margin
-MOST = np.iinfo(np.uint8).max
+MAX_COUNT = np.iinfo(np.uint8).max
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MAX_VOTES) -> Hei
     height, new = _fill_holes(capture, wide, agreed, numbers)
     shape = (wide.height, wide.width)
     sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma).reshape(shape)
-    counted = np.where(np.isfinite(agreed), np.minimum(fit.photos, MOST), 0)
+    counted = np.where(np.isfinite(agreed), np.minimum(fit.photos, MAX_COUNT), 0)
     photos, height = np.where(new, 1, counted).reshape(shape), height.reshape(shape)
     inner = tuple(slice(capture.margin, capture.margin + side) for side in (tile.height, tile.width))
     known = np.isfinite(height)

@@ -25,7 +25,7 @@ MEGAPIXELS = 0.3  # of the photos whose colours are sampled: each pixel averages
 WINDOW_PX = 5  # side of the mean around a point: points are off by a fraction of it
 DARKEST, BRIGHTEST = 8.0, 247.0  # of 255, of a channel that is not clipped
 ROUNDS = 10  # of fitting; a gain changes by less than a thousandth in the last
-LEAST_SEEN = 20  # minimum number of points to estimate a photo's gain
+MIN_SEEN = 20  # minimum number of points to estimate a photo's gain
 DIFFERING = 0.06  # spread above which exposures differ. Measured: 0.027 to 0.034 in three captures whose light or
 # exposure hardly changes (0.1 stops, known, are 0.034), 0.097 to 0.18 in five with automatic exposure
 
@@ -87,7 +87,7 @@ def log_gains(
     shared = count[number] > 1
     photo, number, logs = photo[shared], number[shared], logs[shared]
     rows = [np.flatnonzero(photo == each) for each in range(photos)]
-    rows = [own for own in rows if len(own) >= LEAST_SEEN]
+    rows = [own for own in rows if len(own) >= MIN_SEEN]
     gains, shown = np.zeros((len(rows), 3)), np.zeros_like(logs)  # ``shown``: the gain of each observation's photo
     for _ in range(ROUNDS):
         surface = np.stack([np.bincount(number, channel, len(count)) for channel in (logs - shown).T], axis=1)

@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
 FIRST_SHARE = 0.2  # of a run from sparse points, without this loss: the surface has to form first
-LEAST_ALPHA = 0.5  # below it a pixel shows more background than surface
+MIN_ALPHA = 0.5  # below it a pixel shows more background than surface
 FREE_PX = 0.5  # standard deviation without penalty, in GSD
 HALF_PX = 10.0  # excess in GSD at which half of the maximum penalty is reached
 CENTRE_EVERY = 500  # iterations between updates of the model's centre on a device: it hardly moves
@@ -108,7 +108,7 @@ def spread_loss(
         about_median: Measure the spread about the ray's median depth, not the mean, which distant background shining
             through pulls behind the surface.
     """
-    seen = rendered.alpha.detach() >= LEAST_ALPHA
+    seen = rendered.alpha.detach() >= MIN_ALPHA
     alpha = torch.where(seen, rendered.alpha, 1.0)
     mean = torch.where(seen, rendered.depth_sum, 0.0) / alpha - origin
     square = torch.where(seen, rendered.depth_square_sum, 0.0) / alpha

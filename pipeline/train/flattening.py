@@ -36,7 +36,7 @@ from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder
 from splatpipe.pipeline.train.windows import TrainingSize
 
 VISITS = 8  # of every photo
-LEAST_ITERATIONS = 300  # if there are few photos
+MIN_ITERATIONS = 300  # if there are few photos
 SPREAD_WEIGHT = 0.5  # ten times that of a splat trained for images
 EVENNESS_WEIGHT = 0.1
 FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6  # of positions, times the extent: later half of the published
@@ -164,7 +164,7 @@ def flattening_plan(
     plan = make_plan(options, views, split, gaussians, window_pixels)
     footage = plan.footage
     level = footage.first_level
-    iterations = max(LEAST_ITERATIONS, VISITS * footage.parts(level))
+    iterations = max(MIN_ITERATIONS, VISITS * footage.parts(level))
     schedule = replace(
         plan.schedule,
         iterations=iterations,

@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.windows import TrainingSize, windows_of
 WHOLE_VISITS = 20  # minimum per photo at the size at which it fits whole
 PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/lengths.md
 FIRST_SHARE = 0.5  # of the minimum iterations are at the first size,
-FIRST_MOST = 3500  # but no more than these if 20 visits are fewer: the finest size is worth more
+MAX_FIRST_ITERATIONS = 3500  # but no more than these if 20 visits are fewer: the finest size is worth more
 FEWEST_VISITS = (
     10.0  # of a part, below which a run that was given its length stays with the size before: it learns more
 )
@@ -130,7 +130,7 @@ def lengths(footage: PhotoSizes, least: int, finest: int = 0) -> list[Length]:
     first = max(finest, footage.first_level)
     if first == finest:
         return [(first, max(least, WHOLE_VISITS * footage.parts(first)))]
-    whole = max(WHOLE_VISITS * footage.parts(first), min(math.ceil(FIRST_SHARE * least), FIRST_MOST))
+    whole = max(WHOLE_VISITS * footage.parts(first), min(math.ceil(FIRST_SHARE * least), MAX_FIRST_ITERATIONS))
     finer = [(level, PART_VISITS * footage.parts(level)) for level in range(first - 1, finest, -1)]
     return [(first, whole), *finer, (finest, max(PART_VISITS * footage.parts(finest), least - whole))]
 

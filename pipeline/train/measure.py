@@ -25,7 +25,7 @@ from splatpipe.pipeline.train.stream import TrainingPhoto
 from splatpipe.pipeline.train.techniques import make_techniques
 from splatpipe.pipeline.train.upload import Uploader
 
-MOST_VIEWS = 8  # timed per size: their mean is within a few percent of that of all photos
+MAX_VIEWS = 8  # timed per size: their mean is within a few percent of that of all photos
 PICTURES = 3  # images that `evaluate` keeps per view: photo, render, error
 NEVER = 1_000_000_000  # iterations until a step of density control
 WARM_UP_ITERATIONS = 100  # until opacities, which step by a twentieth of a logit, are spread as in training
@@ -94,7 +94,7 @@ def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: Measuri
     """
     start, views, device = subject.start, subject.views, subject.device
     began = time.monotonic()
-    chosen = [views[index * len(views) // min(len(views), MOST_VIEWS)] for index in range(min(len(views), MOST_VIEWS))]
+    chosen = [views[index * len(views) // min(len(views), MAX_VIEWS)] for index in range(min(len(views), MAX_VIEWS))]
     trial = replace(plan, schedule=pilot_schedule(plan.schedule))
     small, _ = _photos(chosen, SMALLEST_MEGAPIXELS, device)
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})

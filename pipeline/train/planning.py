@@ -30,7 +30,7 @@ PILOT_GROWTH_A_SECOND = {"cpu": 150.0, "cuda": 15_000.0}
 """Approximate number of Gaussians that a second of budget pays for: where the forecast has to be accurate. Measured on
 CPUs; for CUDA a judgement, two orders of magnitude more: with fewer Gaussians an iteration there is all fixed cost,
 which says nothing about the cost per Gaussian."""
-LEAST_SHARE = 0.1  # of the budget for the training, even if nothing is left: the overall tolerance
+MIN_SHARE = 0.1  # of the budget for the training, even if nothing is left: the overall tolerance
 FILM_VIEWS = 40  # held-out views that take as long to evaluate as a ten-second film takes to render
 EXPORT_SECONDS = 5.5  # fixed cost of the last stages: digests, the report with its images, process exit
 
@@ -86,7 +86,7 @@ def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Re
     before = time.monotonic() - began
     effort = MeasuringBudget(
         min(MEASURE_SECONDS, MEASURE_SHARE * budget),
-        max(LEAST_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
+        max(MIN_SHARE * budget, budget - before) / worthwhile_iterations(budget - before),
     )
     trial = pilot(plan, scene)
     subject = TimedScene(scene.start.within(trial.options.max_gaussians), scene.trained_on, scene.device, scene.sky)
@@ -100,7 +100,7 @@ def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Re
         ) from error
     left = budget - (time.monotonic() - began)
     choice = choose(_task(plan, scene, measured, left))
-    if choice.seconds <= LEAST_SHARE * budget:
+    if choice.seconds <= MIN_SHARE * budget:
         report.warning(
             f"The stages before training took {before:.0f} s of the {budget:.0f} s, so there is time only for a "
             "rough model.",
@@ -133,7 +133,7 @@ def pilot(plan: TrainingPlan, scene: PlanningInput) -> TrainingPlan:
 
 def _task(plan: TrainingPlan, scene: PlanningInput, measured: MachineSpeed, left: float) -> BudgetTask:
     options = scene.config.model_copy(update={"max_gaussians": plan.options.max_gaussians})
-    least = LEAST_SHARE * options.time_budget_s
+    least = MIN_SHARE * options.time_budget_s
     views = scene.held_out + (FILM_VIEWS if options.time_budget_s >= FILM_FROM_BUDGET_S else 0)
     looked_at = 1e-6 * footage_of(plan.sizes, JUDGED_MEGAPIXELS, 0).pixels(TrainingSize())  # whatever is trained
     after = EXPORT_SECONDS + views * measured.evaluate_s * looked_at

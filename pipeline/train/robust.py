@@ -34,15 +34,15 @@ from splatpipe.pipeline.train.schedule import ScheduleStep
 from splatpipe.pipeline.train.stream import TrainingPhoto
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone photo spans two
-LEAST_CELL_PX = 4  # smaller photos have fewer cells: a cell has to average out detail
+MIN_CELL_PX = 4  # smaller photos have fewer cells: a cell has to average out detail
 MEMORY = 0.5  # weight of earlier visits in a cell's residual
 NEARBY = 1  # cells: the model may show this far away what the photo shows here
-LEAST_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: anything less is shading, not another object
+MIN_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: anything less is shading, not another object
 VOTES = 4  # minimum among a cell and its eight neighbours: two by two are an object, a single one is noise
 RIM = 0.5  # of the threshold: neighbours of a left-out cell above this are left out too
-MOST_OF_A_PHOTO = 0.25  # may be left out: more than that is a wrong model, not a passer-by
-MOST_WITNESSES = 24  # nearest photos that are compared at a place
-LEAST_ALPHA = 0.8  # of a judged pixel: below it the model has a hole rather than a contradiction
+MAX_SHARE_OF_PHOTO = 0.25  # may be left out: more than that is a wrong model, not a passer-by
+MAX_WITNESSES = 24  # nearest photos that are compared at a place
+MIN_ALPHA = 0.8  # of a judged pixel: below it the model has a hole rather than a contradiction
 SURFACE_ALPHA = 0.5  # of a cell with a valid depth
 UNKNOWN = -1.0  # residual of a cell that no visit has shown
 
@@ -87,7 +87,7 @@ class RobustMask(Technique):
     def watch(self, cameras: Iterable[Camera]) -> None:
         """Set the photos' cameras, of any image size; without them nothing is contradicted or left out."""
         ordered = sorted(cameras, key=lambda camera: self._row[camera.name])
-        self.witnesses = NeighbourCameras.of(ordered, MOST_WITNESSES) if ordered else None
+        self.witnesses = NeighbourCameras.of(ordered, MAX_WITNESSES) if ordered else None
 
     def move_to(self, device: torch.device) -> None:
         """Move all tensors to the training device."""
@@ -132,7 +132,7 @@ class RobustMask(Technique):
         with torch.no_grad():
             row = self._row[photo.camera.name]
             self._before = row, self.scores[row].clone(), self.left_out[row].clone()
-            opaque = rendered.alpha >= LEAST_ALPHA
+            opaque = rendered.alpha >= MIN_ALPHA
             counts = opaque if photo.mask is None else photo.mask & opaque
             self._remember(row, *cell_residuals(shown, photo.colour, counts, photo.camera))
             cells = PhotoCells(photo.camera, GRID, GRID)
@@ -152,7 +152,7 @@ class RobustMask(Technique):
 
     def _left_out_cells(self, row: int, rendered: Render, cells: PhotoCells) -> Bool[Tensor, "g g"]:
         scores, threshold = self.scores[row], self.threshold
-        most = torch.quantile(scores, 1.0 - MOST_OF_A_PHOTO)
+        most = torch.quantile(scores, 1.0 - MAX_SHARE_OF_PHOTO)
         high, low = torch.maximum(threshold, most), torch.maximum(RIM * threshold, most)
         core = _voted(scores > high)
         core &= self._contradicted(row, core, rendered, cells)
@@ -188,7 +188,7 @@ class RobustMask(Technique):
             self.threshold.fill_(torch.inf)
             return
         place = min(len(known) - 1, int((1.0 - share) * len(known)))
-        self.threshold.fill_(max(LEAST_RESIDUAL, float(np.partition(known, place)[place])))
+        self.threshold.fill_(max(MIN_RESIDUAL, float(np.partition(known, place)[place])))
 
     def share_left_out(self) -> float:
         """Mean over the photos of the share left out at their last visits."""
@@ -226,7 +226,7 @@ def cell_residuals(
         all.
     """
     whole = camera.uncropped()
-    size = (min(GRID, max(1, whole.height // LEAST_CELL_PX)), min(GRID, max(1, whole.width // LEAST_CELL_PX)))
+    size = (min(GRID, max(1, whole.height // MIN_CELL_PX)), min(GRID, max(1, whole.width // MIN_CELL_PX)))
     cells = PhotoCells(camera, *size)
     weight, judged = cells.means(counts[None].float()), cells.judged(shown)
     known = weight[0] >= 0.5  # of the visible part: the rim of a neighbouring cell is evidence too

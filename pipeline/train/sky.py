@@ -33,14 +33,14 @@ from splatpipe.pipeline.train.photo_sky import PhotoSkies, PhotoSky
 from splatpipe.pipeline.train.random_numbers import ELSEWHERE
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
-LEAST_TRACK = 3  # minimum track length of points used in sky detection
-MOST_ERROR_PX = 2.0
+MIN_TRACK = 3  # minimum track length of points used in sky detection
+MAX_ERROR_PX = 2.0
 OPACITY_WEIGHT = 0.1  # of the mean opacity in front of the sky in the loss; judgement
 SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills areas no photo covers
 FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # learning rates of the colours at the start and end of the schedule
 EPSILON = 1e-8  # Adam's: cells with hardly any gradient stay where they are
 FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: unseen cells above the horizon are smooth by then
-LEAST_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour must at least average
+MIN_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour must at least average
 
 RGB = tuple[float, float, float]
 
@@ -111,7 +111,7 @@ class SkyModel(AuxiliaryModel, Technique):
             StageError: if a photo is missing or broken.
         """
         points = load_points(dataset)
-        believed = points.xyz[(points.track_lengths >= LEAST_TRACK) & (points.errors_px <= MOST_ERROR_PX)]
+        believed = points.xyz[(points.track_lengths >= MIN_TRACK) & (points.errors_px <= MAX_ERROR_PX)]
         cameras = [view.camera for view in views]
 
         def photo(index: int) -> SkyPhoto:
@@ -225,7 +225,7 @@ def first_colours(
 
 def filled(total: Float64[np.ndarray, "cells 4"]) -> Float32[np.ndarray, "cells 3"]:
     """Colours from sums of colour and weight; cells of little weight become the mean of their neighbours."""
-    known = (total[:, 3] >= LEAST_EVIDENCE).reshape(ROWS, COLUMNS, 1)
+    known = (total[:, 3] >= MIN_EVIDENCE).reshape(ROWS, COLUMNS, 1)
     whole = total[:, :3].sum(axis=0) / max(total[:, 3].sum(), 1e-12)
     mean = (total[:, :3] / np.maximum(total[:, 3:], 1e-12)).reshape(ROWS, COLUMNS, 3)
     grid = np.where(known, mean, whole)

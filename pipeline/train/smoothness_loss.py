@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.train.distortion_loss import LEAST_ALPHA
+from splatpipe.pipeline.train.distortion_loss import MIN_ALPHA
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.stream import EVERYWHERE
 
@@ -54,7 +54,7 @@ def unevenness(
         inside: Rows and columns that count.
         reaches: Pixels between a pixel and its neighbours; reaches too large for the image are left out.
     """
-    seen = (rendered.alpha.detach() >= LEAST_ALPHA)[inside]
+    seen = (rendered.alpha.detach() >= MIN_ALPHA)[inside]
     inverse = torch.where(seen, rendered.alpha[inside], 1.0) / torch.where(seen, rendered.depth_sum[inside], 1.0)
     ground = camera.fx / inverse.detach()  # converts a difference of inverse depths to GSD
     total = inverse.new_zeros(())

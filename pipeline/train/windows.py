@@ -11,8 +11,8 @@ from itertools import pairwise
 
 REACH_PX = 5  # of SSIM: half its window, which reaches this far over a border
 NODES_PX = 8  # node spacing: the panorama's `STEP_PX`
-LEAST_SIDE_PX = 2 * NODES_PX  # of a cell: borders move by at most half the node spacing
-MOST_OBLONG = 2.5  # aspect ratio of a cell: the borders of strips cost more than a few extra cells
+MIN_SIDE_PX = 2 * NODES_PX  # of a cell: borders move by at most half the node spacing
+MAX_OBLONG = 2.5  # aspect ratio of a cell: the borders of strips cost more than a few extra cells
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def windows_of(width: int, height: int, window_pixels: int) -> list[PixelRectang
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         window_pixels: Most pixels of a window; 0 for one window over the whole image. Sides never fall below
-            ``LEAST_SIDE_PX``.
+            ``MIN_SIDE_PX``.
     """
     if window_pixels == 0 or width * height <= window_pixels:
         return [PixelRectangle(0, 0, width, height)]
@@ -103,7 +103,7 @@ def windows_of(width: int, height: int, window_pixels: int) -> list[PixelRectang
 
 def _divisions(width: int, height: int, window_pixels: int) -> tuple[int, int]:
     """Number of rows and columns of cells: the fewest cells that fit, and of those the most nearly square."""
-    most_rows, most_columns = max(1, height // LEAST_SIDE_PX), max(1, width // LEAST_SIDE_PX)
+    most_rows, most_columns = max(1, height // MIN_SIDE_PX), max(1, width // MIN_SIDE_PX)
     found: list[tuple[int, bool, int, float, int, int]] = []
     for rows in range(1, most_rows + 1):
         tallest = _longest(height, rows)
@@ -113,7 +113,7 @@ def _divisions(width: int, height: int, window_pixels: int) -> tuple[int, int]:
         excess = max(0, tallest * _longest(width, columns) - window_pixels)
         aspect = (width / columns) / (height / rows)
         oblong = max(aspect, 1.0 / aspect)
-        found.append((excess, oblong > MOST_OBLONG, rows * columns, oblong, rows, columns))
+        found.append((excess, oblong > MAX_OBLONG, rows * columns, oblong, rows, columns))
     *_, rows, columns = min(found)
     return rows, columns
 

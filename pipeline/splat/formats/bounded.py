@@ -12,11 +12,11 @@ import torch
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-MOST_EXPANSION = 10.0
+MAX_EXPANSION = 10.0
 """Splats hardly compress: SPZ to a third, with zero SH to a sixth. A file that expands more is a decompression bomb."""
 FREE_BYTES = 1 << 25
 """Expansion allowed for files of any size: with little or uniform content, they may be very small."""
-MOST_LOG_SCALE, MOST_COORDINATE = 40.0, 1e18  # float32 holds the squares of what is smaller
+MAX_LOG_SCALE, MAX_COORDINATE = 40.0, 1e18  # float32 holds the squares of what is smaller
 _READ_BYTES = 1 << 16
 _AGAIN = "Copy or export it again."
 
@@ -65,7 +65,7 @@ def read_exactly(path: Path, file: BufferedIOBase, count: int) -> bytes:
     return data
 
 
-def check_expansion(path: Path, expanded_bytes: int, stored_bytes: int, most: float = MOST_EXPANSION) -> None:
+def check_expansion(path: Path, expanded_bytes: int, stored_bytes: int, most: float = MAX_EXPANSION) -> None:
     """Refuse a file that would take far more memory than its size justifies, before any is allocated.
 
     Args:
@@ -103,13 +103,13 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
         )
     if not len(gaussians):
         return
-    if float(gaussians.log_scales.max()) > MOST_LOG_SCALE:
+    if float(gaussians.log_scales.max()) > MAX_LOG_SCALE:
         raise SplatpipeError(
             f"{path}: scales as large as exp({float(gaussians.log_scales.max()):.6g}) are not valid for a splat.",
             hint="A splat file holds the scales' logarithms; this file appears to hold something else.",
         )
-    if max(float(gaussians.means.max()), -float(gaussians.means.min())) > MOST_COORDINATE:
-        raise SplatpipeError(f"{path}: coordinates beyond {MOST_COORDINATE:g} are not valid for a splat.", hint=_AGAIN)
+    if max(float(gaussians.means.max()), -float(gaussians.means.min())) > MAX_COORDINATE:
+        raise SplatpipeError(f"{path}: coordinates beyond {MAX_COORDINATE:g} are not valid for a splat.", hint=_AGAIN)
 
 
 def all_finite(gaussians: Gaussians) -> bool:

@@ -43,7 +43,7 @@ _VECTOR_BITS = (11, 10, 11)
 _COARSE_AXIS = (1.0, 2.0, 1.0)
 """How much coarser an axis of a position is coded than the first."""
 _SH_REACH = 4.0
-_MOST_LOG_SCALE = 20.0
+_MAX_LOG_SCALE = 20.0
 """Beyond which writers cut off, so that one broken Gaussian does not spoil the other 255's scales."""
 _ALPHA_END = 0.25 / 255.0
 """Stands for an opacity coded as 0, and this below 1 for one coded as 1, of which there are no logits."""
@@ -185,7 +185,7 @@ def _degree_of(path: Path, sh: PlyElement, count: int) -> int:
 def _coded(piece: Gaussians) -> tuple[bytes, ...]:
     """Encoded rows of chunks, vertices and SH for some Gaussians, the first of which starts a chunk."""
     colours = piece.sh[:, 0] * C0 + 0.5
-    log_scales = piece.log_scales.clamp(-_MOST_LOG_SCALE, _MOST_LOG_SCALE)
+    log_scales = piece.log_scales.clamp(-_MAX_LOG_SCALE, _MAX_LOG_SCALE)
     ranges, unit = [], []
     for values in (piece.means, log_scales, colours):
         least, most, scaled = _within_chunks(values.numpy())

@@ -13,7 +13,7 @@ from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_
 from splatpipe.pipeline.splat.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 16
-_MOST_HEADER_BYTES = 65_536  # of a PLY, in which it says whether it is compressed
+_MAX_HEADER_BYTES = 65_536  # of a PLY, in which it says whether it is compressed
 _MAGIC = ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK", "sog"), (b"glTF", "glb"))
 _HINT = "Give a splat as PLY, compressed PLY, SPZ, SOG or GLB, or the folder of a 3DGS model."
 
@@ -58,7 +58,7 @@ def format_of_content(path: Path) -> SplatFormat:
 def _name_of_file(path: Path) -> str:
     try:
         with path.open("rb") as file:
-            start = file.read(_MOST_HEADER_BYTES)
+            start = file.read(_MAX_HEADER_BYTES)
     except OSError as error:
         raise SplatpipeError(f"Cannot read {path}: {error.strerror}.", hint="Check the path.") from error
     if start.startswith(b"ply"):

@@ -28,10 +28,10 @@ __all__ = ["AXES", "SogImages", "encode_sog", "read", "write"]
 
 AXES: Axes = "y down"
 _FIRST_DAY = (1980, 1, 1, 0, 0, 0)  # of a ZIP's calendar: the same bytes on any day
-_MOST_META_BYTES = 1 << 20  # three codebooks and a record are 80 kB
-_MOST_DIRECTORY_BYTES = 1 << 16  # of a ZIP: a SOG has 9 files
+_MAX_META_BYTES = 1 << 20  # three codebooks and a record are 80 kB
+_MAX_DIRECTORY_BYTES = 1 << 16  # of a ZIP: a SOG has 9 files
 _END, _END_OF_LARGE = b"PK\5\6", b"PK\6\7"  # begin a ZIP's last record, and the one before it in a ZIP of ≥ 4 GB
-_END_BYTES, _MOST_COMMENT_BYTES = 22, 65_535  # of that record
+_END_BYTES, _MAX_COMMENT_BYTES = 22, 65_535  # of that record
 _HINT = "Give a .sog file, or the meta.json beside its pictures."
 _AGAIN = "Copy or export it again."
 
@@ -85,7 +85,7 @@ def _read_bundle(path: Path) -> Scene:
                 with archive.open(info) as file:
                     return _at_most(path, name, file.read(most_bytes + 1), most_bytes)
 
-            meta = _meta(path, load(META, _MOST_META_BYTES))
+            meta = _meta(path, load(META, _MAX_META_BYTES))
             return _scene(SogDecoder(path, meta, load, path.stat().st_size))
     except SplatpipeError:
         raise
@@ -98,13 +98,13 @@ def _check_directory(path: Path) -> None:
     """Refuse a ZIP whose directory alone would take seconds and much memory."""
     with open_file(path) as file:
         size = file.seek(0, 2)
-        file.seek(max(0, size - _END_BYTES - _MOST_COMMENT_BYTES))
+        file.seek(max(0, size - _END_BYTES - _MAX_COMMENT_BYTES))
         end = file.read()
     at = end.rfind(_END)
     if at < 0 or at + _END_BYTES > len(end):
         raise SplatpipeError(f"{path} is cut off: its ZIP directory is missing.", hint=_AGAIN)
     listed = int.from_bytes(end[at + 12 : at + 16], "little")
-    if listed > _MOST_DIRECTORY_BYTES or _END_OF_LARGE in end[max(0, at - 20) : at]:
+    if listed > _MAX_DIRECTORY_BYTES or _END_OF_LARGE in end[max(0, at - 20) : at]:
         raise SplatpipeError(f"{path} is a ZIP with a far larger directory than a SOG's.", hint=_HINT)
 
 
@@ -118,7 +118,7 @@ def _read_folder(path: Path) -> Scene:
         with open_file(beside) as file:
             return _at_most(path, name, file.read(most_bytes + 1), most_bytes)
 
-    meta = _meta(path, load(path.name, _MOST_META_BYTES))
+    meta = _meta(path, load(path.name, _MAX_META_BYTES))
     pictures = {name for part in meta.values() if isinstance(part, dict) for name in _files(part) if _is_plain(name)}
     there = (path.with_name(name) for name in pictures)
     stored = sum(picture.stat().st_size for picture in there if picture.is_file())

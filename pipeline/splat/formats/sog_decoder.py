@@ -16,17 +16,17 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.codebooks import CODEBOOK_SIZE
 from splatpipe.pipeline.splat.formats.bounded import check_expansion, check_values
 from splatpipe.pipeline.splat.formats.lossless_pictures import pixels_of_picture
-from splatpipe.pipeline.splat.formats.sog_images import ENTRIES_A_ROW, FIRST_MODE, LEVELS, MOST_ENTRIES, VERSION
+from splatpipe.pipeline.splat.formats.sog_images import ENTRIES_A_ROW, FIRST_MODE, LEVELS, MAX_ENTRIES, VERSION
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count
 
-MOST_EXPANSION = 40.0
+MAX_EXPANSION = 40.0
 """With SH of degree 3 a Gaussian takes 15 of 236 bytes, in simple scenes half as many."""
 _SPARE_PIXELS = 1 << 16  # allowed beyond four times the pixels needed
 _HEADER_BYTES = 1 << 12  # of a picture
 _PIXEL_BYTES = 5  # of a picture that does not compress, and some more
-_MOST_LOG = 1e3  # of a coordinate: larger values are caught after decoding
-_LEAST_OPACITY = 1e-6  # a byte of 0 or 255 is read as this far from 0 or 1, as PlayCanvas does
+_MAX_LOG = 1e3  # of a coordinate: larger values are caught after decoding
+_MIN_OPACITY = 1e-6  # a byte of 0 or 255 is read as this far from 0 or 1, as PlayCanvas does
 _ROWS_AT_ONCE = 1 << 16
 _AGAIN = "Copy or export it again."
 
@@ -58,14 +58,14 @@ class SogDecoder:
         harmonics = self._part("shN") if "shN" in self.meta else None
         if harmonics is not None:
             bands = self._whole(harmonics, "bands", 1, MAX_DEGREE)
-        check_expansion(self.path, count * (11 + 3 * coefficient_count(bands)) * 4, self.stored_bytes, MOST_EXPANSION)
+        check_expansion(self.path, count * (11 + 3 * coefficient_count(bands)) * 4, self.stored_bytes, MAX_EXPANSION)
         gaussians = Gaussians.empty(count, bands)
         gaussians.means[:] = torch.from_numpy(self._means(count))
         gaussians.quats[:] = torch.from_numpy(self._quats(count))
         gaussians.log_scales[:] = torch.from_numpy(self._coded("scales", self._pixels("scales", count)[:, :3]))
         colours = self._pixels("sh0", count)
         gaussians.sh[:, 0] = torch.from_numpy(self._coded("sh0", colours[:, :3]))
-        opacities = torch.from_numpy(colours[:, 3] / 255.0).clamp(_LEAST_OPACITY, 1.0 - _LEAST_OPACITY)
+        opacities = torch.from_numpy(colours[:, 3] / 255.0).clamp(_MIN_OPACITY, 1.0 - _MIN_OPACITY)
         gaussians.opacity_logits[:] = torch.logit(opacities).float()
         if harmonics is not None:
             self._fill_harmonics(gaussians, harmonics)
@@ -90,7 +90,7 @@ class SogDecoder:
     def _means(self, count: int) -> Float32[np.ndarray, "n 3"]:
         part = self._part("means")
         low, high = (self._numbers("means", part.get(name), 3) for name in ("mins", "maxs"))
-        if max(np.abs(low).max(), np.abs(high).max()) > _MOST_LOG:
+        if max(np.abs(low).max(), np.abs(high).max()) > _MAX_LOG:
             raise self._wrong("its positions have no sensible range")
         levels = self._pixels("means", count, 1, 2)[:, :3].astype(np.float64) * 256.0
         levels += self._pixels("means", count, 0, 2)[:, :3]
@@ -112,7 +112,7 @@ class SogDecoder:
         return quats
 
     def _fill_harmonics(self, gaussians: Gaussians, part: Mapping[str, Any]) -> None:
-        count, per_entry = self._whole(part, "count", 1, MOST_ENTRIES), gaussians.sh.shape[1] - 1
+        count, per_entry = self._whole(part, "count", 1, MAX_ENTRIES), gaussians.sh.shape[1] - 1
         rows = -(-count // ENTRIES_A_ROW)
         picture = self._picture("shN", 0, 2, rows * ENTRIES_A_ROW * per_entry)
         if picture.shape[1] != ENTRIES_A_ROW * per_entry:

@@ -27,11 +27,11 @@ RECORD = "splatpipe"
 LEVELS = 65_535  # of a coordinate
 FIRST_MODE = 252  # of a quaternion: 252 + which of w, x, y, z is the largest
 ENTRIES_A_ROW = 64  # of the picture of the palette
-MOST_ENTRIES = 65_536
+MAX_ENTRIES = 65_536
 _HARMONIC_LEVELS = 64  # of the palette's numbers: as good as 256 beside the palette's own error, and a quarter smaller
-_MOST_LOG_AREA = 80.0  # of natural logarithms
+_MAX_LOG_AREA = 80.0  # of natural logarithms
 _SHOWN_QUANTILE = 0.99
-_LEAST_SHOWN = 1e-3  # of the mean: what is hardly seen from afar is seen from near
+_MIN_SHOWN = 1e-3  # of the mean: what is hardly seen from afar is seen from near
 _ROWS_AT_ONCE = 1 << 16
 _SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
 
@@ -124,11 +124,11 @@ def _shown(gaussians: Gaussians) -> Float[Tensor, " n"]:
     """
     if not len(gaussians):
         return torch.zeros(0)
-    sides = gaussians.log_scales.sort(1).values[:, 1:].sum(1).clamp(-_MOST_LOG_AREA, _MOST_LOG_AREA)
+    sides = gaussians.log_scales.sort(1).values[:, 1:].sum(1).clamp(-_MAX_LOG_AREA, _MAX_LOG_AREA)
     areas = torch.sigmoid(gaussians.opacity_logits).double() * torch.exp(sides.double())
     most = areas.sort().values[int(_SHOWN_QUANTILE * (len(areas) - 1))]  # the largest are hidden behind others
     areas = areas.clamp_max(most)
-    return (areas / areas.mean().clamp_min(1e-300)).clamp_min(_LEAST_SHOWN).float()
+    return (areas / areas.mean().clamp_min(1e-300)).clamp_min(_MIN_SHOWN).float()
 
 
 def _means(means: Float[Tensor, "n 3"]) -> _Part:
@@ -206,7 +206,7 @@ def _by_first_use(
 
 def palette_size(count: int) -> int:
     """Number of palette entries: the largest power of two up to the number of Gaussians, within the format's limit."""
-    return min(1 << (count.bit_length() - 1), MOST_ENTRIES)
+    return min(1 << (count.bit_length() - 1), MAX_ENTRIES)
 
 
 def _picture(pixels: UInt8[np.ndarray, "n c"]) -> UInt8[np.ndarray, "h w c"]:

@@ -34,9 +34,9 @@ from splatpipe.pipeline.splat.spz import (
     ARRAYS,
     COLOUR_SCALE,
     FIRST_THREE_VERSION,
-    LEAST_LOG_SCALE,
     LOG_SCALE_STEPS,
     MAGIC,
+    MIN_LOG_SCALE,
     RECORD_FIELD,
     ROTATION_STEPS,
     SH_STEPS,
@@ -53,10 +53,10 @@ RIGHT_UP_BACK = 4
 _ROWS = 1 << 16
 _HEADER, _ZSTD_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 _TABLE_ENTRY = struct.Struct("<QQ")
-_MOST_EXTENSION_BYTES = 1 << 16
-_MOST_WINDOW_BYTES = 1 << 26
+_MAX_EXTENSION_BYTES = 1 << 16
+_MAX_WINDOW_BYTES = 1 << 26
 """Largest zstd window: for streams of such size, writers' highest levels use 8 MB."""
-_MOST_GZIP_HEADER_BYTES = 12 + 65_535
+_MAX_GZIP_HEADER_BYTES = 12 + 65_535
 _HAS_EXTRA_FIELD = 4
 _ALPHA_END = 0.25 / 255.0
 """Replaces an opacity coded as 0, and 1 minus this one coded as 1, whose logits would be infinite."""
@@ -100,7 +100,7 @@ def read(path: Path) -> Scene:
         SplatpipeError: if the file is missing, truncated, damaged, not an SPZ, or of an unsupported kind.
     """
     with open_file(path) as file:
-        start = file.read(_MOST_GZIP_HEADER_BYTES)
+        start = file.read(_MAX_GZIP_HEADER_BYTES)
         file.seek(0)
         if start.startswith(b"NGSP"):
             packed, record = _zstd_streams(path, file), None
@@ -146,7 +146,7 @@ class _ZstdStream:
         """
         if self._reader is None:
             self._file.seek(self._offset)
-            inflate = zstandard.ZstdDecompressor(max_window_size=_MOST_WINDOW_BYTES)
+            inflate = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
             self._reader = inflate.stream_reader(self._file, closefd=False)
         parts, left = [], count
         try:
@@ -211,7 +211,7 @@ def _zstd_streams(path: Path, file: BufferedReader) -> _Packed:
         raise SplatpipeError(f"{path}: version {version} of SPZ cannot be read.", hint="Export it as version 3.")
     packed = _checked(path, _Packed(version, count, degree, bits, flags), file_bytes(file))
     expected = [width * count for width in packed.widths() if width * count]
-    if not _ZSTD_HEADER.size <= table <= _ZSTD_HEADER.size + _MOST_EXTENSION_BYTES or stream_count != len(expected):
+    if not _ZSTD_HEADER.size <= table <= _ZSTD_HEADER.size + _MAX_EXTENSION_BYTES or stream_count != len(expected):
         raise SplatpipeError(f"{path} is damaged: its header is not valid.", hint=_AGAIN)
     if flags & HAS_EXTENSIONS:
         _check_coordinates(path, read_exactly(path, file, table - _ZSTD_HEADER.size))
@@ -231,8 +231,8 @@ def _zstd_streams(path: Path, file: BufferedReader) -> _Packed:
 
 def _check_end(path: Path, packed: _Packed) -> None:
     """Read up to the checksums after the last array; extensions may come before them."""
-    rest = b"".join(stream.at_most(_MOST_EXTENSION_BYTES + 1) for stream in packed.streams[-1:])
-    if len(rest) > _MOST_EXTENSION_BYTES:
+    rest = b"".join(stream.at_most(_MAX_EXTENSION_BYTES + 1) for stream in packed.streams[-1:])
+    if len(rest) > _MAX_EXTENSION_BYTES:
         raise SplatpipeError(f"{path} holds more than its header says.", hint=_AGAIN)
     if packed.version < ZSTD_VERSION and packed.flags & HAS_EXTENSIONS:
         _check_coordinates(path, rest)
@@ -285,7 +285,7 @@ def _put(gaussians: Gaussians, part: slice, array: int, data: UInt8[np.ndarray, 
         case 2:
             gaussians.sh[part, 0] = torch.from_numpy((values / 255.0 - 0.5) / COLOUR_SCALE)
         case 3:
-            gaussians.log_scales[part] = torch.from_numpy(values / LOG_SCALE_STEPS + LEAST_LOG_SCALE)
+            gaussians.log_scales[part] = torch.from_numpy(values / LOG_SCALE_STEPS + MIN_LOG_SCALE)
         case 4:
             coarse = packed.version <= FIRST_THREE_VERSION
             gaussians.quats[part] = torch.from_numpy(_first_three(data) if coarse else _smallest_three(data))

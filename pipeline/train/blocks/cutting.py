@@ -22,7 +22,7 @@ from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 BINS = 1024  # along the longer side of the site: 256 blocks are still cut to a few percent of a cell
 NEAR = 4.0  # times the median GSD: anything seen more coarsely is background
 SITE_PERCENTILES = (0.5, 99.5)  # of the visible places, along each axis: the few wrong depths lie outside
-MOST_SAMPLES = 1_000_000  # used to locate the site: 24 MB
+MAX_SAMPLES = 1_000_000  # used to locate the site: 24 MB
 MARGIN_SHARE = 0.1  # of a cell's side (of a square of equal area)
 
 
@@ -63,7 +63,7 @@ def site(
     Raises:
         ValueError: if no photo sees anything.
     """
-    every = [_evenly(coverage, xyz, max(1, MOST_SAMPLES // len(seen))) for coverage in seen]
+    every = [_evenly(coverage, xyz, max(1, MAX_SAMPLES // len(seen))) for coverage in seen]
     places = np.concatenate([found for found, _ in every] or [np.zeros((0, 3))])
     sizes = np.concatenate([found for _, found in every] or [np.zeros(0)])
     if area is not None and (inside := area.contains(places)).any():

@@ -28,7 +28,7 @@ from splatpipe.pipeline.train.limits import (
 
 PHOTOS_A_BLOCK = 8  # at least: each photo shows many smaller blocks and would be trained on in each
 FEWEST_GAUSSIANS = 1000  # of a block: fewer are not a useful model
-LIKELY_MOST = 2.0  # times the expected size is hardly ever exceeded: forecasts are off by up to this factor
+MAX_LIKELY_GROWTH = 2.0  # times the expected size is hardly ever exceeded: forecasts are off by up to this factor
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def divided(scene: SceneSize, limit_bytes: int, least: int = 0) -> Division:
         return _of(scene, max(1, least), scene.cap, limit_bytes, scene.window_pixels)
     room = limit_bytes - LIBRARIES_BYTES
     window = window_within(room - FIXED_BYTES, scene.window_pixels)
-    likely = min(scene.cap, int(LIKELY_MOST * scene.expected))
+    likely = min(scene.cap, int(MAX_LIKELY_GROWTH * scene.expected))
     if need_of_blocks(1, likely, window, scene.sh_degree).memory_bytes <= room:
         return _of(scene, max(1, least), scene.cap, limit_bytes, window)
     most = max(1, least, scene.photos // PHOTOS_A_BLOCK)

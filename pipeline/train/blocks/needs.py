@@ -26,7 +26,7 @@ SPLAT_BYTES = 249  # per Gaussian in a file
 CHECKPOINT_BYTES = 2 * 720  # per trained Gaussian: parameters and moments, the new checkpoint beside the old
 GROWTH_A_STEP = 1.25  # of a block's Gaussians per density-control step: 1.2 in the tiled demo, 1.8 initially if the
 # coarse pass ended at smaller photos
-MOST_BLOCKS = 4096  # beyond it a block is not larger than its margin
+MAX_BLOCKS = 4096  # beyond it a block is not larger than its margin
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def fewest_blocks(cap: int, room_bytes: int, window_pixels: int, sh_degree: int)
         window_pixels: Pixels of the largest window.
         sh_degree: SH degree of the model.
     """
-    for blocks in range(1, MOST_BLOCKS + 1):
+    for blocks in range(1, MAX_BLOCKS + 1):
         if need_of_blocks(blocks, cap, window_pixels, sh_degree).memory_bytes <= room_bytes:
             return blocks
     return None

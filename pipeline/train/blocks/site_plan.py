@@ -15,7 +15,7 @@ from splatpipe.pipeline.train.blocks.needs import FROZEN_SHARE, MARGIN_GROWTH, f
 from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.limits import FIXED_BYTES, LIBRARIES_BYTES, PIXEL_BYTES, bytes_per_gaussian
 
-MOST_GROWTH = 2.0 * MARGIN_GROWTH  # of a cell with its margin over the cell: beyond it, the neighbours are what is full
+MAX_GROWTH = 2.0 * MARGIN_GROWTH  # of a cell with its margin over the cell: beyond it, the neighbours are what is full
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[flo
     found = []
     shares = capped_shares(cap, [weight for weight, _, _ in counted], [top] * len(counted))
     for share, (_, in_cell, in_block) in zip(shares, counted, strict=True):
-        wanted = max(share, min(with_margin(share, in_cell, in_block), int(MOST_GROWTH * share)))
+        wanted = max(share, min(with_margin(share, in_cell, in_block), int(MAX_GROWTH * share)))
         trained = max(share, min(wanted, most)) if division.limit_bytes else wanted
         found.append(BlockLimits(share, trained, _frozen(division, trained, sh_degree)))
     return found

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from splatpipe.pipeline.raster.definitions import ALPHA_MAX
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
-LEAST_VARIANCE = 1e-30  # world units squared: coplanar Gaussians have none across the plane, or less by rounding
-LEAST_OPACITY = 1e-6  # whose logit is still finite
+MIN_VARIANCE = 1e-30  # world units squared: coplanar Gaussians have none across the plane, or less by rounding
+MIN_OPACITY = 1e-6  # whose logit is still finite
 
 
 def thinned(gaussians: Gaussians, voxel: Float64[np.ndarray, " n"]) -> Gaussians:
@@ -47,7 +47,7 @@ def _merged(gaussians: Gaussians, starts: Int64[np.ndarray, " g"]) -> Gaussians:
     opacities = torch.sigmoid(gaussians.opacity_logits.detach().double()).numpy()
     turns = Rotation.from_quat(np.where(np.any(quats, axis=1)[:, None], quats, [1.0, 0, 0, 0]), scalar_first=True)
     axes = turns.as_matrix() * scales[:, None, :]
-    weights = np.maximum(opacities, LEAST_OPACITY) * scales.prod(axis=1) ** (2.0 / 3.0)
+    weights = np.maximum(opacities, MIN_OPACITY) * scales.prod(axis=1) ** (2.0 / 3.0)
     lengths = np.diff(starts, append=len(means))
     total = np.add.reduceat(weights, starts)
     share = weights / np.repeat(total, lengths)
@@ -56,10 +56,10 @@ def _merged(gaussians: Gaussians, starts: Int64[np.ndarray, " g"]) -> Gaussians:
     spread = axes @ axes.transpose(0, 2, 1) + apart[:, :, None] * apart[:, None, :]
     values, vectors = np.linalg.eigh(np.add.reduceat(share[:, None, None] * spread, starts))
     vectors[..., 0] *= np.sign(np.linalg.det(vectors))[:, None]  # rotations, no mirrors
-    sigma = np.sqrt(np.maximum(values, LEAST_VARIANCE))
+    sigma = np.sqrt(np.maximum(values, MIN_VARIANCE))
     light = total / sigma.prod(axis=1) ** (2.0 / 3.0)
     sigma *= np.sqrt(np.maximum(light / ALPHA_MAX, 1.0))[:, None]
-    opacity = np.clip(light, LEAST_OPACITY, ALPHA_MAX)
+    opacity = np.clip(light, MIN_OPACITY, ALPHA_MAX)
     harmonics = gaussians.sh.detach().double().numpy()
     return Gaussians(
         torch.from_numpy(centre).float(),

@@ -19,8 +19,8 @@ from splatpipe.pipeline.train.blocks.partition import NOBODY, Partition
 from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, Samples
 from splatpipe.pipeline.train.windows import windows_of
 
-LEAST_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner that neighbouring windows show whole
-LEAST_POINTS = 4  # observed points in the cell and the window: thin objects that a coarse depth misses
+MIN_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner that neighbouring windows show whole
+MIN_POINTS = 4  # observed points in the cell and the window: thin objects that a coarse depth misses
 
 Windows = Int64[np.ndarray, "w 4"]  # left, top, right and bottom of each in the dataset's photo, the last two exclusive
 
@@ -99,7 +99,7 @@ def block_views(
         points = Samples(points.pixels, points.places, np.ones(len(points.places)), points.distances)
         observed = _counted(partition, points, parts)
         sizes = (parts[:, 2] - parts[:, 0]) * (parts[:, 3] - parts[:, 1])
-        chosen = (weights >= LEAST_SHARE * sizes) | (observed >= LEAST_POINTS)
+        chosen = (weights >= MIN_SHARE * sizes) | (observed >= MIN_POINTS)
         for block in np.flatnonzero(chosen.any(axis=1)).tolist():
             rows = chosen[block]
             covered = float(weights[block, rows].sum())
