@@ -352,7 +352,7 @@ def test_the_reported_size_is_the_blocks_not_the_coarse_passs(tmp_path: Path) ->
     summaries = {"blocks": {"coarse": {"train_megapixels": 0.49}}, "train.1": {"train_megapixels": 1.9466}}
     summaries |= {"train.2": {"train_megapixels": 0.0}}  # one that had nothing to train
     given = replace(Inputs({}, tmp_path), summaries=summaries, shards=(tmp_path,) * 2)
-    assert assembly._told(given, {"curve": []}, 100)["train_megapixels"] == 1.9466
+    assert assembly._summary(given, {"curve": []}, 100)["train_megapixels"] == 1.9466
 
 
 def test_the_reason_for_fewer_iterations_of_blocks_is_reported(tmp_path: Path) -> None:
@@ -361,7 +361,7 @@ def test_the_reason_for_fewer_iterations_of_blocks_is_reported(tmp_path: Path) -
     summaries = {"blocks": {"coarse": {"iterations": 20, "planned_iterations": 30, "sizes_ended": [10]}}}
     summaries |= {f"train.{number}": part for number, part in enumerate(parts, 1)}
     given = replace(Inputs({}, tmp_path), summaries=summaries, shards=(tmp_path,) * 3)
-    told = assembly._told(given, {"curve": []}, 100) | {"blocks": 3}
+    told = assembly._summary(given, {"curve": []}, 100) | {"blocks": 3}
     assert (told["iterations"], told["planned_iterations"]) == (240, 280)
     assert told["flat"] == {
         "coarse": {"sizes_ended": [10]},
@@ -369,4 +369,4 @@ def test_the_reason_for_fewer_iterations_of_blocks_is_reported(tmp_path: Path) -
         "3": {"flat_at": 50, "sizes_ended": [30]},
     }
     assert training._why_earlier(told) == ": the loss was flat in the coarse pass and in 2 of 3 blocks"
-    assert "flat" not in assembly._told(replace(given, summaries={}), {"curve": []}, 100)
+    assert "flat" not in assembly._summary(replace(given, summaries={}), {"curve": []}, 100)

@@ -24,7 +24,7 @@ from splatpipe.pipeline.edit.visibility import GaussianVisibility, TrainingPhoto
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 Flags = Bool[np.ndarray, " n"]
-Told = Callable[[int, int], None]
+Progress = Callable[[int, int], None]
 
 TRANSPARENT = 0.01
 """Invisible opacity: two and a half steps of an 8-bit image, and a few overlapping ones stay invisible."""
@@ -55,13 +55,15 @@ class CleaningResult:
     removed: dict[str, int]
 
 
-def clean_scene(gaussians: Gaussians, photos: TrainingPhotos | None = None, told: Told | None = None) -> CleaningResult:
+def clean_scene(
+    gaussians: Gaussians, photos: TrainingPhotos | None = None, on_progress: Progress | None = None
+) -> CleaningResult:
     """Find which Gaussians are floaters, haze, or beyond the photos.
 
     Args:
         gaussians: Finite Gaussians, on the device that renders them if there are photos, else on the CPU.
         photos: Exactly the photos it was trained on; None if unknown.
-        told: Called with the steps done and their total.
+        on_progress: Called with the steps done and their total.
 
     Raises:
         ValueError: if a Gaussian is not finite.
@@ -69,7 +71,7 @@ def clean_scene(gaussians: Gaussians, photos: TrainingPhotos | None = None, told
     if not bool(gaussians.finite().all()):
         raise ValueError("Gaussians that are not finite are to be left out before")
     keep, removed = np.ones(len(gaussians), np.bool_), {}
-    for reason, flags in _found(gaussians, photos, told or _ignore_progress):
+    for reason, flags in _found(gaussians, photos, on_progress or _ignore_progress):
         removed[reason] = int((flags & keep).sum())
         keep &= ~flags
     return CleaningResult(torch.from_numpy(keep), removed)
@@ -89,7 +91,7 @@ def _ignore_progress(_done: int, _total: int) -> None:
     """Ignore progress."""
 
 
-def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> Iterator[tuple[str, Flags]]:
+def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Progress) -> Iterator[tuple[str, Flags]]:
     """Yield the reasons for removal and the Gaussians each applies to."""
     opacity = torch.sigmoid(gaussians.opacity_logits.detach()).numpy(force=True)
     yield "transparent", opacity < TRANSPARENT
@@ -100,7 +102,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> I
         return
     looks = len(photos.cameras)
     steps = looks * (1 if photos.picture is None else 1 + LOOKS)
-    found = measure_visibility(gaussians, photos, lambda done: told(done, steps))
+    found = measure_visibility(gaussians, photos, lambda done: on_progress(done, steps))
     seen = found.weight >= SEEN_PIXELS
     floats = seen & (found.floating > FLOATING)
     ground = seen & ~floats & solid
@@ -115,10 +117,10 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, told: Told) -> I
         return
     suspected = seen & (found.floating > SUSPECTED)
     suspects = Suspects(gaussians, shapes, suspected, seen & ~suspected & solid, found)
-    floaters = likely_floaters(suspects, photos, lambda done: told(looks + done, steps))
+    floaters = likely_floaters(suspects, photos, lambda done: on_progress(looks + done, steps))
     yield "oversized", floaters & large
     yield "floating", floaters
-    told(steps, steps)
+    on_progress(steps, steps)
 
 
 def _oversized(shapes: GaussianShapes, photos: TrainingPhotos) -> Flags:

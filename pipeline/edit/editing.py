@@ -113,17 +113,17 @@ def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
             report.warning(f"No pictures were written: {error.message}", error.hint)
     report.progress(total, total, "done", "steps")
     placed = None if facts.place is None else [facts.place.latitude, facts.place.longitude, facts.place.height_m]
-    told = {"steps": edits, "gaussians": after.count, "place": placed, "metres": facts.metres}
-    return {**told, "outputs": [str(path) for path in outputs]}
+    result_facts = {"steps": edits, "gaussians": after.count, "place": placed, "metres": facts.metres}
+    return {**result_facts, "outputs": [str(path) for path in outputs]}
 
 
 def _take_steps(task: EditTask, piece: Workpiece, total: int, report: Reporter) -> list[Edit]:
     edits: list[Edit] = []
     for number, step in enumerate(task.steps, start=1):
-        count, told = len(piece), len(piece.notes)
+        count, earlier_notes = len(piece), len(piece.notes)
         edits.append({**step.apply(piece), "gaussians": [count, len(piece)]})
         report.progress(number, total, str(edits[-1]["step"]), "steps")
-        for note in piece.notes[told:]:
+        for note in piece.notes[earlier_notes:]:
             report.warning(note)
     return edits
 

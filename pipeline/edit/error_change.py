@@ -44,7 +44,7 @@ class PhotoErrorChange:
 
 
 def error_change_in_photos(
-    gaussians: Gaussians, asked: Bool[np.ndarray, " n"], photos: TrainingPhotos, told: Callable[[int], None]
+    gaussians: Gaussians, asked: Bool[np.ndarray, " n"], photos: TrainingPhotos, on_progress: Callable[[int], None]
 ) -> PhotoErrorChange:
     """Compute how much each Gaussian decreases and increases the photos' error.
 
@@ -54,7 +54,7 @@ def error_change_in_photos(
         gaussians: All Gaussians, finite, on the device that renders them.
         asked: Which Gaussians to evaluate.
         photos: The training photos, with images.
-        told: Called with the number of photos done.
+        on_progress: Called with the number of photos done.
 
     Returns:
         The changes; 0 for Gaussians not asked for or not seen.
@@ -75,7 +75,7 @@ def error_change_in_photos(
         paid = slope.numpy(force=True) * per_logit
         better -= np.minimum(paid, 0.0)
         worse += np.maximum(paid, 0.0)
-        told(index + 1)
+        on_progress(index + 1)
     return PhotoErrorChange(better, worse)
 
 

@@ -80,23 +80,23 @@ class Verdicts:
     better: Figures
 
 
-def likely_floaters(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int], None]) -> Flags:
+def likely_floaters(suspects: Suspects, photos: TrainingPhotos, on_progress: Callable[[int], None]) -> Flags:
     """Which of the suspects are more likely floaters than not.
 
     Args:
         suspects: The suspects and what is known of them.
         photos: The training photos, with images.
-        told: Called with the number of images processed, at most ``LOOKS`` times the number of photos.
+        on_progress: Called with the number of images processed, at most ``LOOKS`` times the number of photos.
     """
     if suspects.ground.sum() <= NEIGHBOURS:
         return np.zeros(len(suspects.ground), np.bool_)  # not enough of a scene for anything to float in front of
-    figures = evidence(suspects, verdicts_of(suspects, photos, told))
+    figures = evidence(suspects, verdicts_of(suspects, photos, on_progress))
     odds = PRIOR + sum(EVIDENCE[name] * figure for name, figure in figures.items())
     likely = np.asarray(suspects.suspected & (odds > 0.0))
     if not likely.any():
         return likely
     looks = len(LIMITS) * len(photos.cameras)
-    worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, told, looks))
+    worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, on_progress, looks))
     missed = (worth.better - worth.worse) / _pixels(suspects) > LIMITS[-1][1]
     return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # a loose one may hide other floaters
 
@@ -124,7 +124,7 @@ def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
     }
 
 
-def verdicts_of(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int], None]) -> Verdicts:
+def verdicts_of(suspects: Suspects, photos: TrainingPhotos, on_progress: Callable[[int], None]) -> Verdicts:
     """Measure the suspects' effect on the photos in several passes, excluding the worst suspects after each."""
     gaussians, pixels = suspects.gaussians, _pixels(suspects)
     n = len(gaussians)
@@ -136,7 +136,7 @@ def verdicts_of(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int]
         rows = np.flatnonzero(shown)
         model = gaussians if len(rows) == n else gaussians.select(torch.from_numpy(rows).to(gaussians.means.device))
         looks = number * len(photos.cameras)
-        worth = error_change_in_photos(model, asked[rows], photos, partial(_after, told, looks))
+        worth = error_change_in_photos(model, asked[rows], photos, partial(_after, on_progress, looks))
         of_pixel = np.full(n, np.inf, np.float32)
         of_pixel[rows] = (worth.better - worth.worse) / pixels[rows]
         lower = asked[rows] & (of_pixel[rows] < least[rows])
@@ -147,5 +147,5 @@ def verdicts_of(suspects: Suspects, photos: TrainingPhotos, told: Callable[[int]
     return Verdicts(worse, better)
 
 
-def _after(told: Callable[[int], None], before: int, done: int) -> None:
-    told(before + done)
+def _after(on_progress: Callable[[int], None], before: int, done: int) -> None:
+    on_progress(before + done)

@@ -105,9 +105,9 @@ def _on_earth(ours: SplatOrigin, other: SplatOrigin, name: str) -> Similarity:
     datums = parse_vertical(ours.vertical_datum), parse_vertical(other.vertical_datum)
     known = datums[0] == datums[1] or (UNKNOWN not in datums and same_datum(*datums))
     if not known:
-        told = [describe_vertical(datum) if datum != UNKNOWN else "an unknown datum" for datum in datums]
+        names = [describe_vertical(datum) if datum != UNKNOWN else "an unknown datum" for datum in datums]
         raise SplatpipeError(
-            f"Heights of the splat are in {told[0]}, those of {name} in {told[1]}: they may be tens of metres apart.",
+            f"Heights of the splat are in {names[0]}, those of {name} in {names[1]}: they may be tens of metres apart.",
             hint="Give both runs the same vertical datum: --set georef.vertical=…, then splatpipe georef OUT.",
         )
     to_ours = between(origin_of(other), origin_of(ours))

@@ -24,9 +24,9 @@ def with_edits(facts: SceneFacts, edits: Sequence[Edit]) -> SceneFacts:
     every: list[Mapping[str, Any]] = [*facts.edits, *edits]
     dropped = 0
     while True:
-        told = replace(facts, edits=tuple([{"step": EARLIER, "count": dropped}, *every] if dropped else every))
-        if len(told.edits) <= MAX_EDITS and _fits(told):
-            return told
+        shortened = replace(facts, edits=tuple([{"step": EARLIER, "count": dropped}, *every] if dropped else every))
+        if len(shortened.edits) <= MAX_EDITS and _fits(shortened):
+            return shortened
         first = every.pop(0)
         dropped += int(first.get("count", 1)) if first.get("step") == EARLIER else 1
 

@@ -90,13 +90,15 @@ class _VisibilitySums:
         return GaussianVisibility(self.weight, photos, angle, border, before, gap)
 
 
-def measure_visibility(gaussians: Gaussians, photos: TrainingPhotos, told: Callable[[int], None]) -> GaussianVisibility:
+def measure_visibility(
+    gaussians: Gaussians, photos: TrainingPhotos, on_progress: Callable[[int], None]
+) -> GaussianVisibility:
     """Compute the visibility of each Gaussian in the photos.
 
     Args:
         gaussians: Finite Gaussians on the CPU or device that renders them.
         photos: The training photos; only their cameras are used.
-        told: Called with the number of photos done.
+        on_progress: Called with the number of photos done.
     """
     grey = grey_of(gaussians)
     plain = replace(photos.options, sh_degree=0, depth=True, magnitudes=False)
@@ -109,7 +111,7 @@ def measure_visibility(gaussians: Gaussians, photos: TrainingPhotos, told: Calla
         found = weights_of(rendered, grey, picture)
         rows = np.flatnonzero(found[:, 0] > MIN_SEEN)
         _add(sums, rows, found[rows], camera, (centres[rows], axes[rows]))
-        told(done)
+        on_progress(done)
     return sums.sightings()
 
 

@@ -153,5 +153,5 @@ def _check_pattern(
         return None
     centre = homography @ np.array([0.5, 0.5, 1.0])
     middle = centre[:2] / centre[2]
-    told = name.removeprefix("DICT_").lower()
-    return CodedTarget(told, number, float(middle[0]), float(middle[1]), float(np.sqrt(area)), CENTRE_SIGMA_PX, score)
+    family = name.removeprefix("DICT_").lower()
+    return CodedTarget(family, number, float(middle[0]), float(middle[1]), float(np.sqrt(area)), CENTRE_SIGMA_PX, score)

@@ -46,10 +46,10 @@ class Device:
 
     def facts(self) -> dict[str, JSON]:
         """The device's entries in a manifest."""
-        told: dict[str, JSON] = {"device": self.name, "instruction_set": self.kernels, "mode": SAME_BITS}
+        found: dict[str, JSON] = {"device": self.name, "instruction_set": self.kernels, "mode": SAME_BITS}
         if self.tensors.type == "cuda":
-            told["device_peak_memory_bytes"] = torch.cuda.max_memory_allocated(self.tensors)
-        return told
+            found["device_peak_memory_bytes"] = torch.cuda.max_memory_allocated(self.tensors)
+        return found
 
     def wait(self) -> None:
         """Wait until the device has finished all work; needed only for timing."""

@@ -108,16 +108,16 @@ def georef_points(control: Path) -> list[dict[str, Any]]:
         StageError: if it is broken.
     """
     try:
-        told = []
+        entries = []
         for point in _read(control)["points"]:
             entry = {name: point.get(name) for name in POINT_FACTS}
             used = [seen for seen in point["observations"] if seen.get("used", True)]
             squares = [x * x + y * y for x, y in filter(None, (seen["residual_px"] for seen in used))]
             rms = math.sqrt(math.fsum(squares) / len(squares)) if squares else None
-            told.append({**entry, "photos": len(used), "rms_px": None if rms is None else round(rms, 3)})
+            entries.append({**entry, "photos": len(used), "rms_px": None if rms is None else round(rms, 3)})
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise StageError(f"{control.name} is broken: {error!r}.", hint="Run again with --rerun georef.") from error
-    return told
+    return entries
 
 
 def read_surveyed(control: Path, photos: Sequence[str]) -> list[ObservedPoint]:
@@ -189,7 +189,7 @@ def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Fram
 def _splat(
     points: Sequence[ObservedPoint], places: Mapping[str, list[dict[str, Any]]], held_out: set[str]
 ) -> dict[str, Any]:
-    told: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     residuals: dict[str, list[Float64[np.ndarray, " 3"]]] = {"control": [], "check": []}
     for point in points:
         found = places[point.name]
@@ -208,10 +208,10 @@ def _splat(
             }
             for seen in found
         ]
-        told.append(entry)
+        entries.append(entry)
     groups = {**residuals, "all": [*residuals["control"], *residuals["check"]]}
     tables = {name: accuracy_table(np.array(group).reshape(-1, 3)) for name, group in groups.items()}
-    return {"tables": tables, "points": told}
+    return {"tables": tables, "points": entries}
 
 
 def _rounded(vector: Float64[np.ndarray, " 3"]) -> list[float | None]:

@@ -85,11 +85,11 @@ def _or_alone(
 ) -> Float64[np.ndarray, "n k"]:
     """Compare photos that match no other with all others; fill in their values where they differ by over ``least``."""
     alone = ~np.isfinite(own).any(axis=1)
-    told = np.stack(plain) if len(plain) else own
-    others = told[~alone & np.isfinite(told).all(axis=1)]
+    stacked = np.stack(plain) if len(plain) else own
+    others = stacked[~alone & np.isfinite(stacked).all(axis=1)]
     if not alone.any() or not len(others):
         return own
-    steps = told - np.median(others, axis=0)
+    steps = stacked - np.median(others, axis=0)
     far = alone & (np.abs(np.nan_to_num(steps)) > least).any(axis=1)
     return np.where(far[:, None], steps, own)
 
@@ -108,9 +108,9 @@ def _own_share(
     own = np.full((count, size), np.nan)
     is_odd = np.zeros(count, dtype=bool)
     for _ in range(PASSES):
-        for photo, told in enumerate(neighbours):
-            if told:
-                trusted = [value for other, value in told if not is_odd[other]] or [value for _, value in told]
+        for photo, pairs in enumerate(neighbours):
+            if pairs:
+                trusted = [value for other, value in pairs if not is_odd[other]] or [value for _, value in pairs]
                 own[photo] = np.median(trusted, axis=0)
         is_odd = (np.abs(np.nan_to_num(own)) > odd).any(axis=1)
     return own

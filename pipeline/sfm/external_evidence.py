@@ -48,10 +48,12 @@ def outside_reasons(
         cameras: The camera groups of ``ingest.cameras``.
         positions: The entries of ``positions.json``.
     """
-    return [*_untold_focal_lengths(model, verified, cameras), *_positions(model, positions)]
+    return [*_uncertain_focal_lengths(model, verified, cameras), *_positions(model, positions)]
 
 
-def _untold_focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[Reason]:
+def _uncertain_focal_lengths(
+    model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]
+) -> list[Reason]:
     used = sorted({model.images[number].camera_id for number in model.reg_image_ids()})
     rough = [number for number in used if not is_trusted(cameras[number - 1])]
     if not rough:
@@ -61,8 +63,8 @@ def _untold_focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, c
     if worst <= UNOBSERVED:
         return []
     known = all(verified.cameras[number].has_prior_focal_length for number in rough)
-    told = f"to {100.0 * worst:.0f} %" if math.isfinite(worst) else "not at all"
-    text = f"The photos determine the focal length {told}, and "
+    accuracy = f"to {100.0 * worst:.0f} %" if math.isfinite(worst) else "not at all"
+    text = f"The photos determine the focal length {accuracy}, and "
     text += "the value in the metadata is only approximate." if known else "it is not in the metadata."
     return [
         Reason("doubt", text, "Add oblique photos or a second height, or compare distances with known ones.", "lens")

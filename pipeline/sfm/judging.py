@@ -88,8 +88,8 @@ class Judgement:
 
     def as_json(self) -> JSON:
         """Return level and reasons for ``models.json``."""
-        told = [{"level": it.level, "kind": it.kind, "text": it.text, "hint": it.hint} for it in self.reasons]
-        return {"level": self.level, "reasons": told}
+        reasons = [{"level": it.level, "kind": it.kind, "text": it.text, "hint": it.hint} for it in self.reasons]
+        return {"level": self.level, "reasons": reasons}
 
 
 def judge(

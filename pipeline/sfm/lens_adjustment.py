@@ -112,14 +112,14 @@ class LensAdjustment:
 
 
 def adjust_lenses(
-    model: pycolmap.Reconstruction, freedoms: Mapping[int, LensFreedom], doubt: bool = False
+    model: pycolmap.Reconstruction, freedoms: Mapping[int, LensFreedom], with_covariances: bool = False
 ) -> LensAdjustment:
     """Adjust poses, points and free lens parameters in place, with equal feature weights and the gauge fixed.
 
     Args:
         model: A model whose cameras are of wide models.
         freedoms: By camera id.
-        doubt: Also estimate covariances.
+        with_covariances: Also estimate covariances.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
@@ -135,7 +135,7 @@ def adjust_lenses(
     kept = [free_lens(adjuster.problem, camera, freedoms[number]) for number, camera in sorted(model.cameras.items())]
     pyceres.solve(solver_options(len(photos)), adjuster.problem, pyceres.SolverSummary())
     covariances: dict[int, Float64[np.ndarray, "_ _"]] = {}
-    if doubt:
+    if with_covariances:
         covariance = pycolmap.estimate_ba_covariance_from_problem(_all_covariances(), model, adjuster.problem)
         for number, camera in sorted(model.cameras.items()):
             block = None if covariance is None else covariance.get_other_params_cov(camera.params)

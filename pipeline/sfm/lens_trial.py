@@ -51,7 +51,7 @@ class LensState:
 
     Attributes:
         freedom: Its free parameters.
-        focal_told: Whether the photos determine its focal length.
+        focal_determined: Whether the photos determine its focal length.
         freed: The groups that were kept, in order.
         tried: A row for every group that was tried.
         changed: Whether the lens differs from the result of mapping.
@@ -59,7 +59,7 @@ class LensState:
     """
 
     freedom: LensFreedom
-    focal_told: bool
+    focal_determined: bool
     freed: tuple[str, ...] = ()
     tried: tuple[JSON, ...] = ()
     changed: bool = False
@@ -105,7 +105,7 @@ class LensTrial:
             widen(camera)
             set_lens(model.cameras[number], camera.model_name, named_params(camera))
             state = self.states[number]
-            names = (*BASE, *sum(STEPS[camera.model_name], ())) if state.focal_told and not held else ()
+            names = (*BASE, *sum(STEPS[camera.model_name], ())) if state.focal_determined and not held else ()
             freedom = LensFreedom(names, stated_prior(camera))
             wanted[number] = replace(state, freedom=freedom, changed=True, stated=lens.source, freed=("stated",))
         solved, errors = self._solve(model, wanted)
@@ -115,8 +115,8 @@ class LensTrial:
             row = {"freed": "stated", "held_out_gain": round(gain, 4)}
             good = held or gain > -MIN_GAIN
             kept[number] = good
-            told = state if good else self.states[number]
-            wanted[number] = replace(told, tried=(*self.states[number].tried, {**row, "kept": good}))
+            chosen = state if good else self.states[number]
+            wanted[number] = replace(chosen, tried=(*self.states[number].tried, {**row, "kept": good}))
         self._keep(solved, errors, wanted, kept)
 
     def free_steps(self) -> None:
@@ -157,22 +157,22 @@ class LensTrial:
             gain, sure = self._gain(number, errors)
             row = {"freed": "fisheye", "held_out_gain": round(gain, 4), "kept": sure}
             kept[number] = sure
-            told = wanted[number] if sure else self.states[number]
-            wanted[number] = replace(told, tried=(*self.states[number].tried, row))
+            chosen = wanted[number] if sure else self.states[number]
+            wanted[number] = replace(chosen, tried=(*self.states[number].tried, row))
         self._keep(solved, errors, wanted, kept)
 
     def _free_group(self, groups: Mapping[int, tuple[str, ...]]) -> None:
         if not groups:
             return
         wanted = {number: self._with(number, names) for number, names in groups.items()}
-        solved, errors = self._solve(pycolmap.Reconstruction(self.model), wanted, doubt=True)
+        solved, errors = self._solve(pycolmap.Reconstruction(self.model), wanted, with_covariances=True)
         kept = {}
         for number, names in groups.items():
             gain, sure = self._gain(number, errors)
-            effect, sigma, focal = self._doubt(number, names, solved, wanted[number])
+            effect, sigma, focal = self._effect_and_uncertainty(number, names, solved, wanted[number])
             least = MIN_EFFECT * self._typical(number)
-            told = effect >= max(least, MIN_SIGMAS * sigma) and focal <= UNOBSERVED
-            kept[number] = sure and told
+            observable = effect >= max(least, MIN_SIGMAS * sigma) and focal <= UNOBSERVED
+            kept[number] = sure and observable
             row = {
                 "freed": " ".join(names),
                 "held_out_gain": round(gain, 4),
@@ -187,7 +187,7 @@ class LensTrial:
             wanted[number] = state
         self._keep(solved, errors, wanted, kept)
 
-    def _doubt(
+    def _effect_and_uncertainty(
         self, number: int, names: tuple[str, ...], solved: LensAdjustment, state: LensState
     ) -> tuple[float, float, float]:
         """Return a group's corner effect and its sigma, pixels, and the relative sigma of the focal length."""
@@ -225,10 +225,10 @@ class LensTrial:
         return {number: state.freedom for number, state in self.states.items()}
 
     def _solve(
-        self, model: pycolmap.Reconstruction, wanted: Mapping[int, LensState], doubt: bool = False
+        self, model: pycolmap.Reconstruction, wanted: Mapping[int, LensState], with_covariances: bool = False
     ) -> tuple[LensAdjustment, Float64[np.ndarray, " n"]]:
         freedoms = {**self._freedoms(), **{number: state.freedom for number, state in wanted.items()}}
-        solved = adjust_lenses(model, freedoms, doubt)
+        solved = adjust_lenses(model, freedoms, with_covariances)
         return solved, predicted_errors(solved.model, self._tracks)
 
     def _gain(self, number: int, errors: Float64[np.ndarray, " n"]) -> tuple[float, bool]:

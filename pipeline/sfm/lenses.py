@@ -90,7 +90,7 @@ def _with_held(
     lensed = _only(model, set(model.points3D))
     states = {}
     for number, camera in lensed.cameras.items():
-        states[number] = LensState(LensFreedom((), weak_prior(camera)), focal_told=False)
+        states[number] = LensState(LensFreedom((), weak_prior(camera)), focal_determined=False)
         if number in stated:
             lens = stated[number].colmap(number)
             widen(lens)
@@ -134,9 +134,9 @@ def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> 
     sigmas = focal_sigmas(within)
     states = {}
     for number, camera in sorted(within.cameras.items()):
-        told = fewer * sigmas.get(number, math.inf) <= UNOBSERVED
-        free = BASE if told and counts[number] >= MIN_PHOTOS and is_known(camera.model_name) else ()
-        states[number] = LensState(LensFreedom(free, weak_prior(camera)), told)
+        determined = fewer * sigmas.get(number, math.inf) <= UNOBSERVED
+        free = BASE if determined and counts[number] >= MIN_PHOTOS and is_known(camera.model_name) else ()
+        states[number] = LensState(LensFreedom(free, weak_prior(camera)), determined)
     return states
 
 
@@ -205,7 +205,7 @@ def _rows(
             "width": camera.width,
             "freed": list(state.freed),
             "stated": state.stated,
-            "focal_told": state.focal_told,
+            "focal_told": state.focal_determined,
             "tried": list(state.tried),
             "moved_px": _rms(apart_px(camera, before.cameras[number], turn=True)),
         }

@@ -116,8 +116,8 @@ class _SpzSplat:
             try:
                 return reader.read(path).turned("y up").gaussians
             except SplatpipeError as error:
-                told = error.message.replace(str(path), f"The SPZ file in {container.path}")
-                raise SplatpipeError(told, hint=error.hint) from error
+                message = error.message.replace(str(path), f"The SPZ file in {container.path}")
+                raise SplatpipeError(message, hint=error.hint) from error
 
 
 @dataclass(frozen=True)
@@ -210,12 +210,12 @@ def _splat(container: Container, primitive: Mapping[str, Any]) -> _Splat | _SpzS
 
 def _harmonics(container: Container, names: Mapping[str, Any]) -> list[str]:
     """SH attribute names of complete degrees, from 0; none if the colour is in COLOR_0."""
-    told = {name for name in names if name.startswith(f"{EXTENSION}:SH_DEGREE_")}
+    present = {name for name in names if name.startswith(f"{EXTENSION}:SH_DEGREE_")}
     for degree in range(MAX_DEGREE, -1, -1):
         wanted = harmonics_names(degree)
-        if told == set(wanted):
+        if present == set(wanted):
             return wanted
-    if told:
+    if present:
         container.refuse("its spherical harmonics are not complete to a degree of 0 to 3")
     return []
 

@@ -24,6 +24,6 @@ def sparse_count(comments: Sequence[str], gaussians: int) -> int:
         comments: Comments of a splat's header.
         gaussians: Number of Gaussians in the file.
     """
-    told = [re.fullmatch(rf"{_NAME}: ([0-9]{{1,15}})", comment, re.ASCII) for comment in comments]
-    counts = [int(match[1]) for match in told if match is not None]
+    matches = [re.fullmatch(rf"{_NAME}: ([0-9]{{1,15}})", comment, re.ASCII) for comment in comments]
+    counts = [int(match[1]) for match in matches if match is not None]
     return min(counts[0], gaussians) if counts else gaussians

@@ -26,7 +26,7 @@ from splatpipe.pipeline.surface.whole_file import whole_file, write_whole_text
 
 FORMAT = 1
 METRE_DIGITS = 4  # of lengths and coordinates in the JSON: a tenth of a millimetre
-LIKELY = 0.95  # share of depths whose deviation is within the second one that is told
+LIKELY = 0.95  # the higher of the two quantiles of standard deviations that are reported
 
 
 def height_zero_m(elevation: Elevation, crs: MapCrs) -> float:

@@ -70,16 +70,16 @@ def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence
     """
     start, end = np.array(line[:2], np.float64), np.array(line[2:], np.float64)
     length = float(np.linalg.norm(end - start)) if np.isfinite([start, end]).all() else 0.0
-    told = ",".join(f"{number:.10g}" for number in line)
+    text = ",".join(f"{number:.10g}" for number in line)
     count = math.ceil(length / surface.cell * SAMPLES_PER_CELL) + 1
     if length == 0.0 or count > MAX_SAMPLES:
-        raise SplatpipeError(f"The section {told} has no length, or is far too long.", "Check its coordinates.")
+        raise SplatpipeError(f"The section {text} has no length, or is far too long.", "Check its coordinates.")
     share = np.linspace(0.0, 1.0, count)
     place = start + share[:, None] * (end - start)
     height, sigma_m = surface.along(place)
     if not np.isfinite(height).any():
         raise SplatpipeError(
-            f"The section {told} does not cross the surface model.",
+            f"The section {text} does not cross the surface model.",
             f"Give the easting and northing of its start and end, in {crs.horizontal.name}.",
         )
     metre = ground_metres(crs)

@@ -161,9 +161,9 @@ def _elsewhere(
             hint = "Its coordinates are swapped: in GeoJSON, longitude (or easting) comes first."
     except SplatpipeError:  # swapped coordinates are invalid
         pass
-    told = f"{away / 1000.0:,.1f} km" if away >= 1000.0 else f"{away:.0f} m"
+    distance = f"{away / 1000.0:,.1f} km" if away >= 1000.0 else f"{away:.0f} m"
     return SplatpipeError(
-        f"No part of the capture lies inside the boundary {drawing.name}, {told} {direction} of its centre.", hint
+        f"No part of the capture lies inside the boundary {drawing.name}, {distance} {direction} of its centre.", hint
     )
 
 

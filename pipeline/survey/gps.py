@@ -172,16 +172,16 @@ def _origin(geodetic: Float64[np.ndarray, "n 3"]) -> Origin:
 
 def _residuals(names: Sequence[str], fit: PositionFit) -> dict[str, Any]:
     used = fit.residuals[fit.inliers]
-    told = fit.uncertainty
+    uncertainty = fit.uncertainty
     return {
         "rmse_horizontal_m": _rms(used[:, :2]),
         "rmse_vertical_m": _rms(used[:, 2:]),
         "rmse_m": _rms(used),
         "photos_used": len(used),
-        "over_stated_sigmas": float(np.sqrt((told.noise.factors[[0, 0, 1]] ** 2).mean())),
-        "sigma_scale_percent": 100.0 * told.scale,
-        "sigma_rotation_deg": math.degrees(told.weakest_rad),
-        "uncertainty": told.as_json(),
+        "over_stated_sigmas": float(np.sqrt((uncertainty.noise.factors[[0, 0, 1]] ** 2).mean())),
+        "sigma_scale_percent": 100.0 * uncertainty.scale,
+        "sigma_rotation_deg": math.degrees(uncertainty.weakest_rad),
+        "uncertainty": uncertainty.as_json(),
         "photos": dict(sorted(zip(names, fit.residuals.tolist(), strict=True))),
     }
 

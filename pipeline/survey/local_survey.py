@@ -123,9 +123,9 @@ def _worse_than_stated(frame: Frame) -> Float64[np.ndarray, " 2"]:
     The mean of many errors with correlation r between neighbours is as uncertain as that of independent errors that are
     larger by the square root of (1 + r) / (1 - r).
     """
-    told = frame.residuals.get("uncertainty", {})
-    factors = np.array(told.get("noise_over_stated", [1.0, 1.0]), dtype=np.float64)
-    correlations = np.array(told.get("noise_correlation", [0.0, 0.0]), dtype=np.float64)
+    uncertainty = frame.residuals.get("uncertainty", {})
+    factors = np.array(uncertainty.get("noise_over_stated", [1.0, 1.0]), dtype=np.float64)
+    correlations = np.array(uncertainty.get("noise_correlation", [0.0, 0.0]), dtype=np.float64)
     return np.asarray(np.maximum(1.0, factors * np.sqrt((1.0 + correlations) / (1.0 - correlations))))
 
 

@@ -59,8 +59,8 @@ class TargetSurvey:
         found = named_tracks(self.finds, names, (self.model, self.photos), self._expected(points), seeds)
         if found.named:
             marks = sum(len(each.track.finds) for each in found.named)
-            told = list_names([each.name for each in found.named])
-            report.note(f"Targets detected in the photos: {told}, with {marks} marks.")
+            listed = list_names([each.name for each in found.named])
+            report.note(f"Targets detected in the photos: {listed}, with {marks} marks.")
         refused = [f"{count} {what}" for what, count in sorted(found.refused.items())]
         if refused:
             report.note(f"Targets not used: {', '.join(refused)}.")
@@ -159,9 +159,9 @@ def scale_json(bars: Sequence[ScaleBar], scale: ModelScale | None, frame: Frame)
     if scale is None:
         return {}
     ratio = frame.world_from_model.scale / scale.metres_per_unit
-    told = f"its metres are those of {_counted(scale)}, good to {scale.sigma:.2%} where they lie."
+    sentence = f"its metres are those of {_counted(scale)}, good to {scale.sigma:.2%} where they lie."
     if frame.origin is not None:
-        told = f"by {_counted(scale)} (good to {scale.sigma:.2%}) lengths are {ratio - 1.0:+.2%} off."
+        sentence = f"by {_counted(scale)} (good to {scale.sigma:.2%}) lengths are {ratio - 1.0:+.2%} off."
     rows = [
         {
             "a": bar.a,
@@ -173,7 +173,7 @@ def scale_json(bars: Sequence[ScaleBar], scale: ModelScale | None, frame: Frame)
         for k, (bar, error) in enumerate(zip(bars, scale.errors_m, strict=True))
     ]
     placed = frame.origin is not None
-    return {"scale": {"metric": True, "placed": placed, "sentence": told, "sigma": scale.sigma, "bars": rows}}
+    return {"scale": {"metric": True, "placed": placed, "sentence": sentence, "sigma": scale.sigma, "bars": rows}}
 
 
 def _counted(scale: ModelScale) -> str:

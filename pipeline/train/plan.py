@@ -82,7 +82,7 @@ class TrainingPlan:
         schedule = asdict(self.schedule)
         parts = {f"{part}_{name}": value for part in ("rates", "density") for name, value in schedule.pop(part).items()}
         found = parts | self.options.model_dump(mode="json") | schedule
-        looks = [f"{size} until {stretch.until:,}" for size, stretch in zip(*self._told_sizes(), strict=True)]
+        looks = [f"{size} until {stretch.until:,}" for size, stretch in zip(*self._size_labels(), strict=True)]
         return found | {"initial_gaussians": self.initial_gaussians, "stretches": "; ".join(looks)}
 
     def digest(self) -> str:
@@ -128,7 +128,7 @@ class TrainingPlan:
         """The photos at their training sizes."""
         return footage_of(self.sizes or ((1, 1, len(self.train_views)),), self.megapixels, self.window_pixels)
 
-    def _told_sizes(self) -> tuple[list[str], tuple[Stretch, ...]]:
+    def _size_labels(self) -> tuple[list[str], tuple[Stretch, ...]]:
         stretches, footage = self.schedule.stretches, self.footage
         whole = [1e-6 * footage.pixels(TrainingSize(stretch.level)) for stretch in stretches]
         windows = [" in windows" if stretch.window_pixels else "" for stretch in stretches]
@@ -138,7 +138,7 @@ class TrainingPlan:
         """The plan as one readable line."""
         options = self.options
         parts = [
-            self._told_size(),
+            self._size_text(),
             f"up to {options.max_gaussians:,} Gaussians",
             f"{self.schedule.iterations:,} iterations",
         ]
@@ -149,16 +149,16 @@ class TrainingPlan:
             parts.append(f"within {options.max_memory_bytes / 1e9:.1f} GB")
         return "plan: " + ", ".join(parts)
 
-    def _told_size(self) -> str:
+    def _size_text(self) -> str:
         """The photos' size, from first to last, and that of the windows."""
         footage, finest = self.footage, self.schedule.finest
         first = 1e-6 * footage.pixels(TrainingSize(self.schedule.stretches[0].level))
-        told = f"{self.train_megapixels:.2f} MP"
+        text = f"{self.train_megapixels:.2f} MP"
         if len(self.schedule.stretches) > 1:
-            told = f"{first:.2f} to {told}"
+            text = f"{first:.2f} to {text}"
         if finest.window_pixels:
-            told += f" in windows of {1e-6 * footage.pixels(finest):.2f} MP"
-        return told
+            text += f" in windows of {1e-6 * footage.pixels(finest):.2f} MP"
+        return text
 
     @staticmethod
     def from_json(text: str) -> TrainingPlan:

@@ -32,8 +32,8 @@ def with_measurements(page: bytes, measurements: Mapping[str, Any] | None) -> by
     _, end, rest = after.partition(END)
     if not mark or not end:
         raise ValueError("the page has no place for measurements")
-    told = NOTHING
+    content = NOTHING
     if measurements is not None:
-        told = script_safe(json.dumps(measurements, ensure_ascii=False, allow_nan=False, sort_keys=True)).encode()
-        told += b" " * (zlib.crc32(told) % SIZES)
-    return b"".join((before, mark, told, end, rest))
+        content = script_safe(json.dumps(measurements, ensure_ascii=False, allow_nan=False, sort_keys=True)).encode()
+        content += b" " * (zlib.crc32(content) % SIZES)
+    return b"".join((before, mark, content, end, rest))

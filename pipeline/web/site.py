@@ -61,8 +61,8 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
         (folder / name).mkdir(parents=True)
     tree = [_write_node(folder, node, splat.facts.antialias) for node in nodes]
     number = {id(node): k for k, node in enumerate(nodes)}
-    for told, node in zip(tree, nodes, strict=True):
-        told["children"] = [number[id(child)] for child in node.children]
+    for entry, node in zip(tree, nodes, strict=True):
+        entry["children"] = [number[id(child)] for child in node.children]
     for shown, address in zip(scene.cameras, thumbs, strict=True):
         if shown.thumb is not None and address is not None:
             (folder / address).write_bytes(shown.thumb)

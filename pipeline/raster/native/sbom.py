@@ -38,9 +38,9 @@ def main() -> int:
     parser.add_argument("output", type=Path)
     parser.add_argument("--nanobind", required=True, help="Version of nanobind that the kernels' module was made with.")
     parser.add_argument("--cuda", default="", help="Version of the CUDA runtime in libsplat_cuda.so, if there is one.")
-    told = parser.parse_args()
-    text = json.dumps(bill(told.nanobind, told.cuda), indent=2, ensure_ascii=False)
-    told.output.write_text(text + "\n", encoding="utf-8")
+    arguments = parser.parse_args()
+    text = json.dumps(bill(arguments.nanobind, arguments.cuda), indent=2, ensure_ascii=False)
+    arguments.output.write_text(text + "\n", encoding="utf-8")
     return 0
 
 

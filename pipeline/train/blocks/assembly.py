@@ -47,7 +47,7 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
     plans = {"coarse": _read(coarse / "plan.json"), "blocks": [_read(each / "plan.json") for each in inputs.shards]}
     (out / "plan.json").write_text(json_text(plans), encoding="utf-8")
     most = sum(block.share for block in site.blocks)
-    return {"gaussians": count, "blocks": len(inputs.shards), **_told(inputs, history, most)}
+    return {"gaussians": count, "blocks": len(inputs.shards), **_summary(inputs, history, most)}
 
 
 def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:
@@ -59,9 +59,9 @@ def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:
     there = {number for number, folder in enumerate(shards, 1) if (folder / "model.ply").is_file()}
     missing = [str(number) for number in range(1, len(site.blocks) + 1) if number not in there]
     if missing or len(shards) > len(site.blocks):
-        told = f"block {', '.join(missing)} has no model" if missing else f"{len(shards)} models are here"
+        problem = f"block {', '.join(missing)} has no model" if missing else f"{len(shards)} models are here"
         raise StageError(
-            f"The {len(site.blocks)} blocks cannot be merged: {told}.",
+            f"The {len(site.blocks)} blocks cannot be merged: {problem}.",
             hint="Run again with --rerun-from train: missing blocks are trained.",
         )
 
@@ -107,12 +107,12 @@ def _side_by_side(curves: Sequence[Sequence[Mapping[str, Any]]], before: int) ->
     length = max(map(len, curves), default=0)
     for step in range(1, length + 1):
         points = [curve[math.ceil(step * len(curve) / length) - 1] for curve in curves]
-        told = [(float(point["loss"]), float(point["iteration"])) for point in points if point["loss"] is not None]
-        weight = sum(iterations for _, iterations in told)
+        losses = [(float(point["loss"]), float(point["iteration"])) for point in points if point["loss"] is not None]
+        weight = sum(iterations for _, iterations in losses)
         found.append(
             {
                 "iteration": before + sum(int(point["iteration"]) for point in points),
-                "loss": sum(loss * iterations for loss, iterations in told) / weight if weight else None,
+                "loss": sum(loss * iterations for loss, iterations in losses) / weight if weight else None,
                 "gaussians": sum(int(point["gaussians"]) for point in points),
                 "sh_degree": max(int(point["sh_degree"]) for point in points),
                 "width": max(int(point["width"]) for point in points),
@@ -121,7 +121,7 @@ def _side_by_side(curves: Sequence[Sequence[Mapping[str, Any]]], before: int) ->
     return found
 
 
-def _told(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JSON]:
+def _summary(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JSON]:
     """The training's summary: sums over its blocks and the coarse pass; the loss is that of the blocks."""
     first = inputs.summaries.get("blocks", {}).get("coarse", {})
     each = [inputs.summaries.get(f"train.{number}", {}) for number in range(1, len(inputs.shards) + 1)]
@@ -136,7 +136,7 @@ def _told(inputs: Inputs, history: Mapping[str, Any], most: int) -> dict[str, JS
     }
     if sizes := [float(part["train_megapixels"]) for part in each if part.get("train_megapixels")]:
         found["train_megapixels"] = max(sizes)
-    if flat := {name: told for name, part in _named(first, each).items() if (told := _ended_flat(part))}:
+    if flat := {name: ended for name, part in _named(first, each).items() if (ended := _ended_flat(part))}:
         found["flat"] = flat
     if robust := [part for part in each if "robust_left_out" in part]:
         photos = sum(part["photos"] for part in robust)

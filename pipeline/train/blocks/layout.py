@@ -75,7 +75,7 @@ def lay_out(
         around = _look_around(partition, parts, forecasts, scene, out / PROSPECTS, report)
         if train.prune_free_space:
             write_free_space(out / PROSPECTS, free_space(cameras, xyz, observed))
-    told: Mapping[str, JSON] = {
+    summary: Mapping[str, JSON] = {
         "limit_bytes": division.limit_bytes,
         "margin": partition.margin,
         "photos": [forecast.photos for forecast in forecasts],
@@ -87,7 +87,7 @@ def lay_out(
         "frozen": [min(limit.frozen, count) for limit, count in zip(limits, around, strict=True)],
         "disk_bytes": [forecast.disk_bytes for forecast in forecasts],
     }
-    return SitePlan(partition, tuple(limits), division.window_pixels, division.limit_bytes), {"of_blocks": told}
+    return SitePlan(partition, tuple(limits), division.window_pixels, division.limit_bytes), {"of_blocks": summary}
 
 
 def _look_around(
