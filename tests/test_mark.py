@@ -123,11 +123,11 @@ def test_twelve_points_marked_in_the_browser_georeference_the_demo(
     errors, unseen = [], 0
     for _ in range(400):
         now = state(page)
-        done = {point["name"] for point in now["told"]["points"] if point["marks"] >= MARKS}
+        done = {point["name"] for point in now["overview"]["points"] if point["marks"] >= MARKS}
         if done >= set(TWELVE):
             break
-        if now["told"]["expected_m"] and (not errors or errors[-1] != now["told"]["expected_m"]):
-            errors.append(now["told"]["expected_m"])
+        if now["overview"]["expected_m"] and (not errors or errors[-1] != now["overview"]["expected_m"]):
+            errors.append(now["overview"]["expected_m"])
         point, photo = now["point"], now["photo"]
         if point not in TWELVE or point in done:
             page.keyboard.press("j")
@@ -140,7 +140,7 @@ def test_twelve_points_marked_in_the_browser_georeference_the_demo(
     assert unseen <= len(TWELVE)  # the page seldom asks for a point where something hides it
     assert done >= set(TWELVE)
     assert errors[0][0] > 1.0 and errors[-1][0] < 0.03 and errors[-1][1] < 0.03
-    told = now["told"]
+    told = now["overview"]
     assert told["file"] == str(file) and told["tables"]["check"]["rmse_horizontal_m"] < 0.03
     assert watched.errors == [] and all(url.startswith(server.address) for url in watched.requests)
     for (name, photo), pixel in marks_in(file).items():
@@ -469,7 +469,7 @@ def test_detected_targets_are_shown_moved_and_rejected_in_the_browser(found_run:
     with serving(found_run, "--mark") as server:
         watched = opened(open_page, server, 1000, 640)
         page = watched.page
-        told = state(page)["told"]
+        told = state(page)["overview"]
         assert sum(point["found"] for point in told["points"]) == sum(point["marks"] for point in told["points"]) > 200
         photo, pixel = "DJI_0034.JPG", TRUTH["P16"]["seen_px"]["DJI_0034.JPG"]
         page.evaluate(f"splatpipe.mark.goTo('P16', '{photo}')")

@@ -15,7 +15,7 @@ const MODELS = {
   model: "finished, iteration",
 };
 
-let told = null;
+let latest = null;
 let updates = 0;
 let view = null; // name of the photo shown
 let pictured = { address: "" };
@@ -27,8 +27,8 @@ async function ask() {
     if (!answer.ok) throw new Error();
     const text = await answer.text();
     const next = JSON.parse(text);
-    if (!told || JSON.stringify({ ...next, now_s: 0 }) !== JSON.stringify({ ...told, now_s: 0 })) updates += 1;
-    told = next;
+    if (!latest || JSON.stringify({ ...next, now_s: 0 }) !== JSON.stringify({ ...latest, now_s: 0 })) updates += 1;
+    latest = next;
     show();
   } catch {
     $("state").textContent = "The server does not answer.";
@@ -51,11 +51,11 @@ function duration(seconds) {
 const make = (tag, name, text) => Object.assign(document.createElement(tag), { className: name, textContent: text });
 
 function show() {
-  const running = told.stages.find((stage) => stage.state === "running");
-  const failed = told.stages.find((stage) => stage.state === "failed");
+  const running = latest.stages.find((stage) => stage.state === "running");
+  const failed = latest.stages.find((stage) => stage.state === "failed");
   showState(running, failed);
   $("stages").replaceChildren(
-    ...told.stages.map((stage) => {
+    ...latest.stages.map((stage) => {
       const item = make("li", stage.state, stage.name);
       item.title = NAMES[stage.state] + (stage.seconds == null ? "" : `, ${duration(stage.seconds)}`);
       return item;
@@ -65,13 +65,13 @@ function show() {
   showViews();
   showCurves();
   $("notes").replaceChildren(
-    ...told.notes.toReversed().map((note) => make("li", note.kind, [`${note.stage}:`, note.message, note.hint].filter(Boolean).join(" "))),
+    ...latest.notes.toReversed().map((note) => make("li", note.kind, [`${note.stage}:`, note.message, note.hint].filter(Boolean).join(" "))),
   );
 }
 
 function showState(running, failed) {
-  const all = told.stages.length > 0 && told.stages.every((stage) => ["done", "reused"].includes(stage.state));
-  const [kind, text] = told.at_work
+  const all = latest.stages.length > 0 && latest.stages.every((stage) => ["done", "reused"].includes(stage.state));
+  const [kind, text] = latest.at_work
     ? ["running", running ? running.name : "beginning"]
     : failed
       ? ["failed", `${failed.name}: ${failed.message}`]
@@ -80,13 +80,13 @@ function showState(running, failed) {
         : ["failed", "not at work"];
   $("state").className = `state ${kind}`;
   $("state").textContent = text;
-  const after = told.left_after_s ? `, ${duration(running.seconds_left + told.left_after_s)} with those that follow` : "";
+  const after = latest.left_after_s ? `, ${duration(running.seconds_left + latest.left_after_s)} with those that follow` : "";
   $("left").textContent =
-    told.at_work && running?.seconds_left != null ? `${duration(running.seconds_left)} left in ${running.name}${after}` : "";
+    latest.at_work && running?.seconds_left != null ? `${duration(running.seconds_left)} left in ${running.name}${after}` : "";
 }
 
 function showProgress(running) {
-  const stage = told.at_work ? running : null;
+  const stage = latest.at_work ? running : null;
   const share = stage?.total ? Math.min(1, stage.done / stage.total) : 0;
   $("progress").hidden = !stage?.total;
   $("progress").setAttribute("aria-valuenow", String(Math.round(100 * share)));
@@ -97,23 +97,23 @@ function showProgress(running) {
 
 function showViews() {
   const select = $("view");
-  const names = told.views.map((each) => each.name + (each.held_out ? " (held out)" : ""));
+  const names = latest.views.map((each) => each.name + (each.held_out ? " (held out)" : ""));
   if (names.join() !== [...select.options].map((option) => option.textContent).join()) {
-    select.replaceChildren(...told.views.map((each, k) => Object.assign(make("option", "", names[k]), { value: each.name })));
+    select.replaceChildren(...latest.views.map((each, k) => Object.assign(make("option", "", names[k]), { value: each.name })));
   }
-  view = told.views.some((each) => each.name === view) ? view : (told.views.find((each) => each.held_out) ?? told.views[0])?.name;
+  view = latest.views.some((each) => each.name === view) ? view : (latest.views.find((each) => each.held_out) ?? latest.views[0])?.name;
   if (view) select.value = view;
-  const number = told.views.findIndex((each) => each.name === view);
-  const model = told.model;
+  const number = latest.views.findIndex((each) => each.name === view);
+  const model = latest.model;
   for (const id of ["view", "previous", "next"]) $(id).disabled = number < 0;
   $("nothing").hidden = Boolean(model);
-  $("iteration").textContent = model ? tellModel(model) : "";
+  $("iteration").textContent = model ? modelLabel(model) : "";
   $("viewer").hidden = !model?.in_3d;
   $("viewer").href = `/live/${model?.stamp}/viewer.html`;
   if (model && number >= 0) picture(model.stamp, number);
 }
 
-function tellModel(model) {
+function modelLabel(model) {
   const count = ["initial", "coarse"].includes(model.kind) ? "" : ` ${model.iteration?.toLocaleString("en")}`;
   return `${model.block ? `block ${model.block}, ` : ""}${MODELS[model.kind]}${count}`;
 }
@@ -139,17 +139,17 @@ async function picture(stamp, number) {
 }
 
 function showCurves() {
-  for (const [name, points] of Object.entries(told.curves)) {
+  for (const [name, points] of Object.entries(latest.curves)) {
     const node = $(name);
     if (!node || !points.length) continue;
-    node.previousElementSibling.textContent = CURVES[name] + tellPart(told.curves_of);
+    node.previousElementSibling.textContent = CURVES[name] + partLabel(latest.curves_of);
     const data = [points.map((point) => point[0]), points.map((point) => point[1])];
     plots[name] ??= plot(node, name);
     plots[name].setData(data);
   }
 }
 
-function tellPart(stage) {
+function partLabel(stage) {
   return stage === "blocks" ? ", before blocks" : stage.includes(".") ? `, block ${stage.split(".")[1]}` : "";
 }
 
@@ -172,8 +172,8 @@ function plot(node, name) {
 }
 
 function choose(by) {
-  const at = told.views.findIndex((each) => each.name === view);
-  view = told.views[(at + by + told.views.length) % told.views.length].name;
+  const at = latest.views.findIndex((each) => each.name === view);
+  view = latest.views[(at + by + latest.views.length) % latest.views.length].name;
   showViews();
 }
 
@@ -184,10 +184,10 @@ $("view").addEventListener("change", (event) => {
 $("previous").addEventListener("click", () => choose(-1));
 $("next").addEventListener("click", () => choose(1));
 document.addEventListener("keydown", (event) => {
-  if (event.target.matches("select") || !told?.views.length) return;
+  if (event.target.matches("select") || !latest?.views.length) return;
   if (event.key === "ArrowLeft") choose(-1);
   if (event.key === "ArrowRight") choose(1);
 });
 
-window.splatpipe = { live: { state: () => told, updates: () => updates } };
+window.splatpipe = { live: { state: () => latest, updates: () => updates } };
 ask();

@@ -25,7 +25,7 @@ const KEYS = [
   ["R  Ctrl+Y", "redo"],
 ];
 
-const state = { told: null, detail: null, point: 0, asked: 0, photo: -1, moved: null, order: new Map(), wanted: 6, acting: Promise.resolve() };
+const state = { overview: null, detail: null, point: 0, requested: 0, photo: -1, moved: null, order: new Map(), wanted: 6, acting: Promise.resolve() };
 const photos = new Photos();
 const picture = new Picture($("canvas"), $("overall"), {
   click: (place) => row() && mark(place, false),
@@ -34,34 +34,34 @@ const picture = new Picture($("canvas"), $("overall"), {
 let outbox;
 
 const row = (photo = state.photo) => state.detail?.photos.find((each) => each.photo === photo);
-const pointName = () => state.told.points[state.point].name;
+const pointName = () => state.overview.points[state.point].name;
 const place = () => row()?.mark ?? state.moved ?? row()?.predicted;
 
 async function begin() {
-  state.told = await fetchJson("/api/mark");
+  state.overview = await fetchJson("/api/mark");
   state.wanted = Number(localStorage.getItem("splatpipe.wanted")) || state.wanted;
-  outbox = new Outbox(state.told.file, numbers, hear);
+  outbox = new Outbox(state.overview.file, numbers, onResult);
   await outbox.send();
-  const first = state.told.points.findIndex(needsMore);
+  const first = state.overview.points.findIndex(needsMore);
   await choosePoint(Math.max(0, first));
 }
 
 function numbers({ point, photo }) {
   const at = (list, name) => list.findIndex((each) => each.name === name);
-  return [at(state.told.points, point), at(state.told.photos, photo)];
+  return [at(state.overview.points, point), at(state.overview.photos, photo)];
 }
 
 const needsMore = (point) => point.marks < state.wanted && point.left > 0;
 
 // The server's answer: applied unless changes of ours are still pending.
-function hear({ answer, refused }) {
+function onResult({ answer, refused }) {
   if (refused) hint(refused, true);
   if (answer && outbox.count === 0) take(answer);
   showSaved();
 }
 
 function take(answer) {
-  state.told = answer.overview;
+  state.overview = answer.overview;
   if (answer.detail && answer.detail.name === pointName()) setDetail(answer.detail);
   showAll();
 }
@@ -76,9 +76,9 @@ function setDetail(detail) {
 
 // Until the point's photos are known and its photo is loaded, clicks apply to what is shown.
 async function choosePoint(number, photo) {
-  state.asked = number;
+  state.requested = number;
   const detail = await fetchJson(`/api/mark/${number}`);
-  if (state.asked !== number) return;
+  if (state.requested !== number) return;
   state.point = number;
   state.order.delete(detail.name);
   setDetail(detail);
@@ -93,7 +93,7 @@ async function choosePhoto(number) {
   state.photo = number;
   state.moved = null;
   hint("");
-  const size = state.told.photos[number];
+  const size = state.overview.photos[number];
   picture.show(null, size); // without a photo, nothing can be clicked
   showAll();
   try {
@@ -102,7 +102,7 @@ async function choosePhoto(number) {
     picture.show(bitmap, size);
     home();
     const next = nextLeft();
-    if (next) photos.get(next.photo, state.told.photos[next.photo]).catch(() => 0);
+    if (next) photos.get(next.photo, state.overview.photos[next.photo]).catch(() => 0);
   } catch (error) {
     if (state.photo === number) hint(error.message, true);
   }
@@ -125,12 +125,12 @@ function nextLeft() {
 }
 
 function send(change) {
-  const photo = state.told.photos[state.photo].name;
+  const photo = state.overview.photos[state.photo].name;
   outbox.add({ point: pointName(), photo, ...change });
 }
 
 function mark([x, y], nudge) {
-  const size = state.told.photos[state.photo];
+  const size = state.overview.photos[state.photo];
   const inside = (value, most) => Math.round(Math.min(most, Math.max(0, value)) * 100) / 100;
   const here = row();
   here.mark = [inside(x, size.width), inside(y, size.height)];
@@ -164,7 +164,7 @@ async function accept() {
 async function onward() {
   const next = nextLeft();
   if (next && state.detail.photos.filter((each) => each.mark).length < state.wanted) return choosePhoto(next.photo);
-  const { points } = state.told;
+  const { points } = state.overview;
   const order = [...points.keys()].map((k) => (state.point + 1 + k) % points.length);
   const other = order.find((k) => k !== state.point && needsMore(points[k]));
   if (other != null) return choosePoint(other);
@@ -197,7 +197,7 @@ async function turnBack(what) {
   try {
     const answer = await post(`/api/mark/${what}`, {});
     if (answer.point == null) return hint(`Nothing to ${what}.`);
-    state.told = answer.overview;
+    state.overview = answer.overview;
     if (answer.point !== state.point) await choosePoint(answer.point, answer.photo);
     else {
       setDetail(answer.detail);
@@ -215,7 +215,7 @@ function step(by) {
   return choosePhoto(rows[(at + by + rows.length) % rows.length].photo);
 }
 
-const stepPoint = (by) => choosePoint((state.point + by + state.told.points.length) % state.told.points.length);
+const stepPoint = (by) => choosePoint((state.point + by + state.overview.points.length) % state.overview.points.length);
 
 function hint(text, bad = false) {
   $("hint").textContent = text;
@@ -231,12 +231,12 @@ function showSaved() {
 }
 
 function showAll() {
-  const { told, detail } = state;
-  showEstimate($("estimate"), told);
-  showPoints($("list"), told, state.point, state.wanted, (number) => atOnce(() => choosePoint(number)));
+  const { overview, detail } = state;
+  showEstimate($("estimate"), overview);
+  showPoints($("list"), overview, state.point, state.wanted, (number) => atOnce(() => choosePoint(number)));
   showFile();
-  $("undo").disabled = !told.can_undo && !outbox?.count;
-  $("redo").disabled = !told.can_redo;
+  $("undo").disabled = !overview.can_undo && !outbox?.count;
+  $("redo").disabled = !overview.can_redo;
   if (detail) {
     showPhotos(document.querySelector("#photos ol"), detail.photos, state.photo, (number) => atOnce(() => choosePhoto(number)));
     $("point").textContent = detail.name;
@@ -244,7 +244,7 @@ function showAll() {
     const found = detail.photos.filter((each) => each.found).length;
     const left = detail.photos.filter(isLeft).length;
     $("about").textContent = `marked in ${marked},${found ? ` found in ${found},` : ""} ${left} to do`;
-    $("photo").textContent = state.told.photos[state.photo]?.name ?? "";
+    $("photo").textContent = state.overview.photos[state.photo]?.name ?? "";
   }
   picture.draw();
   showSaved();
@@ -258,8 +258,8 @@ function showFile() {
   }
   $("file").replaceChildren(
     element("p", {}, "Mark each point in ", wanted),
-    element("p", {}, "Marks go into ", element("code", {}, state.told.file), ` in ${state.told.crs}.`),
-    element("p", {}, "Then: ", element("code", {}, state.told.command)),
+    element("p", {}, "Marks go into ", element("code", {}, state.overview.file), ` in ${state.overview.crs}.`),
+    element("p", {}, "Then: ", element("code", {}, state.overview.command)),
   );
 }
 
@@ -337,7 +337,7 @@ const ready = begin().catch((error) => hint(error.message, true));
 window.splatpipe = {
   mark: {
     ready,
-    state: () => ({ point: pointName(), photo: state.told.photos[state.photo].name, told: state.told, detail: state.detail, waiting: outbox.count }),
+    state: () => ({ point: pointName(), photo: state.overview.photos[state.photo].name, overview: state.overview, detail: state.detail, waiting: outbox.count }),
     goTo: (point, photo) => choosePoint(...numbers({ point, photo })),
     screenAt: (at) => {
       picture.resize(); // the layout may have changed since the last frame

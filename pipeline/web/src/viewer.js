@@ -20,12 +20,12 @@
 
 import { Box3, Vector3 } from "three";
 import { fillStrip, Frusta, frustumDepth } from "./viewer/cameras.js";
-import { told, toCrs } from "./viewer/crs.js";
+import { coordinateLabels, toCrs } from "./viewer/crs.js";
 import { LoadError } from "./viewer/error.js";
 import { fetchPatiently } from "./viewer/files.js";
 import { readLevels } from "./viewer/levels.js";
 import { Measuring } from "./viewer/measure.js";
-import { acceptFile, loaded, note, progress, tell } from "./viewer/messages.js";
+import { acceptFile, loaded, note, progress, showMessage } from "./viewer/messages.js";
 import { Navigation } from "./viewer/navigation.js";
 import { bytesOf, readFacts, readMeasurements, readPoints, readSplat } from "./viewer/page.js";
 import { readPart } from "./viewer/part.js";
@@ -71,8 +71,8 @@ class Viewer {
     this.results = this.makeResults();
     this.stage.scene.add(this.frusta.group);
     this.stage.beforeDraw = () => this.beforeDraw();
-    this.stage.failed = (error) => tell(`Drawing failed: ${error.message}`, "Reload this page, or try another browser.");
-    this.stage.canvas.addEventListener("webglcontextlost", () => tell("The graphics card stopped drawing.", "Reload this page."));
+    this.stage.failed = (error) => showMessage(`Drawing failed: ${error.message}`, "Reload this page, or try another browser.");
+    this.stage.canvas.addEventListener("webglcontextlost", () => showMessage("The graphics card stopped drawing.", "Reload this page."));
     new ResizeObserver(() => this.stage.resize()).observe(this.stage.canvas);
     if (facts.sky) this.stage.scene.add(makeSky(await bytesOf(facts.sky.colours), facts.sky, facts.background));
     this.points = makePoints();
@@ -170,7 +170,7 @@ class Viewer {
       height: () => this.use("height"),
       undo: () => {
         this.measuring.undo();
-        this.tellTool(null);
+        this.showMeasurement(null);
       },
       screenshot: () => this.screenshot(),
       help_button: () => ($("help").open ? $("help").close() : $("help").showModal()),
@@ -255,14 +255,14 @@ class Viewer {
     const photo = this.tool ? null : this.frusta.at(this.view, x, y);
     if (photo) return this.goTo(photo);
     const point = this.pick(x, y);
-    this.tellPoint(point);
+    this.showCoordinates(point);
     if (!this.tool) return;
     if (!point) {
       $("hint").textContent = "No surface here: click on the model.";
       return;
     }
     const result = this.measuring.click(point);
-    this.tellTool(result);
+    this.showMeasurement(result);
   }
 
   hover(x, y) {
@@ -279,7 +279,7 @@ class Viewer {
     if (now - (this.hovered ?? 0) < HOVER_MS || this.view.journey) return;
     this.hovered = now;
     const point = this.pick(x, y);
-    this.tellPoint(point);
+    this.showCoordinates(point);
     if (this.tool) this.measuring.hover(point);
   }
 
@@ -288,8 +288,8 @@ class Viewer {
     if (this.frusta.mark(null)) this.stage.invalidate();
   }
 
-  tellPoint(point) {
-    const values = point ? told(this.facts, array(point)) : [];
+  showCoordinates(point) {
+    const values = point ? coordinateLabels(this.facts, array(point)) : [];
     $("coordinates").textContent = values.map(([label, value]) => `${label} ${value}`).join("   ");
     $("where").classList.toggle("off", !point);
   }
@@ -299,16 +299,16 @@ class Viewer {
     this.measuring.use(this.tool);
     for (const name of ["distance", "height"]) $(name).setAttribute("aria-pressed", String(this.tool === name));
     document.body.classList.toggle("measuring", this.tool !== null);
-    this.tellTool(null);
+    this.showMeasurement(null);
   }
 
-  tellTool(result) {
+  showMeasurement(result) {
     const { measuring } = this;
     const hint = $("hint");
     hint.hidden = !this.tool && !result;
     if (result) {
       const { distance, horizontal, height } = result;
-      hint.textContent = `Length ${measuring.told(distance)} · horizontal ${measuring.told(horizontal)} · height ${measuring.told(height, true)}`;
+      hint.textContent = `Length ${measuring.formatLength(distance)} · horizontal ${measuring.formatLength(horizontal)} · height ${measuring.formatLength(height, true)}`;
     } else if (this.tool) {
       hint.textContent = measuring.first ? "Click the second point." : "Click the first point. Esc to finish, Backspace to undo.";
     }
@@ -396,6 +396,6 @@ window.splatpipe = viewer.api(ready);
 ready.catch((error) => {
   const known = error instanceof LoadError;
   const beside = viewer.facts.splat?.inlined === false;
-  tell(known ? error.message : `The model cannot be shown: ${error.message}`, known ? error.hint : "Try another browser.", beside);
+  showMessage(known ? error.message : `The model cannot be shown: ${error.message}`, known ? error.hint : "Try another browser.", beside);
   if (viewer.stage && beside) acceptFile((bytes) => viewer.show(bytes));
 });

@@ -19,28 +19,28 @@ export function metres(value) {
   return size >= 0.00995 ? `${(value * 100).toFixed(size >= 0.0995 ? 0 : 1)} cm` : `${(value * 1000).toFixed(0)} mm`;
 }
 
-export function showEstimate(root, told) {
+export function showEstimate(root, overview) {
   root.replaceChildren(element("h2", {}, "Fit of the marks"));
-  if (!told.placed) {
+  if (!overview.placed) {
     root.append(element("p", {}, "No frame yet: mark three points, each in two photos or more."));
   } else {
-    const [horizontal, vertical] = told.expected_m ?? [NaN, NaN];
+    const [horizontal, vertical] = overview.expected_m ?? [NaN, NaN];
     const row = (title, h, v, count) =>
       element("tr", {}, element("th", {}, title), element("td", {}, count ?? ""), element("td", {}, metres(h)), element("td", {}, metres(v)));
     const head = ["", "points", "horizontal", "height"].map((text) => element("th", {}, text));
     const table = element("table", {}, element("tr", {}, ...head));
-    const { control, check } = told.tables;
+    const { control, check } = overview.tables;
     if (control) table.append(row("control, rms", control.rmse_horizontal_m, control.rmse_up_m, control.count));
     if (check) table.append(row("check, rms", check.rmse_horizontal_m, check.rmse_up_m, check.count));
-    table.append(row("expected (σ)", horizontal, told.heights_tied ? vertical : NaN));
-    root.append(table, element("p", { class: "faint" }, `A pixel is ${metres(told.gsd_m)} on the ground.`));
-    if (!told.heights_tied) root.append(element("p", {}, "Heights are not tied to the survey yet: mark one point in two photos."));
+    table.append(row("expected (σ)", horizontal, overview.heights_tied ? vertical : NaN));
+    root.append(table, element("p", { class: "faint" }, `A pixel is ${metres(overview.gsd_m)} on the ground.`));
+    if (!overview.heights_tied) root.append(element("p", {}, "Heights are not tied to the survey yet: mark one point in two photos."));
   }
-  for (const warning of told.warnings) root.append(element("p", { class: "warning" }, warning));
+  for (const warning of overview.warnings) root.append(element("p", { class: "warning" }, warning));
 }
 
-export function showPoints(root, told, chosen, wanted, choose) {
-  const rows = told.points.map((point, number) => {
+export function showPoints(root, overview, chosen, wanted, choose) {
+  const rows = overview.points.map((point, number) => {
     const [state, text] = stateOf(point, wanted);
     const size = point.residual_m && Math.hypot(...point.residual_m.map((value) => value ?? 0));
     return element(

@@ -30,11 +30,11 @@ export async function post(path, body) {
 }
 
 export class Outbox {
-  // Pending changes, in order; `hear` is called with answers and errors.
-  constructor(key, numbers, hear) {
+  // Pending changes, in order; `onResult` is called with answers and errors.
+  constructor(key, numbers, onResult) {
     this.key = `splatpipe.marks:${key}`;
     this.numbers = numbers;
-    this.hear = hear;
+    this.onResult = onResult;
     this.waiting = [];
     this.sending = null;
     this.trouble = "";
@@ -69,7 +69,7 @@ export class Outbox {
     } catch {
       // A browser without storage: the page itself still holds them.
     }
-    this.hear({});
+    this.onResult({});
   }
 
   // Resolves when nothing is pending any more, or when something has to be sent later.
@@ -88,16 +88,16 @@ export class Outbox {
         this.trouble = "";
         this.waiting.shift();
         this.keep();
-        this.hear({ answer });
+        this.onResult({ answer });
       } catch (error) {
         if (error.status === 400) {
           this.waiting.shift(); // it will never be accepted
           this.keep();
-          this.hear({ refused: `${change.point} in ${change.photo}: ${error.message}` });
+          this.onResult({ refused: `${change.point} in ${change.photo}: ${error.message}` });
           continue;
         }
         this.trouble = error.status ? error.message : "The server does not answer.";
-        this.hear({});
+        this.onResult({});
         setTimeout(() => this.send(), RETRY_MS);
         return;
       }

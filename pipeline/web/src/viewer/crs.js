@@ -16,7 +16,7 @@ export function toCrs(crs, point) {
 }
 
 /** Coordinates for people: [label, value] for each axis. */
-export function told(facts, point) {
+export function coordinateLabels(facts, point) {
   if (!facts.crs) {
     const digits = facts.metres ? 2 : 3;
     return ["x", "y", "z"].map((label, axis) => [label, point[axis].toFixed(digits)]);

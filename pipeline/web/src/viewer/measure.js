@@ -70,12 +70,12 @@ export class Measuring {
     const corner = new Vector3(to.x, to.y, from.z);
     const lines = kind === "height" ? [[corner, to, false], [from, corner, true]] : [[from, to, false]];
     const label = this.label("measured");
-    label.textContent = kind === "height" ? `Δh ${this.told(height, true)}` : this.told(result.distance);
+    label.textContent = kind === "height" ? `Δh ${this.formatLength(height, true)}` : this.formatLength(result.distance);
     const middle = new Vector3().addVectors(lines[0][0], lines[0][1]).multiplyScalar(0.5);
     return { result, lines, label, ends: [this.label("dot"), this.label("dot")], middle };
   }
 
-  told(length, signed = false) {
+  formatLength(length, signed = false) {
     const sign = signed && length > 0 ? "+" : "";
     if (!this.facts.metres) return `${sign}${length.toPrecision(4)} units`;
     return `${sign}${length.toFixed(Math.abs(length) < 1 ? 3 : 2)} m`;

@@ -8,7 +8,7 @@ export function progress(share) {
 }
 
 /** Show a message in the middle of the page, while there is nothing else to see. */
-export function tell(message, hint, choose = false) {
+export function showMessage(message, hint, choose = false) {
   $("loading").hidden = false;
   $("loading").classList.add("failed");
   $("message").textContent = message;
@@ -41,7 +41,7 @@ export function acceptFile(show) {
     try {
       await show(new Uint8Array(await file.arrayBuffer()));
     } catch (error) {
-      tell(error.message, error.hint ?? "", true);
+      showMessage(error.message, error.hint ?? "", true);
     }
   };
   $("file").addEventListener("change", (event) => take(event.target.files[0]));

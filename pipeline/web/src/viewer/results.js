@@ -27,9 +27,9 @@ function sectionLines({ length_m, share_with_height, height_sigma_m }) {
 }
 
 function volumeLines(facts) {
-  const told = (kind) => `${withSigma(facts[`${kind}_m3`], facts[`${kind}_sigma_m3`])} m³`;
+  const volume = (kind) => `${withSigma(facts[`${kind}_m3`], facts[`${kind}_sigma_m3`])} m³`;
   const base = { rim: "the plane through the rim", lowest: "the lowest point of the rim", stated: "a stated height" }[facts.base];
-  return [`net ${told("net")}`, `cut ${told("cut")}, fill ${told("fill")}`, `${facts.area_m2.toFixed(1)} m², over ${base ?? "a base"}`];
+  return [`net ${volume("net")}`, `cut ${volume("cut")}, fill ${volume("fill")}`, `${facts.area_m2.toFixed(1)} m², over ${base ?? "a base"}`];
 }
 
 /** The part of the window not covered by the list and the photos, CSS pixels. */
@@ -66,8 +66,8 @@ export class Results {
 
   title() {
     const count = (kind) => this.items.filter((item) => item.kind === kind).length;
-    const told = (number, one) => (number ? [`${number} ${one}${number === 1 ? "" : "s"}`] : []);
-    return [...told(count("section"), "section"), ...told(count("volume"), "volume")].join(", ");
+    const counted = (number, one) => (number ? [`${number} ${one}${number === 1 ? "" : "s"}`] : []);
+    return [...counted(count("section"), "section"), ...counted(count("volume"), "volume")].join(", ");
   }
 
   button({ kind, name, lines }, index) {
@@ -115,8 +115,8 @@ export class Results {
       return;
     }
     const [height, sigma] = [trace.height[index], trace.sigma[index]];
-    const told = height === null ? "no height here" : `height ${height.toFixed(2)} m${sigma === null ? "" : ` ± ${length(sigma)}`}`;
-    reading.textContent = `${trace.distance[index].toFixed(2)} m: ${told}`;
+    const heightText = height === null ? "no height here" : `height ${height.toFixed(2)} m${sigma === null ? "" : ` ± ${length(sigma)}`}`;
+    reading.textContent = `${trace.distance[index].toFixed(2)} m: ${heightText}`;
     this.traces.point(height === null ? null : new Vector3(trace.x[index], trace.y[index], trace.z[index]));
   }
 

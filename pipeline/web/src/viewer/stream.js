@@ -7,7 +7,7 @@ import { readPart } from "./part.js";
 
 const PIXELS = 8; // on the screen: smaller errors are not refined; Gaussians are then half a pixel off
 const NARROW = "(max-width: 640px), (max-height: 520px), (pointer: coarse)";
-const MOST = { wide: 3_000_000, narrow: 800_000 }; // Gaussians in view that a computer and a phone can draw smoothly
+const MAX_GAUSSIANS = { wide: 3_000_000, narrow: 800_000 }; // Gaussians in view that a computer and a phone can draw smoothly
 const HELD = 1.5; // times as many are in memory at most, including those out of sight: 200 bytes each
 const LITTLE_MEMORY_GB = 4; // with less memory, the phone's limits apply
 const AT_ONCE = { wide: 4, narrow: 2 }; // files: each is decoded by a worker with its own memory
@@ -29,7 +29,7 @@ export class LevelStream {
     this.byFile = new Map(nodes.map((node) => [node.file, node]));
     this.stage = stage;
     this.failed = failed;
-    this.limit(MOST[size()]);
+    this.limit(MAX_GAUSSIANS[size()]);
     this.refined = new Set();
     this.shown = [];
     this.loaded = 0; // Gaussians
@@ -105,8 +105,8 @@ export class LevelStream {
 
   miss(file, error) {
     this.byFile.get(file).failed = true;
-    if (!this.told) this.failed(error);
-    this.told = true;
+    if (!this.failureShown) this.failed(error);
+    this.failureShown = true;
     this.stage.invalidate();
   }
 
