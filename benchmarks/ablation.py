@@ -35,7 +35,7 @@ FRONT_SIZE = 4.0  # photos are registered once at this multiple of the training 
 LARGEST_FRONT = 200.0  # megapixels
 FOLLOW = VARIANTS.with_name("time_to_quality.py")
 CURVE = "curve.json"
-TOLD = ("psnr", "psnr_cc", "best_psnr")  # figures of a finished run, recorded along the way
+RECORDED = ("psnr", "psnr_cc", "best_psnr")  # figures of a finished run, recorded along the way
 AS_TRAINED = ("clean.enabled=false",)  # training is what is compared; a variant with cleaning sets this option
 FRONT = ("ingest", "features", "matches", "sparse", "georef", "undistort")
 
@@ -225,7 +225,7 @@ def run_cases(cases: Sequence[AblationCase], finished: ResultLog, arguments: arg
                 else:
                     row = case.figures(end, arguments.threads)
                     finished.add(case.key, row)
-                    outcome = ", ".join(f"{key} {row[key]:.2f} dB" for key in TOLD if row.get(key) is not None)
+                    outcome = ", ".join(f"{key} {row[key]:.2f} dB" for key in RECORDED if row.get(key) is not None)
                 leave(case.out)
                 walls.append(end.wall_s)
                 left = sum(walls) / len(walls) * (len(wanted) - len(walls)) / arguments.jobs

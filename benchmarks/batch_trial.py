@@ -81,23 +81,24 @@ class BatchTrial:
         """Start the batch."""
         return subprocess.Popen(self.command("--json"), stdout=subprocess.PIPE, text=True)
 
-    def told(self, process: subprocess.Popen[str]) -> dict[str, Any]:
+    def result_of(self, process: subprocess.Popen[str]) -> dict[str, Any]:
         """Return the batch's final report, which must match the one in its folder."""
         printed, _ = process.communicate()
-        told: dict[str, Any] = json.loads(printed)
+        summary: dict[str, Any] = json.loads(printed)
         filed = json.loads((self.out / "batch.json").read_text(encoding="utf-8"))
-        check(filed["captures"] == told["captures"], "batch.json says what the command says")
+        check(filed["captures"] == summary["captures"], "batch.json says what the command says")
         check(
-            process.returncode == told["exit_code"] == filed["exit_code"], f"exit code {process.returncode} everywhere"
+            process.returncode == summary["exit_code"] == filed["exit_code"],
+            f"exit code {process.returncode} everywhere",
         )
         rows = (self.out / "batch.csv").read_text(encoding="utf-8")
-        for capture in told["captures"]:
+        for capture in summary["captures"]:
             check(
                 f"{capture['name']},{capture['state']}," in rows, f"batch.csv: {capture['name']} is {capture['state']}"
             )
             print(f"    {capture['name']}: {capture['state']} {capture['stage']} | {capture['verdict']} | "
                   f"{capture['reason'][:160]!r} | tries {capture['tries']} {list(capture['earlier'])}")  # fmt: skip
-        return told
+        return summary
 
     def events(self) -> dict[str, bytes]:
         """Return the event log of every capture: it shows which stages ran."""
@@ -109,15 +110,15 @@ def first(night: BatchTrial) -> None:
     print("The night:")
     process = night.start()
     killed = kill_in_training(night.out / "killed", process)
-    told = night.told(process)
-    states = {capture["name"]: capture for capture in told["captures"]}
+    result = night.result_of(process)
+    states = {capture["name"]: capture for capture in result["captures"]}
     check({name: capture["state"] for name, capture in states.items()} == EXPECTED, "each in its right state")
-    check(told["exit_code"] == 1, "exit code 1, since not all succeeded")
+    check(result["exit_code"] == 1, "exit code 1, since not all succeeded")
     check(
         all(states[name]["reason"] and states[name]["hint"] for name in EXPECTED if EXPECTED[name] == "failed"),
         "each failure has a reason and a hint",
     )
-    check("cut off" in states["broken"]["reason"], "the broken photos are told to be cut off")
+    check("cut off" in states["broken"]["reason"], "the broken photos are reported as cut off")
     check(
         "control" in states["wrong control"]["reason"] or "gcp_list" in states["wrong control"]["reason"],
         "the control file is named",
@@ -136,11 +137,11 @@ def repeated(night: BatchTrial) -> None:
     while process.poll() is None:
         seen |= set(descendants(process.pid))
         time.sleep(0.01)
-    told = night.told(process)
+    result = night.result_of(process)
     check(night.events() == before, "no capture has a new event")
     check(not seen, f"no process was started ({seen or 'none'})")
-    check({capture["state"] for capture in told["captures"]} == {"reused", "failed"}, "all as they were")
-    check(told["exit_code"] == 1, "exit code 1, since not all succeeded")
+    check({capture["state"] for capture in result["captures"]} == {"reused", "failed"}, "all as they were")
+    check(result["exit_code"] == 1, "exit code 1, since not all succeeded")
 
 
 def changed(night: BatchTrial, captures: Mapping[str, Path]) -> None:
@@ -148,7 +149,7 @@ def changed(night: BatchTrial, captures: Mapping[str, Path]) -> None:
     print("One added, one changed:")
     night.write_list(captures, {"orbit": ["train.iterations=120"]})
     before = night.events()
-    told = night.told(night.start())
+    result = night.result_of(night.start())
     after = night.events()
     check({name for name in after if after[name] != before.get(name)} == {"added", "orbit"}, "just these two ran")
     new = [json.loads(line) for line in after["orbit"][len(before["orbit"]) :].splitlines()]
@@ -157,7 +158,7 @@ def changed(night: BatchTrial, captures: Mapping[str, Path]) -> None:
         started == ["blocks", "train", "clean", "evaluate", "export", "flythrough", "splat_depths"],
         f"of the changed one {', '.join(started)}",
     )
-    states = {capture["name"]: capture["state"] for capture in told["captures"]}
+    states = {capture["name"]: capture["state"] for capture in result["captures"]}
     check(states["added"] == states["orbit"] == "done" and states["nadir"] == "reused", "both are done, others reused")
 
 

@@ -195,13 +195,13 @@ def answer(capture: MappingInput) -> tuple[pycolmap.Reconstruction, Row]:
     config, report = SparseConfig(), SilentReporter()
     found = run_ladder(capture, reconstruct(capture, config, report), config, report)
     took = time.process_time() - began
-    told = judge(found.model, found.verified, capture.cameras)
+    verdict = judge(found.model, found.verified, capture.cameras)
     chosen = next(row["how"] for row in found.tried if row["chosen"])
     row = {
         "how": chosen,
         "placed": found.model.num_reg_images(),
-        "verdict": told.level,
-        "against": f"{told.contradicted}/{told.pairs}",
+        "verdict": verdict.level,
+        "against": f"{verdict.contradicted}/{verdict.pairs}",
         "cpu": took,
         "focal": found.model.cameras[min(found.model.cameras)].mean_focal_length(),
     }
@@ -233,11 +233,11 @@ def try_variants(out: Path, only: Sequence[str], sound_mm: float) -> list[Row]:
             cameras = [{**camera, "has_prior": False, "focal_source": "guess"} for camera in capture.cameras]
             model, row = answer(replace(capture, database=database, cameras=cameras))
             error = error_m(model, truth)
-            told = {"name": variant.name, **row, "mm": 1e3 * error, "is": _verdict(row, error, sound, len(truth))}
+            result = {"name": variant.name, **row, "mm": 1e3 * error, "is": _verdict(row, error, sound, len(truth))}
             if before is not None:
-                told |= _before(before, error_m(before, truth), sound, len(truth))
-            rows.append(told)
-            print(variant.name, told["is"], flush=True)
+                result |= _before(before, error_m(before, truth), sound, len(truth))
+            rows.append(result)
+            print(variant.name, result["is"], flush=True)
     return rows
 
 

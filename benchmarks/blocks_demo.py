@@ -112,8 +112,8 @@ def _share(events: Path, before: int) -> float:
         return 0.0
     with events.open("rb") as file:
         file.seek(before)
-        told = [json.loads(line) for line in file.read().split(b"\n")[:-1] if b'"iterations"' in line]
-    steps = [each["data"] for each in told if each["kind"] == "progress"]
+        lines = [json.loads(line) for line in file.read().split(b"\n")[:-1] if b'"iterations"' in line]
+    steps = [each["data"] for each in lines if each["kind"] == "progress"]
     return float(steps[-1]["done"]) / float(steps[-1]["total"]) if steps else 0.0
 
 

@@ -86,9 +86,9 @@ def swap_positions(one: Path, two: Path) -> str:
     photos = [Image.open(path) for path in (one, two)]
     exifs, xmps = [photo.getexif() for photo in photos], [photo.info["xmp"] for photo in photos]
     there = [dict(exif.get_ifd(GPS)) for exif in exifs]
-    told = [[match.group(0) for match in place.finditer(xmp)] for xmp in xmps]
+    stated = [[match.group(0) for match in place.finditer(xmp)] for xmp in xmps]
     for path, photo, exif, xmp, gps, fields in zip(
-        (one, two), photos, exifs, xmps, reversed(there), reversed(told), strict=True
+        (one, two), photos, exifs, xmps, reversed(there), reversed(stated), strict=True
     ):
         exif.get_ifd(GPS).update(gps)
         fresh = iter(fields)
@@ -156,7 +156,7 @@ def put_faults(photos: Path, trial: int) -> list[CaptureFault]:
     return faults
 
 
-def is_told(fault: CaptureFault, findings: list[dict[str, object]]) -> bool:
+def is_reported(fault: CaptureFault, findings: list[dict[str, object]]) -> bool:
     """Whether a finding of the right kind names one of the fault's photos."""
     for finding in findings:
         if re.search(fault.codes, str(finding["code"])):
@@ -171,8 +171,8 @@ def check(capture: Path) -> dict[str, list[dict[str, object]]]:
     done = subprocess.run(
         [*command, "-o", str(capture / "check.html")], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=False
     )
-    told: dict[str, list[dict[str, object]]] = json.loads(done.stdout)
-    return told
+    findings: dict[str, list[dict[str, object]]] = json.loads(done.stdout)
+    return findings
 
 
 def main() -> None:
@@ -188,10 +188,10 @@ def main() -> None:
             findings = check(capture)["findings"]
         for fault in faults:
             kind = re.sub(r"[ ,]*[-+0-9.]+.*| px", "", fault.kind) or fault.kind
-            told = is_told(fault, findings)
+            is_found = is_reported(fault, findings)
             put[kind] += 1
-            found[kind] += told
-            if not told:
+            found[kind] += is_found
+            if not is_found:
                 print(f"trial {trial}: not found: {fault.kind} ({', '.join(fault.photos)})", flush=True)
         faulty = {name for fault in faults for name in fault.photos}
         for finding in findings:

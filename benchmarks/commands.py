@@ -90,9 +90,11 @@ class _Running:
     def start(command: Command) -> _Running:
         command.log.parent.mkdir(parents=True, exist_ok=True)
         words = [sys.executable, *command.words]
-        with command.log.open("wb") as log, _told(command).open("wb") as told:
+        with command.log.open("wb") as log, _output_file(command).open("wb") as output:
             # In a session of its own: the terminal's Ctrl-C reaches only this process, which terminates the children.
-            process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=told, stderr=log, start_new_session=True)
+            process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=output, stderr=log, start_new_session=True
+            )
         return _Running(command, process, time.perf_counter())
 
     def poll(self) -> CommandEnd | None:
@@ -102,11 +104,11 @@ class _Running:
             return None
         self.process.returncode = os.waitstatus_to_exitcode(status)
         failure = _failure(self.command, self.process.returncode)
-        _told(self.command).unlink()
+        _output_file(self.command).unlink()
         return CommandEnd(self.command, failure, time.perf_counter() - self.since, usage.ru_utime + usage.ru_stime)
 
 
-def _told(command: Command) -> Path:
+def _output_file(command: Command) -> Path:
     """Return the file for its standard output: the pipeline's JSON object."""
     return command.log.with_name(f"{command.log.name}.json")
 
@@ -115,7 +117,7 @@ def _failure(command: Command, code: int) -> str:
     if code == 0:
         return ""
     try:
-        error = json.loads(_told(command).read_bytes())["error"]
+        error = json.loads(_output_file(command).read_bytes())["error"]
         text = f"{error['message']} {error['hint']}"
     except (ValueError, KeyError, TypeError):
         text = f"It ended with exit code {code}; see {command.log}."

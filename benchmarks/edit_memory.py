@@ -146,8 +146,8 @@ def main() -> None:
             peaks[size] = measured(command)
         above = peaks["many"][0] - peaks["few"][0]
         share = above / (BYTES * sizes["many"])
-        told = f"{above / 1e6:8.0f} MB above, {share:.2f} × the splat, {peaks['many'][1]:.1f} s"
-        print(f"{name:20} {told}", flush=True)
+        text = f"{above / 1e6:8.0f} MB above, {share:.2f} × the splat, {peaks['many'][1]:.1f} s"
+        print(f"{name:20} {text}", flush=True)
 
 
 if __name__ == "__main__":

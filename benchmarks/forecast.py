@@ -47,14 +47,14 @@ def main() -> int:
         return 0
     fitted_to, others = runs_of(rows)
     if options.costs:
-        sys.stdout.write(told(fit(fitted_to)) + "\n")
+        sys.stdout.write(costs_text(fit(fitted_to)) + "\n")
         return 0
     show(f"{FITTED_TO}, each against the costs of the others: forecast over used", left_out(fitted_to))
     show("other presets, against the costs in stages/costs.py", [compared(run, REFERENCE) for run in others])
     return 0
 
 
-def told(costs: Costs) -> str:
+def costs_text(costs: Costs) -> str:
     """Format costs as in `stages/costs.py`, to three digits."""
     lines = [f"{name}: {getattr(costs, name):.3g}" for name in ("pairs", "gaussians", "flat")]
     lines.append(f"keypoints: { {name: round(count) for name, count in costs.keypoints.items()} }")

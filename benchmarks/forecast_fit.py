@@ -114,8 +114,8 @@ def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
     units = [work.units() for work in works]
     keypoints = dict(base.keypoints)
     for extractor in {run.config.features.extractor for run in runs}:
-        told = [scene.keypoints[extractor] for run, scene in zip(runs, scenes, strict=True) if _uses(run, extractor)]
-        keypoints[extractor] = _typical(told, 0.0)
+        counts = [scene.keypoints[extractor] for run, scene in zip(runs, scenes, strict=True) if _uses(run, extractor)]
+        keypoints[extractor] = _typical(counts, 0.0)
     chosen = [scene.pairs for run, scene in zip(runs, scenes, strict=True) if run.counts["pairs"] < _every(run)]
     ended = [scene.flat for run, scene in zip(runs, scenes, strict=True) if run.config.train.stop_when_flat]
     stages = {}
@@ -206,8 +206,8 @@ def compared(run: FinishedRun, costs: Costs) -> ForecastRatio:
     needs = forecast(run.size, run.config, run.threads, costs=costs)
     used = run.used
 
-    def ratio(join: Callable[[Iterable[float]], float], told: Mapping[str, float], kind: str) -> float:
-        return join(told.values()) / join(used[stage][kind] for stage in used)
+    def ratio(join: Callable[[Iterable[float]], float], predicted: Mapping[str, float], kind: str) -> float:
+        return join(predicted.values()) / join(used[stage][kind] for stage in used)
 
     return ForecastRatio(
         run,

@@ -131,13 +131,13 @@ def build() -> PartOutcome:
 def machine() -> Row:
     """Describe the machine that the figures were measured on."""
     ask = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total,clocks.sm,clocks.mem", "--format=csv,noheader"]
-    told = subprocess.run(ask, capture_output=True, text=True, check=False).stdout if shutil.which(ask[0]) else ""
+    output = subprocess.run(ask, capture_output=True, text=True, check=False).stdout if shutil.which(ask[0]) else ""
     commit = ""
     if shutil.which("git"):
         ask = ["git", "rev-parse", "HEAD"]
         commit = subprocess.run(ask, capture_output=True, text=True, check=False, cwd=ROOT).stdout.strip()
     return {
-        "gpu": told.strip() or "none",
+        "gpu": output.strip() or "none",
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cores": os.cpu_count(),
         "python": platform.python_version(),
@@ -153,8 +153,9 @@ def day(name: str, parts: list[GpuPart], out: Path, pack: Path, seconds: float) 
     print(f"-- build: {built.state}, {built.seconds:.0f} s: {built.rows[0]['built']}", flush=True)
 
     def write(outcomes: list[PartOutcome]) -> None:
-        told = {"benchmark": f"gpu_day {name}", "machine": facts, "parts": [asdict(one) for one in [built, *outcomes]]}
-        (out / f"{name}.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        parts = [asdict(one) for one in [built, *outcomes]]
+        record = {"benchmark": f"gpu_day {name}", "machine": facts, "parts": parts}
+        (out / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
     outcomes: list[PartOutcome] = []
     write(outcomes)

@@ -84,9 +84,9 @@ def training(capture: str, seed: int, iterations: int, on: str) -> Iterator[Row]
     with tempfile.TemporaryDirectory() as scratch:
         began = time.perf_counter()
         trained, found = train_capture(capture, on, Path(scratch), iterations=iterations, seed=seed)
-        told = {name: trained.get(name) for name in ("device", "instruction_set", "gaussians", "train_seconds")}
-        told |= {name: found[name] for name in ("psnr_cc", "psnr", "ssim")}
-        yield {"capture": capture, "seed": seed} | told | {"seconds": round(time.perf_counter() - began, 1)}
+        facts = {name: trained.get(name) for name in ("device", "instruction_set", "gaussians", "train_seconds")}
+        facts |= {name: found[name] for name in ("psnr_cc", "psnr", "ssim")}
+        yield {"capture": capture, "seed": seed} | facts | {"seconds": round(time.perf_counter() - began, 1)}
 
 
 def marked_tests() -> Iterator[Row]:

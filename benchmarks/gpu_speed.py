@@ -183,8 +183,8 @@ def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterato
         took = event_times(lambda: rasterizer.render(model, camera, options), 3, where)
         got = rasterizer.render(model, camera, options).colour
         same = bool(torch.equal(got, expected))
-        told = {"pairs": pairs, "over_2_31": pairs > MANY_PAIRS, "same": same}
-        yield told | {"forward_s": min(took), "peak_gb": peak_gb(where)}
+        facts = {"pairs": pairs, "over_2_31": pairs > MANY_PAIRS, "same": same}
+        yield facts | {"forward_s": min(took), "peak_gb": peak_gb(where)}
         if not same:
             raise SystemExit("the view differs from that of its nearest Gaussians")
 

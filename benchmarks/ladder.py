@@ -103,15 +103,15 @@ def measured(name: str, capture: MappingInput, mapper: str) -> list[Row]:
     found = run_ladder(capture, reconstruct(capture, config, SilentReporter()), config, SilentReporter())
     total = time.process_time() - began
     rows: list[Row] = []
-    for told in found.tried:
-        focal = told.get("focal_px") or [None]
-        note = ("taken" if told["chosen"] else "not taken") + (f"; {told['why']}" if told.get("why") else "")
-        rows.append({"what": told["how"], "photos": told["placed"], "points": told.get("points3d"), "note": note})
-        rows[-1] |= {"error_px": told.get("error_px"), "focal_px": focal[0], "cpu_s": told["cpu_s"]}
-    for told in found.rungs:
-        row = {"what": f"rung: {told['rung']}", "photos": told["photos"], "points": told["points"]}
-        row |= {"pairs": told["verified_pairs_added"], "keypoints": told["keypoints_added"], "cpu_s": told["cpu_s"]}
-        rows.append({**row, "note": f"{told['placed']} of {told['left']} that were left"})
+    for one in found.tried:
+        focal = one.get("focal_px") or [None]
+        note = ("taken" if one["chosen"] else "not taken") + (f"; {one['why']}" if one.get("why") else "")
+        rows.append({"what": one["how"], "photos": one["placed"], "points": one.get("points3d"), "note": note})
+        rows[-1] |= {"error_px": one.get("error_px"), "focal_px": focal[0], "cpu_s": one["cpu_s"]}
+    for rung in found.rungs:
+        row = {"what": f"rung: {rung['rung']}", "photos": rung["photos"], "points": rung["points"]}
+        row |= {"pairs": rung["verified_pairs_added"], "keypoints": rung["keypoints_added"], "cpu_s": rung["cpu_s"]}
+        rows.append({**row, "note": f"{rung['placed']} of {rung['left']} that were left"})
     rows.append(_end(found, total))
     return [{"capture": name, "of": len(capture.photos), **row} for row in rows]
 
@@ -135,16 +135,16 @@ def main() -> None:
     arguments.add_argument("--mapper", default="auto", choices=("auto", "incremental", "global"))
     arguments.add_argument("--left", action="store_true", help="make captures of which much is left")
     arguments.add_argument("--json", type=Path, help="write the rows here, too")
-    told = arguments.parse_args()
+    options = arguments.parse_args()
     pycolmap.logging.minloglevel = 2
     rows: list[Row] = []
-    for out, photos in zip(told.runs[::2], told.runs[1::2], strict=True):
+    for out, photos in zip(options.runs[::2], options.runs[1::2], strict=True):
         with tempfile.TemporaryDirectory(prefix="ladder-") as scratch:
             capture = read_capture(out, photos, Path(scratch))
-            rows += measured(out.name, with_photos_left(capture) if told.left else capture, told.mapper)
+            rows += measured(out.name, with_photos_left(capture) if options.left else capture, options.mapper)
         print_table(out.name, [row for row in rows if row["capture"] == out.name], COLUMNS)
-    if told.json:
-        told.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

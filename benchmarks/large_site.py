@@ -47,13 +47,13 @@ COLUMNS = {
     "photos": "photos:,",
     "iterations": "iterations:,",
     "Gaussians": "gaussians:,",
-    "memory told MB": "memory_told:MB",
+    "memory forecast MB": "memory_forecast:MB",
     "measured": "memory:MB",
     "ratio": "memory_ratio:.2f",
-    "disk told MB": "disk_told:MB",
+    "disk forecast MB": "disk_forecast:MB",
     "measured ": "disk:MB",
     "ratio ": "disk_ratio:.2f",
-    "CPU s told": "cpu_told:.0f",
+    "CPU s forecast": "cpu_forecast:.0f",
     "measured  ": "cpu:.0f",
     "ratio  ": "cpu_ratio:.2f",
 }
@@ -181,7 +181,7 @@ def main() -> None:
     options.add_argument("--preset", default="standard")
     options.add_argument("--set", nargs="*", default=[], metavar="SECTION.OPTION=VALUE")
     options.add_argument("--threads", type=int, default=2)
-    options.add_argument("--told-only", action="store_true", help="train nothing")
+    options.add_argument("--forecast-only", action="store_true", help="train nothing")
     arguments = options.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     limits = {
@@ -202,7 +202,7 @@ def main() -> None:
         options.exit(2, "That much memory holds the site in one: lower --max-memory, or raise --gaussians.\n")
     print(f"{tiling.photos:,} photos in {len(tiling.offsets)} tiles, {blocks_text(work.blocks)}; machine {speed:.2f}")
     _report_whole(needs)
-    if arguments.told_only:
+    if arguments.forecast_only:
         return
 
     began = time.process_time()
@@ -212,14 +212,14 @@ def main() -> None:
     inputs = Inputs(parts, arguments.work, machine=Machine("cpu", arguments.threads))
     shutil.rmtree(arguments.work / PROSPECTS, ignore_errors=True)
     (arguments.work / PROSPECTS).mkdir()
-    site, told = lay_out(config.train, inputs, work.blocks.division, arguments.work, WarningReporter())
+    site, forecast = lay_out(config.train, inputs, work.blocks.division, arguments.work, WarningReporter())
     (arguments.work / "blocks.json").write_text(site.to_json(), encoding="utf-8")
     print(
         f"{len(load_views(parts['undistort.dataset'])):,} photos laid out and cut: {time.process_time() - began:.0f} s"
     )
     parts |= {"blocks.plan": arguments.work / "blocks.json", "blocks.coarse": coarse}
     parts["blocks.prospects"] = arguments.work / PROSPECTS
-    of_blocks = told["of_blocks"]
+    of_blocks = forecast["of_blocks"]
     print(f"photos a block: {of_blocks['photos']}; iterations: {of_blocks['iterations']}")
     print(f"Gaussians that each begins with: {of_blocks['start']}; around it: {of_blocks['frozen']}")
     own = needs_of_blocks(work, of_blocks, speed)
@@ -227,7 +227,7 @@ def main() -> None:
     for place, block in zip(("middle", "edge"), middle_and_edge(site.partition.cells), strict=True):
         took = trained(block + 1, site, parts, config, arguments.work, arguments.threads)
         rows.append(_row(f"{block + 1}, {place}", own[f"train.{block + 1}"], took, of_blocks, block))
-        print_table("told against measured", rows, COLUMNS)
+        print_table("forecast against measured", rows, COLUMNS)
 
 
 def _report_whole(needs: dict[str, Need]) -> None:
@@ -246,13 +246,13 @@ def _row(name: str, need: Need, took: Row, of_blocks: dict[str, list[int]], bloc
         "photos": of_blocks["photos"][block],
         "iterations": took["summary"]["iterations"],
         "gaussians": took["summary"]["gaussians"],
-        "memory_told": need.memory_bytes,
+        "memory_forecast": need.memory_bytes,
         "memory": took["memory"],
         "memory_ratio": took["memory"] / need.memory_bytes,
-        "disk_told": disk,
+        "disk_forecast": disk,
         "disk": took["disk"],
         "disk_ratio": took["disk"] / disk,
-        "cpu_told": need.cpu_seconds,
+        "cpu_forecast": need.cpu_seconds,
         "cpu": took["cpu"],
         "cpu_ratio": took["cpu"] / need.cpu_seconds,
     }

@@ -76,11 +76,11 @@ def main() -> None:
 def photo_cameras(out: Path) -> list[Camera]:
     """Return the run's cameras at half size."""
     found = []
-    for told in json.loads((out / "cameras.json").read_text(encoding="utf-8")):
-        pose, turn = np.eye(4), np.array(told["rotation"]).T
-        pose[:3, :3], pose[:3, 3] = turn, -turn @ np.array(told["position"])
-        width, height = told["width"], told["height"]
-        camera = Camera(told["img_name"], width, height, told["fx"], told["fy"], width / 2, height / 2, pose)
+    for entry in json.loads((out / "cameras.json").read_text(encoding="utf-8")):
+        pose, turn = np.eye(4), np.array(entry["rotation"]).T
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ np.array(entry["position"])
+        width, height = entry["width"], entry["height"]
+        camera = Camera(entry["img_name"], width, height, entry["fx"], entry["fy"], width / 2, height / 2, pose)
         found.append(camera.scaled(width // 2, height // 2))
     return found
 

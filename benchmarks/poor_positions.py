@@ -180,11 +180,13 @@ def row_of(scene: SimulatedCameras, case: PositionError, seeds: int) -> Row:
             frame, _ = georeference(part.model, positions, "auto", photos)
         except FrameUndeterminedError:
             continue
-        told = frame.residuals["uncertainty"]
+        figures = frame.residuals["uncertainty"]
         keys = ("offset", "north", "up", "scale")
         units = ("m", "deg", "deg", "percent")
         sigma, bound = (
-            np.concatenate([np.atleast_1d(told[f"{key}_{what}_{unit}"]) for key, unit in zip(keys, units, strict=True)])
+            np.concatenate(
+                [np.atleast_1d(figures[f"{key}_{what}_{unit}"]) for key, unit in zip(keys, units, strict=True)]
+            )
             for what in ("sigma", "95")
         )
         error = errors_of(frame, part)

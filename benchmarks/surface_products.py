@@ -238,9 +238,9 @@ def read_facades(path: Path, from_crs: Callable[[Points], Points]) -> list[Facad
         UsageError: if it is invalid.
     """
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8"))
         facades = []
-        for each in told["facades"] if isinstance(told, dict) else told:
+        for each in data["facades"] if isinstance(data, dict) else data:
             with warnings.catch_warnings(), open_plain(path.parent / each["depth"]) as held:
                 depth, there = held.read(1).astype(np.float64), held.dataset_mask() > 0
             corners = from_crs(np.array(each["corners"], np.float64).reshape(4, 3))

@@ -57,7 +57,7 @@ PUBLISHED_COLUMNS = {
     "hardware": "on:",
 }
 # From each table of surface_truth: the row, the key, and its label.
-TOLD = {
+TABLE_COLUMNS = {
     "dsm": (
         ("roofs and ground", "nmad", "NMAD, GSD"),
         ("roofs and ground", "bias", "bias, GSD"),
@@ -91,16 +91,16 @@ def stage_rows(line: str, artifacts: Mapping[str, Artifact]) -> list[Row]:
     """
     rows = []
     for name, artifact in artifacts.items():
-        told: Mapping[str, Any] = artifact.manifest
-        machine = told["machine"]
+        manifest: Mapping[str, Any] = artifact.manifest
+        machine = manifest["machine"]
         rows.append(
             {
                 "line": "both" if name in SHARED else line,
                 "stage": name,
-                "cpu": told.get("cpu_seconds"),
-                "seconds": told.get("seconds"),
-                "peak": told.get("peak_memory_bytes"),
-                "bytes": sum(file["size"] for part in told["parts"].values() for file in part["files"]),
+                "cpu": manifest.get("cpu_seconds"),
+                "seconds": manifest.get("seconds"),
+                "peak": manifest.get("peak_memory_bytes"),
+                "bytes": sum(file["size"] for part in manifest["parts"].values() for file in part["files"]),
                 "machine": f"{machine['processor']}, {machine['threads']} threads, {machine['device']}",
             }
         )
@@ -124,9 +124,9 @@ def product_rows(line: str, out: Path, tables: Mapping[str, list[Row]]) -> list[
     """
     rows: list[Row] = []
     files = find_products(out)
-    for table, told in TOLD.items():
+    for table, columns in TABLE_COLUMNS.items():
         for row in tables.get(table, []):
-            wanted = [(key, what) for of, key, what in told if of in (None, row.get("what"))]
+            wanted = [(key, what) for of, key, what in columns if of in (None, row.get("what"))]
             product = row["what"] if table == "points" else table
             for key, what in wanted:
                 figure: Row = {"product": product, "line": line, "what": what, "found": row.get(key)}
@@ -166,8 +166,8 @@ def main() -> None:
     print_table("what it gives", sorted(products, key=lambda row: str(row["product"])), FIGURES)
     print_table("published: minutes for a building, photos to products", PUBLISHED, PUBLISHED_COLUMNS)
     if arguments.json:
-        told = {"stages": stages, "products": products, "published": PUBLISHED}
-        arguments.json.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        report = {"stages": stages, "products": products, "published": PUBLISHED}
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

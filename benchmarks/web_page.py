@@ -110,7 +110,7 @@ class Traffic:
         session.on("Network.requestWillBeSent", asked)
         session.on("Network.dataReceived", received)
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Summarise the traffic."""
         return f"{self.received / 1e6:.1f} MB in {len(self.requests)} requests to {len(self.hosts)} host"
 
@@ -146,32 +146,32 @@ class PageVisit:
         began = time.perf_counter()
         page.goto(address, wait_until="commit")
         page.wait_for_function("() => window.splatpipe?.facts")
-        print(f"\n{name} at {self._size}: script after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
+        print(f"\n{name} at {self._size}: script after {time.perf_counter() - began:.1f} s, {self._traffic.summary()}")
         page.evaluate("() => splatpipe.ready")
-        print(f"  first whole picture after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
+        print(f"  first whole picture after {time.perf_counter() - began:.1f} s, {self._traffic.summary()}")
         self._print_memory()
         page.screenshot(path=pictures / f"{name}-{self._size}-first.png")
         if options.first_only:
             return
         page.evaluate("() => splatpipe.complete()")
-        print(f"  in full after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
+        print(f"  in full after {time.perf_counter() - began:.1f} s, {self._traffic.summary()}")
         self._print_memory()
         page.screenshot(path=pictures / f"{name}-{self._size}-full.png")
         nearer(page)
         page.evaluate("() => splatpipe.complete()")
-        print(f"  nearer in full after {time.perf_counter() - began:.1f} s, {self._traffic.told()}")
+        print(f"  nearer in full after {time.perf_counter() - began:.1f} s, {self._traffic.summary()}")
         self._print_memory()
         page.screenshot(path=pictures / f"{name}-{self._size}-near.png")
 
     def _print_memory(self) -> None:
         """Print the memory of the browser's processes: the page's own, and the renderer's, in place of GPU memory."""
         session = self._browser.new_browser_cdp_session()
-        told = {}
+        sizes = {}
         for process in session.send("SystemInfo.getProcessInfo")["processInfo"]:
             if process["type"] in ("renderer", "GPU"):
-                told[process["type"]] = max(told.get(process["type"], 0.0), resident_bytes(process["id"]))
+                sizes[process["type"]] = max(sizes.get(process["type"], 0.0), resident_bytes(process["id"]))
         session.detach()
-        words = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in sorted(told.items()))
+        words = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in sorted(sizes.items()))
         heap = self._page.evaluate("() => performance.memory.usedJSHeapSize")
         print(f"    resident: {words}; JS heap {heap / 1e6:.0f} MB")
 

@@ -18,9 +18,9 @@ sys.path.insert(0, str(Path(__file__).parent / "lines"))
 import leftovers
 
 
-def main(photos: str, out: str, told: str, threads: str) -> None:
+def main(photos: str, out: str, stop_at: str, threads: str) -> None:
     def die(event: Event) -> None:
-        if told and event.kind == "progress" and told in str(event.data["what"]):
+        if stop_at and event.kind == "progress" and stop_at in str(event.data["what"]):
             os.killpg(os.getpgid(0), signal.SIGKILL)
 
     config = resolve(leftovers.LineConfig, [{"sparse": {"mapper": "incremental", "lens": "simple"}}])

@@ -53,8 +53,8 @@ def test_only_new_trainings_run(dataset: Path, tmp_path: Path, capfd: pytest.Cap
     work = tmp_path / "work"
     smooth = ("--only", "smooth", "--variant", "smooth=train.antialias=true")
     code, first = ablate(dataset, work, *smooth, "--seeds", "2")
-    told = capfd.readouterr()
-    assert code == 0 and told.err.count("min left") == 4
+    printed = capfd.readouterr()
+    assert code == 0 and printed.err.count("min left") == 4
     assert {(each["variant"], each["seed"]) for each in first["rows"]} == {
         (variant, seed) for variant in ("base", "smooth") for seed in (0, 1)
     }
@@ -72,9 +72,9 @@ def test_only_new_trainings_run(dataset: Path, tmp_path: Path, capfd: pytest.Cap
     assert kept == {"log", "metrics.json"}
 
     code, again = ablate(dataset, work, *smooth, "--seeds", "2")
-    retold = capfd.readouterr()
-    assert code == 0 and "min left" not in retold.err
-    assert again["rows"] == first["rows"] and tables(retold.out) == tables(told.out)
+    repeated = capfd.readouterr()
+    assert code == 0 and "min left" not in repeated.err
+    assert again["rows"] == first["rows"] and tables(repeated.out) == tables(printed.out)
 
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -91,14 +91,14 @@ def test_only_new_trainings_run(dataset: Path, tmp_path: Path, capfd: pytest.Cap
     )
     broken = ("--variant", "broken=ingest.min_size=9999", "--seeds", "1")  # fails as soon as it runs
     code, partly = ablate(dataset, work, *changed, *broken)
-    told = capfd.readouterr()
-    assert code == 1 and told.err.count("min left") == 2  # the base is there
+    printed = capfd.readouterr()
+    assert code == 1 and printed.err.count("min left") == 2  # the base is there
     found = {each["variant"]: each for each in partly["rows"]}
     assert found.keys() == {"base", "smooth"} and found["base"] == by_name["base", 0]
     assert found["smooth"]["psnr"] != by_name["smooth", 0]["psnr"]
     lost, failure = partly["machine"]["failed"]
     assert (failure["capture"], failure["variant"]) == ("tiny", "broken")
-    assert "ingest.min_size=9999" in failure["message"] and "None of the 9" in " ".join(told.out.split())
+    assert "ingest.min_size=9999" in failure["message"] and "None of the 9" in " ".join(printed.out.split())
     assert (lost["capture"], lost["variant"]) == ("lost", None) and "a.jpg" in lost["message"]
 
 

@@ -60,7 +60,7 @@ def control(
 ) -> dict[str, Any]:
     """A control.json: the points seen in every photo, two of them check points, surveyed ``off_m`` from the wall."""
     surveyed = WORLD_FROM_MODEL.apply(points) + off_m
-    told = []
+    entries = []
     for number, (point, place) in enumerate(zip(points, surveyed, strict=True)):
         in_cameras = [camera.cam_from_world[:3, :3] @ point + camera.cam_from_world[:3, 3] for camera in views]
         observations = [
@@ -68,8 +68,8 @@ def control(
             for camera, x in zip(views, in_cameras, strict=True)
         ]
         role = "check" if number < 2 else "control"
-        told.append({"name": f"P{number}", "role": role, "surveyed_m": place.tolist(), "observations": observations})
-    return {"crs": "EPSG:32633", "points": told}
+        entries.append({"name": f"P{number}", "role": role, "surveyed_m": place.tolist(), "observations": observations})
+    return {"crs": "EPSG:32633", "points": entries}
 
 
 @pytest.fixture
@@ -97,17 +97,17 @@ def test_a_true_splat_has_no_residuals(parts: dict[str, Path]) -> None:
     tables = result["splat"]["tables"]
     assert (tables["control"]["count"], tables["check"]["count"], tables["all"]["count"]) == (4, 2, 6)
     assert tables["all"]["rmse_3d_m"] < RENDERED
-    for told, point in zip(result["splat"]["points"], WORLD_FROM_MODEL.apply(points_on_the_wall()), strict=True):
-        np.testing.assert_allclose(told["estimated_m"], point, atol=2.0 * RENDERED)
-        assert len(told["observations"]) == tiny_scene.CAMERAS and not told["held_out"]
+    for entry, point in zip(result["splat"]["points"], WORLD_FROM_MODEL.apply(points_on_the_wall()), strict=True):
+        np.testing.assert_allclose(entry["estimated_m"], point, atol=2.0 * RENDERED)
+        assert len(entry["observations"]) == tiny_scene.CAMERAS and not entry["held_out"]
 
 
 def test_georefs_findings_on_each_point_are_kept(parts: dict[str, Path]) -> None:
-    told = json.loads(parts["georef.control"].read_text())
-    told["points"][1] |= {"why": "", "residual_m": [0.01, 0.02, None], "surveyed_crs": [388_710.5, 5_299_705.2, None]}
-    told["points"][1]["observations"][0]["residual_px"] = [0.3, -0.4]
-    told["points"][1]["observations"][1]["residual_px"] = [0.0, 1.2]
-    rewrite(parts["georef.control"], told)
+    stored = json.loads(parts["georef.control"].read_text())
+    stored["points"][1] |= {"why": "", "residual_m": [0.01, 0.02, None], "surveyed_crs": [388_710.5, 5_299_705.2, None]}
+    stored["points"][1]["observations"][0]["residual_px"] = [0.3, -0.4]
+    stored["points"][1]["observations"][1]["residual_px"] = [0.0, 1.2]
+    rewrite(parts["georef.control"], stored)
     point = measured(parts)["points"][1]
     assert (point["name"], point["role"], point["photos"]) == ("P1", "check", 9)
     assert point["residual_m"] == [0.01, 0.02, None] and point["surveyed_crs"][0] == 388_710.5
@@ -126,9 +126,9 @@ def test_the_offset_of_a_misplaced_splat_is_reported(parts: dict[str, Path]) -> 
 
 def test_only_held_out_photos_count_if_three_of_them_see_the_point(parts: dict[str, Path]) -> None:
     names = [camera.name for camera in cameras()]
-    told = json.loads(parts["georef.control"].read_text())
-    told["points"][0]["observations"] = told["points"][0]["observations"][2:]  # in two of the held-out ones
-    rewrite(parts["georef.control"], told)
+    stored = json.loads(parts["georef.control"].read_text())
+    stored["points"][0]["observations"] = stored["points"][0]["observations"][2:]  # in two of the held-out ones
+    rewrite(parts["georef.control"], stored)
     points = measured(parts, (names[0], names[3], names[5]))["splat"]["points"]
     assert [seen["photo"] for seen in points[1]["observations"]] == [names[0], names[3], names[5]]
     assert points[1]["held_out"] and not points[0]["held_out"]
@@ -148,24 +148,24 @@ def test_median_over_photos_tolerates_one_floater(parts: dict[str, Path]) -> Non
 
 
 def test_a_mark_that_georef_rejected_is_not_used(parts: dict[str, Path]) -> None:
-    told = json.loads(parts["georef.control"].read_text())
-    wrong = told["points"][0]["observations"][0]
+    stored = json.loads(parts["georef.control"].read_text())
+    wrong = stored["points"][0]["observations"][0]
     wrong |= {"ray": [0.4, 0.4], "residual_px": [900.0, 0.0], "used": False}
-    rewrite(parts["georef.control"], told)
+    rewrite(parts["georef.control"], stored)
     result = measured(parts)
     assert wrong["photo"] not in [seen["photo"] for seen in result["splat"]["points"][0]["observations"]]
     assert (result["points"][0]["photos"], result["points"][0]["rms_px"]) == (tiny_scene.CAMERAS - 1, None)
 
 
 def test_points_without_a_height_photo_or_surface_are_reported_as_far_as_possible(parts: dict[str, Path]) -> None:
-    told = json.loads(parts["georef.control"].read_text())
-    told["points"][2]["surveyed_m"][2] = None
-    for seen in told["points"][3]["observations"]:
+    stored = json.loads(parts["georef.control"].read_text())
+    stored["points"][2]["surveyed_m"][2] = None
+    for seen in stored["points"][3]["observations"]:
         seen["photo"] = "elsewhere.jpg"
-    for seen in told["points"][4]["observations"]:
+    for seen in stored["points"][4]["observations"]:
         seen["ray"] = [0.45, 0.3]  # past the wall
-    told["points"][5]["role"] = "left_out"
-    rewrite(parts["georef.control"], told)
+    stored["points"][5]["role"] = "left_out"
+    rewrite(parts["georef.control"], stored)
     splat = measured(parts)["splat"]
     assert splat["points"][2]["residual_m"][2] is None and splat["points"][2]["estimated_m"][2] is not None
     assert splat["points"][3]["estimated_m"] is None and splat["points"][4]["estimated_m"] is None
@@ -282,7 +282,7 @@ def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixt
     assert "Positions of" not in shown
     flights = [{"flight": 0, "offset_m": [0.001, 0.0, -47.002]}, {"flight": 1, "offset_m": [0.001, 0.0, 0.002]}]
     show_accuracy({"tables": {"gps": {**check, "flights": flights}}}, [])
-    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Positions of")]
-    assert told == ["Positions of flight 1: common offset east +0.001, north +0.000, up -47.002 m."]
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Positions of")]
+    assert lines == ["Positions of flight 1: common offset east +0.001, north +0.000, up -47.002 m."]
     show_accuracy({}, [])
     assert capsys.readouterr().err == ""

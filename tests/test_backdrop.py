@@ -190,11 +190,11 @@ def test_a_photo_that_hardly_shows_the_inside_is_not_counted(inputs: Inputs, tmp
     bounded = replace(inputs, parts={**inputs.parts, "georef.boundary": tmp_path / "boundary.json"})
     evaluate.run(EvaluateConfig(), bounded, tmp_path, tiny_scene.Recorder())
     result = json.loads((tmp_path / "metrics.json").read_text())
-    told = [view["psnr"] for view in result["per_view"] if view["psnr"] is not None]
+    psnrs = [view["psnr"] for view in result["per_view"] if view["psnr"] is not None]
     for view in result["per_view"]:
         assert (view["psnr"] is None) == (view["counted"] < 0.01) and view["whole"]["psnr"] is not None
-    assert 0 < len(told) < len(result["per_view"])
-    assert result["mean"]["psnr"] == pytest.approx(sum(told) / len(told), abs=2e-6)
+    assert 0 < len(psnrs) < len(result["per_view"])
+    assert result["mean"]["psnr"] == pytest.approx(sum(psnrs) / len(psnrs), abs=2e-6)
 
 
 def test_the_inside_comes_first_and_the_page_begins_there(inputs: Inputs, tmp_path: Path) -> None:
@@ -209,9 +209,9 @@ def test_the_inside_comes_first_and_the_page_begins_there(inputs: Inputs, tmp_pa
     assert comment in read_splat_header(tmp_path / "splat.ply").comments
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures["gaussians_inside"] == count and figures["whole"]["psnr"] != figures["psnr"]
-    told = json.loads((tmp_path / "georef.json").read_text())["boundary"]
-    assert told["area_m2"] == pytest.approx(4.0 * 200.0)
-    assert told["wgs84"]["coordinates"][0][0][0] == told["wgs84"]["coordinates"][0][0][-1]
+    psnrs = json.loads((tmp_path / "georef.json").read_text())["boundary"]
+    assert psnrs["area_m2"] == pytest.approx(4.0 * 200.0)
+    assert psnrs["wgs84"]["coordinates"][0][0][0] == psnrs["wgs84"]["coordinates"][0][0][-1]
     page = (tmp_path / "viewer/viewer.html").read_text()
     facts = json.loads(page.split('id="scene"', 1)[1].split(">", 1)[1].split("</script>", 1)[0])
     assert facts["centre"][0] < 5.0 - 0.5  # the world's east of the model's x = 0 is 5

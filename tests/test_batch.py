@@ -43,13 +43,13 @@ def command(captures: Path, out: Path, *more: str) -> list[str]:
 
 def batch(captures: Path, out: Path, *more: str) -> dict[str, object]:
     done = subprocess.run(command(captures, out, *more), capture_output=True, text=True, check=False)
-    told: dict[str, object] = json.loads(done.stdout)
-    assert done.returncode == told["exit_code"], done.stderr
-    return told
+    output: dict[str, object] = json.loads(done.stdout)
+    assert done.returncode == output["exit_code"], done.stderr
+    return output
 
 
-def states(told: dict[str, object]) -> dict[str, str]:
-    return {capture["name"]: capture["state"] for capture in told["captures"]}  # type: ignore[index,attr-defined]
+def states(output: dict[str, object]) -> dict[str, str]:
+    return {capture["name"]: capture["state"] for capture in output["captures"]}  # type: ignore[index,attr-defined]
 
 
 def link(folder: Path, photos: Iterable[Path]) -> Path:
@@ -81,33 +81,33 @@ def test_a_failed_capture_stops_no_other_and_finished_ones_are_not_touched(tmp_p
     night = ("--until", "ingest", "--retries", "1", "--notify", notice)
     os.chdir(tmp_path)
 
-    told = batch(listed, out, *night)
+    output = batch(listed, out, *night)
     bad = dict.fromkeys(("broken", "wrong", "nowhere"), "failed")
-    assert states(told) == {"house": "done", **bad} and told["exit_code"] == 1
-    of = {capture["name"]: capture for capture in told["captures"]}  # type: ignore[attr-defined]
+    assert states(output) == {"house": "done", **bad} and output["exit_code"] == 1
+    of = {capture["name"]: capture for capture in output["captures"]}  # type: ignore[attr-defined]
     assert "is truncated" in of["broken"]["reason"] and of["broken"]["hint"] and of["broken"]["tries"] == 1
     assert "train.iterations" in of["wrong"]["reason"] and "There is no folder" in of["nowhere"]["reason"]
-    assert json.loads((out / "batch.json").read_text())["captures"] == told["captures"]
+    assert json.loads((out / "batch.json").read_text())["captures"] == output["captures"]
     table = {row["capture"]: row for row in csv.DictReader((out / "batch.csv").read_text().splitlines())}
-    assert {name: row["state"] for name, row in table.items()} == states(told)
+    assert {name: row["state"] for name, row in table.items()} == states(output)
     assert "broken" in (out / "batch.html").read_text()
     notices = ["done house", "failed broken", "failed nowhere", "failed out", "failed wrong"]
     assert sorted((tmp_path / "notices").read_text().splitlines()) == notices
     assert (out / "notices").exists() is False
 
     before = events(out)
-    told = batch(listed, out, *night)
-    assert states(told) == {"house": "reused", **bad} and told["exit_code"] == 1
-    assert "--retry-failed" in {each["name"]: each["hint"] for each in told["captures"]}["broken"]  # type: ignore[attr-defined]
+    output = batch(listed, out, *night)
+    assert states(output) == {"house": "reused", **bad} and output["exit_code"] == 1
+    assert "--retry-failed" in {each["name"]: each["hint"] for each in output["captures"]}["broken"]  # type: ignore[attr-defined]
     assert events(out) == before and not list((out / ".batch" / "call").glob("tries/*"))
     assert not (out / ".batch" / "call" / "Snakefile").exists()  # Snakemake was not even started
 
     link(captures / "barn", demo()[5:7])
     (captures / "house" / demo()[9].name).symlink_to(demo()[9])
     listed.write_text("\n".join([*rows[:2], "barn,captures/barn,"]))
-    told = batch(listed, out, *night)
-    assert states(told) == {"house": "done", "barn": "done"} and told["exit_code"] == 0
-    assert told["unlisted"] == ["broken"] and events(out)["broken"] == before["broken"]
+    output = batch(listed, out, *night)
+    assert states(output) == {"house": "done", "barn": "done"} and output["exit_code"] == 0
+    assert output["unlisted"] == ["broken"] and events(out)["broken"] == before["broken"]
 
 
 def descendants(process: int) -> dict[int, str]:
@@ -133,7 +133,7 @@ def words(process: int) -> str:
 
 
 def alive(processes: dict[int, str]) -> list[str]:
-    return [told for process, told in processes.items() if words(process) == told]
+    return [command for process, command in processes.items() if words(process) == command]
 
 
 def worker_of(running: subprocess.Popen[str], out: Path, but: int = 0) -> int:
@@ -143,7 +143,7 @@ def worker_of(running: subprocess.Popen[str], out: Path, but: int = 0) -> int:
         assert running.poll() is None
         if b'"stage_started", "stage": "features"' not in events(out).get("house", b""):
             return 0
-        workers = (child for child, told in descendants(running.pid).items() if "engine.worker" in told)
+        workers = (child for child, output in descendants(running.pid).items() if "engine.worker" in output)
         return next((child for child in workers if child != but), 0)
 
     return wait_until(found, "the stage features")
@@ -158,9 +158,9 @@ def test_a_killed_stage_is_restarted_and_ctrl_c_ends_everything_cleanly(tmp_path
         worker_of(running, out, but=first)
         others = descendants(running.pid)
         running.send_signal(signal.SIGINT)
-        told = json.loads(running.communicate()[0])
+        output = json.loads(running.communicate()[0])
     assert alive(others) == []
-    assert running.returncode == told["exit_code"] == 130
+    assert running.returncode == output["exit_code"] == 130
     filed = json.loads((out / "batch.json").read_text())
     (house,) = filed["captures"]
     assert (house["state"], house["stage"], house["tries"], filed["at_work"]) == ("stopped", "features", 2, False)
@@ -176,8 +176,8 @@ def test_a_killed_batch_leaves_no_process_and_no_false_report(tmp_path: Path) ->
         assert json.loads((out / "batch.json").read_text())["at_work"]
         running.kill()
     wait_until(lambda: not alive(others), "the end of what it had started")
-    told = json.loads((out / "batch.json").read_text())
-    assert states(told) == {"house": "stopped"} and not told["at_work"] and "killed" in told["message"]
+    summary = json.loads((out / "batch.json").read_text())
+    assert states(summary) == {"house": "stopped"} and not summary["at_work"] and "killed" in summary["message"]
     assert states(batch(tmp_path / "captures", out, "--until", "ingest")) == {"house": "reused"}
 
 
@@ -289,10 +289,10 @@ def test_the_workflow_has_a_rule_for_each_stage_that_runs_with_its_resources(tmp
 def test_a_folder_of_any_name_is_one_word_of_the_workflows_command(tmp_path: Path) -> None:
     call = call_of(tmp_path / "a\nb \"c\" \\n {d} 'e' $(f) é😀", planned("house", "georef"))
     (line,) = [line for line in workflow_text(call, call.plan(), LINE).splitlines() if line.startswith('        "exec')]
-    told = ast.literal_eval(line.strip()).format(
+    command = ast.literal_eval(line.strip()).format(
         wildcards=SimpleNamespace(capture=Plain("x")), threads=1, output=Plain("y")
     )
-    assert shlex.split(told)[4] == str(call.folder)
+    assert shlex.split(command)[4] == str(call.folder)
 
 
 class Plain(str):
@@ -331,7 +331,7 @@ def test_a_stopped_batch_notifies_only_of_itself_and_waits_for_no_notice(
     """Docker kills ten seconds after SIGTERM, and the jobs may have taken eight of them."""
     call = call_of(tmp_path, planned("house", "train"), planned("barn", "train"))
     said: list[str] = []
-    hangs = "echo $SPLATPIPE_STATE,$SPLATPIPE_CAPTURE >> told; sleep 99"
+    hangs = "echo $SPLATPIPE_STATE,$SPLATPIPE_CAPTURE >> notice; sleep 99"
     driver = Driver(call, open_profile(None), Notifications(said.append, hangs))
 
     def stop(_lock: int) -> None:
@@ -341,7 +341,7 @@ def test_a_stopped_batch_notifies_only_of_itself_and_waits_for_no_notice(
     monkeypatch.setattr(driver, "_work", stop)
     with pytest.raises(StopSignal):
         driver.run(0)
-    assert (tmp_path / "told").read_text() == f"stopped,{tmp_path.name}\n"
+    assert (tmp_path / "notice").read_text() == f"stopped,{tmp_path.name}\n"
     assert [line for line in said if "--notify" in line] == [
         f"The --notify command did not end within {STOPPED_NOTICE_S:.0f} s and was killed."
     ]
@@ -354,6 +354,6 @@ def test_a_cell_of_the_table_is_never_a_formula() -> None:
 
 
 def test_a_time_budget_includes_the_captures_earlier_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    for told, expected in (("90.5", 90.5), ("-3", 0.0), ("soon", 0.0)):
-        monkeypatch.setenv(SPENT_VARIABLE, told)
+    for value, expected in (("90.5", 90.5), ("-3", 0.0), ("soon", 0.0)):
+        monkeypatch.setenv(SPENT_VARIABLE, value)
         assert spent_s() == expected

@@ -151,8 +151,8 @@ def test_a_missing_list_and_a_binary_file_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("column", ["config", "georef.control"])
 @pytest.mark.parametrize("path", ["~nobody-here/x", "a\\u0000b"])
 def test_an_impossible_path_fails_only_its_own_capture(tmp_path: Path, column: str, path: str) -> None:
-    told = f'config = "{path}"' if column == "config" else f'set = ["{column}={path}"]'
-    (tmp_path / "a.toml").write_text(f'[[capture]]\nphotos = "x"\n{told}\n[[capture]]\nphotos = "y"\n')
+    setting = f'config = "{path}"' if column == "config" else f'set = ["{column}={path}"]'
+    (tmp_path / "a.toml").write_text(f'[[capture]]\nphotos = "x"\n{setting}\n[[capture]]\nphotos = "y"\n')
     wrong, right = read_captures(tmp_path / "a.toml", tmp_path / "out")
     assert (
         wrong.trouble is not None and "cannot be expanded to a path" in wrong.trouble.message and right.trouble is None

@@ -49,9 +49,9 @@ def batch(listed: Path, out: Path, *more: str, **variables: str) -> subprocess.C
 def test_captures_run_in_shards_and_a_killed_shard_costs_only_its_own_job(tmp_path: Path) -> None:
     """Their number is known once the stage that counts them has run; in later runs, before anything runs."""
     listed, out = captures(tmp_path), tmp_path / "night"
-    told = batch(listed, out, "--dry-run")
-    assert told.returncode == 0 and "sum_shard" not in told.stderr
-    assert "north: read, divide, sum, show (" in told.stderr and len(told.stderr.splitlines()) < 40
+    output = batch(listed, out, "--dry-run")
+    assert output.returncode == 0 and "sum_shard" not in output.stderr
+    assert "north: read, divide, sum, show (" in output.stderr and len(output.stderr.splitlines()) < 40
     done = batch(listed, out, "--until", "sum", "--threads", "1", "--json", SHARDED_KILL="2")
     assert done.returncode == 0, done.stderr
     sums = {path.parts[-4]: json.loads(path.read_text())["total"] for path in out.glob("*/stages/sum-*/total.json")}

@@ -51,9 +51,9 @@ def test_the_smallest_limit_that_the_message_names_is_accepted(tmp_path: Path) -
 
 
 def test_a_run_states_its_cost_and_what_the_memory_limit_leaves_out(tmp_path: Path) -> None:
-    told = forecast_text(request(tmp_path, "preview"))
-    assert told.startswith("40 photos of 1.1 megapixels take about ") and "1,500 iterations" in told
-    assert "GB of memory" in told and "GB of disk" in told and "memory holds" not in told
+    text = forecast_text(request(tmp_path, "preview"))
+    assert text.startswith("40 photos of 1.1 megapixels take about ") and "1,500 iterations" in text
+    assert "GB of memory" in text and "GB of disk" in text and "memory holds" not in text
     least = min_memory_bytes(LineConfig())
     tight = request(tmp_path, "standard", max_memory_bytes=least)
     assert "the memory holds" in forecast_text(tight) and "the photos would support more" in forecast_text(tight)

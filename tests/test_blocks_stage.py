@@ -361,12 +361,12 @@ def test_the_reason_for_fewer_iterations_of_blocks_is_reported(tmp_path: Path) -
     summaries = {"blocks": {"coarse": {"iterations": 20, "planned_iterations": 30, "sizes_ended": [10]}}}
     summaries |= {f"train.{number}": part for number, part in enumerate(parts, 1)}
     given = replace(Inputs({}, tmp_path), summaries=summaries, shards=(tmp_path,) * 3)
-    told = assembly._summary(given, {"curve": []}, 100) | {"blocks": 3}
-    assert (told["iterations"], told["planned_iterations"]) == (240, 280)
-    assert told["flat"] == {
+    summary = assembly._summary(given, {"curve": []}, 100) | {"blocks": 3}
+    assert (summary["iterations"], summary["planned_iterations"]) == (240, 280)
+    assert summary["flat"] == {
         "coarse": {"sizes_ended": [10]},
         "1": {"flat_at": 80},
         "3": {"flat_at": 50, "sizes_ended": [30]},
     }
-    assert training._why_earlier(told) == ": the loss was flat in the coarse pass and in 2 of 3 blocks"
+    assert training._why_earlier(summary) == ": the loss was flat in the coarse pass and in 2 of 3 blocks"
     assert "flat" not in assembly._summary(replace(given, summaries={}), {"curve": []}, 100)

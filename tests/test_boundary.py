@@ -262,14 +262,15 @@ def test_few_points_inside_are_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("offset", "told"), [((0.0, 9_000.0), "9.0 km north of"), ((-400.0, 0.0), "m west of"), ((5e4, -5e4), "south-east")]
+    ("offset", "text"),
+    [((0.0, 9_000.0), "9.0 km north of"), ((-400.0, 0.0), "m west of"), ((5e4, -5e4), "south-east")],
 )
 def test_a_boundary_elsewhere_is_refused_with_distance_and_direction(
-    tmp_path: Path, offset: tuple[float, float], told: str
+    tmp_path: Path, offset: tuple[float, float], text: str
 ) -> None:
     with pytest.raises(SplatpipeError, match="No part of the capture lies inside") as caught:
         laid(tmp_path, polygon(metres, OUTLINE + np.array(offset)))
-    assert told in caught.value.message and "UTM zone 33N" in caught.value.hint
+    assert text in caught.value.message and "UTM zone 33N" in caught.value.hint
     assert "georef.boundary=none" in caught.value.hint
 
 
@@ -316,19 +317,21 @@ def stated() -> tuple[Position, ...]:
 
 
 def test_the_preflight_reports_problems_of_the_boundary(tmp_path: Path, stated: tuple[Position, ...]) -> None:
-    def told(value: Any, positions: tuple[Position, ...] = stated, controlled: bool = False) -> list[tuple[str, str]]:
+    def findings(
+        value: Any, positions: tuple[Position, ...] = stated, controlled: bool = False
+    ) -> list[tuple[str, str]]:
         found = boundary_findings(written(tmp_path, value), GeorefConfig(), positions, controlled)
         assert all(finding.hint for finding in found)
         return [(finding.code, finding.message) for finding in found]
 
     assert len(stated) == 4
-    assert told(polygon(degrees, OUTLINE)) == told(polygon(metres, OUTLINE)) == []
-    assert told(polygon(degrees, 1000.0 * OUTLINE)) == []  # around all of it
-    assert "9.0 km north" in told(polygon(degrees, np.add(OUTLINE, (0.0, 9000.0))))[0][1]
-    assert "not valid GeoJSON" in told("{")[0][1]
-    assert told(polygon(degrees, OUTLINE[[0, 2, 1, 3]]))[0][0] == "boundary-crossing"
-    assert "have no positions" in told(polygon(degrees, OUTLINE), ())[0][1]
-    assert told(polygon(degrees, OUTLINE), (), controlled=True) == []
+    assert findings(polygon(degrees, OUTLINE)) == findings(polygon(metres, OUTLINE)) == []
+    assert findings(polygon(degrees, 1000.0 * OUTLINE)) == []  # around all of it
+    assert "9.0 km north" in findings(polygon(degrees, np.add(OUTLINE, (0.0, 9000.0))))[0][1]
+    assert "not valid GeoJSON" in findings("{")[0][1]
+    assert findings(polygon(degrees, OUTLINE[[0, 2, 1, 3]]))[0][0] == "boundary-crossing"
+    assert "have no positions" in findings(polygon(degrees, OUTLINE), ())[0][1]
+    assert findings(polygon(degrees, OUTLINE), (), controlled=True) == []
 
 
 def test_any_datum_gives_the_same_area_on_the_ground(tmp_path: Path) -> None:

@@ -397,11 +397,11 @@ def test_memory_that_holds_the_sparse_points_takes_dense_ones_without_a_warning(
     pixels = tiny_scene.WIDTH * tiny_scene.HEIGHT
     limit = FIXED_BYTES + PIXEL_BYTES * pixels + 2000 * bytes_per_gaussian(plan.options.sh_degree)
     limited = plan.of(plan.options.model_copy(update={"max_memory_bytes": limit}))
-    for sparse, told in ((1500, 0), (2500, 1)):
+    for sparse, warnings in ((1500, 0), (2500, 1)):
         recorder = tiny_scene.Recorder()
         capped = memory.within_memory(replace(limited, initial_gaussians=50_000), sparse, recorder)
         assert capped.options.max_gaussians == 2000
-        assert len(recorder.warnings) == told
+        assert len(recorder.warnings) == warnings
     assert "2,000 Gaussians, fewer than the 2,500 sparse points" in recorder.warnings[0]
 
 
@@ -458,17 +458,17 @@ def in_little_memory(scene: Path, out: Path, room: int) -> dict[str, object]:
     command = [sys.executable, "-c", TRAIN_IN_LITTLE_MEMORY, scenes, scene, out, room]
     done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    told: dict[str, object] = json.loads(done.stdout)
-    return told
+    output: dict[str, object] = json.loads(done.stdout)
+    return output
 
 
 def test_a_memory_limit_binds_and_the_resident_memory_stays_below_it(scene: Path, tmp_path: Path) -> None:
     room = 30_000_000
-    told = in_little_memory(scene, tmp_path / "out", room)
+    output = in_little_memory(scene, tmp_path / "out", room)
     cap = read_plan(tmp_path / "out").options.max_gaussians
     assert cap < room // bytes_per_gaussian(TrainConfig().sh_degree) < TrainConfig().max_gaussians
-    assert 0.8 * cap < told["gaussians"] <= cap  # type: ignore[operator]  # halved again and again, some are never seen
-    assert told["peak"] <= told["limit"]  # type: ignore[operator]
+    assert 0.8 * cap < output["gaussians"] <= cap  # type: ignore[operator]  # halved again and again, some are never seen
+    assert output["peak"] <= output["limit"]  # type: ignore[operator]
 
 
 def test_growth_ends_when_memory_runs_out_and_pruning_continues(

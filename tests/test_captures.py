@@ -13,9 +13,9 @@ pytestmark = pytest.mark.captures
 def splatpipe(*arguments: object) -> dict[str, object]:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments), "--json"]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    told: dict[str, object] = json.loads(done.stdout)
-    assert done.returncode == 0, told
-    return told
+    output: dict[str, object] = json.loads(done.stdout)
+    assert done.returncode == 0, output
+    return output
 
 
 @pytest.mark.timeout(1200)

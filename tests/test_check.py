@@ -88,9 +88,9 @@ def with_exif(path: Path, gps: dict[int, object] | None = None, model: str = "")
 
 def test_of_good_photos_without_a_strip_of_three_only_the_gap_is_reported(tmp_path: Path) -> None:
     preflight = examined(ring(tmp_path / "photos", leave_out=(6, 7, 8)))
-    told = [finding for finding in preflight.findings if finding.severity != "note"]
-    assert [finding.code for finding in told] == ["gap"] and told[0].photos == ()
-    assert "3 photos are missing between DJI_0005.JPG and DJI_0009.JPG" in told[0].message
+    findings = [finding for finding in preflight.findings if finding.severity != "note"]
+    assert [finding.code for finding in findings] == ["gap"] and findings[0].photos == ()
+    assert "3 photos are missing between DJI_0005.JPG and DJI_0009.JPG" in findings[0].message
     assert len(preflight.gaps) == 1 and len(preflight.gaps[0].outline_m) == 4
     assert len(preflight.components) == 1 and preflight.orphans == ()
     assert all(photo.sharpness is not None and photo.sharpness > 0.7 for photo in preflight.photos)
@@ -116,14 +116,14 @@ def test_faults_of_single_photos_are_found_and_name_them(tmp_path: Path) -> None
         small, kept = picture.resize((900, 675)), picture.getexif().tobytes()
     small.save(photos / name(1), quality=92, exif=kept)
     preflight = examined(photos)
-    told = {code: found(preflight, code) for code in {finding.code for finding in preflight.findings}}
-    assert [finding.photos for finding in told["blurred"]] == [(name(3),)]
-    assert [finding.photos for finding in told["underexposed"]] == [(name(8),)]
-    assert [finding.photos for finding in told["duplicate"]] == [(name(5), "copy.JPG")]
-    assert told["unreadable"][0].photos == (name(10),) and "is truncated" in told["unreadable"][0].message
-    assert [finding.photos for finding in told["position-swapped"]] == [(name(6), name(13))]
-    assert (name(15),) in [finding.photos for finding in told["cameras"]]
-    assert (name(1),) in [finding.photos for finding in told["resized"]]
+    by_code = {code: found(preflight, code) for code in {finding.code for finding in preflight.findings}}
+    assert [finding.photos for finding in by_code["blurred"]] == [(name(3),)]
+    assert [finding.photos for finding in by_code["underexposed"]] == [(name(8),)]
+    assert [finding.photos for finding in by_code["duplicate"]] == [(name(5), "copy.JPG")]
+    assert by_code["unreadable"][0].photos == (name(10),) and "is truncated" in by_code["unreadable"][0].message
+    assert [finding.photos for finding in by_code["position-swapped"]] == [(name(6), name(13))]
+    assert (name(15),) in [finding.photos for finding in by_code["cameras"]]
+    assert (name(1),) in [finding.photos for finding in by_code["resized"]]
     assert preflight.worst == "warning"
 
 
@@ -207,10 +207,10 @@ def test_a_capture_that_cannot_be_reconstructed_exits_with_1_and_says_why(tmp_pa
     (photos / "scale_bars.csv").write_text("name_a,name_b,metres\nA,A,1.0\n")
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "check", str(photos), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    told = json.loads(done.stdout)
-    assert done.returncode == told["exit_code"] == 1, done.stderr
-    assert {"no-overlap", "control-broken", "scale-bars"} <= {finding["code"] for finding in told["findings"]}
-    assert told["verdict"] == "error" and (tmp_path / "check.html").is_file()
+    output = json.loads(done.stdout)
+    assert done.returncode == output["exit_code"] == 1, done.stderr
+    assert {"no-overlap", "control-broken", "scale-bars"} <= {finding["code"] for finding in output["findings"]}
+    assert output["verdict"] == "error" and (tmp_path / "check.html").is_file()
     assert "Line 2 of gcp_list.txt" in done.stderr
 
 
@@ -220,9 +220,10 @@ def test_findings_are_printed_even_if_the_page_cannot_be_written(tmp_path: Path)
     (photos / "[red]broken[bold].jpg").write_bytes(b"none")
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "check", str(photos), "--json", "-o", "none/c.html"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    told = json.loads(done.stdout)
-    assert done.returncode == told["exit_code"] == 4 and "Cannot write the page none/c.html" in told["error"]["message"]
-    assert {"unreadable", "too-few"} == {finding["code"] for finding in told["findings"]}
+    output = json.loads(done.stdout)
+    assert done.returncode == output["exit_code"] == 4
+    assert "Cannot write the page none/c.html" in output["error"]["message"]
+    assert {"unreadable", "too-few"} == {finding["code"] for finding in output["findings"]}
     assert "[red]broken[bold].jpg" in done.stderr and "only one usable" not in done.stderr
 
 

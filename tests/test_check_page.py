@@ -233,7 +233,7 @@ def test_images_are_few_and_a_truncated_photo_shows_what_there_is(
     path = tmp_path / "check.html"
     write_page(grid(tmp_path, demo_names, findings=tuple(findings)), path)
     watched = open_page(path.as_uri())
-    figures = [told.locator("img").count() for told in watched.page.locator("article.finding-card").all()]
+    figures = [card.locator("img").count() for card in watched.page.locator("article.finding-card").all()]
     assert figures[:2] == [1, MAX_PER_FINDING] and sum(figures) == MAX_PICTURES
     assert (
         watched.page.locator("article.finding-card").nth(2).locator("details bdi").all_text_contents()

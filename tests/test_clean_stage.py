@@ -79,8 +79,8 @@ def test_floaters_are_removed_and_the_rest_keeps_its_bits(dataset: Path, tmp_pat
     kept = [bool((both.means[row] == cleaned.means).all(1).any()) for row in range(len(both))]
     assert not any(kept[-FLOATERS:]) and sum(kept[:-FLOATERS]) >= 0.97 * len(truth)
     assert summary["removed"] == len(both) - len(cleaned) and summary["gaussians"] == len(cleaned)
-    told = json.loads((tmp_path / "1/cleaned.json").read_text())
-    assert told["gaussians"] == len(both) and sum(told["removed"].values()) == summary["removed"]
+    data = json.loads((tmp_path / "1/cleaned.json").read_text())
+    assert data["gaussians"] == len(both) and sum(data["removed"].values()) == summary["removed"]
     assert recorder.notes[0].startswith(f"Removed {summary['removed']} of {len(both)} Gaussians: ")
     assert recorder.steps[-1][0] == recorder.steps[-1][1] and not recorder.warnings
 

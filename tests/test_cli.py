@@ -87,10 +87,10 @@ def test_an_invalid_call_gets_one_message_and_its_exit_code(
 def test_json_is_one_object_on_stdout_even_on_failure(tmp_path: Path, photos: Path) -> None:
     done = splatpipe("run", photos, tmp_path / "out", "--json")
     assert done.returncode == 1
-    told = json.loads(done.stdout)
-    assert told["exit_code"] == 1
-    assert told["error"]["message"]
-    assert told["error"]["hint"]
+    output = json.loads(done.stdout)
+    assert output["exit_code"] == 1
+    assert output["error"]["message"]
+    assert output["error"]["hint"]
 
 
 def test_doctor_names_the_instruction_set_in_use_and_those_available() -> None:
@@ -108,11 +108,11 @@ def unwrapped(panel: str) -> str:
 
 def test_cuda_is_refused_at_once_with_the_same_reason_as_in_doctor(tmp_path: Path, photos: Path) -> None:
     hidden = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}  # with a GPU or without
-    told = json.loads(splatpipe("doctor", "--json", env=hidden).stdout)["CUDA"]
-    assert told.startswith("not used. ")
+    output = json.loads(splatpipe("doctor", "--json", env=hidden).stdout)["CUDA"]
+    assert output.startswith("not used. ")
     done = splatpipe("run", photos, tmp_path / "out", "--device", "cuda", env=hidden)
     assert done.returncode == 4, done.stderr
-    assert "CUDA does not work here. " + told.removeprefix("not used. ").split(". ")[0] in unwrapped(done.stderr)
+    assert "CUDA does not work here. " + output.removeprefix("not used. ").split(". ")[0] in unwrapped(done.stderr)
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
 

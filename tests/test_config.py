@@ -98,11 +98,11 @@ def test_a_configuration_of_another_version_is_refused_with_each_reason_once() -
     old = {"train": {"lr_means": 1e-4, "iterations": 7, "sh_limit": False, "lr_sh": 2e-3, "spread_weight": 0.1}}
     with pytest.raises(UsageError) as caught:
         resolve(LineConfig, [old])
-    told = caught.value.message
-    assert "The options train.lr_means, train.lr_sh no longer exist. This is now set by constants" in told
-    assert "The option train.sh_limit no longer exists. This was removed" in told
-    assert "train.spread_weight no longer exists. It is now called train.distortion_weight." in told
-    assert told.count("no longer exist") == 3
+    message = caught.value.message
+    assert "The options train.lr_means, train.lr_sh no longer exist. This is now set by constants" in message
+    assert "The option train.sh_limit no longer exists. This was removed" in message
+    assert "train.spread_weight no longer exists. It is now called train.distortion_weight." in message
+    assert message.count("no longer exist") == 3
 
 
 def test_no_existing_option_is_reported_as_removed() -> None:

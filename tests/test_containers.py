@@ -51,7 +51,7 @@ def slurm(tmp_path: Path, *arguments: object) -> subprocess.Popen[str]:
     (programs / "splatpipe").write_text(f'#!/bin/sh\nexec {sys.executable} -m splatpipe.pipeline.app.cli "$@"\n')
     (programs / "splatpipe").chmod(0o755)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
-    (programs / "scontrol").write_text('#!/bin/sh\necho "$@" >> "$TOLD_SLURM"\n')
+    (programs / "scontrol").write_text('#!/bin/sh\necho "$@" >> "$SUBMITTED"\n')
     (programs / "scontrol").chmod(0o755)
     environment |= {"SLURM_JOB_ID": "7", "PATH": f"{programs}:{os.environ['PATH']}", "SPLATPIPE_IMAGE": ""}
     command = ["bash", str(SLURM), *map(str, arguments)]
@@ -60,24 +60,24 @@ def slurm(tmp_path: Path, *arguments: object) -> subprocess.Popen[str]:
 
 def test_the_slurm_job_ends_with_the_exit_code_of_its_command(tmp_path: Path) -> None:
     process = slurm(tmp_path, tmp_path / "none", tmp_path / "out", "--preset", "preview")
-    _, told = process.communicate(timeout=TIMEOUT_S)
-    assert process.returncode == 1, told
-    assert "There is no folder" in told
+    _, output = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 1, output
+    assert "There is no folder" in output
 
 
 @pytest.mark.parametrize(("number", "queued"), [(signal.SIGUSR1, "requeue 7\n"), (signal.SIGTERM, "")])
 def test_the_slurm_job_forwards_the_signal_waits_for_the_end_and_is_requeued_unless_cancelled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, queued: str
 ) -> None:
-    out, told_slurm = tmp_path / "out", tmp_path / "told_slurm"
-    monkeypatch.setenv("TOLD_SLURM", str(told_slurm))
+    out, submitted = tmp_path / "out", tmp_path / "submitted"
+    monkeypatch.setenv("SUBMITTED", str(submitted))
     process = slurm(tmp_path, capture_path(), out, "--preset", "preview")
     wait_until(lambda: (out / "events.jsonl").exists() or process.poll() is not None, "the run")
     process.send_signal(number)  # Slurm's B: the shell only
-    _, told = process.communicate(timeout=TIMEOUT_S)
-    assert process.returncode == 143, told
-    assert "Finished work is kept" in told, told
-    assert (told_slurm.read_text() if told_slurm.exists() else "") == queued
+    _, output = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 143, output
+    assert "Finished work is kept" in output, output
+    assert (submitted.read_text() if submitted.exists() else "") == queued
 
 
 def test_a_batch_of_a_user_without_home_or_name_gets_both_below_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,7 +67,7 @@ class Result:
     out: Path
     parts: dict[str, Path]
     summary: Summary
-    told: Notes
+    notes: Notes
 
     def read(self, name: str) -> Any:
         return json.loads((self.out / name).read_text(encoding="utf-8"))
@@ -105,9 +105,9 @@ def georef(
     records = [] if stated is None else [r for r in positions(*stated, lift) if r["name"] in names]
     parts = capture_parts(folder, model, records, control)
     (folder / "out").mkdir()
-    told = Notes()
-    summary = run(GeorefConfig(**options), Inputs(parts, folder / "photos"), folder / "out", told)
-    return Result(folder / "out", parts, summary, told)
+    notes = Notes()
+    summary = run(GeorefConfig(**options), Inputs(parts, folder / "photos"), folder / "out", notes)
+    return Result(folder / "out", parts, summary, notes)
 
 
 def checks(*names: str) -> str:
@@ -162,7 +162,7 @@ def test_five_control_points_make_the_check_points_right_whatever_the_datum_of_g
     assert offset[2] == pytest.approx(lift, abs=3.0 * 3.0 / np.sqrt(40))
     assert result.is_model_untouched()
     assert result.summary["moved_px"] < 0.1
-    assert result.told.warnings == []
+    assert result.notes.warnings == []
 
 
 def test_figures_are_those_computed_independently_from_the_truth(
@@ -194,7 +194,7 @@ def test_check_points_in_another_datum_than_the_positions_are_reported(
     tmp_path: Path, whole: pycolmap.Reconstruction
 ) -> None:
     result = georef(tmp_path, whole, gcp_list(rows(FIVE)), RTK, lift=47.0, check_points=checks(*FIVE))
-    assert [w for w in result.told.warnings if "+47.0 m" in w and "vertical datum" in w]
+    assert [w for w in result.notes.warnings if "+47.0 m" in w and "vertical datum" in w]
 
 
 def test_control_places_a_model_without_positions(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
@@ -214,7 +214,7 @@ def test_doming_of_a_wrong_lens_is_straightened_by_control(tmp_path: Path) -> No
         vertical[adjust] = result.table("check")["rmse_up_m"]
         assert result.table("check")["count"] == 8
         assert result.is_model_untouched() == (adjust == "off")
-    assert any("adjusted to it" in note for note in result.told.notes)
+    assert any("adjusted to it" in note for note in result.notes.notes)
     assert result.summary["model_bent"]
     assert vertical["off"] >= 3.0 * vertical["auto"]
     horizontal, up = independent_rmse(result, tuple(others))
@@ -254,7 +254,7 @@ def test_blunder_that_doming_hides_is_found_by_the_adjustment(tmp_path: Path) ->
         tmp_path, domed, gcp_list(lines), check_points=checks(*(n for n in GROUND_AND_ROOF if n not in control))
     )
     assert result.roles()["P05"] == "left_out"
-    assert [w for w in result.told.warnings if "Control point P05 is left out" in w and "field book" in w]
+    assert [w for w in result.notes.warnings if "Control point P05 is left out" in w and "field book" in w]
     assert result.table("check")["rmse_up_m"] <= 1.5 * result.gsd_m
 
 
@@ -275,7 +275,7 @@ def test_undetermined_focal_length_is_held_near_the_metadata(tmp_path: Path) -> 
     flat = adjusted(true_model(NADIR, flat=True), LENS[0] * 1.1, LENS[3])
     ground = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08")
     result = georef(tmp_path, flat, gcp_list(rows(ground, NADIR)), check_points="none")
-    assert [w for w in result.told.warnings if "determine the focal length" in w]
+    assert [w for w in result.notes.warnings if "determine the focal length" in w]
     assert result.summary["focal_held"] == [1]
     if result.summary["model_bent"]:
         focal = pycolmap.Reconstruction(result.out / "sparse" / "0").cameras[1].params[0]
@@ -300,8 +300,8 @@ def test_control_point_half_a_metre_off_is_named_and_left_out(
     ]
     result = georef(tmp_path, whole, gcp_list(shifted), stated, check_points=checks(*OTHERS))
     assert result.roles()["P05"] == "left_out"
-    (told,) = result.told.warnings
-    assert re.search(r"Control point P05 is left out: .*0\.(48|49|50|51|52) m .*east -0\.[45].*field book", told)
+    (warning,) = result.notes.warnings
+    assert re.search(r"Control point P05 is left out: .*0\.(48|49|50|51|52) m .*east -0\.[45].*field book", warning)
     assert result.table("check")["rmse_up_m"] <= 1.5 * result.gsd_m
 
 
@@ -313,7 +313,7 @@ def test_check_point_that_is_off_is_named_and_stays_in_the_table(
         for row in rows(tuple(POINTS))
     ]
     result = georef(tmp_path, whole, gcp_list(shifted), check_points=checks(*OTHERS))
-    assert [w for w in result.told.warnings if "Check point P08" in w and "up +0.5" in w]
+    assert [w for w in result.notes.warnings if "Check point P08" in w and "up +0.5" in w]
     assert result.roles()["P08"] == "check"
     assert result.table("check")["rmse_up_m"] > 0.1
 
@@ -326,7 +326,7 @@ def test_swapped_names_are_reported(tmp_path: Path, whole: pycolmap.Reconstructi
     swapped = [replace(row, place=places[other.get(row.name, row.name)]) for row in rows(tuple(POINTS))]
     result = georef(tmp_path, whole, gcp_list(swapped), check_points=checks(*OTHERS))
     a, b = sorted(pair)
-    assert [w for w in result.told.warnings if f"{a} and {b} look swapped" in w and "Swap" in w]
+    assert [w for w in result.notes.warnings if f"{a} and {b} look swapped" in w and "Swap" in w]
     assert {result.roles()[name] for name in pair} == {"left_out"}
     assert result.table("check")["rmse_3d_m"] < 2.0 * result.gsd_m
 
@@ -361,7 +361,7 @@ def test_file_of_other_photos_is_refused_and_some_missing_ones_are_named(
     assert "listed by their file names" in caught.value.hint
     some = [replace(row, photo="GONE.JPG") if row.photo == "DJI_0020.JPG" else row for row in rows(FIVE)]
     result = georef(tmp_path / "b", whole, gcp_list(some))
-    assert [w for w in result.told.warnings if "1 photo that is not in this capture: GONE.JPG" in w]
+    assert [w for w in result.notes.warnings if "1 photo that is not in this capture: GONE.JPG" in w]
     assert result.table("control")["count"] == 5
 
 
@@ -381,8 +381,8 @@ def test_control_on_a_line_is_reported_and_well_distributed_control_is_not(
     control = gcp_list(rows(tuple(POINTS)))
     for name, kept, weak in (("line", ("P06", "P12", "P14"), True), ("site", FIVE, False)):
         others = checks(*(point for point in POINTS if point not in kept))
-        told = georef(tmp_path / name, whole, control, None, check_points=others, adjust="off").told.warnings
-        assert any("spread over the site" in warning for warning in told) == weak, name
+        warnings = georef(tmp_path / name, whole, control, None, check_points=others, adjust="off").notes.warnings
+        assert any("spread over the site" in warning for warning in warnings) == weak, name
 
 
 def test_coordinates_beyond_their_crs_are_of_a_named_file(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
@@ -395,7 +395,7 @@ def test_coordinates_beyond_their_crs_are_of_a_named_file(tmp_path: Path, whole:
 def test_heights_in_feet_are_reported(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     feet = [replace(row, place=(*row.place[:2], row.place[2] / 0.3048)) for row in rows(FIVE)]
     result = georef(tmp_path, whole, gcp_list(feet), check_points="none", adjust="off")
-    assert [w for w in result.told.warnings if "more than vertical datums can differ" in w and "feet" in w]
+    assert [w for w in result.notes.warnings if "more than vertical datums can differ" in w and "feet" in w]
 
 
 def test_mark_on_the_wrong_pixel_is_named_and_left_out(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
@@ -403,7 +403,7 @@ def test_mark_on_the_wrong_pixel_is_named_and_left_out(tmp_path: Path, whole: py
     wrong = next(k for k, row in enumerate(lines) if row.name == "P03")
     lines[wrong] = replace(lines[wrong], pixel=(lines[wrong].pixel[0], 40.0))
     result = georef(tmp_path, whole, gcp_list(lines))
-    assert [w for w in result.told.warnings if "Marks of P03" in w and lines[wrong].photo in w]
+    assert [w for w in result.notes.warnings if "Marks of P03" in w and lines[wrong].photo in w]
     point = next(p for p in result.read("control.json")["points"] if p["name"] == "P03")
     assert [o["photo"] for o in point["observations"] if not o["used"]] == [lines[wrong].photo]
     assert np.abs(point["residual_m"]).max() < 0.03
@@ -419,7 +419,7 @@ def test_marks_made_in_larger_photos_are_refused(tmp_path: Path, whole: pycolmap
 def test_point_seen_once_is_named(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:
     lines = [row for row in rows(FIVE) if row.name != "P03"] + rows(("P03",))[:1]
     result = georef(tmp_path, whole, gcp_list(lines))
-    assert [w for w in result.told.warnings if "P03" in w and "marked in one photo only" in w]
+    assert [w for w in result.notes.warnings if "P03" in w and "marked in one photo only" in w]
     assert result.roles()["P03"] == "left_out"
 
 
@@ -427,7 +427,7 @@ def test_control_without_heights_controls_horizontally(tmp_path: Path, whole: py
     """Without positions, the cameras' usual attitude levels the model; with them, heights are the positions'."""
     flat = [replace(row, place=(*row.place[:2], 0.0)) for row in rows(GROUND_AND_ROOF)]
     alone = georef(tmp_path / "alone", whole, gcp_list(flat), None)
-    assert any("0.0 is treated as unknown" in note for note in alone.told.notes)
+    assert any("0.0 is treated as unknown" in note for note in alone.notes.notes)
     assert alone.table("check")["rmse_up_m"] is None
     assert alone.table("check")["rmse_horizontal_m"] < 2.0 * alone.gsd_m
     frame = load_frame(alone.out / "frame.json")
@@ -452,7 +452,7 @@ def test_hand_held_control_is_weighted_by_its_agreement(tmp_path: Path, whole: p
     result = georef(tmp_path, whole, gcp_list(rough), None)
     assert result.is_model_untouched()
     assert "left_out" not in result.roles().values()
-    assert [w for w in result.told.warnings if "hand-held" in w]
+    assert [w for w in result.notes.warnings if "hand-held" in w]
     assert 0.4 < result.table("check")["rmse_horizontal_m"] < 2.5
 
 
@@ -484,14 +484,14 @@ def test_option_takes_precedence_over_roles_in_the_file_and_says_so(
         role = "check" if row.name in {"P02", "P05"} else "control"
         lines.append(",".join(map(str, (row.name, *row.place, row.photo, *row.pixel, role))))
     control = "\n".join(lines) + "\n"
-    told = {}
+    notes_of = {}
     for k, option in enumerate(("auto", "P02,P05", "P01", "none")):
         result = georef(tmp_path / str(k), whole, control, check_points=option)
         checks = [name for name, role in result.roles().items() if role == "check"]
         assert checks == {"auto": ["P02", "P05"], "none": []}.get(option, option.split(","))
-        told[option] = [note for note in result.told.notes if "georef.check_points=" in note]
-    assert not told["auto"] + told["P02,P05"]
-    assert all("which has P02, P05 as check points" in " ".join(told[option]) for option in ("P01", "none"))
+        notes_of[option] = [note for note in result.notes.notes if "georef.check_points=" in note]
+    assert not notes_of["auto"] + notes_of["P02,P05"]
+    assert all("which has P02, P05 as check points" in " ".join(notes_of[option]) for option in ("P01", "none"))
 
 
 def test_pixels_may_count_from_the_centre_of_the_first(tmp_path: Path, whole: pycolmap.Reconstruction) -> None:

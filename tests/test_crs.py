@@ -158,11 +158,11 @@ def test_local_to_crs_and_back_at_a_kilometre(text: str, vertical: str) -> None:
 @pytest.mark.parametrize("text", CRSS)
 def test_georef_json_alone_agrees_with_proj(text: str) -> None:
     """Transform by the file and PROJ, compare with PROJ's direct geocentric transform, and invert by our World."""
-    told = json.loads(json.dumps(georeference(frame(text), BOX)))
+    stored = json.loads(json.dumps(georeference(frame(text), BOX)))
     local = far_points()
-    earth = np.c_[local, np.ones(len(local))] @ np.array(told["exact_path"]["matrix"])[:3].T
+    earth = np.c_[local, np.ones(len(local))] @ np.array(stored["exact_path"]["matrix"])[:3].T
     lon, lat, height = pyproj.Transformer.from_crs(4978, 4979, always_xy=True).transform(*earth.T)
-    pipeline = pyproj.Transformer.from_pipeline(told["crs"]["operation"]["pipeline"])
+    pipeline = pyproj.Transformer.from_pipeline(stored["crs"]["operation"]["pipeline"])
     x, y, _ = pipeline.transform(lon, lat, height, direction="INVERSE")
     topocentric = pyproj.Transformer.from_pipeline(
         "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0=47.8412 +lon_0=13.5127 +h_0=512"
@@ -194,15 +194,15 @@ def test_the_demos_truth_comes_back_through_georef_json_in_three_crss() -> None:
 
 
 def test_tangent_approximation_has_its_stated_error() -> None:
-    told = georeference(frame("EPSG:32633"), BOX)["crs_from_local_tangent"]
-    matrix = np.array(told["matrix"])
+    tangent = georeference(frame("EPSG:32633"), BOX)["crs_from_local_tangent"]
+    matrix = np.array(tangent["matrix"])
     world = open_world(frame("EPSG:32633"))
     for box, most in ((BOX, 1.0), (BOX / 20.0, 0.0025)):  # quadratic: a twentieth of the size, a 400th of the error
         corners = np.array([[e, n, u] for e in box[:, 0] for n in box[:, 1] for u in box[:, 2]])
         off = (corners @ matrix[:3, :3].T + matrix[:3, 3]) - world.crs_from_local(corners)
-        assert np.linalg.norm(off[:, :2], axis=1).max() <= 1.05 * most * told["largest_error_m"]
+        assert np.linalg.norm(off[:, :2], axis=1).max() <= 1.05 * most * tangent["largest_error_m"]
     # The height's error is the earth's curvature, d² / 2R at 1,414 m.
-    assert told["largest_height_error_m"] == pytest.approx(2e6 / (2.0 * 6.38e6), rel=0.01)
+    assert tangent["largest_height_error_m"] == pytest.approx(2e6 / (2.0 * 6.38e6), rel=0.01)
 
 
 def test_grid_scale_and_convergence_are_the_projections() -> None:
@@ -290,10 +290,11 @@ def test_heights_use_the_geoid_grid_if_it_is_present(tmp_path: Path) -> None:
     try:
         raised = undulation("EPSG:5773", np.array([47.0, 47.8412]), np.array([13.5, 13.5127]))
         np.testing.assert_allclose(raised, [40.0, 40.0 - 2.0 * 0.8412], atol=1e-4)
-        told = georeference(frame("EPSG:32633+5773", "EPSG:5773"), BOX)["ecef_from_local"]
-        lifted = (np.array(told["matrix"])[:3, 3] - HALLSTATT.ecef_from_enu()[:3, 3]) @ HALLSTATT.ecef_from_enu()[:3, 2]
-        assert not told["approximate"] and lifted == pytest.approx(raised[1], abs=1e-4)
-        assert 0.005 < told["largest_error_m"] < 0.05  # the slope, 2 m per 111 km, at 1.4 km; and 7 mm of scale
+        entry = georeference(frame("EPSG:32633+5773", "EPSG:5773"), BOX)["ecef_from_local"]
+        earth = HALLSTATT.ecef_from_enu()
+        lifted = (np.array(entry["matrix"])[:3, 3] - earth[:3, 3]) @ earth[:3, 2]
+        assert not entry["approximate"] and lifted == pytest.approx(raised[1], abs=1e-4)
+        assert 0.005 < entry["largest_error_m"] < 0.05  # the slope, 2 m per 111 km, at 1.4 km; and 7 mm of scale
         world = open_world(frame("EPSG:4979", "EPSG:5773"))  # orthometric within, ellipsoidal without
         local = far_points()
         np.testing.assert_allclose(world.local_from_crs(world.crs_from_local(local)), local, atol=1e-6)

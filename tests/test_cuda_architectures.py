@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent / "harness"))
 from building import NATIVE, build_on_cpu, load
 
 
-def told(built_for: str) -> tuple[int, SplatDevice]:
+def open_library(built_for: str) -> tuple[int, SplatDevice]:
     """Return what a library compiled for some architectures, as nvcc lists them, reports for the harness's device."""
     library = load(build_on_cpu([NATIVE / "cuda" / "device.cu"], "device", flags=[f"-D__CUDA_ARCH_LIST__={built_for}"]))
     device = SplatDevice()
@@ -32,13 +32,14 @@ def told(built_for: str) -> tuple[int, SplatDevice]:
     ],
 )
 def test_kernels_exist_for_the_family_and_as_ptx_for_newer_devices(built_for, has_kernels):
-    _, device = told("500")
+    _, device = open_library("500")
     architecture = 10 * device.architecture
     assert architecture > 500
-    code, told_of = told(built_for.format(same=architecture, newer_minor=architecture + 10, newer=architecture + 100))
+    built_for = built_for.format(same=architecture, newer_minor=architecture + 10, newer=architecture + 100)
+    code, reported = open_library(built_for)
     assert code == (0 if has_kernels else NO_KERNEL)
-    assert told_of.architecture == device.architecture
-    assert told_of.runtime > 0
+    assert reported.architecture == device.architecture
+    assert reported.runtime > 0
 
 
 def test_no_such_device_is_an_error_and_codes_have_texts():

@@ -34,11 +34,11 @@ def devices_asked_for() -> set[int]:
         return EVERY_DEVICE
     if asked != "auto":
         return {int(device) for device in re.findall(r"\d+", asked)}
-    builds = sorted(ROOT.glob("build/*/cuda.txt"), key=lambda told: told.stat().st_mtime)
-    return devices_told(builds[-1].read_text()) if builds else set()
+    builds = sorted(ROOT.glob("build/*/cuda.txt"), key=lambda path: path.stat().st_mtime)
+    return reported_devices(builds[-1].read_text()) if builds else set()
 
 
-def devices_told(text: str) -> set[int]:
+def reported_devices(text: str) -> set[int]:
     """Return the architectures that a build recorded: cuda.txt in its folder."""
     built = re.fullmatch(r"with CUDA for ([\d ]+) \(nvcc .*\)\n", text)
     assert built or text.startswith("without CUDA: "), text
@@ -91,10 +91,10 @@ def strangers(library: Path) -> list[str]:
 
 
 def test_a_builds_record_is_read() -> None:
-    assert devices_told("with CUDA for 86 90 (nvcc 13.0.88)\n") == {86, 90}
-    assert devices_told("without CUDA: this machine has no NVIDIA GPU (nvidia-smi finds none)\n") == set()
+    assert reported_devices("with CUDA for 86 90 (nvcc 13.0.88)\n") == {86, 90}
+    assert reported_devices("without CUDA: this machine has no NVIDIA GPU (nvidia-smi finds none)\n") == set()
     with pytest.raises(AssertionError):
-        devices_told("with CUDA\n")
+        reported_devices("with CUDA\n")
 
 
 def test_the_library_exists_if_it_was_requested() -> None:

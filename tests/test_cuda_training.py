@@ -258,8 +258,8 @@ def test_short_memory_makes_chunks_then_the_model_smaller_and_then_is_reported(
     assert any("most opaque" in warning for warning in recorder.warnings)
     assert 120 <= fewer["gaussians"] < len(most) and fewer["iterations"] == ALL.iterations
     assert kernels.back_bytes(shot, fewer["gaussians"], fewer["gaussians"]) <= kernels.most_bytes
-    told = history(tmp_path / "fewer")
-    assert told["growth_ended"] > 0 and sum(event["pruned"] for event in told["density"]) > 0
+    recorded = history(tmp_path / "fewer")
+    assert recorded["growth_ended"] > 0 and sum(event["pruned"] for event in recorded["density"]) > 0
 
     # Then the end.
     kernels.most_bytes = 1000

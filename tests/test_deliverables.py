@@ -131,10 +131,10 @@ def test_tiles_are_placed_on_the_globe_and_the_site_is_complete(delivered: Path)
 
 
 def test_formats_that_need_a_scale_are_left_out_with_a_note(run: RunSplat, tmp_path: Path) -> None:
-    told = tiny_scene.Recorder()
+    recorder = tiny_scene.Recorder()
     nowhere = replace(run, frame=Frame("arbitrary", Similarity.identity()))
-    assert list(write_deliverables(("laz", "model"), nowhere, tmp_path, told)) == ["model"]
-    assert "laz is left out" in told.warnings[0]
+    assert list(write_deliverables(("laz", "model"), nowhere, tmp_path, recorder)) == ["model"]
+    assert "laz is left out" in recorder.warnings[0]
 
 
 def test_names_are_ordered_and_unknown_ones_refused() -> None:

@@ -111,9 +111,9 @@ def test_nothing_lies_outside_the_boundary(tmp_path: Path) -> None:
     ring = np.array([[-2.0, -2.0], [2.0, -2.0], [0.0, 2.0]])
     area = PlanArea.seen_from_above([(ring,)])
     task = CloudTask(run_surface(FRAME, photos()[::3], area), house_site(), 2.0 * GSD_M, 1)
-    told = make_cloud(task, tmp_path / "work", tmp_path, Recorder())
+    summary = make_cloud(task, tmp_path / "work", tmp_path, Recorder())
     cloud = laspy.read(tmp_path / "cloud.laz")
-    assert told["points"] == len(cloud.xyz) > 100
+    assert summary["points"] == len(cloud.xyz) > 100
     assert area.contains(np.asarray(cloud.xyz)).mean() > 0.99  # millimetres of rounding
 
 

@@ -27,8 +27,8 @@ def one_array() -> bytes:
 
 def test_a_map_reads_back_as_written(tmp_path: Path) -> None:
     kept = DepthMap(np.full((3, 4), 2.5, np.float32), np.full((3, 4), 3, np.uint8))
-    told = save_depth_maps(tmp_path / "maps", [(CAMERA, kept)])
-    assert told == {"maps": 1, "megapixels": 12e-6, "found": 1.0}
+    summary = save_depth_maps(tmp_path / "maps", [(CAMERA, kept)])
+    assert summary == {"maps": 1, "megapixels": 12e-6, "found": 1.0}
     read = DepthMapFile(CAMERA, tmp_path / "maps/00000.npz").load()
     np.testing.assert_array_equal(read.depth, kept.depth)
     np.testing.assert_array_equal(read.confidence, kept.confidence)

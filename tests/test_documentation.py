@@ -104,12 +104,12 @@ def test_a_page_begins_with_the_essentials(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_command_is_valid(page: Path) -> None:
     for name, *arguments in command_lines(page, "splatpipe"):
-        told = COMMANDS[name].make_context(name, list(arguments)).params
-        assignments = told.get("assignments") or []
-        preset = told.get("preset") or "standard"
+        params = COMMANDS[name].make_context(name, list(arguments)).params
+        assignments = params.get("assignments") or []
+        preset = params.get("preset") or "standard"
         resolve(LineConfig, [load_preset(preset), *(parse_set(text, LineConfig) for text in assignments)])
         stages = [stage.name for stage in LINE]
-        assert all(each in stages for each in (told.get("until"), told.get("name")) if each)
+        assert all(each in stages for each in (params.get("until"), params.get("name")) if each)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -184,8 +184,8 @@ def test_the_page_of_options_has_types_limits_and_presets() -> None:
 
 
 def test_the_stages_of_the_line_are_described() -> None:
-    told = (ROOT / "docs/rooms.md").read_text(encoding="utf-8")
-    rows = [name.strip() for row in re.findall(r"^\| ([a-z_, ]+) \|", told, re.MULTILINE) for name in row.split(",")]
+    params = (ROOT / "docs/rooms.md").read_text(encoding="utf-8")
+    rows = [name.strip() for row in re.findall(r"^\| ([a-z_, ]+) \|", params, re.MULTILINE) for name in row.split(",")]
     assert [name for name in rows if name not in ("stage", "thing")][: len(LINE)] == [stage.name for stage in LINE]
 
 

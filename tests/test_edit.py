@@ -153,13 +153,13 @@ def test_moved_far_away_it_is_upright_in_a_new_local_frame():
     piece = Workpiece(Scene(scene.gaussians.clone(), scene.facts))
     for step in parse_steps([("move_to", f"{far[0]!r},{far[1]!r},100")], OUTPUT, False):
         step.apply(piece)
-    told = piece.scene()
-    place = told.facts.place
+    moved = piece.scene()
+    place = moved.facts.place
     assert place is not None
     assert (place.latitude, place.longitude) == pytest.approx((53.1, 21.9), abs=1e-6)
     assert place.height_m == pytest.approx(100.0, abs=0.01)
     assert "origin" in piece.notes[0]
-    shift = (told.gaussians.means - scene.gaussians.means).double().numpy()
+    shift = (moved.gaussians.means - scene.gaussians.means).double().numpy()
     np.testing.assert_allclose(shift - shift[0], 0.0, atol=1e-4)  # neither tipped nor turned
     with pytest.raises(SplatpipeError, match="60 km away"):
         edited(scene, ("move", "60000,0,0"))
@@ -248,16 +248,16 @@ def test_a_self_intersecting_polygon_is_reported_and_filled_by_the_even_odd_rule
 
 def test_crops_that_leave_nothing_state_where_the_splat_is(tmp_path: Path):
     scene = Scene(true_model(), PLACED)
-    with pytest.raises(SplatpipeError, match="would remove the whole splat") as told:
+    with pytest.raises(SplatpipeError, match="would remove the whole splat") as caught:
         edited(scene, ("crop_box", "0,0,1,1"))
-    assert "EPSG:32634" in told.value.hint and "--local" in told.value.hint
+    assert "EPSG:32634" in caught.value.hint and "--local" in caught.value.hint
     away = geojson(tmp_path / "away.geojson", [[21.1, 52.2], [21.2, 52.2], [21.2, 52.3]])
-    with pytest.raises(SplatpipeError, match=r"km (north-)?east") as told:
+    with pytest.raises(SplatpipeError, match=r"km (north-)?east") as caught:
         edited(scene, ("crop_polygon", away))
     swapped = geojson(tmp_path / "swapped.geojson", [[52.1, 20.9], [52.3, 20.9], [52.3, 21.1], [52.1, 21.1]])
-    with pytest.raises(SplatpipeError) as told:
+    with pytest.raises(SplatpipeError) as caught:
         edited(scene, ("crop_polygon", swapped))
-    assert "swapped" in told.value.hint and "georef.boundary" not in told.value.hint
+    assert "swapped" in caught.value.hint and "georef.boundary" not in caught.value.hint
     nowhere = Scene(true_model(), SceneFacts())
     with pytest.raises(SplatpipeError, match="not georeferenced"):
         edited(nowhere, ("crop_polygon", away))
@@ -318,7 +318,7 @@ def test_degrees_of_harmonics_may_differ(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("facts", "told"),
+    ("facts", "message"),
     [
         (replace(PLACED, place=replace(PLACE, vertical_datum="ellipsoidal")), "tens of metres"),
         (replace(PLACED, place=replace(PLACE, vertical_datum="unknown")), "tens of metres"),
@@ -327,9 +327,9 @@ def test_degrees_of_harmonics_may_differ(tmp_path: Path):
         (SceneFacts("z up", metres=True), "not georeferenced"),
     ],
 )
-def test_splats_of_unknown_place_are_not_merged(tmp_path: Path, facts, told):
+def test_splats_of_unknown_place_are_not_merged(tmp_path: Path, facts, message):
     plain_ply.write(tmp_path / "other.ply", Scene(true_model(), facts))
-    with pytest.raises(SplatpipeError, match=told):
+    with pytest.raises(SplatpipeError, match=message):
         edited(Scene(true_model(), PLACED), ("merge", tmp_path / "other.ply"))
 
 
@@ -351,21 +351,21 @@ def test_cleaning_uses_cameras_moved_with_the_splat():
     kept = []
     for steps in ((), (("rotate", "37"), ("move", "5,6,7"), ("scale", "3"))):
         piece = Workpiece(Scene(scene.gaussians.clone(), scene.facts))
-        told = [step.apply(piece) for step in parse_steps([*steps, ("clean", True)], OUTPUT, False, views)]
-        assert told[-1]["photos"] == 4
-        assert told[-1]["removed"]["transparent"] == 15
-        kept.append((told[-1]["removed"], piece.scene().gaussians.opacity_logits))
+        records = [step.apply(piece) for step in parse_steps([*steps, ("clean", True)], OUTPUT, False, views)]
+        assert records[-1]["photos"] == 4
+        assert records[-1]["removed"]["transparent"] == 15
+        kept.append((records[-1]["removed"], piece.scene().gaussians.opacity_logits))
     assert kept[0][0] == kept[1][0] and torch.equal(kept[0][1], kept[1][1])
 
 
 def test_photos_of_one_run_do_not_judge_merged_splats(tmp_path: Path):
     plain_ply.write(tmp_path / "other.ply", Scene(true_model(), SceneFacts()))
     piece = Workpiece(Scene(true_model(), SceneFacts()))
-    told = [
+    records = [
         step.apply(piece)
         for step in parse_steps([("merge", tmp_path / "other.ply"), ("clean", True)], OUTPUT, False, cameras(2))
     ]
-    assert told[-1]["photos"] == 0 and "before --merge" in piece.notes[0]
+    assert records[-1]["photos"] == 0 and "before --merge" in piece.notes[0]
 
 
 def test_held_out_photos_are_not_used_for_cleaning(run_folder: Path):
@@ -441,9 +441,9 @@ def test_a_record_keeps_the_newest_edits_and_counts_the_others():
     ],
 )
 def test_invalid_steps_are_refused_before_anything_is_read(name, value):
-    with pytest.raises(UsageError) as told:
+    with pytest.raises(UsageError) as caught:
         parse_steps([(name, value)], OUTPUT, False)
-    assert told.value.hint and len(told.value.message) < 200
+    assert caught.value.hint and len(caught.value.message) < 200
 
 
 def test_coinciding_points_and_absurd_factors_are_refused():
@@ -499,18 +499,18 @@ def test_a_run_is_edited_from_the_command_line_and_stays_unchanged(run_folder: P
     before = (run_folder / "splat.ply").read_bytes()
     out = tmp_path / "site.ply"
     steps = "--rotate", "30", "--crop-box", "-1.5,-9,1.5,9", "--about", "0,0,0", "--rotate", "7", "--local"
-    told = splatpipe_edit(run_folder, out, *steps)
-    assert told["exit_code"] == 0
-    assert [step["step"] for step in told["steps"]] == ["rotate", "crop", "rotate"]
-    assert [step.get("degrees") for step in told["steps"]] == [30.0, None, 7.0]
-    assert told["place"] == [52.2, 21.0, 113.25]
+    printed = splatpipe_edit(run_folder, out, *steps)
+    assert printed["exit_code"] == 0
+    assert [step["step"] for step in printed["steps"]] == ["rotate", "crop", "rotate"]
+    assert [step.get("degrees") for step in printed["steps"]] == [30.0, None, 7.0]
+    assert printed["place"] == [52.2, 21.0, 113.25]
     read = plain_ply.read(out)
     assert read.facts.place == PLACE and len(read.facts.edits) == 3
     expected = edited(Scene(true_model(), PLACED), ("rotate", "30"), ("crop_box", "-1.5,-9,1.5,9"), local=True)
-    assert len(read.gaussians) == told["gaussians"] == len(expected.gaussians)
+    assert len(read.gaussians) == printed["gaussians"] == len(expected.gaussians)
     record = json.loads((tmp_path / "site.edits.json").read_text())
     assert record["input"]["sha256"] == SplatSource(run_folder / "splat.ply", None).digest()
-    assert record["steps"] == told["steps"] and record["output"]["gaussians"] == told["gaussians"]
+    assert record["steps"] == printed["steps"] and record["output"]["gaussians"] == printed["gaussians"]
     assert (run_folder / "splat.ply").read_bytes() == before
     picture = cv2.imread(str(tmp_path / "site.edit.png"))
     assert picture is not None and picture[40:, :960].std() > 10 and picture[40:, 968:].std() > 10
@@ -524,8 +524,8 @@ def test_a_run_is_edited_from_the_command_line_and_stays_unchanged(run_folder: P
 
 
 def test_errors_leave_nothing_behind_and_say_what_to_do(run_folder: Path, tmp_path: Path):
-    told = splatpipe_edit(run_folder, tmp_path / "a.ply", "--crop-box", "0,0,1,1")
-    assert told["exit_code"] == 1 and "would remove the whole splat" in told["error"]["message"]
+    output = splatpipe_edit(run_folder, tmp_path / "a.ply", "--crop-box", "0,0,1,1")
+    assert output["exit_code"] == 1 and "would remove the whole splat" in output["error"]["message"]
     with pytest.raises(UsageError, match="No edit step"):
         edit_splat(
             EditTask(open_source(run_folder), OutputFile(tmp_path / "a.ply", format_named("ply")), []), Recorder()
@@ -537,9 +537,9 @@ def test_errors_leave_nothing_behind_and_say_what_to_do(run_folder: Path, tmp_pa
 def test_files_of_a_run_are_not_overwritten(run_folder: Path, name):
     steps = parse_steps([("rotate", "1")], OUTPUT, False)
     task = EditTask(open_source(run_folder), OutputFile(run_folder / name, format_named("ply")), steps)
-    with pytest.raises(UsageError) as told:
+    with pytest.raises(UsageError) as caught:
         edit_splat(task, Recorder())
-    assert "edited.ply" in told.value.hint or "IN must not be overwritten" in told.value.hint
+    assert "edited.ply" in caught.value.hint or "IN must not be overwritten" in caught.value.hint
 
 
 def test_new_files_in_a_run_may_be_written_and_overwritten(run_folder: Path):

@@ -77,13 +77,13 @@ def test_partial_deliverables_of_a_killed_run_are_removed(numbers: Path, out: Pa
 
 
 def test_starts_are_reported_however_soon_they_follow() -> None:
-    told: list[str] = []
-    reporter = EventReporter("count", lambda event: told.append(f"{event.data['what']} {event.data['done']}"))
+    messages: list[str] = []
+    reporter = EventReporter("count", lambda event: messages.append(f"{event.data['what']} {event.data['done']}"))
     for what in ("placing", "joining"):
         for done in range(3):
             reporter.progress(done, 1000, what)
-    assert told[0] == "placing 0"
-    assert "joining 0" in told
+    assert messages[0] == "placing 0"
+    assert "joining 0" in messages
 
 
 def test_a_changed_option_reruns_exactly_as_far_as_it_changes_bytes(numbers: Path, out: Path) -> None:
@@ -257,8 +257,8 @@ def test_interrupt_ends_a_stage_that_ignores_signals(numbers: Path, out: Path) -
 def test_a_worker_that_is_asked_to_end_is_not_waited_for(numbers: Path, tmp_path: Path) -> None:
     """Its stdin stays open: it ends because it was asked to, not because of a timeout."""
     machine, config = asdict(Machine("cpu", 1)), {"steps": 3000, "step_s": 0.1}
-    told = {"parts": {}, "photos_dir": str(numbers), "out": str(tmp_path), "settings": {}, "summaries": {}}
-    task = Task("count", "arithmetic:count", "arithmetic:CountConfig", config, machine=machine, **told)
+    fields = {"parts": {}, "photos_dir": str(numbers), "out": str(tmp_path), "settings": {}, "summaries": {}}
+    task = Task("count", "arithmetic:count", "arithmetic:CountConfig", config, machine=machine, **fields)
     command = [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
         assert worker.stdin is not None and worker.stdout is not None
@@ -535,5 +535,5 @@ def test_the_log_thins_progress_and_keeps_starts(tmp_path: Path) -> None:
     ):
         log(Event("progress", "train", {"done": done, "total": 99, "what": what, "unit": ""}, time_s))
     log.close()
-    told = [json.loads(line)["data"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
-    assert [(data["what"], data["done"]) for data in told] == [("decoding", 1), ("training", 10), ("decoding", 3)]
+    logged = [json.loads(line)["data"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [(data["what"], data["done"]) for data in logged] == [("decoding", 1), ("training", 10), ("decoding", 3)]

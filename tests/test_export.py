@@ -165,13 +165,13 @@ def test_header_states_the_origin(exported: Path, tmp_path: Path) -> None:
 
 def test_georef_json_places_the_exported_cameras(exported: Path) -> None:
     """A camera's position by georef.json agrees with its exact path through PROJ; a shrunken scene in a known CRS."""
-    told = json.loads((exported / "georef.json").read_text())
-    assert told["crs"]["id"] == "EPSG:32634" and told["ecef_from_local"]["approximate"]
+    data = json.loads((exported / "georef.json").read_text())
+    assert data["crs"]["id"] == "EPSG:32634" and data["ecef_from_local"]["approximate"]
     positions = np.array([entry["position"] for entry in json.loads((exported / "cameras.json").read_text())])
-    earth = positions @ np.array(told["exact_path"]["matrix"])[:3, :3].T + np.array(told["exact_path"]["matrix"])[:3, 3]
+    earth = positions @ np.array(data["exact_path"]["matrix"])[:3, :3].T + np.array(data["exact_path"]["matrix"])[:3, 3]
     to_utm = pyproj.Transformer.from_crs(4978, "EPSG:32634", always_xy=True)
     easting, northing = to_utm.transform(*earth.T)[:2]
-    tangent = told["crs_from_local_tangent"]
+    tangent = data["crs_from_local_tangent"]
     by_matrix = positions @ np.array(tangent["matrix"])[:3, :3].T + np.array(tangent["matrix"])[:3, 3]
     off = np.hypot(by_matrix[:, 0] - easting, by_matrix[:, 1] - northing)
     assert off.max() <= tangent["largest_error_m"] + 1e-5  # as rounded

@@ -62,11 +62,11 @@ def test_photos_without_common_points_give_no_gains() -> None:
 
 def test_exposures_are_modelled_if_they_differ_unless_set_otherwise(scene: Path, tmp_path: Path) -> None:
     differing, alike = scene / "dataset", tiny_scene.write_dataset(tmp_path / "dataset")
-    for asked, dataset, told in (("auto", differing, "affine"), ("auto", alike, "off"), ("off", differing, "off")):
+    for asked, dataset, expected in (("auto", differing, "affine"), ("auto", alike, "off"), ("off", differing, "off")):
         recorder = tiny_scene.Recorder()
         found = decided_exposure(TrainConfig(exposure=asked), load_views(dataset), dataset, 1, recorder)
-        assert found.exposure == told
-        assert [note[:9] for note in recorder.notes] == (["exposures"] if told == "affine" else [])
+        assert found.exposure == expected
+        assert [note[:9] for note in recorder.notes] == (["exposures"] if expected == "affine" else [])
 
 
 def test_a_written_plan_is_final_and_no_photo_is_measured_again(

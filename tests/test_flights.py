@@ -46,8 +46,8 @@ def test_a_step_of_the_takeoff_altitude_is_another_flight() -> None:
 def test_flights_are_distinguished_whatever_the_order_of_names() -> None:
     stamps = flight(0.0, 509.0) + flight(600.0, 509.0)
     order = np.random.default_rng(0).permutation(len(stamps))
-    told = assign_flights([stamps[index] for index in order])
-    assert len({(number, index >= 20) for number, index in zip(told, order, strict=True)}) == 2
+    flights = assign_flights([stamps[index] for index in order])
+    assert len({(number, index >= 20) for number, index in zip(flights, order, strict=True)}) == 2
 
 
 @pytest.mark.parametrize("step_m", [0.0, 2.0, 47.0])

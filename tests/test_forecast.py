@@ -136,7 +136,7 @@ def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> 
     work = CaptureWork.of(LARGE, configured("standard", **LIMITED), REFERENCE, 1)
     assert work.blocks is not None
     most, limit = work.blocks.division.need.trained, LIMITED["max_memory_bytes"]
-    told = {
+    output = {
         "iterations": [1000, 1000, 1000, 2000],
         "start": [10_000, 20_000, 10 * most, 10_000],
         "steps": [4, 4, 4, 4],
@@ -144,7 +144,7 @@ def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> 
         "frozen": [50_000, 50_000, most, 90_000],
         "disk_bytes": [10**8, 10**8, 10**8, 3 * 10**8],
     }
-    needs = needs_of_blocks(work, told, 1.0)
+    needs = needs_of_blocks(work, output, 1.0)
     few, more, full, longer = (needs[f"train.{number}"] for number in (1, 2, 3, 4))
     assert few.memory_bytes < more.memory_bytes < full.memory_bytes <= limit
     assert more.memory_bytes - few.memory_bytes == pytest.approx(10_000 * 1.25**4 * bytes_per_gaussian(3), rel=0.01)
@@ -188,7 +188,7 @@ def test_the_costs_fit_the_runs_and_hold_for_captures_left_out() -> None:
     runs, _others = benchmark.runs_of(rows)
     assert len(runs) >= 6
     fitted = fit(runs)
-    assert benchmark.told(fitted) == benchmark.told(REFERENCE)
+    assert benchmark.costs_text(fitted) == benchmark.costs_text(REFERENCE)
     held = [benchmark.holds(outcome) for outcome in left_out(runs)]
     for each in zip(*held, strict=True):  # memory, CPU time
         assert sum(each) >= 5 / 6 * len(runs)
@@ -200,11 +200,11 @@ def test_the_costs_fit_the_runs_and_hold_for_captures_left_out() -> None:
 
 def test_each_manifest_has_the_forecast_beside_what_was_used(demo_run: Path) -> None:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "status", str(demo_run), "--json"]
-    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-    assert [stage["name"] for stage in told["stages"] if stage["forecast"] is None] == ["ingest"]
-    for stage in told["stages"][1:]:
+    output = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert [stage["name"] for stage in output["stages"] if stage["forecast"] is None] == ["ingest"]
+    for stage in output["stages"][1:]:
         assert set(stage["forecast"]) == set(stage["used"]) == {"memory_bytes", "cpu_seconds", "disk_bytes"}
-    used, forecasts = ([stage[kind] for stage in told["stages"][1:]] for kind in ("used", "forecast"))
+    used, forecasts = ([stage[kind] for stage in output["stages"][1:]] for kind in ("used", "forecast"))
     for kind, join in (("memory_bytes", max), ("cpu_seconds", sum), ("disk_bytes", sum)):
         assert 0.25 < join(each[kind] for each in forecasts) / join(each[kind] for each in used) < 4.0
     for path in demo_run.glob("stages/*/manifest.json"):

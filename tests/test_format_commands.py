@@ -25,9 +25,9 @@ def splatpipe(*arguments: str) -> tuple[int, dict[str, Any]]:
 def test_a_finished_run_is_exported_in_more_formats_and_keeps_earlier_ones(demo_run: Path, tmp_path: Path) -> None:
     out = shutil.copytree(demo_run, tmp_path / "out")
     before = (out / "splat.ply").read_bytes()
-    code, told = splatpipe("export", str(out), "--format", "laz,model")
+    code, output = splatpipe("export", str(out), "--format", "laz,model")
     assert code == 0
-    assert [stage["name"] for stage in told["stages"] if stage["state"] != "reused"] == ["export"]
+    assert [stage["name"] for stage in output["stages"] if stage["state"] != "reused"] == ["export"]
     assert (out / "splat.ply").read_bytes() == before
     place = read_scene(out / "splat.ply").facts.place
     assert place is not None and place.crs == "EPSG:32633"
@@ -35,7 +35,7 @@ def test_a_finished_run_is_exported_in_more_formats_and_keeps_earlier_ones(demo_
     crs = json.loads((out / "georef.json").read_text())["origin"]["in_crs"]
     centres = laspy.read(out / "export/centres.laz")
     assert abs(float(np.mean(centres.x)) - crs[0]) < 200.0 and abs(float(np.mean(centres.y)) - crs[1]) < 200.0
-    code, told = splatpipe("export", str(out), "-f", "colmap")
+    code, output = splatpipe("export", str(out), "-f", "colmap")
     assert code == 0
     assert (out / "export/dataset/sparse/0/images.bin").is_file() and (out / "export/model").is_dir()
 
@@ -50,11 +50,11 @@ def test_unknown_or_impossible_formats_are_reported_at_once(demo_run: Path, tmp_
 
 
 def test_a_file_is_converted_and_the_result_is_reported(demo_run: Path, tmp_path: Path) -> None:
-    code, told = splatpipe("convert", str(demo_run / "splat.ply"), str(tmp_path / "made.viewer.ply"))
+    code, output = splatpipe("convert", str(demo_run / "splat.ply"), str(tmp_path / "made.viewer.ply"))
     assert code == 0
     read = read_scene(tmp_path / "made.viewer.ply")
-    assert told["convert"]["gaussians"] == len(read.gaussians)
-    assert told["convert"]["bytes"] == (tmp_path / "made.viewer.ply").stat().st_size
+    assert output["convert"]["gaussians"] == len(read.gaussians)
+    assert output["convert"]["bytes"] == (tmp_path / "made.viewer.ply").stat().st_size
     assert read.facts.axes == "y down" and read.facts.place == read_scene(demo_run / "splat.ply").facts.place
 
 
@@ -63,7 +63,7 @@ def test_a_file_is_converted_and_the_result_is_reported(demo_run: Path, tmp_path
 )
 def test_files_that_cannot_be_converted_are_reported(tmp_path: Path, source: str, target: str, code: int) -> None:
     (tmp_path / "bad.ply").write_bytes(b"ply\nnonsense\n")
-    found, told = splatpipe("convert", str(tmp_path / source), str(tmp_path / target))
+    found, output = splatpipe("convert", str(tmp_path / source), str(tmp_path / target))
     assert found == code
-    assert told["error"]["message"]
+    assert output["error"]["message"]
     assert not (tmp_path / target).exists()

@@ -321,8 +321,8 @@ def test_scale_bars_make_a_metric_frame_without_any_position(tmp_path: Path) -> 
     assert frame.world_from_model.scale == pytest.approx(TRUTH.scale, rel=2e-4)
     assert abs(frame.world_from_model.rotation @ TRUTH.rotation.T @ [0.0, 0.0, 1.0])[2] > np.cos(np.radians(3.0))
     assert "Metres by 2 scale bars" in frame.note and "place and heading are arbitrary" in frame.note
-    told = georeference(frame, np.zeros((2, 3)))
-    assert told["frame"] == "z up, metres, arbitrary place and heading" and told["origin"] is None
+    facts = georeference(frame, np.zeros((2, 3)))
+    assert facts["frame"] == "z up, metres, arbitrary place and heading" and facts["origin"] is None
     accuracy = json.loads((tmp_path / "out" / "accuracy.json").read_text())
     assert accuracy["scale"]["metric"] and not accuracy["scale"]["placed"]
     bars = accuracy["scale"]["bars"]

@@ -20,7 +20,7 @@ SENTENCE = 160  # characters
 
 
 @cache
-def told(name: str) -> str:
+def help_text(name: str) -> str:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", name, "--help"]
     narrow = {**os.environ, "COLUMNS": "80", "TERMINAL_WIDTH": "80"}
     return subprocess.run(command, env=narrow, capture_output=True, text=True, check=True).stdout
@@ -35,7 +35,7 @@ def test_help_states_what_is_done_read_and_written_in_two_screens(name: str) -> 
     sentence = COMMANDS[name].help.partition("\n\n")[0]
     assert sentence.endswith(".")
     assert len(sentence) <= SENTENCE
-    text = told(name)
+    text = help_text(name)
     words = " ".join(text.split())
     assert len(text.splitlines()) <= SCREENS
     assert " ".join(PAGES[name].about.replace("\\[", "[").split()) in words
@@ -48,7 +48,7 @@ def test_the_examples_in_help_are_valid_calls(name: str, tmp_path: Path) -> None
         first, *arguments = example.split()
         assert first == name
         COMMANDS[name].make_context(name, arguments)
-        assert f"splatpipe {example}" in told(name)
+        assert f"splatpipe {example}" in help_text(name)
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))

@@ -678,10 +678,10 @@ def test_a_file_in_another_zone_is_reported(folder: Path, tmp_path: Path) -> Non
         save(folder / f"{name}.jpg", seed + 3, exif=drone_exif(gps_of(46.5, -91.5, 198.5)))
     geo = tmp_path / "geo.txt"
     rows = "".join(f"{name}.jpg 615097.16 5150696.35 199\n" for name in "cde")  # of zone 15, by PROJ
-    for zone, is_told in ((15, False), (16, True)):
+    for zone, is_reported in ((15, False), (16, True)):
         geo.write_text(f"EPSG:326{zone}\n{rows}")
         warnings = ingest(folder, geo=geo, out=f"out{zone}").warnings
-        assert any("geo.txt places the photos 459." in warning for warning in warnings) == is_told
+        assert any("geo.txt places the photos 459." in warning for warning in warnings) == is_reported
 
 
 def test_impossible_positions_are_left_out_and_named(folder: Path) -> None:

@@ -93,8 +93,8 @@ def thin(folder: Path) -> None:
                 database.write_two_view_geometry(i, j, geometry)
 
 
-def run(photos: Path, out: Path, told: str = "", threads: int = 1) -> int:
-    command = [sys.executable, KILLED_LADDER, photos, out, told, str(threads)]
+def run(photos: Path, out: Path, stop_at: str = "", threads: int = 1) -> int:
+    command = [sys.executable, KILLED_LADDER, photos, out, stop_at, str(threads)]
     # The stages' own processes import the line's bodies, too.
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent / "lines")}
     done = subprocess.run(command, check=False, start_new_session=True, capture_output=True, env=environment)
@@ -103,8 +103,8 @@ def run(photos: Path, out: Path, told: str = "", threads: int = 1) -> int:
 
 
 def digests(out: Path) -> dict[str, str]:
-    told = json.loads(next((out / "stages").glob("sparse-*/manifest.json")).read_text())
-    return {name: part["digest"] for name, part in told["parts"].items()}
+    manifest = json.loads(next((out / "stages").glob("sparse-*/manifest.json")).read_text())
+    return {name: part["digest"] for name, part in manifest["parts"].items()}
 
 
 @pytest.fixture(scope="module")
@@ -117,17 +117,17 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_rung_places_its_photos_and_a_kill_in_any_changes_no_bit(photos: Path, tmp_path: Path) -> None:
     assert run(photos, tmp_path / "whole") == 0
     (summary,) = (tmp_path / "whole" / "stages").glob("sparse-*/models.json")
-    told = json.loads(summary.read_text())
-    assert told["registered"] == WEAK, told["ladder"]
-    assert [(row["rung"], row["placed"]) for row in told["ladder"]] == [
+    content = json.loads(summary.read_text())
+    assert content["registered"] == WEAK, content["ladder"]
+    assert [(row["rung"], row["placed"]) for row in content["ladder"]] == [
         ("registration", 4),
         ("more pairs", 1),
         ("stronger keypoints", 1),
     ]
-    assert told["ladder"][0]["models_joined"] == 1
+    assert content["ladder"][0]["models_joined"] == 1
     out = tmp_path / "killed"
     for rung in RUNGS:
-        assert run(photos, out, rung) == -signal.SIGKILL, f"{rung} was never told"
+        assert run(photos, out, rung) == -signal.SIGKILL, f"{rung} was never reported"
         assert not list((out / "stages").glob("sparse-*")), f"{rung}: left in spite of the kill"
     assert run(photos, out, threads=2) == 0
     assert digests(out) == digests(tmp_path / "whole")

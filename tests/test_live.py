@@ -46,8 +46,8 @@ def wait(page: Page, until: Callable[[Any], bool]) -> Any:
     """The page's state, as soon as it is as expected."""
 
     def state() -> Any:
-        told = page.evaluate("splatpipe.live.state()")
-        return told if told is not None and until(told) else None
+        shown = page.evaluate("splatpipe.live.state()")
+        return shown if shown is not None and until(shown) else None
 
     return wait_until(state, "what the page is to say")
 
@@ -82,17 +82,17 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         assert server.start == "live"
         watched = open_page(f"{server.address}/{server.start}")
         page = watched.page
-        told = wait(page, lambda told: told["model"] and len(told["curves"].get("loss", [])) > 0)
-        assert told["at_work"] and told["model"]["kind"] == "initial"
-        assert [stage["state"] for stage in told["stages"] if stage["name"] in ("ingest", "undistort")] == [
+        state = wait(page, lambda state: state["model"] and len(state["curves"].get("loss", [])) > 0)
+        assert state["at_work"] and state["model"]["kind"] == "initial"
+        assert [stage["state"] for stage in state["stages"] if stage["name"] in ("ingest", "undistort")] == [
             "reused"
         ] * 2
         first, photo = shown(page, "render"), shown(page, "photo")
         assert first.shape == photo.shape
         hold(process, signal.SIGCONT)
-        follow_the_curves(page, len(told["curves"]["loss"]))
+        follow_the_curves(page, len(state["curves"]["loss"]))
         before = page.evaluate("document.getElementById('render').src")
-        told = wait(page, lambda told: told["model"]["kind"] == "checkpoint" and told["model"]["iteration"] > 200)
+        state = wait(page, lambda state: state["model"]["kind"] == "checkpoint" and state["model"]["iteration"] > 200)
         wait_for_picture(page, "(before) => document.getElementById('render').src !== before", before)
         assert page.locator("#iteration").inner_text().startswith("iteration ")
         assert psnr(shown(page, "render"), photo) > psnr(first, photo) + 3.0
@@ -105,7 +105,7 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         assert not np.array_equal(shown(page, "photo"), far)
         process.send_signal(signal.SIGTERM)
         process.wait(timeout=TIMEOUT_S)
-        wait(page, lambda told: not told["at_work"])
+        wait(page, lambda state: not state["at_work"])
         page.locator("#state.failed").wait_for()
         assert "train" in page.locator("#state").inner_text()
         assert watched.errors == []
@@ -130,9 +130,9 @@ def wait_for_picture(page: Page, shows: str, what: object) -> None:
 def follow_the_curves(page: Page, points: int) -> None:
     """The curves grow, on the page and in its data, and the remaining time is shown."""
     for _ in range(2):
-        told = wait(page, lambda told, points=points: len(told["curves"]["loss"]) > points)
-        points = len(told["curves"]["loss"])
-        assert told["curves"]["gaussians"][-1][1] > 100
+        state = wait(page, lambda state, points=points: len(state["curves"]["loss"]) > points)
+        points = len(state["curves"]["loss"])
+        assert state["curves"]["gaussians"][-1][1] > 100
     assert page.locator("#loss canvas").count() == 1 and page.locator("#gaussians canvas").count() == 1
     page.get_by_text("left in train").wait_for()
     done = float(page.locator("#progress").get_attribute("aria-valuenow") or -1)

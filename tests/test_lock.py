@@ -89,23 +89,23 @@ def test_a_second_holder_is_refused_and_a_killed_one_does_not_block(out: Path) -
         process.kill()
         process.wait()
         assert (out / "stages" / LOCK_FILE).read_text()  # still signed
-        told: list[str] = []
-        with locked(out, notify=told.append):
-            assert told == []  # the kernel knows that it is dead: nothing to look for
+        messages: list[str] = []
+        with locked(out, notify=messages.append):
+            assert messages == []  # the kernel knows that it is dead: nothing to look for
 
 
 def test_a_waiting_process_names_the_holder_and_continues_when_it_ends(out: Path) -> None:
-    told: list[str] = []
+    messages: list[str] = []
 
     def notify(text: str) -> None:
-        told.append(text)
+        messages.append(text)
         assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()
 
     with holder(out) as process, locked(out, wait=True, notify=notify):
         assert process.wait(TIMEOUT_S) == 0
-    assert len(told) == 1 and f"process {process.pid}" in told[0]
+    assert len(messages) == 1 and f"process {process.pid}" in messages[0]
 
 
 def test_another_machine_at_work_is_refused(out: Path) -> None:
@@ -145,24 +145,24 @@ def test_of_two_overlapping_signatures_the_last_one_is_read(out: Path) -> None:
 
 def test_the_lock_of_a_dead_machine_expires(out: Path) -> None:
     (out / "stages" / LOCK_FILE).write_text(json.dumps(ELSEWHERE))
-    told: list[str] = []
+    messages: list[str] = []
     began_s = time.monotonic()
-    with locked(out, notify=told.append):
+    with locked(out, notify=messages.append):
         assert time.monotonic() - began_s >= engine_lock.SILENCE_S
-    assert len(told) == 1 and "process 4711 on node7" in told[0]
+    assert len(messages) == 1 and "process 4711 on node7" in messages[0]
 
 
 def test_waiting_for_another_running_machine(out: Path) -> None:
-    told: list[str] = []
+    messages: list[str] = []
     with at_work_elsewhere(out) as over:
 
         def notify(text: str) -> None:
-            told.append(text)
+            messages.append(text)
             if "waiting" in text:
                 over.set()
 
         with locked(out, wait=True, notify=notify):
-            assert "waiting" in told[-1]
+            assert "waiting" in messages[-1]
 
 
 def test_a_lock_released_elsewhere_is_taken_at_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

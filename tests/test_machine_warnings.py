@@ -16,7 +16,9 @@ WINDOWS_DRIVE = (
 )
 
 
-def told(root: Path, place: str, *, mounted: str = "", kernel: str = "6.8.0-45-generic\n", gb: int = 64) -> list[str]:
+def warnings(
+    root: Path, place: str, *, mounted: str = "", kernel: str = "6.8.0-45-generic\n", gb: int = 64
+) -> list[str]:
     """The warnings on a system with these kernel texts."""
     texts = {
         "proc/self/mountinfo": ROOT + mounted,
@@ -30,22 +32,22 @@ def told(root: Path, place: str, *, mounted: str = "", kernel: str = "6.8.0-45-g
 
 
 def test_a_local_disk_needs_no_warning(tmp_path: Path) -> None:
-    assert told(tmp_path, "/home/jane/out") == []
-    assert told(tmp_path, "/home/jane/out", kernel=WSL2) == []
-    assert told(tmp_path, "/", mounted=WINDOWS_DRIVE, kernel=WSL2) == []
+    assert warnings(tmp_path, "/home/jane/out") == []
+    assert warnings(tmp_path, "/home/jane/out", kernel=WSL2) == []
+    assert warnings(tmp_path, "/", mounted=WINDOWS_DRIVE, kernel=WSL2) == []
 
 
 @pytest.mark.parametrize("place", ["/mnt/c", "/mnt/c/Users/jane/out"])
 def test_a_windows_drive_is_reported(tmp_path: Path, place: str) -> None:
-    (said,) = told(tmp_path, place, mounted=WINDOWS_DRIVE, kernel=WSL2)
+    (said,) = warnings(tmp_path, place, mounted=WINDOWS_DRIVE, kernel=WSL2)
     assert f"{place} is on 9p (mounted at /mnt/c)" in said and "~/out" in said
 
 
 def test_half_of_windows_memory_is_reported(tmp_path: Path) -> None:
-    (said,) = told(tmp_path, "/home/jane/out", kernel=WSL2, gb=8)
+    (said,) = warnings(tmp_path, "/home/jane/out", kernel=WSL2, gb=8)
     assert "8.2 GB" in said and ".wslconfig" in said
-    assert "WSL 1" in told(tmp_path, "/home/jane/out", kernel="4.4.0-19041-Microsoft\n")[0]
-    assert told(tmp_path, "/home/jane/out", gb=8) == []  # not WSL
+    assert "WSL 1" in warnings(tmp_path, "/home/jane/out", kernel="4.4.0-19041-Microsoft\n")[0]
+    assert warnings(tmp_path, "/home/jane/out", gb=8) == []  # not WSL
 
 
 @pytest.mark.parametrize(
@@ -69,20 +71,20 @@ def test_locks_that_hold_on_one_machine_only_are_reported(
     tmp_path: Path, kind: str, options: str, locks_hold: bool
 ) -> None:
     mounted = f"81 24 0:46 / /data rw,relatime shared:7 - {kind} server:/share {options}\n"
-    said = told(tmp_path, "/data/out", mounted=mounted)
+    said = warnings(tmp_path, "/data/out", mounted=mounted)
     assert len(said) == (0 if locks_hold else 1)
     assert locks_hold or (f"on {kind} (mounted at /data)" in said[0] and "this machine only" in said[0])
 
 
 def test_read_only_and_in_memory_file_systems_are_reported(tmp_path: Path) -> None:
     mounted = "82 24 0:47 / /media/stick ro - vfat /dev/sdb rw\n83 24 0:48 / /run/x rw - tmpfs tmpfs rw\n"
-    assert "read-only" in told(tmp_path, "/media/stick/out", mounted=mounted)[0]
-    assert "up memory" in told(tmp_path, "/run/x/out", mounted=mounted)[0]
+    assert "read-only" in warnings(tmp_path, "/media/stick/out", mounted=mounted)[0]
+    assert "up memory" in warnings(tmp_path, "/run/x/out", mounted=mounted)[0]
 
 
 def test_the_mount_that_hides_another_counts(tmp_path: Path) -> None:
     hidden = "84 24 0:49 / /data rw - fuse.sshfs a rw\n85 24 8:2 / /data rw - ext4 /dev/sdb rw\n"
-    assert told(tmp_path, "/data/out", mounted=hidden) == []
+    assert warnings(tmp_path, "/data/out", mounted=hidden) == []
 
 
 def test_a_system_without_these_files_is_no_fault(tmp_path: Path) -> None:

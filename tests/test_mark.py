@@ -140,12 +140,12 @@ def test_twelve_points_marked_in_the_browser_georeference_the_demo(
     assert unseen <= len(TWELVE)  # the page seldom asks for a point where something hides it
     assert done >= set(TWELVE)
     assert errors[0][0] > 1.0 and errors[-1][0] < 0.03 and errors[-1][1] < 0.03
-    told = now["overview"]
-    assert told["file"] == str(file) and told["tables"]["check"]["rmse_horizontal_m"] < 0.03
+    overview = now["overview"]
+    assert overview["file"] == str(file) and overview["tables"]["check"]["rmse_horizontal_m"] < 0.03
     assert watched.errors == [] and all(url.startswith(server.address) for url in watched.requests)
     for (name, photo), pixel in marks_in(file).items():
         np.testing.assert_allclose(pixel, TRUTH[name]["seen_px"][photo], atol=0.3)
-    command = shlex.split(told["command"])
+    command = shlex.split(overview["command"])
     assert command[0] == "splatpipe"
     splatpipe(*command[1:])
     metrics = json.loads((gps_run / "metrics.json").read_text())["accuracy"]
@@ -349,30 +349,30 @@ def test_a_phone_shows_and_marks_by_touch(marking: tuple[Served, Path], open_pag
 
 
 def test_the_page_says_what_cannot_be_marked(gps_run: Path, tmp_path: Path) -> None:
-    def told(points: Path | None = None) -> str:
+    def message(points: Path | None = None) -> str:
         with pytest.raises(SplatpipeError) as caught:
             Marking(open_job(open_run_folder(gps_run, LINE), points))
         return f"{caught.value.message} {caught.value.hint}"
 
     (gps_run.parent / "photos of a house" / "gcp_list.txt").unlink(missing_ok=True)
-    assert "--points FILE" in told()
+    assert "--points FILE" in message()
     points = tmp_path / "points.csv"
-    assert "cannot be read" in told(points)
+    assert "cannot be read" in message(points)
     points.write_text("name,x,y,z\nP1,1,2,3\n")
-    assert "states no CRS" in told(points)
+    assert "states no CRS" in message(points)
     points.write_text("EPSG:32633\n")
-    assert "points.csv" in told(points)
+    assert "points.csv" in message(points)
     points.write_bytes(b"\x00\xff" * 100)
-    assert "not UTF-8 text" in told(points)
+    assert "not UTF-8 text" in message(points)
     control = gps_run.parent / "photos of a house" / "gcp_list.txt"
     control.write_text("EPSG:25833\n388710 5299705 512 1 2 DJI_0001.JPG P99\n")
     points.write_text(POINTS)
-    assert "One control file has one CRS" in told(points)
+    assert "One control file has one CRS" in message(points)
     control.write_text("EPSG:32633\n388711 5299705 512 1 2 DJI_0001.JPG P01\n")
-    assert "other coordinates" in told(points)
+    assert "other coordinates" in message(points)
     control.unlink()
     points.write_text(POINTS.replace("EPSG:32633", "EPSG:25832"))  # the neighbour's zone
-    assert "km from the photos" in told(points)
+    assert "km from the photos" in message(points)
 
 
 def test_three_points_determine_a_frame_if_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
@@ -390,8 +390,9 @@ def test_three_points_determine_a_frame_if_photos_have_no_positions(gps_run: Pat
     for name in ("P01", "P04", "P05", "P16"):
         for photo, (x, y) in list(TRUTH[name]["seen_px"].items())[:4]:
             marking.change(name, photo, (x, y))
-    told = marking.overview()
-    assert told["placed"] and told["heights_tied"] and max(told["expected_m"]) < 0.1 and not told["warnings"]
+    overview = marking.overview()
+    assert overview["placed"] and overview["heights_tied"] and not overview["warnings"]
+    assert max(overview["expected_m"]) < 0.1
     rows = {row["name"]: row for row in marking.detail("P07")["photos"]}
     for photo, pixel in TRUTH["P07"]["seen_px"].items():
         assert rows[photo]["predicted"] == pytest.approx(pixel, abs=8.0)
@@ -431,8 +432,8 @@ def test_detected_targets_count_like_marks_and_are_never_written(gps_run: Path, 
         return point["marks"], point["found"]
 
     every = len(found["P01"])
-    told = marking.overview()
-    assert told["tables"]["control"]["count"] == 3 and not told["warnings"] and not told["exists"]
+    overview = marking.overview()
+    assert overview["tables"]["control"]["count"] == 3 and not overview["warnings"] and not overview["exists"]
     assert counts() == (every, every) and seen() == ([round(x, 2), round(y, 2)], True, False)
     marking.change("P01", here, (x + 1.0, y))
     assert counts() == (every, every - 1) and seen() == ([round(x + 1.0, 2), round(y, 2)], False, False)
@@ -469,8 +470,8 @@ def test_detected_targets_are_shown_moved_and_rejected_in_the_browser(found_run:
     with serving(found_run, "--mark") as server:
         watched = opened(open_page, server, 1000, 640)
         page = watched.page
-        told = state(page)["overview"]
-        assert sum(point["found"] for point in told["points"]) == sum(point["marks"] for point in told["points"]) > 200
+        points = state(page)["overview"]["points"]
+        assert sum(point["found"] for point in points) == sum(point["marks"] for point in points) > 200
         photo, pixel = "DJI_0034.JPG", TRUTH["P16"]["seen_px"]["DJI_0034.JPG"]
         page.evaluate(f"splatpipe.mark.goTo('P16', '{photo}')")
         chosen = page.locator("#photos li[aria-current]")

@@ -68,7 +68,7 @@ def out(tmp_path: Path) -> Path:
     return store.out
 
 
-def told(out: Path) -> Any:
+def embedded(out: Path) -> Any:
     """Return the data embedded in the page."""
     return json.loads((out / "viewer.html").read_bytes().partition(BEGIN)[2].partition(END)[0])
 
@@ -80,7 +80,7 @@ def artifact_page(out: Path) -> Path:
 
 def test_measurements_are_in_the_page_and_not_in_the_artifact(out: Path) -> None:
     assert update_viewer(out) == ""
-    (section,), (volume,) = told(out)["sections"], told(out)["volumes"]
+    (section,), (volume,) = embedded(out)["sections"], embedded(out)["volumes"]
     assert (section["name"], section["length_m"], section["trace"]) == ("Section 1", 3.0, TRACE)
     assert (volume["net_m3"], volume["base"]) == (2.5, "rim")
     assert artifact_page(out).read_bytes() == PLAIN
@@ -91,7 +91,7 @@ def test_a_hostile_name_stays_text(out: Path) -> None:
     update_viewer(out)
     page = (out / "viewer.html").read_text(encoding="utf-8")
     assert page.count("</script>") == PLAIN.decode().count("</script>")
-    assert told(out)["volumes"][0]["name"] == "</script><script>alert(1)</script>\ufffd\ufffd"
+    assert embedded(out)["volumes"][0]["name"] == "</script><script>alert(1)</script>\ufffd\ufffd"
 
 
 def test_the_page_is_kept_and_the_store_accepts_it_as_its_copy(out: Path) -> None:
@@ -104,7 +104,7 @@ def test_the_page_is_kept_and_the_store_accepts_it_as_its_copy(out: Path) -> Non
     store.deliver(artifact, EXPORT)
     assert (page.stat().st_ino, page.stat().st_mtime_ns) == (before.st_ino, artifact_page(out).stat().st_mtime_ns)
     newer = make(store, EXPORT, artifact.manifest["inputs"]["reads"], "newer ")
-    assert told(out) is None
+    assert embedded(out) is None
     update_viewer(out)
     assert page.read_bytes() == content
     parts = open_run_folder(out, LINE).lineage(EXPORT)
@@ -119,7 +119,7 @@ def test_the_page_for_web_hosts_shows_the_same(out: Path) -> None:
     (out / "web/index.html").write_bytes(b"<title>of an earlier version</title>")
     (out / "viewer.html").write_bytes(PLAIN)
     assert "web/index.html was written by an earlier version" in update_viewer(out)
-    assert told(out)["sections"]
+    assert embedded(out)["sections"]
 
 
 def test_pages_with_different_contents_differ_in_size() -> None:
@@ -143,13 +143,13 @@ def test_measurements_on_another_surface_model_are_not_shown(out: Path) -> None:
 def test_a_page_in_another_frame_shows_nothing(out: Path) -> None:
     make(Store(out), EXPORT, digests(make(Store(out), GEOREF, {}, "moved "), "georef.frame"))
     update_viewer(out)
-    assert told(out) is None
+    assert embedded(out) is None
 
 
 def test_removed_measurements_are_not_shown(out: Path) -> None:
     (out / "volumes.json").unlink()
     update_viewer(out)
-    assert [len(told(out)[kind]) for kind in ("sections", "volumes")] == [1, 0]
+    assert [len(embedded(out)[kind]) for kind in ("sections", "volumes")] == [1, 0]
     (out / "sections/section-1.csv").unlink()
     update_viewer(out)
     assert (out / "viewer.html").read_bytes() == PLAIN
@@ -169,18 +169,18 @@ def test_the_report_rounds_figures_to_their_uncertainty(out: Path) -> None:
     amounts = {"cut_m3": 12_345.678, "cut_sigma_m3": 45.6, "fill_m3": 0.123456, "fill_sigma_m3": 0.0456}
     amounts |= {"net_m3": -3.0, "net_sigma_m3": 0.0}
     write_measurements(out, "volumes", (surface, "any"), [{**VOLUME, **amounts}])
-    told = measures(read_report_inputs(out))
-    (volume,), (section,) = told["volumes"], told["sections"]
+    embedded = measures(read_report_inputs(out))
+    (volume,), (section,) = embedded["volumes"], embedded["sections"]
     assert volume["cut"] == "12,346 ± 46 m³"
     assert volume["fill"] == "0.123 ± 0.046 m³"
     assert volume["net"] == "-3.000 ± 0.000 m³"
     assert volume["base"] == "rim, 1.00 m"
     assert (section["length"], section["known"], section["picture"]) == ("3.00 m", "75 %", None)
     assert section["files"] == [("CSV", "sections/section-1.csv")]
-    assert not told["outdated"]
+    assert not embedded["outdated"]
     make(Store(out), DSM, {}, "newer ")
-    told = measures(read_report_inputs(out))
-    assert (told["sections"], told["volumes"], told["outdated"]) == ([], [], True)
+    embedded = measures(read_report_inputs(out))
+    assert (embedded["sections"], embedded["volumes"], embedded["outdated"]) == ([], [], True)
 
 
 def changed(item: dict[str, Any], **members: Any) -> dict[str, Any]:

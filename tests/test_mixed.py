@@ -37,8 +37,8 @@ class Notes:
 def photo(name: str, size: tuple[int, int] = (4000, 3000), **exif: object) -> CheckedPhoto:
     """A photo of a compact camera."""
     tags: dict[str, object] = {"make": "Canon", "model": "Canon PowerShot A3300 IS", "focal_mm": 5.0}
-    told = Exif(**{**tags, **exif})  # type: ignore[arg-type]
-    return CheckedPhoto(name, Path(name), "0" * 64, *size, name, True, False, None, told, {})
+    tags_read = Exif(**{**tags, **exif})  # type: ignore[arg-type]
+    return CheckedPhoto(name, Path(name), "0" * 64, *size, name, True, False, None, tags_read, {})
 
 
 def grouped(*photos: CheckedPhoto) -> tuple[list[CameraGroup], list[list[str]]]:

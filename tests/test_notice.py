@@ -12,7 +12,7 @@ from splatpipe.pipeline.app.notice import check_command, notify
 from splatpipe.pipeline.engine.errors import UsageError
 
 HOSTILE = "$(touch pwned) `touch pwned`; touch pwned\n\"' & touch pwned #"
-WRITE = 'printf "%s\\0" "$SPLATPIPE_STATE" "$SPLATPIPE_CAPTURE" "$SPLATPIPE_REPORT" "$SPLATPIPE_OUT" > told'
+WRITE = 'printf "%s\\0" "$SPLATPIPE_STATE" "$SPLATPIPE_CAPTURE" "$SPLATPIPE_REPORT" "$SPLATPIPE_OUT" > notice'
 
 
 @pytest.fixture(autouse=True)
@@ -20,20 +20,20 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
 
 
-def told() -> list[str]:
-    return os.fsdecode(Path("told").read_bytes()).split("\0")[:-1]
+def notified() -> list[str]:
+    return os.fsdecode(Path("notice").read_bytes()).split("\0")[:-1]
 
 
 def test_the_command_finds_the_outcome_in_its_environment(tmp_path: Path) -> None:
     report = tmp_path / "out" / "report.html"
     assert notify(WRITE, "done", "church", report) == ""
-    assert told() == ["done", "church", str(report), str(report.parent)]
+    assert notified() == ["done", "church", str(report), str(report.parent)]
 
 
 def test_no_name_becomes_a_part_of_the_command(tmp_path: Path) -> None:
     for name in (HOSTILE, os.fsdecode(b"\xff\xfe")):
         assert notify(WRITE, "failed", name, None, tmp_path / name.replace("/", "")) == ""
-        assert told()[:3] == ["failed", name, ""]
+        assert notified()[:3] == ["failed", name, ""]
     assert not Path("pwned").exists()
 
 

@@ -74,10 +74,10 @@ def errors_of(frame: Frame, model: SparseModel) -> dict[str, float]:
 
 
 def stated_of(frame: Frame, what: str) -> dict[str, float]:
-    told = frame.residuals["uncertainty"]
-    offset = told[f"offset_{what}_m"]
-    angles = {name: told[f"{name}_{what}_deg"] for name in ("north", "up")}
-    return {"east": offset[0], "height": offset[2], **angles, "scale": told[f"scale_{what}_percent"]}
+    uncertainty = frame.residuals["uncertainty"]
+    offset = uncertainty[f"offset_{what}_m"]
+    angles = {name: uncertainty[f"{name}_{what}_deg"] for name in ("north", "up")}
+    return {"east": offset[0], "height": offset[2], **angles, "scale": uncertainty[f"scale_{what}_percent"]}
 
 
 def test_stated_accuracy_of_positions_off_by_13_m_is_true() -> None:
@@ -117,8 +117,8 @@ def test_correlated_errors_are_reported_and_accounted_for() -> None:
         error[k] = 0.9 * error[k - 1] + math.sqrt(1.0 - 0.9**2) * rng.normal(size=3)
     slow, _ = placed(cameras(), CENTRES + 13.0 * error)
     white, _ = placed(cameras(), CENTRES + 13.0 * rng.normal(size=(40, 3)))
-    told = slow.residuals["uncertainty"]
-    assert min(told["noise_correlation"]) > 0.6
+    uncertainty = slow.residuals["uncertainty"]
+    assert min(uncertainty["noise_correlation"]) > 0.6
     assert stated_of(slow, "sigma")["east"] > 1.8 * stated_of(white, "sigma")["east"]
     errors, bounds = errors_of(slow, cameras()), stated_of(slow, "95")
     assert all(abs(errors[name]) <= bounds[name] for name in errors)
@@ -156,9 +156,9 @@ def test_altitude_that_drifts_does_not_tilt_the_model() -> None:
 
 def test_noise_that_leaves_scale_unknown_is_refused_with_its_size() -> None:
     rng = np.random.default_rng(0)
-    with pytest.raises(FrameUndeterminedError, match="agree with the model: they are off by") as told:
+    with pytest.raises(FrameUndeterminedError, match="agree with the model: they are off by") as uncertainty:
         placed(cameras(), CENTRES + 90.0 * rng.normal(size=CENTRES.shape))
-    assert "%" in str(told.value)
+    assert "%" in str(uncertainty.value)
 
 
 def test_errors_of_all_sizes_are_not_searched_for_ever() -> None:

@@ -110,12 +110,12 @@ def test_pairs_predicted_by_a_bent_model_prove_the_bend(tmp_path: Path) -> None:
     for photos, world in ((range(1, 14), still), (range(14, 25), shifted)):
         add_points(right, ring, photos, still)
         add_points(bent, ring, photos, world)
-    told = [
+    notes = [
         probe(capture, model, (capture.database, verified), 48, 0, corner_photos.Recorder()) for model in (right, bent)
     ]
-    assert told[0].held > 20 and told[0].contradicting == 0 and not told[0].prove_a_bend
-    assert told[1].prove_a_bend
-    assert len(told[1].verified.matches) == len(verified.matches) + told[1].held
+    assert notes[0].held > 20 and notes[0].contradicting == 0 and not notes[0].prove_a_bend
+    assert notes[1].prove_a_bend
+    assert len(notes[1].verified.matches) == len(verified.matches) + notes[1].held
 
 
 def test_a_thin_chain_gets_more_pairs_and_is_mapped_correctly(tmp_path: Path) -> None:

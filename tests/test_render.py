@@ -55,8 +55,8 @@ def render(out: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
 def rendered(out: Path, *arguments: object) -> dict[str, object]:
     done = render(out, *arguments)
     assert done.returncode == 0, done.stderr
-    told: dict[str, object] = json.loads(done.stdout)["render"]
-    return told
+    summary: dict[str, object] = json.loads(done.stdout)["render"]
+    return summary
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +66,11 @@ def parts(demo_run: Path) -> dict[str, Path]:
 
 def test_every_run_makes_a_film_that_a_browser_plays(demo_run: Path, parts: dict[str, Path], browser: Browser) -> None:
     film = demo_run / "flythrough.webm"
-    told, pictures = decoded(browser, film, [0.5 / 25, 2.0 + 0.5 / 25, SECONDS - 0.5 / 25])
-    assert told["duration"] == pytest.approx(SECONDS, abs=0.01)
+    summary, pictures = decoded(browser, film, [0.5 / 25, 2.0 + 0.5 / 25, SECONDS - 0.5 / 25])
+    assert summary["duration"] == pytest.approx(SECONDS, abs=0.01)
     scene = open_scene(parts, 1, cpu())
     lens = scene.lens(None)
-    assert (told["width"], told["height"]) == (lens.width, lens.height)
+    assert (summary["width"], summary["height"]) == (lens.width, lens.height)
     assert lens.width / lens.height == pytest.approx(16 / 9, abs=0.02)
     pixels = np.median([camera.width * camera.height for camera in scene.cameras])
     assert lens.width * lens.height == pytest.approx(pixels, rel=0.02)
@@ -93,8 +93,8 @@ def test_the_film_of_the_demo_stays_outside_the_house(parts: dict[str, Path]) ->
 def test_stills_of_the_photos_are_those_that_were_evaluated(
     demo_run: Path, parts: dict[str, Path], tmp_path: Path
 ) -> None:
-    told = rendered(demo_run, "--stills", "-o", tmp_path / "stills")
-    assert told["pictures"] == 40 and told["file"] == str(tmp_path / "stills")
+    summary = rendered(demo_run, "--stills", "-o", tmp_path / "stills")
+    assert summary["pictures"] == 40 and summary["file"] == str(tmp_path / "stills")
     measured = sorted(parts["evaluate.views"].glob("*.render.png"))
     assert len(measured) == 10
     for picture in measured:
@@ -103,7 +103,7 @@ def test_stills_of_the_photos_are_those_that_were_evaluated(
 
 
 def test_depths_are_metres_to_surveyed_points(demo_run: Path, parts: dict[str, Path], tmp_path: Path) -> None:
-    told = rendered(demo_run, "--stills", "--what", "depth", "-o", tmp_path)
+    summary = rendered(demo_run, "--stills", "--what", "depth", "-o", tmp_path)
     control = json.loads(parts["georef.control"].read_text())
     poses = {entry["img_name"]: entry for entry in json.loads((demo_run / "cameras.json").read_text())}
     off = []
@@ -122,8 +122,8 @@ def test_depths_are_metres_to_surveyed_points(demo_run: Path, parts: dict[str, P
                 off.append(depth[row, column] / z - 1.0)
     assert len(off) > 50 and np.median(np.abs(off)) < 0.01
     with Image.open(tmp_path / "DJI_0001.png") as picture:
-        assert picture.size == (told["width"], told["height"]) and picture.mode == "RGB"
-    assert 0.0 < told["nearest"] < told["farthest"]  # type: ignore[operator]
+        assert picture.size == (summary["width"], summary["height"]) and picture.mode == "RGB"
+    assert 0.0 < summary["nearest"] < summary["farthest"]  # type: ignore[operator]
 
 
 def test_the_ground_of_the_demo_faces_up(demo_run: Path, tmp_path: Path) -> None:
@@ -145,8 +145,8 @@ def test_films_along_keyframes_have_their_length_and_size(
     path = tmp_path / "round the house.csv"
     path.write_text("time,x,y,z,target_x,target_y,target_z\n0,30,0,15,0,0,3\n1,0,30,20,0,0,3\n1.5,-30,0,15,0,0,3\n")
     out = tmp_path / "films" / "film.webm"
-    told = rendered(demo_run, "--path", path, "--what", what, "--size", "160x90", "--fps", 8, "-o", out)
-    assert told["pictures"] == 12
+    summary = rendered(demo_run, "--path", path, "--what", what, "--size", "160x90", "--fps", 8, "-o", out)
+    assert summary["pictures"] == 12
     seen, pictures = decoded(browser, out, [0.05, 1.4])
     assert (seen["width"], seen["height"]) == (160, 90) and seen["duration"] == pytest.approx(1.5, abs=0.01)
     assert psnr(*pictures) < 25.0 and all(np.std(picture) > 10.0 for picture in pictures)
@@ -155,8 +155,8 @@ def test_films_along_keyframes_have_their_length_and_size(
 def test_an_orbit_is_written_below_out_even_without_an_export(demo_run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(demo_run, out, ignore=shutil.ignore_patterns("export-*", "features-*", "matches-*"))
-    told = rendered(out, "--path", "orbit", "--seconds", 0.4, "--size", "64x36", "--threads", 1)
-    assert told == {"pictures": 10, "width": 64, "height": 36, "file": str(out / "renders" / "orbit-colour.webm")}
+    summary = rendered(out, "--path", "orbit", "--seconds", 0.4, "--size", "64x36", "--threads", 1)
+    assert summary == {"pictures": 10, "width": 64, "height": 36, "file": str(out / "renders" / "orbit-colour.webm")}
     assert (out / "renders" / "orbit-colour.webm").is_file()
 
 

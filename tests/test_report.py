@@ -197,8 +197,8 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     watched = open_page((copy_of_run / "report.html").as_uri())
     assert (watched.requests, watched.errors) == ([], [])
     assert headline(watched) == "Stopped in train before it was finished"
-    told = words(watched)
-    iteration = int(re.search(r"It had reached ([\d,]+) of 100,000 iterations", told).group(1).replace(",", ""))
+    shown_text = words(watched)
+    iteration = int(re.search(r"It had reached ([\d,]+) of 100,000 iterations", shown_text).group(1).replace(",", ""))
     events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text()[before:].splitlines()]
     progress = [event["data"]["done"] for event in events if event["data"].get("what") == "training"]
     steps = [event["data"]["step"] for event in events if event["kind"] == "metric"]
@@ -207,7 +207,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     assert state_of(watched, "train") == "stopped" and state_of(watched, "sparse") == "earlier run"
     assert watched.page.locator("#training .chart").count() == 2
     assert watched.page.locator("#views").count() == 0 and "PSNR" not in watched.page.locator(".cards").inner_text()
-    assert "6 check points are off by" in told  # what was found before is not lost
+    assert "6 check points are off by" in shown_text  # what was found before is not lost
     assert watched.page.locator("#files .stale").count() == watched.page.locator("#files tr").filter(
         has_text=re.compile(r"splat\.|\.glb|cameras\.json|georef\.json|metrics\.json|viewer\.html|flythrough")
     ).count() > 0  # fmt: skip
@@ -236,13 +236,13 @@ def test_a_run_that_failed_in_sparse_has_a_truthful_report(tmp_path: Path, open_
         shutil.copy(capture_path() / name, photos)
     out = tmp_path / "out"
     done = splatpipe("run", photos, out, *sets(*QUICK), "--json")
-    told = json.loads(done.stdout)
-    assert (done.returncode, told["failed"]) == (1, "sparse")
+    output = json.loads(done.stdout)
+    assert (done.returncode, output["failed"]) == (1, "sparse")
     watched = open_page((out / "report.html").as_uri())
     assert (watched.requests, watched.errors) == ([], [])
     assert headline(watched) == "Failed in sparse"
     said = words(watched)
-    assert told["error"]["message"] in said and told["error"]["hint"] in said
+    assert output["error"]["message"] in said and output["error"]["hint"] in said
     assert "Not reached, so not in this report: Georeferencing and accuracy, Training, Held-out photos." in said
     assert state_of(watched, "matches") == "finished" and state_of(watched, "sparse") == "failed"
     assert state_of(watched, "train") == "not reached"
@@ -291,16 +291,16 @@ def test_hostile_names_and_messages_stay_text(copy_of_run: Path, open_page: Call
             events.write(json.dumps({"kind": kind, "stage": stage, "data": data, "time_s": 1.8e9}) + "\n")
         events.write("no JSON\n[1, 2]\n" + '{"kind": "metric", "stage": "train", "data": {}, "time_s": "soon"}\n')
 
-    def hostile_control(told: dict[str, object]) -> None:
-        point = told["points"][0]
-        point["name"] = point["why"] = told["file"] = f"$x_{HOSTILE}"
+    def hostile_control(content: dict[str, object]) -> None:
+        point = content["points"][0]
+        point["name"] = point["why"] = content["file"] = f"$x_{HOSTILE}"
         point["observations"][0]["photo"] = f"../{HOSTILE}"
 
     rewrite(inputs.part("georef.control"), hostile_control)
     left_out = [{"name": HOSTILE, "reason": HOSTILE}]
-    rewrite(inputs.part("ingest.left_out"), lambda told: told.update(left_out=left_out))
+    rewrite(inputs.part("ingest.left_out"), lambda content: content.update(left_out=left_out))
     stolen = {"name": HOSTILE, "file": "../../../etc/passwd"}
-    rewrite(inputs.part("evaluate.metrics"), lambda told: told["per_view"][0].update(stolen))
+    rewrite(inputs.part("evaluate.metrics"), lambda content: content["per_view"][0].update(stolen))
     write_report(copy_of_run)
     watched = open_page((copy_of_run / "report.html").as_uri())
     assert (watched.requests, watched.errors) == ([], [])
@@ -332,54 +332,54 @@ def test_a_damaged_artifact_of_a_finished_run_is_not_reported_as_a_requested_end
 
 def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
     """Change a part of an artifact and keep the artifact valid."""
-    told = json.loads(path.read_text())
+    data = json.loads(path.read_text())
     size = path.stat().st_size
-    change(told)
-    path.write_text(json.dumps(told))
+    change(data)
+    path.write_text(json.dumps(data))
     manifest = path.parent / "manifest.json"
     manifest.write_text(manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
 
 
-def show_nothing_inside(told: dict[str, Any]) -> None:
+def show_nothing_inside(data: dict[str, Any]) -> None:
     """evaluate's output if no held-out photo shows the inside of the boundary."""
-    told["whole"] = dict(told["mean"])
-    for measures in (told["mean"], *told["per_view"]):
+    data["whole"] = dict(data["mean"])
+    for measures in (data["mean"], *data["per_view"]):
         measures.update(psnr=None, psnr_cc=None, ssim=None)
 
 
 @pytest.mark.parametrize(
     ("part", "change", "level", "said"),
     [
-        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=17.0), "bad", "poor image quality"),
-        ("evaluate.metrics", lambda told: told["mean"].update(psnr_cc=22.0), "doubt", "fair image quality"),
-        ("evaluate.metrics", lambda told: told.update(per_view=[]), "doubt", "No photo was held out"),
-        ("evaluate.metrics", lambda told: told.update(whole=told["mean"]), "good", "dB inside the boundary"),
+        ("evaluate.metrics", lambda data: data["mean"].update(psnr_cc=17.0), "bad", "poor image quality"),
+        ("evaluate.metrics", lambda data: data["mean"].update(psnr_cc=22.0), "doubt", "fair image quality"),
+        ("evaluate.metrics", lambda data: data.update(per_view=[]), "doubt", "No photo was held out"),
+        ("evaluate.metrics", lambda data: data.update(whole=data["mean"]), "good", "dB inside the boundary"),
         ("evaluate.metrics", show_nothing_inside, "doubt", "No held-out photo shows the area inside the boundary"),
-        ("evaluate.metrics", lambda told: told["floaters"]["veil"].update(mean=0.2), "doubt", "20.0 % of the light"),
+        ("evaluate.metrics", lambda data: data["floaters"]["veil"].update(mean=0.2), "doubt", "20.0 % of the light"),
         (
             "evaluate.metrics",
-            lambda told: told["floaters"]["veil"].update(mean=0.0, held_out=False),
+            lambda data: data["floaters"]["veil"].update(mean=0.0, held_out=False),
             "good",
             "of the training",
         ),
-        ("georef.accuracy", lambda told: told["tables"]["check"].update(rmse_up_m=0.5), "doubt", "50.0 cm in height"),
+        ("georef.accuracy", lambda data: data["tables"]["check"].update(rmse_up_m=0.5), "doubt", "50.0 cm in height"),
         (
             "evaluate.metrics",
-            lambda told: told["accuracy"]["splat"]["points"][2].update(residual_m=[3.0, 0.0, 4.0]),
+            lambda data: data["accuracy"]["splat"]["points"][2].update(residual_m=[3.0, 0.0, 4.0]),
             "doubt",
             "(5.00 m)",
         ),
-        ("georef.accuracy", lambda told: told["tables"].update(check=None), "doubt", "no check point to verify it"),
+        ("georef.accuracy", lambda data: data["tables"].update(check=None), "doubt", "no check point to verify it"),
         (
             "georef.accuracy",
-            lambda told: told["tables"].update(check=None, control=None),
+            lambda data: data["tables"].update(check=None, control=None),
             "doubt",
             "own positions alone",
         ),
-        ("georef.frame", lambda told: told.update(kind="arbitrary"), "doubt", "neither scale nor georeference"),
+        ("georef.frame", lambda data: data.update(kind="arbitrary"), "doubt", "neither scale nor georeference"),
         (
             "georef.frame",
-            lambda told: told.update(kind="arbitrary", metres=True),
+            lambda data: data.update(kind="arbitrary", metres=True),
             "doubt",
             "metric but not georeferenced",
         ),
@@ -401,8 +401,8 @@ def test_scale_bars_are_reported_one_by_one(copy_of_run: Path) -> None:
     rows = [dict(zip(("a", "b", "metres", "error_m", "used"), bar, strict=True)) for bar in bars]
     scale = {"metric": True, "placed": False, "sentence": "by one bar.", "sigma": 0.001, "bars": rows}
     inputs = read_report_inputs(copy_of_run)
-    rewrite(inputs.part("georef.frame"), lambda told: told.update(kind="arbitrary", metres=True, origin=None))
-    rewrite(inputs.part("georef.accuracy"), lambda told: told.update(scale=scale))
+    rewrite(inputs.part("georef.frame"), lambda data: data.update(kind="arbitrary", metres=True, origin=None))
+    rewrite(inputs.part("georef.accuracy"), lambda data: data.update(scale=scale))
     inputs = read_report_inputs(copy_of_run)
     chapter = georeferencing_chapter(inputs, None)
     assert chapter is not None
@@ -421,10 +421,10 @@ def test_bad_cameras_are_the_headline_of_page_and_console(
 ) -> None:
     reason = {"level": "bad", "kind": "bent", "text": "40 of 90 pairs contradict it.", "hint": "Add photos."}
     verdict = {"level": "bad", "reasons": [reason]}
-    rewrite(read_report_inputs(copy_of_run).part("sparse.summary"), lambda told: told.update(verdict=verdict))
-    told = judge(read_report_inputs(copy_of_run))
-    assert (told.level, told.headline) == ("bad", "The camera poses are unreliable")
-    assert (told.findings[0].level, told.findings[0].text) == ("bad", "40 of 90 pairs contradict it. Add photos.")
+    rewrite(read_report_inputs(copy_of_run).part("sparse.summary"), lambda judged: judged.update(verdict=verdict))
+    judged = judge(read_report_inputs(copy_of_run))
+    assert (judged.level, judged.headline) == ("bad", "The camera poses are unreliable")
+    assert (judged.findings[0].level, judged.findings[0].text) == ("bad", "40 of 90 pairs contradict it. Add photos.")
     show_bad_cameras(verdict)
     assert re.search(
         "The camera poses are unreliable.*40 of 90 pairs contradict it.*Add photos", capsys.readouterr().err, re.DOTALL

@@ -71,9 +71,9 @@ def test_bundled_code_has_a_licence_in_the_wheel(bill: dict[str, Any]) -> None:
     for name in sbom.bundled_names(bill):
         if name != "cuda-runtime":  # its toolkit has it, and CMake puts it into a wheel with CUDA
             assert sbom.licence_file(name) in taken, name
-    told = {part for part in PROJECT["license"].split() if part != "AND"}
+    named = {part for part in PROJECT["license"].split() if part != "AND"}
     bundled = [one["license"] for each in bill["components"] for one in each.get("licenses", [])]
-    assert {one["id"] for one in bundled if "id" in one} <= told
+    assert {one["id"] for one in bundled if "id" in one} <= named
 
 
 def test_every_crate_in_a_page_is_named_with_its_licence(bill: dict[str, Any]) -> None:

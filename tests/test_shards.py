@@ -95,7 +95,8 @@ def digests(out: Path) -> dict[str, object]:
     """Digests of every part of every artifact, by its folder, whose name has the key."""
     manifests = {path.parent.name: json.loads(path.read_text()) for path in out.glob("stages/*-*/manifest.json")}
     return {
-        name: {part: told["digest"] for part, told in manifest["parts"].items()} for name, manifest in manifests.items()
+        name: {part: entry["digest"] for part, entry in manifest["parts"].items()}
+        for name, manifest in manifests.items()
     }
 
 
@@ -182,8 +183,8 @@ def test_two_processes_may_write_two_artifacts_but_not_the_same_one(
         with alone(numbers, out, "sum.2", "--wait", **slow) as waiting:
             _, said = waiting.communicate()
             assert waiting.returncode == 0 and process.wait() == 0, said
-    told = [json.loads(line)["kind"] for line in shard_events(out, "sum.2").read_text().splitlines()]
-    assert told.count("stage_started") == told.count("stage_finished") == told.count("stage_reused") == 1
+    kinds = [json.loads(line)["kind"] for line in shard_events(out, "sum.2").read_text().splitlines()]
+    assert kinds.count("stage_started") == kinds.count("stage_finished") == kinds.count("stage_reused") == 1
 
 
 def test_no_shard_is_made_during_a_run_that_has_exclusive_access(
@@ -272,12 +273,12 @@ def test_manifests_state_what_shards_took_and_their_forecast(numbers: Path, out:
     assert [shard["key"] for shard in whole["shards"]] == [outcome.artifacts[name].key for name in SHARDS]
     assert whole["seconds"] >= sum(shard["seconds"] for shard in whole["shards"]) > 0.2
     assert whole["peak_memory_bytes"] >= max(shard["peak_memory_bytes"] for shard in whole["shards"])
-    told = used_and_forecast(whole)
+    manifest = used_and_forecast(whole)
     own = used_and_forecast({**whole, "shards": []})["used"]["disk_bytes"]
-    assert told["used"]["disk_bytes"] == own + sum(
+    assert manifest["used"]["disk_bytes"] == own + sum(
         used_and_forecast(manifests[name])["used"]["disk_bytes"] for name in SHARDS
     )
-    assert told["forecast"] == {"memory_bytes": 300, "cpu_seconds": 9.0, "disk_bytes": 600}
+    assert manifest["forecast"] == {"memory_bytes": 300, "cpu_seconds": 9.0, "disk_bytes": 600}
 
 
 def test_an_error_of_the_machines_or_the_inputs_stops_the_run_at_once(

@@ -38,12 +38,12 @@ def test_a_finished_run_is_cut_and_measured(demo_run: Path, tmp_path: Path) -> N
     x, y = (west + east) / 2, (south + north) / 2
     (tmp_path / "heap.geojson").write_text(json.dumps(polygon(x - 12.0, y - 12.0, x + 12.0, y + 12.0)))
     line = f"{x - 15.0},{y},{x + 15.0},{y}"
-    code, told = surface(
+    code, output = surface(
         out, "--section", line, "--section", f"{x},{y},{x},{y + 5.0}", "--volume", str(tmp_path / "heap.geojson")
     )
     assert code == 0
-    assert all(stage["state"] == "reused" for stage in told["stages"])
-    section, _ = told["surface"]["sections"]
+    assert all(stage["state"] == "reused" for stage in output["stages"])
+    section, _ = output["surface"]["sections"]
     assert section["length_m"] == pytest.approx(30.0, abs=0.05)
     for kind in ("csv", "dxf", "picture"):
         assert (out / "sections" / section[kind]).stat().st_size > 500
@@ -62,9 +62,9 @@ def test_a_finished_run_is_cut_and_measured(demo_run: Path, tmp_path: Path) -> N
         return {path.name: path.read_bytes() for path in [*(out / "sections").iterdir(), out / "viewer.html"]}
 
     before = files()
-    code, told = surface(out, "--section", line, "--section", "0,0,10,10")
+    code, output = surface(out, "--section", line, "--section", "0,0,10,10")
     assert code == 1
-    assert "does not cross" in told["error"]["message"]
+    assert "does not cross" in output["error"]["message"]
     assert files() == before  # nothing is half done
     (out / "sections/notes.txt").write_text("mine")
     assert surface(out, "--section", f"{x},{y},{x},{y + 5.0}")[0] == 0
@@ -140,8 +140,8 @@ def test_a_run_without_scale_is_refused_at_once_unless_it_is_georeferenced_again
 def test_measurements_are_printed_line_by_line() -> None:
     section = {"name": "Section 1", "length_m": 41.767, "share_with_height": 0.98, "height_sigma_m": 0.0171}
     volume = {"polygon": 2, "name": "", "cut_m3": 23.834, "cut_sigma_m3": 0.9, "fill_m3": 0.0, "fill_sigma_m3": 0.01}
-    told = {"sections": [{**section, "dxf": "section-1.dxf"}], "volumes": [volume]}
-    first, second = measurement_lines(Path("out"), told)
+    facts = {"sections": [{**section, "dxf": "section-1.dxf"}], "volumes": [volume]}
+    first, second = measurement_lines(Path("out"), facts)
     assert first == "Section 1: 41.77 m, 98% with heights, accurate to 1.7 cm: out/sections/section-1.dxf"
     assert second == "Polygon 2: cut 23.83 ± 0.90 m³, fill 0.00 ± 0.01 m³: out/volumes.json"
     assert measurement_lines(Path("out"), {}) == []

@@ -289,9 +289,9 @@ def stated_line() -> tuple[float, float, float, float]:
 def test_files_of_a_stated_wall_are_read_by_other_programs(tmp_path: Path) -> None:
     report = Quiet()
     make_facades(task(stated_line()), tmp_path, report)
-    told = json.loads((tmp_path / "facades.json").read_text())
-    assert told["crs"] == "EPSG:32633"
-    (each,) = told["facades"]
+    data = json.loads((tmp_path / "facades.json").read_text())
+    assert data["crs"] == "EPSG:32633"
+    (each,) = data["facades"]
     corners = crs().local_from_crs(np.array(each["corners"]))
     assert np.abs(corners[:, :2] - [[-2.5, -3], [2.5, -3], [2.5, -3], [-2.5, -3]]).max() < PIXEL_M
     assert each["length_m"] == pytest.approx(5.0, abs=2e-3)

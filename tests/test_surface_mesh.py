@@ -173,16 +173,16 @@ def test_the_complete_mesh_or_how_to_install_open3d(tmp_path: Path) -> None:
         assert "open3d" in refused.value.message and "splatpipe[mesh]" in refused.value.hint
         assert not list(tmp_path.iterdir())
         return
-    told = make_mesh(task, tmp_path / "work", tmp_path, Recorder())
+    summary = make_mesh(task, tmp_path / "work", tmp_path, Recorder())
     mesh = trimesh.load(tmp_path / "mesh.ply", process=False)
-    assert 3000 < told["triangles"] == len(mesh.faces) <= 4000
+    assert 3000 < summary["triangles"] == len(mesh.faces) <= 4000
     places, _ = trimesh.sample.sample_surface(mesh, 20_000, seed=1)
     off = surface_distances(np.asarray(places))
     assert np.quantile(off, 0.5) < 0.3 * GSD_M
     # The eaves have no thickness, but voxels of 2 GSD always do: the errors are there, and little larger than that.
     eaves = ((np.abs(places[:, :2]) >= [3.8, 2.8]).any(axis=1)) & (places[:, 2] > 2.0)
     assert (off < 2.0 * GSD_M)[~eaves].mean() > 0.999 and (off < 4.0 * GSD_M).mean() > 0.99
-    assert told["area_m2"] > 0.95 * (100.0 + 2.0 * 9.0 * 4.03 + 28.0 * 3.0 - 56.0)
+    assert summary["area_m2"] > 0.95 * (100.0 + 2.0 * 9.0 * 4.03 + 28.0 * 3.0 - 56.0)
     made = (tmp_path / "mesh.glb").read_bytes()
     make_mesh(replace(task, threads=2), tmp_path / "other", tmp_path, Recorder())
     assert (tmp_path / "mesh.glb").read_bytes() == made

@@ -53,14 +53,14 @@ class InterruptingReporter:
     stop_after: int = 1 << 30
     calls: int = 0
 
-    def progress(self, *_told: object) -> None:
+    def progress(self, *_arguments: object) -> None:
         self.calls += 1
         if self.calls > self.stop_after:
             raise KeyboardInterrupt
 
-    def metric(self, *_told: object) -> None: ...
-    def note(self, *_told: object) -> None: ...
-    def warning(self, *_told: object) -> None: ...
+    def metric(self, *_arguments: object) -> None: ...
+    def note(self, *_arguments: object) -> None: ...
+    def warning(self, *_arguments: object) -> None: ...
 
 
 @cache
@@ -143,17 +143,17 @@ def test_of_a_site_in_many_small_parts_the_largest_is_kept() -> None:
 def test_a_stage_without_a_site_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dsm_stage, "open_run_surface", lambda *_: run_surface(FRAME, photos(), HOUSE))
     monkeypatch.setattr(dsm_stage, "measure_extent", lambda *_: None)
-    told = InterruptingReporter()
-    assert dsm_stage.run(DsmConfig(), Inputs({}, tmp_path, {}, Machine("cpu", 1)), tmp_path, told) == {"cells": 0}
-    assert told.calls == 1
+    reporter = InterruptingReporter()
+    assert dsm_stage.run(DsmConfig(), Inputs({}, tmp_path, {}, Machine("cpu", 1)), tmp_path, reporter) == {"cells": 0}
+    assert reporter.calls == 1
     assert load_site(tmp_path / "site.json") is None
 
 
 def test_existing_parts_are_reported_as_done(made: Path, tmp_path: Path) -> None:
     shutil.copytree(made / "work", tmp_path / "work")
-    told = InterruptingReporter()
-    dsm(tmp_path, report=told)
-    assert told.calls == 1
+    reporter = InterruptingReporter()
+    dsm(tmp_path, report=reporter)
+    assert reporter.calls == 1
 
 
 def test_a_site_is_read_as_it_was_written(tmp_path: Path) -> None:

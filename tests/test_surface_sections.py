@@ -136,8 +136,8 @@ def test_a_polygon_is_draped_over_the_surface(tmp_path: Path) -> None:
 def test_files_are_read_by_other_programs(tmp_path: Path) -> None:
     sources = tuple(DepthSource(camera, lambda camera=camera: depths_of(camera)) for camera in cameras()[::4])
     section = across(tmp_path, sources)
-    told = write_section(tmp_path, "section-1", section, grid().crs)
-    with (tmp_path / told["csv"]).open(newline="") as file:
+    facts = write_section(tmp_path, "section-1", section, grid().crs)
+    with (tmp_path / facts["csv"]).open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["distance_m", "easting_m", "northing_m", "height_m", "height_sigma_m"]
     assert len(rows) == len(section.height)
@@ -145,20 +145,20 @@ def test_files_are_read_by_other_programs(tmp_path: Path) -> None:
     middle = rows[len(rows) // 2]
     assert float(middle["height_m"]) == pytest.approx(517.0, abs=0.05)
     assert float(middle["easting_m"]) == pytest.approx(section.place[len(rows) // 2, 0], abs=1e-4)
-    names = pyogrio.raw.read(tmp_path / told["dxf"], columns=["Layer"], force_2d=True)[3][0].tolist()
+    names = pyogrio.raw.read(tmp_path / facts["dxf"], columns=["Layer"], force_2d=True)[3][0].tolist()
     assert names.count("SURFACE") == 2  # the hole breaks it
     assert {"GRID", "TEXT", "POINTS"} <= set(names)
-    box = pyogrio.read_bounds(tmp_path / told["dxf"])[1]
+    box = pyogrio.read_bounds(tmp_path / facts["dxf"])[1]
     surface = box[:, [name == "SURFACE" for name in names]]
     assert surface[0].min() == pytest.approx(0.0, abs=1e-3)
     assert surface[2].max() == pytest.approx(15.0, abs=1e-3)
     assert surface[3].max() == pytest.approx(517.0, abs=0.05)
-    with Image.open(tmp_path / told["picture"]) as picture:
+    with Image.open(tmp_path / facts["picture"]) as picture:
         assert picture.width > 400
         assert len(np.unique(np.asarray(picture.convert("L")))) > 10
-    before = (tmp_path / told["picture"]).read_bytes(), (tmp_path / told["dxf"]).read_bytes()
+    before = (tmp_path / facts["picture"]).read_bytes(), (tmp_path / facts["dxf"]).read_bytes()
     write_section(tmp_path, "section-1", section, grid().crs)
-    assert before == ((tmp_path / told["picture"]).read_bytes(), (tmp_path / told["dxf"]).read_bytes())
+    assert before == ((tmp_path / facts["picture"]).read_bytes(), (tmp_path / facts["dxf"]).read_bytes())
 
 
 @pytest.mark.parametrize("local", [(1.0, 1.0, 1.0, 1.0), (200.0, 0.0, 300.0, 0.0), (0.0, 0.0, 9e6, 0.0)])

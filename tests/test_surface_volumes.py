@@ -50,8 +50,8 @@ def surface_file(
     plain_file(folder / f"{name}.tif", grid, heights[None].astype(np.float32), -9999.0)
     if sigma_m is None:
         return open_surface(folder / f"{name}.tif")
-    told = np.full((2, grid.height, grid.width), round(sigma_m * 1000.0), np.uint16)
-    plain_file(folder / f"{name}_confidence.tif", grid, told, 0.0)
+    sigmas_mm = np.full((2, grid.height, grid.width), round(sigma_m * 1000.0), np.uint16)
+    plain_file(folder / f"{name}_confidence.tif", grid, sigmas_mm, 0.0)
     return open_surface(folder / f"{name}.tif", folder / f"{name}_confidence.tif")
 
 
@@ -130,9 +130,9 @@ def test_the_uncertainty_is_that_of_many_trials(tmp_path: Path) -> None:
         trials.append([measure_volume(surface, square(4.0), grid.crs, base).net for base in ("rim", 0.0)])
     for nets in zip(*trials, strict=True):
         found = np.array([net.m3 for net in nets])
-        told = float(np.median([net.sigma_m3 for net in nets]))
-        assert 0.6 < found.std() / told < 1.5  # the deviation of so few is within 40 % of the true one in 99 % of cases
-        assert abs(found.mean() - math.pi * 3.5**2 * 2.0 / 3.0) < 4.0 * told / math.sqrt(TRIALS) + 0.05
+        stated = float(np.median([net.sigma_m3 for net in nets]))
+        assert 0.6 < found.std() / stated < 1.5  # so few determine it within 40 % in 99 % of cases
+        assert abs(found.mean() - math.pi * 3.5**2 * 2.0 / 3.0) < 4.0 * stated / math.sqrt(TRIALS) + 0.05
 
 
 def test_a_stated_height_has_the_datums_uncertainty(tmp_path: Path) -> None:
@@ -174,16 +174,16 @@ def test_the_file_lists_each_polygon_with_units(tmp_path: Path) -> None:
     measured = [
         measure_volume(surface, PlanArea.seen_from_above([polygon]), grid.crs, "lowest") for polygon in both.polygons
     ]
-    told = [volume_facts(number, "Heap", volume) for number, volume in enumerate(measured, 1)]
-    write_volumes(tmp_path / "volumes.json", told, grid.crs)
+    rows = [volume_facts(number, "Heap", volume) for number, volume in enumerate(measured, 1)]
+    write_volumes(tmp_path / "volumes.json", rows, grid.crs)
     read = json.loads((tmp_path / "volumes.json").read_text())
-    assert read["volumes"] == told
-    assert [row["polygon"] for row in told] == [1, 2]
-    assert told[0]["cut_m3"] == pytest.approx(CONE_M3, rel=5e-3)
-    assert told[0]["base"]["height_m"] == pytest.approx(512.0, abs=2e-3)
-    assert told[1]["net_m3"] == pytest.approx(0.0, abs=0.01)
-    assert 0.0 < told[0]["net_sigma_m3"] < 5.0
-    assert told[0]["share_without_height"] < 2e-3
+    assert read["volumes"] == rows
+    assert [row["polygon"] for row in rows] == [1, 2]
+    assert rows[0]["cut_m3"] == pytest.approx(CONE_M3, rel=5e-3)
+    assert rows[0]["base"]["height_m"] == pytest.approx(512.0, abs=2e-3)
+    assert rows[1]["net_m3"] == pytest.approx(0.0, abs=0.01)
+    assert 0.0 < rows[0]["net_sigma_m3"] < 5.0
+    assert rows[0]["share_without_height"] < 2e-3
 
 
 def test_a_file_on_another_grid_is_refused(tmp_path: Path) -> None:

@@ -83,8 +83,8 @@ def test_a_photo_without_targets_has_none() -> None:
 
 
 def test_numbers_are_read_from_names() -> None:
-    told = [number_of(name) for name in ("GCP12", "P07", "tag 3", "corner", "A1-20", "9" * 9)]
-    assert told == [12, 7, 3, None, 20, None]
+    numbers = [number_of(name) for name in ("GCP12", "P07", "tag 3", "corner", "A1-20", "9" * 9)]
+    assert numbers == [12, 7, 3, None, 20, None]
 
 
 def test_displaced_rotated_constellation_with_false_points_is_recognised() -> None:

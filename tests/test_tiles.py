@@ -96,17 +96,17 @@ def test_the_tree_has_the_levels_and_only_its_root_is_georeferenced(tmp_path: Pa
     scene, root = two_levels()
     matrix = np.arange(16.0).reshape(4, 4)
     write_tiles(tmp_path, scene, root, matrix)
-    told = tileset(tmp_path)
-    assert told["asset"]["version"] == "1.1"
-    assert facts_of_record(told["asset"]["extras"]["splatpipe"], SceneFacts()) == FACTS
-    assert told["extensionsUsed"] == ["3DTILES_content_gltf"]
-    assert told["extensions"]["3DTILES_content_gltf"] == {"extensionsUsed": BOTH, "extensionsRequired": BOTH}
-    assert told["root"]["transform"] == matrix.T.ravel().tolist()
-    assert all("transform" not in tile for tile in tiles(told["root"]) if tile is not told["root"])
-    assert all("extensions" not in tile and tile["refine"] == "REPLACE" for tile in tiles(told["root"]))
-    assert [tile["geometricError"] for tile in tiles(told["root"])] == [2.5, 0.0, 0.0]
-    assert told["geometricError"] >= 2.5
-    for node, tile in zip(root.nodes(), tiles(told["root"]), strict=True):
+    root_file = tileset(tmp_path)
+    assert root_file["asset"]["version"] == "1.1"
+    assert facts_of_record(root_file["asset"]["extras"]["splatpipe"], SceneFacts()) == FACTS
+    assert root_file["extensionsUsed"] == ["3DTILES_content_gltf"]
+    assert root_file["extensions"]["3DTILES_content_gltf"] == {"extensionsUsed": BOTH, "extensionsRequired": BOTH}
+    assert root_file["root"]["transform"] == matrix.T.ravel().tolist()
+    assert all("transform" not in tile for tile in tiles(root_file["root"]) if tile is not root_file["root"])
+    assert all("extensions" not in tile and tile["refine"] == "REPLACE" for tile in tiles(root_file["root"]))
+    assert [tile["geometricError"] for tile in tiles(root_file["root"])] == [2.5, 0.0, 0.0]
+    assert root_file["geometricError"] >= 2.5
+    for node, tile in zip(root.nodes(), tiles(root_file["root"]), strict=True):
         document, _ = parts((tmp_path / tile["content"]["uri"]).read_bytes())
         assert document["extensionsRequired"] == BOTH and document["extensionsUsed"] == BOTH
         box = corners(tile)
@@ -179,9 +179,9 @@ def test_points_lie_on_the_earth_where_pyproj_says(tmp_path: Path):
     scene, root = two_levels()
     placement = write_tiles_on_globe(tmp_path, scene, root)
     assert not placement.approximate
-    told = tileset(tmp_path)
-    matrix = np.array(told["root"]["transform"]).reshape(4, 4).T
-    (leaf,) = (tile for tile in tiles(told["root"]) if tile.get("content", {}).get("uri") == "tiles/1.glb")
+    root_file = tileset(tmp_path)
+    matrix = np.array(root_file["root"]["transform"]).reshape(4, 4).T
+    (leaf,) = (tile for tile in tiles(root_file["root"]) if tile.get("content", {}).get("uri") == "tiles/1.glb")
     local = local_means(tmp_path / leaf["content"]["uri"])
     ecef = local @ matrix[:3, :3].T + matrix[:3, 3]
     there = f"+lat_0={PLACE.latitude} +lon_0={PLACE.longitude} +h_0={PLACE.height_m}"
@@ -193,12 +193,12 @@ def test_points_lie_on_the_earth_where_pyproj_says(tmp_path: Path):
 def test_files_give_esri_programs_the_crs_and_its_transformation(tmp_path: Path):
     scene, root = two_levels()
     write_tiles_on_globe(tmp_path, scene, root)
-    told = tileset(tmp_path)
-    assert told["extensions"]["ESRI_crs"] == {"wkid": 32634, "vcsWkid": 115700}
-    assert "ESRI_crs" in told["extensionsUsed"] and "extensionsRequired" not in told
-    every = [tile["extensions"]["ESRI_crs"] for tile in tiles(told["root"])]
+    root_file = tileset(tmp_path)
+    assert root_file["extensions"]["ESRI_crs"] == {"wkid": 32634, "vcsWkid": 115700}
+    assert "ESRI_crs" in root_file["extensionsUsed"] and "extensionsRequired" not in root_file
+    every = [tile["extensions"]["ESRI_crs"] for tile in tiles(root_file["root"])]
     assert ["transform" in each for each in every] == [True, False, False]
-    assert [each["boundingVolume"] for each in every] == [tile["boundingVolume"] for tile in tiles(told["root"])]
+    assert [each["boundingVolume"] for each in every] == [tile["boundingVolume"] for tile in tiles(root_file["root"])]
     matrix = np.array(every[0]["transform"]).reshape(4, 4).T
     local = root.gaussians.means.double().numpy()
     there = f"+lat_0={PLACE.latitude} +lon_0={PLACE.longitude} +h_0={PLACE.height_m}"
@@ -228,9 +228,9 @@ def test_a_crs_without_a_code_is_written_as_its_definition(tmp_path: Path):
     scene, root = two_levels()
     own = "+proj=tmerc +lat_0=52 +lon_0=21 +k=1 +x_0=5000 +y_0=2000 +ellps=GRS80 +units=m"
     write_tiles_on_globe(tmp_path, replace(scene, facts=replace(FACTS, place=replace(PLACE, crs=own))), root)
-    told = tileset(tmp_path)["extensions"]["ESRI_crs"]
-    assert "wkid" not in told
-    assert pyproj.CRS.from_wkt(told["wkt2"]).is_projected
+    root_file = tileset(tmp_path)["extensions"]["ESRI_crs"]
+    assert "wkid" not in root_file
+    assert pyproj.CRS.from_wkt(root_file["wkt2"]).is_projected
 
 
 def test_tiles_of_a_splat_without_georeference_are_refused(tmp_path: Path):

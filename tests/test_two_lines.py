@@ -15,14 +15,14 @@ MACHINE = {"processor": "x86_64", "threads": 2, "device": "cpu"}
 def artifact(cpu: float, sizes: tuple[int, ...]) -> Artifact:
     files = [{"path": f"{size}", "size": size, "sha256": ""} for size in sizes]
     parts = {"one": {"path": "one", "digest": "", "files": files}}
-    told = {
+    manifest = {
         "cpu_seconds": cpu,
         "seconds": cpu / 2.0,
         "peak_memory_bytes": 5_000_000,
         "machine": MACHINE,
         "parts": parts,
     }
-    return Artifact(Path(), told)
+    return Artifact(Path(), manifest)
 
 
 def test_stages_of_both_pipelines_belong_to_neither() -> None:

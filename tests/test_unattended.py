@@ -98,9 +98,9 @@ def test_a_disk_that_runs_full_is_reported_and_the_run_resumes_once_there_is_spa
     disk = tmp_path / "disk"
     with mounted(disk) as able:
         limit = (64 if able else 8) << 20
-        with largest_file(limit), pytest.raises(MachineError, match=r"full|No space left|File too large") as told:
+        with largest_file(limit), pytest.raises(MachineError, match=r"full|No space left|File too large") as caught:
             walk(request_of(numbers, disk / "out", fail="fill"))
-        assert "run again" in told.value.hint
+        assert "run again" in caught.value.hint
         assert [event.data["exit_code"] for event in events(disk / "out")[-2:]] == [EXIT_MACHINE] * 2
         if able:
             with pytest.raises(MachineError, match=r"Cannot write to .*No space left"):
@@ -151,9 +151,9 @@ def test_a_folder_that_vanishes_is_reported_and_not_replaced(
         if (event.kind, event.stage) == ("stage_started", stage):
             (tmp_path / which).rename(tmp_path / "elsewhere")
 
-    with pytest.raises(error, match=f"{which} has disappeared") as told:
+    with pytest.raises(error, match=f"{which} has disappeared") as caught:
         walk(request_of(numbers, out), vanish)
-    assert told.value.exit_code == code and told.value.hint
+    assert caught.value.exit_code == code and caught.value.hint
     assert not (tmp_path / which).exists()
     (tmp_path / "elsewhere").rename(tmp_path / which)
     goes_on(numbers, out, ran)
@@ -231,9 +231,9 @@ def test_no_name_sends_colours_or_commands_to_the_terminal(capfd: pytest.Capture
     assert not {"\x1b", "\x07", "\x9b"} & set(shown) and shown.count("[bold]") >= 5
 
 
-@pytest.mark.parametrize(("stages", "told"), [(["blocks", "train"], True), (["train.2"], False)])
+@pytest.mark.parametrize(("stages", "mentions_rest"), [(["blocks", "train"], True), (["train.2"], False)])
 def test_time_left_is_that_of_all_shards_unless_one_is_made_alone(
-    stages: list[str], told: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    stages: list[str], mentions_rest: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("splatpipe.pipeline.app.console.PLAIN_INTERVAL_S", -1.0)
     console = RunConsole()
@@ -242,7 +242,7 @@ def test_time_left_is_that_of_all_shards_unless_one_is_made_alone(
     console(Event("progress", "train.2", {"done": 5.0, "total": 10.0, "what": "training", "unit": "iterations"}))
     console.close()
     shown = " ".join(capfd.readouterr().err.split())
-    assert "5/10 iterations" in shown and ("including the 2 remaining" in shown) == told
+    assert "5/10 iterations" in shown and ("including the 2 remaining" in shown) == mentions_rest
 
 
 def splatpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -251,12 +251,12 @@ def splatpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]
 
 
 def test_a_notice_reports_a_failure_and_leaves_only_json_on_stdout(tmp_path: Path) -> None:
-    command = 'echo "$SPLATPIPE_STATE,$SPLATPIPE_CAPTURE" > told; echo said; exit 3 # token=hunter2'
+    command = 'echo "$SPLATPIPE_STATE,$SPLATPIPE_CAPTURE" > notice; echo said; exit 3 # token=hunter2'
     done = splatpipe("run", "no photos", "the; touch out", "--notify", command, "--json", cwd=tmp_path)
     assert done.returncode == EXIT_INPUT and json.loads(done.stdout)["exit_code"] == EXIT_INPUT
-    assert (tmp_path / "told").read_text() == "failed,the; touch out\n"
+    assert (tmp_path / "notice").read_text() == "failed,the; touch out\n"
     assert "said" in done.stderr and "exit code 3" in done.stderr and "hunter2" not in done.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["told"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notice"]
 
 
 def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> 
     with (
         subprocess.Popen([sys.executable, "-c", holds], stdin=-1, stdout=-1, text=True, cwd=tmp_path) as holder,
         subprocess.Popen(
-            [*waits, f"echo $SPLATPIPE_STATE > told; sleep {10 * TIME_LIMIT_S}"],
+            [*waits, f"echo $SPLATPIPE_STATE > notice; sleep {10 * TIME_LIMIT_S}"],
             stderr=subprocess.PIPE,
             text=True,
             cwd=tmp_path,
@@ -282,7 +282,7 @@ def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> 
         waiting.send_signal(signal.SIGTERM)
         said = waiting.communicate(timeout=5 * TIME_LIMIT_S)[1]
         assert waiting.returncode == 143 and "did not end within" in said
-        assert (tmp_path / "told").read_text() == "stopped\n"
+        assert (tmp_path / "notice").read_text() == "stopped\n"
         holder.kill()
 
 

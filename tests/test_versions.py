@@ -59,8 +59,8 @@ def run(arguments: list[str], folder: Path, extra: Mapping[str, str]) -> subproc
 
 
 def test_every_version_matches_the_present_sources() -> None:
-    told = record.complaint(ROOT)
-    assert not told, told
+    complaint = record.complaint(ROOT)
+    assert not complaint, complaint
 
 
 def test_a_changed_result_without_a_raised_version_is_noticed(copy: Path) -> None:
@@ -143,21 +143,21 @@ def test_an_upward_import_and_a_stage_that_imports_a_stage_are_noticed(copy: Pat
     append(copy / "stages/undistort.py", "\nfrom splatpipe.stages import sparse\n")
     (copy / "__init__.py").touch()  # so that no other splatpipe joins it
     linter = str(Path(sys.executable).parent / "lint-imports")
-    told = run(
+    done = run(
         [linter, "--no-cache", "--config", str(ROOT / "pyproject.toml")], copy.parent, {"PYTHONPATH": str(copy.parent)}
     )
-    assert told.returncode == 1
-    assert "2 broken" in told.stdout
-    assert "splatpipe.pipeline.geometry.camera -> splatpipe.pipeline.splat.ply" in told.stdout
-    assert "splatpipe.stages.undistort -> splatpipe.stages.sparse" in told.stdout
+    assert done.returncode == 1
+    assert "2 broken" in done.stdout
+    assert "splatpipe.pipeline.geometry.camera -> splatpipe.pipeline.splat.ply" in done.stdout
+    assert "splatpipe.stages.undistort -> splatpipe.stages.sparse" in done.stdout
 
 
 def test_an_option_without_docs_is_noticed(copy: Path) -> None:
     replace(copy / "pipeline/sfm/options.py", r'(^    min_model_size: .*\n)    """[^"]*"""\n', r"\1")
     test = "test_every_option_has_a_help_text"
-    told = run(
+    done = run(
         ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_config.py", "-k", test],
         ROOT,
         {"PYTHONPATH": str(copy.parent), "PYTHONDONTWRITEBYTECODE": "1"},
     )
-    assert told.returncode == 1 and "sparse.min_model_size" in told.stdout
+    assert done.returncode == 1 and "sparse.min_model_size" in done.stdout

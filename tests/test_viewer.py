@@ -142,8 +142,8 @@ def test_the_demos_ridge_is_as_long_as_it_was_built(demo_run: Path, view: Opened
     for end in in_run(demo_run, RIDGE_M).tolist():
         place = page.evaluate("end => splatpipe.project(end)", end)
         page.mouse.click(round(place["x"]), round(place["y"]))
-    told = page.locator("#hint").inner_text()
-    length = float(told.split("Length ")[1].split(" m")[0])
+    hint = page.locator("#hint").inner_text()
+    length = float(hint.split("Length ")[1].split(" m")[0])
     assert length == pytest.approx(np.linalg.norm(RIDGE_M[1] - RIDGE_M[0]), rel=0.01)
     assert page.locator(".measured").inner_text() == f"{length:.2f} m"
 

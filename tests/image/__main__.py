@@ -85,8 +85,8 @@ def run_demo(image: Image) -> None:
         out.mkdir(parents=True)
     command = ["run", "/photos", "/out", "--preset", "preview"]
     whole = Container(image, WORK / "bundle", Mounts(photos / "photos", outs["undisturbed"]))
-    told = json.loads(whole.must_end(0, ["doctor", "--json"], say, cores=1))
-    limits = f"{told['cores']}; {told['memory']}"
+    report = json.loads(whole.must_end(0, ["doctor", "--json"], say, cores=1))
+    limits = f"{report['cores']}; {report['memory']}"
     if not limits.startswith("1 ") or f"{MEMORY / 1e9:.1f} GB for this process" not in limits:
         raise Problem(f"It does not keep to its control group's limits: {limits}.")
     say(f"Limited to one processor and {MEMORY / 1e9:.1f} GB it finds: {limits}.")
@@ -97,7 +97,7 @@ def run_demo(image: Image) -> None:
         end = stopped.stop_inside(command, stage, done)
         say(f"SIGTERM inside {stage} (at {end.progress}): exit code {end.code} after {end.seconds:.1f} s.")
         if end.code != 143 or end.seconds > STOP_S:
-            raise Problem(f"It has to end with 143 in {STOP_S:.0f} s.\n{end.told}")
+            raise Problem(f"It has to end with 143 in {STOP_S:.0f} s.\n{end.output}")
     stopped.must_end(0, command, say)
     first, second = (digests(out) for out in outs.values())
     if first != second:
@@ -109,8 +109,8 @@ def run_demo(image: Image) -> None:
 def digests(out: Path) -> dict[str, str]:
     """Return SHA-256 of the files without times in them; an artifact's name is the key of all its inputs."""
     files = [out / name for name in SAME] + sorted((out / "stages").glob("evaluate-*/views/*.png"))
-    told = {file.relative_to(out).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-    return told | {folder.name: "" for folder in (out / "stages").iterdir() if (folder / "manifest.json").is_file()}
+    found = {file.relative_to(out).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return found | {folder.name: "" for folder in (out / "stages").iterdir() if (folder / "manifest.json").is_file()}
 
 
 def say(text: str) -> None:

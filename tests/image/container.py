@@ -45,13 +45,13 @@ class ContainerEnd:
         code: Exit code; 137 if it had to be killed, as Docker does after ten seconds.
         seconds: From the signal to the end.
         progress: The stage's last progress before the signal.
-        told: The container's last output.
+        output: The container's last output.
     """
 
     code: int
     seconds: float
     progress: str
-    told: str
+    output: str
 
 
 class Container:
@@ -79,10 +79,10 @@ class Container:
             process.wait(PATIENCE_S)
         say(f"splatpipe {' '.join(command)}: exit code {process.returncode}, {time.monotonic() - started_s:.0f} s.")
         if process.returncode != code:
-            raise Problem(f"It has to be {code}.\n{self._told()}")
-        if "Traceback" in self._told() or "not writable" in self._told():
-            raise Problem(f"It complains:\n{self._told()}")
-        return self._told()
+            raise Problem(f"It has to be {code}.\n{self._output()}")
+        if "Traceback" in self._output() or "not writable" in self._output():
+            raise Problem(f"It complains:\n{self._output()}")
+        return self._output()
 
     def stop_inside(self, command: list[str], stage: str, done: float) -> ContainerEnd:
         """Run a command and send SIGTERM to it once a stage has passed a given progress."""
@@ -96,7 +96,7 @@ class Container:
             except subprocess.TimeoutExpired:
                 subprocess.run(["runc", "kill", self._name, "KILL"], check=True)
                 process.wait(PATIENCE_S)
-            return ContainerEnd(process.returncode, time.monotonic() - sent_s, progress, self._told())
+            return ContainerEnd(process.returncode, time.monotonic() - sent_s, progress, self._output())
 
     def _await_progress(self, process: subprocess.Popen[bytes], before: int, stage: str, done: float) -> str:
         until_s = time.monotonic() + PATIENCE_S
@@ -106,9 +106,9 @@ class Container:
                 if event["stage"] == stage and event["kind"] == "progress" and data["done"] > done:
                     return f"{data['what']} {data['done']:.0f} of {data['total']:.0f}"
             if process.poll() is not None:
-                raise Problem(f"It ended before it could be stopped inside {stage}.\n{self._told()}")
+                raise Problem(f"It ended before it could be stopped inside {stage}.\n{self._output()}")
             time.sleep(LOOK_S)
-        raise Problem(f"It never came to {stage}.\n{self._told()}")
+        raise Problem(f"It never came to {stage}.\n{self._output()}")
 
     def _events(self) -> Iterator[dict]:
         log = self._mounts.out / "events.jsonl"
@@ -117,8 +117,8 @@ class Container:
                 if line.endswith("\n"):
                     yield json.loads(line)
 
-    def _told(self) -> str:
-        return (self._bundle / "told.txt").read_text(encoding="utf-8", errors="replace")[-3000:]
+    def _output(self) -> str:
+        return (self._bundle / "output.txt").read_text(encoding="utf-8", errors="replace")[-3000:]
 
     @contextmanager
     def _running(self, command: list[str], cores: int = 0) -> Iterator[subprocess.Popen[bytes]]:
@@ -126,8 +126,8 @@ class Container:
         self._bundle.mkdir(parents=True)
         (self._bundle / "config.json").write_text(json.dumps(self._config(command, cores)), encoding="utf-8")
         arguments = ["runc", "run", "--bundle", str(self._bundle), self._name]
-        with (self._bundle / "told.txt").open("wb") as told:
-            process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=told, stderr=told)
+        with (self._bundle / "output.txt").open("wb") as output:
+            process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
         try:
             yield process
         finally:

@@ -70,8 +70,8 @@ def sum_piece(config: SumConfig, inputs: Inputs, out: Path, report: Reporter) ->
 def add_sums(config: SumConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     assert inputs.shard is None
     sums = [int((folder / "sum.txt").read_text()) for folder in inputs.shards]
-    told = [inputs.summaries[f"sum.{number}"]["sum"] for number in range(1, len(sums) + 1)]
-    assert told == sums
+    reported = [inputs.summaries[f"sum.{number}"]["sum"] for number in range(1, len(sums) + 1)]
+    assert reported == sums
     if not inputs.shards:
         sums = [sum(number**2 + config.offset for number in json.loads(inputs["read.numbers"].read_text()))]
     (out / "total.json").write_text(json.dumps({"total": sum(sums), "sums": sums}))

@@ -122,9 +122,9 @@ def check_wheel(wheel: Path, clean: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         info = next(name for name in names if name.endswith(".dist-info/METADATA")).removesuffix("METADATA")
-        told = HeaderParser().parsestr(archive.read(f"{info}METADATA").decode())
-        missing = {f"{info}licenses/{name}" for name in told.get_all("License-File", [])} - set(names)
-        if missing or len(told.get_all("License-File", [])) < 2:
+        metadata = HeaderParser().parsestr(archive.read(f"{info}METADATA").decode())
+        missing = {f"{info}licenses/{name}" for name in metadata.get_all("License-File", [])} - set(names)
+        if missing or len(metadata.get_all("License-File", [])) < 2:
             raise Problem(f"Licences are missing: {missing}")
         archive.extract(f"{info}sboms/splatpipe.cdx.json", WORK)
     check_bill(WORK / f"{info}sboms/splatpipe.cdx.json")

@@ -45,12 +45,12 @@ def decoded(browser: Browser, film: Path, times_s: list[float]) -> tuple[dict[st
     page = browser.new_page()
     try:
         kind = {".webm": "video/webm", ".mp4": "video/mp4"}[film.suffix]
-        told = page.evaluate(SCRIPT, [base64.b64encode(film.read_bytes()).decode(), kind, times_s])
+        video = page.evaluate(SCRIPT, [base64.b64encode(film.read_bytes()).decode(), kind, times_s])
     finally:
         page.close()
-    shape = (told["height"], told["width"], 4)
-    pictures = [np.frombuffer(base64.b64decode(text), np.uint8).reshape(shape)[:, :, :3] for text in told["pictures"]]
-    return told, pictures
+    shape = (video["height"], video["width"], 4)
+    pictures = [np.frombuffer(base64.b64decode(text), np.uint8).reshape(shape)[:, :, :3] for text in video["pictures"]]
+    return video, pictures
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:

@@ -93,14 +93,14 @@ def serving(out: Path, *options: object) -> Iterator[Served]:
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
-        told = ""
+        output = ""
         for line in process.stderr:
-            told += line
+            output += line
             if found := ADDRESS.search(line):
                 yield Served(int(found.group(1)), found.group(2), process)
                 break
         else:
-            raise AssertionError(told)
+            raise AssertionError(output)
     finally:
         process.send_signal(signal.SIGINT)
         try:

@@ -33,7 +33,7 @@ def main() -> int:
     verdicts = comparison.verdicts(commit)
     refused = {name: verdict for name, verdict in verdicts.items() if not verdict.accepted}
     for name in now:
-        _say(f"{name:12} {_told(verdicts.get(name))}")
+        _say(f"{name:12} {_verdict_text(verdicts.get(name))}")
     kept = {name: before[name] for name in refused if name in before}
     write(ROOT, {name: kept.get(name, stage) for name, stage in now.items() if name in kept or name not in refused})
     if refused:
@@ -41,7 +41,7 @@ def main() -> int:
     return 1 if refused else 0
 
 
-def _told(verdict: Verdict | None) -> str:
+def _verdict_text(verdict: Verdict | None) -> str:
     if verdict is None:
         return "the same sources"
     return f"{'recorded' if verdict.accepted else 'NOT recorded'}: {verdict.why}"

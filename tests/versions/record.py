@@ -30,18 +30,19 @@ def present(root: Path) -> dict[str, StageSources]:
     found = {}
     for node in ast.walk(ast.parse((root / LINE_FILE).read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Stage":
-            said = {keyword.arg: keyword.value for keyword in node.keywords}
-            name, version, entry = (ast.literal_eval(said_) for said_ in (node.args[0], said["version"], said["entry"]))
-            found[name] = StageSources(version, sources.digest(entry, *_shards_entry(said.get("shards"))))
+            arguments = {keyword.arg: keyword.value for keyword in node.keywords}
+            values = (node.args[0], arguments["version"], arguments["entry"])
+            name, version, entry = (ast.literal_eval(value) for value in values)
+            found[name] = StageSources(version, sources.digest(entry, *_shards_entry(arguments.get("shards"))))
     return found
 
 
-def _shards_entry(said: ast.expr | None) -> list[str]:
+def _shards_entry(call: ast.expr | None) -> list[str]:
     """Return the body of a stage's shards, if it has any."""
-    if not isinstance(said, ast.Call):
+    if not isinstance(call, ast.Call):
         return []
-    named = [keyword.value for keyword in said.keywords if keyword.arg == "entry"]
-    return [ast.literal_eval(value) for value in (*said.args[2:3], *named)]
+    named = [keyword.value for keyword in call.keywords if keyword.arg == "entry"]
+    return [ast.literal_eval(value) for value in (*call.args[2:3], *named)]
 
 
 def recorded(root: Path) -> dict[str, StageSources]:

@@ -18,10 +18,10 @@ from typing import Any
 
 PACKAGE = "splatpipe"
 NAMED_MODULE = re.compile(rf"{PACKAGE}(\.\w+)+(?=(:\w+)?$)")  # a module imported by name from a string
-MADE_FOLDERS = ("dist", "node_modules", "__pycache__")
+GENERATED_FOLDERS = ("dist", "node_modules", "__pycache__")
 UNCOUNTED = (".py", ".pyi", ".so", ".pyc", ".typed")  # read as modules, or irrelevant to the results
 RECORD = "versions.toml"  # in a package that all stages reach, and contains the digests
-UNSAID = ("ctx", "kind", "type_comment")  # of a syntax tree: redundant, or formatting
+OMITTED_FIELDS = ("ctx", "kind", "type_comment")  # of a syntax tree: redundant, or formatting
 CPP = (".cpp", ".h", ".cu", ".cuh")
 CPP_NUMBER = r"(?<!\w)\d(?:'?\w)*"  # an apostrophe between digits does not begin a character literal
 CPP_PIECES = re.compile(
@@ -59,13 +59,13 @@ class Sources:
     def reached(self, module: str) -> set[str]:
         """Return the module and all its direct and indirect imports, except those for type checkers only."""
         found: set[str] = set()
-        ahead = {module}
-        while ahead:
-            name = ahead.pop()
+        pending = {module}
+        while pending:
+            name = pending.pop()
             found.add(name)
             above = name.rpartition(".")[0]
             named = {above, *self._imports(name)} if above else self._imports(name)
-            ahead |= {other for other in named if other not in found and self._file(other)}
+            pending |= {other for other in named if other not in found and self._file(other)}
         return found
 
     def _file(self, module: str) -> Path | None:
@@ -127,9 +127,9 @@ def _module_digest(text: str) -> str:
 def _shape(node: Any) -> Any:
     """Return a syntax tree as JSON, the same in all Python versions: empty fields and docstrings are omitted."""
     if isinstance(node, ast.AST):
-        fields = {name: value for name, value in ast.iter_fields(node) if name not in UNSAID}
-        said = {name: _shape(value) for name, value in fields.items() if value is not None and value != []}
-        return [type(node).__name__, {name: value for name, value in said.items() if value != []}]
+        fields = {name: value for name, value in ast.iter_fields(node) if name not in OMITTED_FIELDS}
+        shapes = {name: _shape(value) for name, value in fields.items() if value is not None and value != []}
+        return [type(node).__name__, {name: value for name, value in shapes.items() if value != []}]
     if isinstance(node, list):
         return [_shape(item) for item in node if not _is_docstring(item)]
     return f"{type(node).__name__} {node!r}"
@@ -147,7 +147,7 @@ def data_digests(folder: Path) -> dict[str, str]:
 
 def _data(folder: Path) -> Iterator[tuple[str, Path]]:
     for path in sorted(folder.iterdir()):
-        if path.is_dir() and path.name not in MADE_FOLDERS and not (path / "__init__.py").is_file():
+        if path.is_dir() and path.name not in GENERATED_FOLDERS and not (path / "__init__.py").is_file():
             yield from ((f"{path.name}/{name}", file) for name, file in _data(path))
         elif path.is_file() and path.suffix not in UNCOUNTED and path.name != RECORD and not path.name.startswith("."):
             yield path.name, path

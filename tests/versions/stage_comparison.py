@@ -17,7 +17,7 @@ from small_capture import CONFIG, write_capture
 from trees import Say, Tree, complete, git, take_commit, take_working
 
 HERE = Path(__file__).resolve().parent
-TOLD = 3  # number of differing files that are reported
+MAX_LISTED = 3  # number of differing files that are reported
 LOOKED_BACK = 20  # commits that changed the record; a typical branch has fewer
 
 
@@ -128,8 +128,8 @@ def _verdict(found: Mapping[str, Any], before: Mapping[str, str]) -> Verdict:
     if "failed" in found:
         bits = f"fails on what was left before: {found['failed']}"
     elif changed:
-        more = f" and {len(changed) - TOLD} more files" if len(changed) > TOLD else ""
-        bits = f"other bits in {', '.join(changed[:TOLD])}{more}"
+        more = f" and {len(changed) - MAX_LISTED} more files" if len(changed) > MAX_LISTED else ""
+        bits = f"other bits in {', '.join(changed[:MAX_LISTED])}{more}"
     else:
         bits = f"the same bits in all {len(names)} files"
     if reused:
