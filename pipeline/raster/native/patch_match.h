@@ -17,7 +17,7 @@ constexpr float kPatchWorst = 2.0f;  // cost of a plane that no photo constrains
 // A photo to compare with.
 struct PatchView {
     int width, height;             // at least 4
-    const std::uint32_t* corners;  // (height, width): four grey values a pixel: its own, right, below, below right
+    const std::uint32_t* corners;  // (height, width): four grey values per pixel: its own, right, below, below right
     const std::uint8_t* counts;    // (height, width)
     float turn[9], shift[3];       // from pixels of the photo to its own, as above
 };
@@ -30,22 +30,22 @@ struct PatchJob {
     int view_count;
     float least, most;  // inverse depths
     std::uint32_t seed;
-    int begun;              // how many times planes were changed less than at first
+    int begun;              // number of earlier iterations, each with smaller changes
     float* planes;          // (3, height, width): inverse depth at the pixel's centre, across and down a pixel
-    float* costs;           // (height, width): 0 alike to 1 unlike; kPatchWorst where no photo constrains it
+    float* costs;           // (height, width): 0 (alike) to 1 (unlike); kPatchWorst if no photo constrains it
     std::uint32_t* chosen;  // (height, width): the photos that a pixel is compared with at first; filled by `begin`
 };
 
 struct PatchKernels {
     // Costs of a row's planes; random ones where the inverse depth is not within the range.
     void (*begin)(const PatchJob& job, int row);
-    // Every other pixel of a row, from `row + colour` on, takes its neighbours' planes, or its own a little changed,
-    // where they are better. Neighbours are of the other colour, so rows do not depend on each other.
+    // Every other pixel of a row, from `row + colour` on, takes a neighbour's plane or a small change of its own, if
+    // that is better. Neighbours are of the other colour, so rows do not depend on each other.
     void (*improve)(const PatchJob& job, int row, int colour, int iteration);
 };
 
 // Processes rows on the pool's threads; bit-identical for any number of them.
-// `job.chosen` is its own.
+// `job.chosen` is overwritten.
 void patch_match(PatchJob job, int iterations);
 
 }  // namespace splat

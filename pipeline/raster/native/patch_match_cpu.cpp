@@ -11,11 +11,11 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kSamples = 32;            // of a round window: 6 x 6, two pixels apart, without the corners
-constexpr int kLooked = 4;              // photos in which a pixel's planes are tried: the most similar ones so far
-constexpr int kBest = 2;                // photos that count
-constexpr int kNoView = 255;            // instead of a photo's index
-constexpr float kUnlike = 1.2f;         // cost above which a photo is uninformative: it shows something else
+constexpr int kSamples = 32;     // of a round window: 6 x 6, two pixels apart, without the corners
+constexpr int kLooked = 4;       // number of photos in which a pixel's planes are tried: the most similar ones so far
+constexpr int kBest = 2;         // number of photos whose costs count
+constexpr int kNoView = 255;     // instead of a photo's index
+constexpr float kUnlike = 1.2f;  // cost above which a photo is uninformative: it shows something else
 constexpr float kNoise2 = 1.5f * 1.5f;  // variance of grey values: contrast below it does not count as similarity
 constexpr float kPerGrey = 0.047f;      // of a weight's logarithm to base two
 constexpr float kPerPixel2 = 0.028f;    // the same, by squared distance
@@ -25,15 +25,15 @@ constexpr float kSlopeShare = 2.0f;     // the same for a slope, relative to the
 constexpr float kFainter = 0.5f;        // factor on changes from one iteration to the next
 constexpr float kSame = 1e-3f;          // of the inverse depth: planes closer than that everywhere in the window
 constexpr float kReach = 6.0f;          // pixels from the middle to the window's sides
-constexpr int kTries = 2;               // each of a depth, a slope, and both a little
-constexpr int kFirstFar = 7, kLastFar = 23;  // pixels away along rows and columns; odd, so of the other colour
+constexpr int kTries = 2;  // random changes of each kind: of the depth, of the slope, and small ones of both
+constexpr int kFirstFar = 7, kLastFar = 23;  // distances along rows and columns, pixels; odd, so of the other colour
 
-// Right and down of a pixel, as sides of the window. Even distances from the middle, half a step away from it.
+// Offsets of the samples from the pixel, to the right and down, pixels.
 SPLAT_TABLE float kRight[kSamples] = {-3, -1, 1,  3, -5, -3, -1, 1,  3,  5, -5, -3, -1, 1,  3, 5,
                                       -5, -3, -1, 1, 3,  5,  -5, -3, -1, 1, 3,  5,  -3, -1, 1, 3};
 SPLAT_TABLE float kDown[kSamples] = {-5, -5, -5, -5, -3, -3, -3, -3, -3, -3, -1, -1, -1, -1, -1, -1,
                                      1,  1,  1,  1,  1,  1,  3,  3,  3,  3,  3,  3,  5,  5,  5,  5};
-// By direction: right and down of seven pixels near by, all of the other colour.
+// By direction: offsets of seven nearby pixels, all of the other colour.
 SPLAT_TABLE int kNear[4][7][2] = {{{0, -1}, {-1, -2}, {1, -2}, {-2, -3}, {2, -3}, {0, -3}, {0, -5}},
                                   {{0, 1}, {-1, 2}, {1, 2}, {-2, 3}, {2, 3}, {0, 3}, {0, 5}},
                                   {{-1, 0}, {-2, -1}, {-2, 1}, {-3, -2}, {-3, 2}, {-3, 0}, {-5, 0}},
@@ -56,7 +56,7 @@ struct Draws {
     SPLAT_METHOD float either_side() { return 2.0f * next() - 1.0f; }
 };
 
-// A pixel's surroundings: weights that sum up to one, and the same times the grey value's difference from the mean.
+// A pixel's window: weights that sum to one, and the weights times the grey values' differences from the mean.
 struct Window {
     float x, y;  // of the pixel's centre
     float weights[kSamples], centred[kSamples];
@@ -104,7 +104,7 @@ void open_window(const PatchJob& job, int column, int row, Window* window) {
 float view_cost(const PatchView& view, const Window& window, const Plane& plane) {
     const float* turn = view.turn;
     const float rest = plane.inverse - plane.across * window.x - plane.down * window.y;
-    float right[3], down[3], at[3];  // how the homogeneous pixel changes, and where the middle goes
+    float right[3], down[3], at[3];  // change of the homogeneous pixel per step, and the image of the centre
     for (int k = 0; k < 3; ++k) {
         right[k] = turn[3 * k] + view.shift[k] * plane.across;
         down[k] = turn[3 * k + 1] + view.shift[k] * plane.down;
@@ -140,7 +140,7 @@ float view_cost(const PatchView& view, const Window& window, const Plane& plane)
     return 1.0f - sums[2] / __builtin_sqrtf(product);
 }
 
-// The photos that a pixel is compared with, those that show its plane most alike, as bytes of a number: 255 is none.
+// The photos that a pixel is compared with, the most similar ones for its plane, as bytes of an integer; 255: none.
 SPLAT_INLINE int chosen_view(uint32_t chosen, int k) { return static_cast<int>(chosen >> (8 * k) & 255U); }
 
 float plane_cost(const PatchJob& job, const Window& window, const Plane& plane, uint32_t chosen) {
@@ -160,7 +160,7 @@ float plane_cost(const PatchJob& job, const Window& window, const Plane& plane, 
     return sum * (1.0f / kBest);
 }
 
-// The photos to compare with; what the plane costs in them is `plane_cost`'s, without looking twice.
+// The photos to compare with; the plane's cost in them is that of `plane_cost`, which is not computed twice.
 uint32_t choose(const PatchJob& job, const Window& window, const Plane& plane, float* cost) {
     float costs[kLooked + 1];
     int views[kLooked + 1], count = 0;
@@ -181,11 +181,11 @@ uint32_t choose(const PatchJob& job, const Window& window, const Plane& plane, f
     return chosen;
 }
 
-// A pixel at work: the best plane so far.
+// A pixel being processed: the best plane so far.
 struct Pixel {
     const PatchJob& job;
     const Window& window;
-    uint32_t chosen;  // the photos that planes are tried in
+    uint32_t chosen;  // the photos in which planes are tried
     Plane plane;
     float cost;
 
@@ -193,7 +193,7 @@ struct Pixel {
         const float found = plane_cost(job, window, other, chosen);
         if (found < cost) cost = found, plane = other;
     }
-    // The plane that another pixel has, here; -1: none.
+    // The plane of another pixel, evaluated here; -1: none.
     SPLAT_METHOD void attempt_of(int64_t other, float right, float down) {
         const int64_t size = static_cast<int64_t>(job.width) * job.height;
         if (other < 0) return;

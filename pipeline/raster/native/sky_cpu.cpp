@@ -9,8 +9,8 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kCells = 32;                              // of a tile
-constexpr int kTile = kCells * kSkyMostStep;            // columns at most
+constexpr int kCells = 32;                              // per tile
+constexpr int kTile = kCells * kSkyMostStep;            // maximum number of columns
 constexpr int kPadded = kTile + kLanes + kSkyMostStep;  // including what the last vector and the last cell may overrun
 
 SPLAT_INLINE int least(int a, int b) { return a < b ? a : b; }
@@ -21,13 +21,13 @@ struct Tile {
     int above, below;  // rows of nodes
 };
 
-// By column of a tile: the colour at the upper row of nodes, and from there to the lower one.
+// By column of a tile: the colour at the upper row of nodes, and the difference to the lower one.
 struct Lines {
     float top[3][kPadded];
     float slope[3][kPadded];
 };
 
-// What gets to the columns of a tile from its rows.
+// Gradients of the columns of a tile, summed over its rows.
 struct ColumnSums {
     float top[3][kPadded];
     float bottom[3][kPadded];
@@ -135,7 +135,7 @@ SPLAT_INLINE void add_to(ColumnSums* sums, int x, const Colours& up, Mask is_sky
     }
 }
 
-// A tile's columns to its nodes, in order.
+// Adds the columns' gradients to those of the tile's nodes, in order.
 void share_out(const SkyJob& job, const Tile& tile, const ColumnSums& sums, float* shares) {
     const float part = 1.0f / static_cast<float>(job.step);
     for (int x = 0, left = tile.first / job.step; x < tile.last - tile.first; x += job.step, ++left) {

@@ -9,17 +9,16 @@
 namespace splat {
 namespace {
 
-constexpr double kSigmaPixels =
-    0.7;                            // standard deviation of a height from one photo's depths, perpendicular to the ray
-constexpr double kLeastSine = 0.2;  // of a ray's angle against the ground: flatter ones count as if they were not
-constexpr double kSpan = 3.0;       // heights within this many deviations of each other are one surface
-constexpr double kWeightUnit = 256.0;  // weights are whole numbers of its parts
+constexpr double kSigmaPixels = 0.7;   // standard deviation of a depth's position perpendicular to the ray
+constexpr double kLeastSine = 0.2;     // of a ray's angle to the ground; flatter ones are treated as this
+constexpr double kSpan = 3.0;          // heights within this many standard deviations are one surface
+constexpr double kWeightUnit = 256.0;  // weights are integers in units of 1 / this
 constexpr double kMostWeight = 1 << 30;
 constexpr int kFullyConfirmed = 4;    // more photos that confirm a depth add no weight
-constexpr int kLeastVotes = 2;        // photos that have to agree,
-constexpr double kLeastShare = 0.25;  // and of the weight of the cell's best surface
+constexpr int kLeastVotes = 2;        // minimum number of photos that agree,
+constexpr double kLeastShare = 0.25;  // and minimum share of the weight of the cell's best surface
 constexpr int kRounds = 3;            // of the robust mean: it has converged after two
-constexpr double kBiweight = 2.5;     // deviations beyond which a vote counts nothing
+constexpr double kBiweight = 2.5;     // standard deviations beyond which a vote has no weight
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 int cell_of(std::uint64_t key) { return static_cast<int>(key >> (64 - kCellBits)); }
@@ -28,11 +27,11 @@ std::int64_t steps_of(std::uint64_t key) {
     return static_cast<std::int64_t>(key >> (kCoverBits + kConfidenceBits) & ((std::uint64_t{1} << kStepBits) - 1));
 }
 
-// Puts what was found in cells into the cells' order, each cell's as it came; `starts` says where cells begin.
+// Stable counting sort by cell; `starts` receives the index of each cell's first element.
 template <class T, class CellOf>
 void sort_by_cell(const std::vector<T>& from, int cells, CellOf cell_of_one, std::vector<T>* to,
                   std::vector<std::size_t>* starts) {
-    std::vector<std::size_t>& places = *starts;  // of a cell's next one, a cell on: in the end, where the next begins
+    std::vector<std::size_t>& places = *starts;  // next index of each cell, shifted by one cell: in the end its start
     places.assign(static_cast<std::size_t>(cells) + 2, 0);
     for (const T& one : from) ++places[static_cast<std::size_t>(cell_of_one(one)) + 2];
     for (std::size_t cell = 1; cell < places.size(); ++cell) places[cell] += places[cell - 1];
@@ -41,7 +40,7 @@ void sort_by_cell(const std::vector<T>& from, int cells, CellOf cell_of_one, std
     places.pop_back();
 }
 
-// Expected deviation of a height: of a pixel on the ground, which is longer where the ray is flat.
+// Standard deviation of a height: that of a pixel projected to the ground, which is longer where the ray is flat.
 double sigma_of(const SurfaceCamera& camera, const CellTile& tile, int cell, double height) {
     const double east = tile.east + (tile.column + cell % tile.width + 0.5) * tile.cell - camera.centre[0];
     const double north = tile.north - (tile.row + cell / tile.width + 0.5) * tile.cell - camera.centre[1];
@@ -50,15 +49,15 @@ double sigma_of(const SurfaceCamera& camera, const CellTile& tile, int cell, dou
     return kSigmaPixels * away / std::max(camera.fx, camera.fy) / std::max(above / away, kLeastSine);
 }
 
-// A cell's votes, and of each the surface that it is the top of: votes down to so far below that they may be the same.
+// Candidate surfaces of a cell: for each vote, the votes below it that are close enough to be the same surface.
 struct Surfaces {
-    std::vector<std::int64_t> weights, covers;  // of all votes before each
+    std::vector<std::int64_t> weights, covers;  // prefix sums over the votes
     std::vector<std::size_t> bottoms;
-    std::int64_t best;  // weight of any
+    std::int64_t best;  // maximum weight of a surface
 
     void rank(const Vote* votes, std::size_t count);
     std::int64_t weight(std::size_t top) const { return weights[top + 1] - weights[bottoms[top]]; }
-    // Whether enough photos agree.
+    // Whether enough photos agree on the surface.
     bool stands(const Vote& vote, std::size_t top) const {
         return (top + 1 - bottoms[top] >= kLeastVotes || vote.confirmed >= kLeastVotes) &&
                static_cast<double>(weight(top)) >= kLeastShare * static_cast<double>(best);
@@ -86,7 +85,7 @@ struct Fit {
 // Tukey's biweight of a vote about a height, times its own weight (Beaton and Tukey 1974).
 double counted(const Vote& vote, double height) {
     const double off = (vote.height - height) / (kBiweight * static_cast<double>(vote.sigma));
-    if (!(std::fabs(off) < 1.0)) return 0.0;  // also of what is not a number
+    if (!(std::fabs(off) < 1.0)) return 0.0;  // also for NaN
     const double kept = 1.0 - off * off;
     return vote.weight * kept * kept;
 }
@@ -94,7 +93,7 @@ double counted(const Vote& vote, double height) {
 Fit fitted(const Vote* begin, const Vote* end, double start) {
     double height = start, about = start, total = 0.0;
     for (int round = 0; round < kRounds; ++round) {
-        double above = 0.0;  // sums of heights about the last one lose no digits
+        double above = 0.0;  // sum relative to the last height, to keep precision
         about = height, total = 0.0;
         for (const Vote* vote = begin; vote != end; ++vote) {
             const double weight = counted(*vote, about);
@@ -165,7 +164,7 @@ void CellVotes::sort_keys() {
                   sorted_keys_.begin() + static_cast<std::ptrdiff_t>(starts_[cell + 1]));
 }
 
-// One vote for each run of heights in a cell that no gap divides.
+// One vote for each run of heights in a cell without a gap.
 void CellVotes::vote(const SurfaceCamera& camera, std::size_t begin, std::size_t end, int cell) {
     while (begin < end) {
         const std::int64_t lowest = steps_of(sorted_keys_[begin]);

@@ -7,16 +7,16 @@
 namespace splat {
 namespace {
 
-constexpr int kReach = 3;  // pixels around a place that a cubic may look at
+constexpr int kReach = 3;  // pixels on each side of a position that the cubic uses
 
-// Where places lie, in halved pixels.
+// Bounding box of positions, in pixels of the halved photo.
 struct Extent {
     double left = 1e30, top = 1e30, right = -1e30, bottom = -1e30;
 };
 
 int halved_size(int size, int times) { return (size + (1 << times) - 1) >> times; }
 
-// The part of a photo, halved, that the cubic of places within an extent looks at.
+// Reads and halves the part of a photo that the cubic needs for positions within an extent.
 std::vector<std::uint32_t> open_part(const Photo& photo, const Extent& extent, Halved* part) {
     const ColourKernels& kernels = SPLAT_KERNELS(colour_sample_kernels);
     const double side = 1 << part->times;
@@ -36,7 +36,7 @@ std::vector<std::uint32_t> open_part(const Photo& photo, const Extent& extent, H
                      row_of(rows, row, width));
     for (int time = 0; time < part->times; ++time) {
         width /= 2, height /= 2;
-        for (int row = 0; row < height; ++row)  // in place: what is written was read
+        for (int row = 0; row < height; ++row)  // in place: only rows that have been read are overwritten
             kernels.halve(row_of(rows, 2 * row, 2 * width), row_of(rows, 2 * row + 1, 2 * width), width,
                           row_of(rows, row, width));
     }

@@ -1,4 +1,4 @@
-// Colours of places from a photo, by a cubic that fits the scale.
+// Colours of points from a photo, by bicubic interpolation at the matching scale.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,8 @@
 
 namespace splat {
 
-constexpr int kMostHalved = 6;  // times: a photo 64 times finer than the cells is softened no further
+constexpr int kMostHalved =
+    6;  // maximum number of halvings: finer photos than 64 times the cells are halved no further
 
 // The mapping from a pinhole's pixels to a photo's: columns and rows of the photo at every `step` pixels of the
 // pinhole's, linear in between.
@@ -18,7 +19,7 @@ struct Lens {
     const double* nodes;  // (rows, columns, 2); null: the photo is the pinhole's
 };
 
-// A photo, and what becomes of each of its values in each channel.
+// A photo, and its tone curves.
 struct Photo {
     SurfaceCamera camera;  // a pinhole
     Lens lens;
@@ -27,7 +28,7 @@ struct Photo {
     const std::uint8_t* tone;    // (256, 3)
 };
 
-// A part of a photo that was halved some times: four bytes a pixel, the last one unused.
+// A part of a photo after `times` halvings: four bytes per pixel, the last one unused.
 struct Halved {
     int left, top, width, height;   // of the part, halved pixels
     int whole_width, whole_height;  // of the photo
@@ -36,19 +37,19 @@ struct Halved {
 };
 
 struct ColourKernels {
-    // Where places lie in a photo, and how often it is halved there; -1: not seen.
+    // Positions of points in a photo, and the number of halvings there; -1: not visible.
     void (*find)(const Photo& photo, const Places& places, double cell, const std::uint8_t* seen, double* column,
                  double* row, std::int8_t* times);
-    // A row of a part, its values toned; the photo's rim goes on beyond it.
+    // A row of a part after the tone curve; the photo's edge is replicated.
     void (*read)(const Photo& photo, int row, int left, int count, std::uint32_t* out);
-    // Means of two by two pixels, of two rows of twice `count`.
+    // Means of 2 x 2 pixels, from two rows of 2 * `count` pixels.
     void (*halve)(const std::uint32_t* upper, const std::uint32_t* lower, int count, std::uint32_t* out);
-    // Colours of the places for which the photo was halved this often.
+    // Colours of the points with this number of halvings.
     void (*sample)(const Halved& part, std::int64_t count, const double* column, const double* row,
                    const std::int8_t* times, std::uint8_t* colour);
 };
 
-// Colours of visible places; black elsewhere. Bit-identical whatever else is requested in the same call.
+// Colours of visible points; black elsewhere. Bit-identical whatever else is requested in the same call.
 void sample_photo(const Photo& photo, const Places& places, double cell, const std::uint8_t* seen,
                   std::uint8_t* colour);
 

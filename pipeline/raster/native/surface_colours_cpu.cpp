@@ -6,8 +6,8 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr float kCubic = -0.75f;                   // Keys' parameter; OpenCV's, sharper than -0.5
-constexpr double kFirstFiner = 1.515716566510398;  // 2 to the power of 0.6: where a photo is halved first
+constexpr float kCubic = -0.75f;                   // parameter a of Keys' kernel; OpenCV's value, sharper than -0.5
+constexpr double kFirstFiner = 1.515716566510398;  // 2^0.6: how much finer a photo must be to be halved
 
 using Quad = float __attribute__((vector_size(16)));
 using QuadInts = int32_t __attribute__((vector_size(16)));
@@ -20,7 +20,7 @@ SPLAT_INLINE Quad quad(uint32_t pixel) {
 
 SPLAT_INLINE double within(double value, double last) { return value > 0.0 ? (value < last ? value : last) : 0.0; }
 
-// A pinhole's place in the photo; beyond its picture by that of its rim's squares.
+// Maps a pinhole's pixel to the photo; beyond the grid, the outermost squares are extrapolated.
 SPLAT_INLINE void through_lens(const Lens& lens, double* column, double* row) {
     const double x = *column / lens.step, y = *row / lens.step;
     const int left = static_cast<int>(within(x, lens.columns - 2)), top = static_cast<int>(within(y, lens.rows - 2));
@@ -73,13 +73,13 @@ void read(const Photo& photo, int row, int left, int count, uint32_t* out) {
 void halve(const uint32_t* upper, const uint32_t* lower, int count, uint32_t* out) {
     for (int k = 0; k < count; ++k) {
         const uint32_t pixels[4] = {upper[2 * k], upper[2 * k + 1], lower[2 * k], lower[2 * k + 1]};
-        uint32_t even = 0x00020002U, odd = 0x00000002U;  // sums of bytes, two and one a number, and half of four
+        uint32_t even = 0x00020002U, odd = 0x00000002U;  // sums of bytes, packed, plus 2 to round the mean of four
         for (uint32_t pixel : pixels) even += pixel & 0x00ff00ffU, odd += pixel >> 8 & 0xffU;
         out[k] = (even >> 2 & 0x00ff00ffU) | (odd >> 2) << 8;
     }
 }
 
-// Weights of the four pixels around a place, `part` of a pixel behind the second.
+// Weights of the four pixels around a position, `part` of a pixel after the second.
 SPLAT_INLINE void cubic(float part, float* weights) {
     const float a = kCubic, far = part + 1.0f, near = 1.0f - part;
     weights[0] = ((a * far - 5.0f * a) * far + 8.0f * a) * far - 4.0f * a;
@@ -100,7 +100,8 @@ void sample(const Halved& part, int64_t count, const double* column, const doubl
     const double scale = 1.0 / static_cast<double>(1 << part.times);
     for (int64_t k = 0; k < count; ++k) {
         if (times[k] != part.times) continue;
-        const double x = column[k] * scale + 0.5, y = row[k] * scale + 0.5;  // above 0: of one pixel before
+        const double x = column[k] * scale + 0.5,
+                     y = row[k] * scale + 0.5;  // shifted by a pixel, so that truncation rounds down
         const int left = static_cast<int>(x), top = static_cast<int>(y);
         float across[4], down[4];
         int columns[4];

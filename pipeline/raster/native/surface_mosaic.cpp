@@ -9,15 +9,15 @@ namespace splat {
 namespace {
 
 constexpr int kSeam = 60;      // cost of a seam between two cells,
-constexpr int kSeamStep = 12;  // and of each grey value that the photos differ there
+constexpr int kSeamStep = 12;  // and of each grey value by which the photos differ there
 
-// Sums over squares of the cells of a picture, row by row from the top; what is outside repeats the rim.
+// Box sums over the cells of a picture, row by row from the top; the border is replicated.
 class SlidingBox {
   public:
     SlidingBox(int width, int height, int radius)
         : width_(width), height_(height), radius_(radius), sums_(static_cast<std::size_t>(width + 2 * radius)) {}
 
-    // The sums of row `row` of a picture; rows are asked for in their order.
+    // The sums of row `row` of a picture; rows are requested in order.
     void row(int row, const std::uint16_t* picture, std::int32_t* out) {
         const MosaicKernels& kernels = SPLAT_KERNELS(mosaic_kernels);
         std::int32_t* middle = sums_.data() + radius_;
@@ -76,8 +76,8 @@ class Mosaic {
     std::vector<std::uint16_t> average_;  // costs
 };
 
-// Photos cost more where they look unlike the others: softened, for a texture that two photos show a fraction of a
-// pixel apart is not odd.
+// Photos cost more where they differ from the others. They are blurred first, because a texture that two photos show
+// a fraction of a pixel apart is no outlier.
 void Mosaic::compare() {
     const MosaicKernels& kernels = SPLAT_KERNELS(mosaic_kernels);
     const auto width = static_cast<std::size_t>(job_.width), photos = static_cast<std::size_t>(job_.photos);
@@ -98,7 +98,7 @@ void Mosaic::compare() {
     }
 }
 
-// The least cost averaged around each cell (Hosni et al., "Fast Cost-Volume Filtering", 2013).
+// The minimum of the costs averaged around each cell (Hosni et al., "Fast Cost-Volume Filtering", 2013).
 void Mosaic::choose() {
     const MosaicKernels& kernels = SPLAT_KERNELS(mosaic_kernels);
     std::vector<std::uint16_t> least(static_cast<std::size_t>(cells_), kNever);

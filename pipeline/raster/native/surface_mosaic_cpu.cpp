@@ -6,11 +6,11 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr float kOddFree = 15.0f;   // a photo may differ from the others by so many grey values at no cost...
-constexpr float kOdd = 15.0f;       // ...and costs so much for each one more
+constexpr float kOddFree = 15.0f;   // difference from the other photos, grey values, that costs nothing,
+constexpr float kOdd = 15.0f;       // and the cost of each further grey value
 constexpr float kOddMost = 60.0f;   // larger differences are clamped to this
 constexpr float kEvenCost = 64.0f;  // added to costs, so that the best photo does not outweigh the rest a hundredfold
-constexpr int kRounds = 2;          // of the mean
+constexpr int kRounds = 2;          // of the robust mean
 
 void rank(const uint8_t* seen, const uint16_t* cost, int most, int64_t cells, uint16_t* least, uint8_t* seen_by) {
     constexpr int kPart = 512;  // cells at a time: their values stay in the L1 cache
@@ -38,7 +38,7 @@ void drop(const uint16_t* cost, const uint16_t* limits, int64_t cells, uint8_t* 
 }
 
 void grey(const uint8_t* colour, int64_t count, uint8_t* out) {
-    for (int64_t k = 0; k < count; ++k) {  // BT.601, in parts of 16,384
+    for (int64_t k = 0; k < count; ++k) {  // BT.601, in units of 1 / 16,384
         const uint8_t* pixel = colour + 3 * k;
         out[k] = static_cast<uint8_t>((4899 * pixel[0] + 9617 * pixel[1] + 1868 * pixel[2] + 8192) >> 14);
     }

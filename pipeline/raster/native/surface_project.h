@@ -1,4 +1,4 @@
-// Projection of places into a photo, in batches: for kernel files.
+// Projection of points into a photo, in batches: for kernel files.
 #pragma once
 
 #include "simd.h"
@@ -9,14 +9,14 @@ namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
 constexpr int kPlaces = 64;        // at a time: their values stay in the L1 cache
-constexpr double kFlattest = 0.2;  // sine of a ray's angle against the ground: flatter ones are treated as this
+constexpr double kFlattest = 0.2;  // sine of a ray's angle to the ground; flatter ones are treated as this
 
 struct InPhoto {
     int count;
     double column[kPlaces], row[kPlaces];  // the first pixel's centre is at 0.5
     double depth[kPlaces];                 // along the camera's z
-    double sine[kPlaces];                  // of the ray's angle against the ground
-    uint8_t is_in[kPlaces];                // the place is in front of the camera and inside the photo
+    double sine[kPlaces];                  // of the ray's angle to the ground
+    uint8_t is_in[kPlaces];                // the point is in front of the camera and inside the photo
 };
 
 SPLAT_INLINE void project(const SurfaceCamera& camera, const Places& places, int64_t first, InPhoto* out) {

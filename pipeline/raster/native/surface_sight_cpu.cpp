@@ -5,23 +5,22 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr double kTolerancePixels =
-    3.0;                            // depths so many pixels' widths apart, at a right angle to the surface, are one
-constexpr double kLeaning = 1.0;    // cost of a ray along the ground, against one straight down
-constexpr double kCoarse = 0.5;     // cost of a photo half as fine as the cells,
-constexpr double kCoarsest = 4.0;   // and at most of so many times as much
-constexpr double kRim = 0.06;       // of a photo's width: nearer to its edge it costs more, for lenses are worst there,
-constexpr double kRimCost = 0.5;    // up to so much
-constexpr double kMixedCost = 0.6;  // colours may be mixed there
-constexpr double kUnknownCost = 0.3;  // it colours others beside it none the less
-constexpr double kCostUnit = 1000.0;  // costs are whole numbers of its parts
+constexpr double kTolerancePixels = 3.0;  // pixel widths, perpendicular to the surface, within which depths agree
+constexpr double kLeaning = 1.0;          // cost of a ray along the ground; one straight down costs nothing
+constexpr double kCoarse = 0.5;           // cost of a photo half as fine as the cells,
+constexpr double kCoarsest = 4.0;         // and the maximum multiple of it
+constexpr double kRim = 0.06;     // of a photo's width: nearer to its edge it costs more, since lenses are worst there,
+constexpr double kRimCost = 0.5;  // up to this much
+constexpr double kMixedCost = 0.6;    // colours may be mixed there
+constexpr double kUnknownCost = 0.3;  // added where the visibility is unknown
+constexpr double kCostUnit = 1000.0;  // costs are integers in units of 1 / this
 
 SPLAT_INLINE double greater(double a, double b) { return a > b ? a : b; }
 SPLAT_INLINE double smaller(double a, double b) { return a < b ? a : b; }
 SPLAT_INLINE double focal(const SurfaceCamera& camera) { return greater(camera.fx, camera.fy); }
 
-// The least of a pixel's depth and those around it; 0 where one of them has none. A point at an edge lies in a pixel
-// that may show what is behind: only where all pixels around do, too, is it in the way of the photo's rays.
+// The minimum of a pixel's depth and its neighbours'; 0 if one of them has none. A point at an edge projects into a
+// pixel that may show the background: only if all pixels around it do so as well, does the photo look through it.
 SPLAT_INLINE float least_around(const DepthPicture& picture, int row, int column) {
     const int width = picture.camera.width, height = picture.camera.height;
     const int left = column > 0 ? column - 1 : 0, right = column + 1 < width ? column + 1 : column;
@@ -99,7 +98,7 @@ void confirm(const SurfaceCamera& camera, const float* inverse, const Places& pl
         for (int k = 0; k < at.count; ++k) {
             if (!at.is_in[k]) continue;
             const int64_t pixel = static_cast<int64_t>(at.row[k]) * camera.width + static_cast<int64_t>(at.column[k]);
-            const double ratio = at.depth[k] * static_cast<double>(inverse[pixel]);  // over the depth found there
+            const double ratio = at.depth[k] * static_cast<double>(inverse[pixel]);  // to the depth found there
             const double far = agreeing.pixels * at.depth[k] / agreeing.parallax;
             const double most = smaller(greater(far, agreeing.share), agreeing.loosest), off = ratio - 1.0;
             if (!(off < most && -off < most)) continue;

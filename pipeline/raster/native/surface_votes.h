@@ -9,13 +9,14 @@
 namespace splat {
 
 constexpr double kHeightStep = 1e-4;  // metres: heights are whole multiples of this
-// A height found in a cell is one whole number, to be sorted: the cell, the steps above the lowest height, how much of
-// the cell is covered, and the confidence.
+// A height in a cell is packed into one integer, for sorting: cell, steps above the lowest height, covered share of
+// the cell, and confidence.
 constexpr int kConfidenceBits = 3, kCoverBits = 8, kStepBits = 27, kCellBits = 26;
-constexpr double kCoverUnit = 128.0;  // covered areas are counted in such parts of a cell
-constexpr int kMostParts = 4;         // per side of a pixel; larger pixels leave gaps, which other photos fill
-constexpr int kSlopeReach = 2;        // pixels around one that its slope is taken from
-constexpr int kRowPadding = 64;       // values past the end of a row's inverse depths that may be read
+constexpr double kCoverUnit = 128.0;  // covered areas are in units of 1 / this of a cell
+constexpr int kMostParts =
+    4;  // a side: parts a pixel is divided into at most; larger pixels leave gaps, which other photos fill
+constexpr int kSlopeReach = 2;   // pixels on each side that a slope is estimated from
+constexpr int kRowPadding = 64;  // values past the end of a row's inverse depths that may be read
 
 // A row of pixels that is turned into heights of cells.
 struct HeightRow {
@@ -29,8 +30,8 @@ struct HeightRow {
 struct VoteKernels {
     // Inverse depths, NaN where there is none.
     void (*invert)(const float* depth, int count, float* inverse);
-    // Where the row's pixels, as small planes, cover cells of the tile. Returns how many keys it wrote, kMostParts
-    // squared a pixel at most.
+    // Keys of the cells of the tile that the row's pixels, as small planes, cover. Returns their number, at most
+    // kMostParts squared per pixel.
     std::int64_t (*heights)(const HeightRow& job, std::uint64_t* keys);
 };
 

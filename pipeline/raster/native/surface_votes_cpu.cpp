@@ -11,7 +11,7 @@ namespace {
 
 constexpr float kSamePixels = 10.0f;  // depths that differ by more than this many pixel widths are not one surface
 constexpr double kSteepest = 3.0;     // rise over run; steeper is a wall, which has no single height at a place
-constexpr double kCovered = 0.75;     // of a cell: pixels further apart than that are divided
+constexpr double kCovered = 0.75;     // of a cell: pixels that are farther apart are divided
 constexpr int kWidest = 4;            // cells from a pixel's centre to its edge; larger pixels are too coarse
 constexpr int kBlock = kRowPadding;   // pixels at a time: their planes stay in the L1 cache
 constexpr int kMostConfident = (1 << kConfidenceBits) - 1;
@@ -20,7 +20,7 @@ constexpr double kMostCover = (1 << kCoverBits) - 1;
 // Planes of some pixels of a row.
 struct Block {
     int first, count;
-    uint8_t is_near[kBlock];                         // the tile, and between its heights
+    uint8_t is_near[kBlock];                         // inside the tile and its range of heights
     float slope_x[kBlock], slope_y[kBlock];          // of the inverse depth, a pixel to the right and down; NaN: none
     double x[kBlock];                                // of the ray
     double east[kBlock], north[kBlock], up[kBlock];  // of the pixel's centre
@@ -50,7 +50,7 @@ void invert(const float* depth, int count, float* inverse) {
     for (int k = 0; k < count; ++k) inverse[k] = depth[k] > 0.0f ? 1.0f / depth[k] : __builtin_nanf("");
 }
 
-// Where the block's pixels lie; false where none is near the tile.
+// Positions of the block's pixels; false if none is near the tile.
 bool place(const HeightRow& job, const RowRay& ray, Block* block) {
     const SurfaceCamera& camera = job.picture.camera;
     const CellTile& tile = job.tile;
@@ -76,7 +76,7 @@ bool place(const HeightRow& job, const RowRay& ray, Block* block) {
 SPLAT_INLINE Floats size(Floats v) { return max(v, fill(0.0f) - v); }  // NaN stays
 
 // Slope of inverse depths per pixel in a direction, by least squares over pairs of pixels on both sides that lie in one
-// plane with it; one-sided at a surface's rim; NaN if there is no neighbour.
+// plane with it; one-sided at a surface's edge; NaN if there is no neighbour.
 SPLAT_INLINE void slope(const HeightRow& job, const Block& block, float same, bool is_down, float* out) {
     const int offset = block.first - job.left + kSlopeReach;
     const auto row = [&](int down, int right) { return job.inverses[kSlopeReach + down] + offset + right; };
@@ -103,7 +103,7 @@ SPLAT_INLINE void slope(const HeightRow& job, const Block& block, float same, bo
     }
 }
 
-// How the planes lie in the world, and into how many parts pixels are divided.
+// The planes in the world, and the number of parts of each pixel.
 void lay(const HeightRow& job, const RowRay& ray, Block* block) {
     const SurfaceCamera& camera = job.picture.camera;
     const double* turn = camera.turn;
@@ -145,7 +145,7 @@ SPLAT_INLINE int64_t floored(double value) {
     return whole - (value < static_cast<double>(whole));
 }
 
-SPLAT_TABLE double kShare[kMostParts + 1] = {0.0, 1.0, 0.5, 1.0 / 3.0, 0.25};  // of one of so many parts
+SPLAT_TABLE double kShare[kMostParts + 1] = {0.0, 1.0, 0.5, 1.0 / 3.0, 0.25};  // of one part, by the number of parts
 
 // The keys of one pixel.
 SPLAT_INLINE int64_t cover(const HeightRow& job, const Block& block, int k, uint64_t* keys) {

@@ -1,4 +1,4 @@
-// A step of Adam for tensors with common rows, for the side models.
+// A step of Adam for tensors with common rows, for the auxiliary models.
 #include "../adam.h"
 #include "frame.h"
 #include "step.cuh"

@@ -9,7 +9,7 @@
 namespace splat {
 namespace cuda {
 
-// Maximum that a thread counts or writes by itself; a splat with more is handled by the whole warp.
+// Maximum that a thread counts or writes by itself; a splat with more is processed by the whole warp.
 constexpr int kOwnRows = 4;
 constexpr uint32_t kOwnPairs = 16;
 

@@ -1,4 +1,5 @@
-// Density control's kernels: the random numbers of train/random_numbers.py, the positions of a split's halves, and Morton codes.
+// Density control's kernels: the random numbers of train/random_numbers.py, the positions of a split's halves, and
+// Morton codes.
 #include <math.h>
 
 #include "api.h"
