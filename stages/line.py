@@ -205,7 +205,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=8,
+    version=9,
     config=ExportConfig,
     reads=(
         "clean.model",
