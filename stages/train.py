@@ -14,7 +14,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the model, its history, plan and side models: trained here, or merged from blocks if there are any.
+    """Write the model, its history, plan and auxiliary models: trained here, or merged from blocks if there are any.
 
     Raises:
         SplatpipeError: if nothing is left to train on, or a block is missing.

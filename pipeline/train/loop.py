@@ -79,7 +79,7 @@ Fit = Callable[[TrainingPlan, PlanningInput, Step, Reporter], TrainingPlan]
 
 
 def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write the model, history, plan and side models; resume from the checkpoint of a killed run if there is one.
+    """Write the model, history, plan and auxiliary models; resume from the checkpoint of a killed run if there is one.
 
     Raises:
         SplatpipeError: if there is nothing to train on.
@@ -185,7 +185,7 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
 
 
 def write_side_models(out: Path, techniques: Techniques) -> None:
-    """Write the side models (sky, exposures); a model that was not trained is written as absent."""
+    """Write the auxiliary models (sky, exposures); a model that was not trained is written as absent."""
     sky = techniques.find(SkyModel)
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
     (out / "exposures.json").write_text(exposures_json(techniques.find(Exposure)), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Joining trained blocks into the output of a whole training: model, history, plan and side models."""
+"""Joining trained blocks into the output of a whole training: model, history, plan and auxiliary models."""
 
 from __future__ import annotations
 
