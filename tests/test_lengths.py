@@ -81,10 +81,8 @@ def test_a_given_number_is_exact_and_the_excess_over_auto_goes_to_the_finest_siz
     fewer = divided(footage, 7000, 3 * total // 4)
     assert all(abs(count - 0.75 * wanted) <= 1 for (_, count), (_, wanted) in zip(fewer, auto, strict=True))
     # Whatever the minimum length of a training, its first size is trained no longer than needed.
-    assert lengths(footage, 300_000)[0] == (2, MAX_FIRST_ITERATIONS) and lengths(footage_of(500, 4.0), 7000)[0] == (
-        2,
-        10_000,
-    )
+    assert lengths(footage, 300_000)[0] == (2, MAX_FIRST_ITERATIONS)
+    assert lengths(footage_of(500, 4.0), 7000)[0] == (2, 10_000)
     assert divided(footage_of(50, 0.3), 7000, 600) == [(0, 600)]
 
 
