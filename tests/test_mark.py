@@ -30,7 +30,7 @@ from splatpipe.pipeline.survey.level import Positions
 from splatpipe.stages.line import LINE
 
 sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from served import Served, linked_copy, serving
+from served import Served, linked_copy, reserved_port, serving
 
 TRUTH = {point["name"]: point for point in json.loads((CAPTURE / "truth.json").read_text())["points"]}
 TWELVE = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08", "P15", "P16", "P17", "P18")
@@ -242,7 +242,7 @@ def read_points(file: Path) -> list[Any]:
 def test_a_mark_survives_a_killed_server(gps_run: Path, open_page: Callable) -> None:
     file = gps_run.parent / "photos of a house" / "gcp_list.txt"
     file.unlink(missing_ok=True)
-    options = ("--mark", "--points", gps_run.parent / "points.csv")
+    options = ("--mark", "--points", gps_run.parent / "points.csv", "--port", reserved_port())
     with serving(gps_run, *options) as server:
         page = opened(open_page, server).page
         page.evaluate("splatpipe.mark.goTo('P17', 'DJI_0034.JPG')")
@@ -251,7 +251,7 @@ def test_a_mark_survives_a_killed_server(gps_run: Path, open_page: Callable) -> 
         click(page, TRUTH["P17"]["seen_px"]["DJI_0034.JPG"])
         page.get_by_text("1 change not saved").wait_for()
     assert not file.exists()
-    with serving(gps_run, *options, "--port", server.port) as server:
+    with serving(gps_run, *options) as server:
         page.get_by_text("Load it again").wait_for()  # the new server has a secret of its own
         page.on("dialog", lambda dialog: dialog.accept())
         page.reload()

@@ -86,6 +86,15 @@ class Served:
         return Answer(int(first.split()[1]) if first else 0, {name.lower(): value for name, _, value in fields}, body)
 
 
+def reserved_port() -> int:
+    """Return a free port for a server that is restarted: below those that the system gives to other programs."""
+    for port in range(20_000 + os.getpid() % 10_000, 32_000):
+        with socket.socket() as attempt, contextlib.suppress(OSError):
+            attempt.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("no port is free")
+
+
 @contextlib.contextmanager
 def serving(out: Path, *options: object) -> Iterator[Served]:
     """Run ``splatpipe view OUT`` while the context lasts."""
