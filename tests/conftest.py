@@ -1,6 +1,7 @@
 """Shared by all tests: the location of the real photos, and a browser."""
 
 import fcntl
+import gc
 import importlib.util
 import os
 import shutil
@@ -64,9 +65,11 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Import the tests' modules and what they test without garbage collection."""
+    """Import the tests' modules and what they test without garbage collection; later collections leave them out."""
     with importing():
-        return (yield)
+        result = yield
+        gc.freeze()
+    return result
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

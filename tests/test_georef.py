@@ -201,6 +201,16 @@ def test_wrong_positions_are_named_and_left_out(tmp_path: Path) -> None:
     assert any(all(name.replace(" ", "_") in warning for name in wrong) for warning in warnings)
 
 
+def test_inaccurate_positions_are_reported_with_the_rms_of_the_table(tmp_path: Path) -> None:
+    scene = survey(grid(), (15.0, 30.0))
+    for record in scene.positions:
+        record |= {"sigma_horizontal_m": 1.5, "sigma_vertical_m": 3.0}
+    _, _, warnings = georef(scene, tmp_path)
+    table = json.loads((tmp_path / "out" / "accuracy.json").read_text())["tables"]["gps"]
+    expected = f"off by {table['rmse_horizontal_m']:.1f} m horizontally and {table['rmse_up_m']:.1f} m in height (RMS)"
+    assert any(expected in warning for warning in warnings), warnings
+
+
 def test_photos_without_position_and_positions_without_photo_do_no_harm(tmp_path: Path) -> None:
     scene = survey(grid())
     scene.positions = scene.positions[5:]

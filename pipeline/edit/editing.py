@@ -113,8 +113,13 @@ def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
             report.warning(f"No pictures were written: {error.message}", error.hint)
     report.progress(total, total, "done", "steps")
     placed = None if facts.place is None else [facts.place.latitude, facts.place.longitude, facts.place.height_m]
-    result_facts = {"steps": edits, "gaussians": after.count, "place": placed, "metres": facts.metres}
-    return {**result_facts, "outputs": [str(path) for path in outputs]}
+    return {
+        "steps": edits,
+        "gaussians": after.count,
+        "place": placed,
+        "metres": facts.metres,
+        "outputs": [str(path) for path in outputs],
+    }
 
 
 def _take_steps(task: EditTask, piece: Workpiece, total: int, report: Reporter) -> list[Edit]:

@@ -16,13 +16,9 @@ def return_free_heap() -> None:
 
 @contextlib.contextmanager
 def importing() -> Iterator[None]:
-    """Pause garbage collection while large libraries are imported: it finds nothing, and takes a tenth of the time.
-
-    What was created meanwhile stays to the end of the process, so later collections skip it.
-    """
+    """Pause garbage collection while large libraries are imported: what they create stays, so it would find nothing."""
     gc.disable()
     try:
         yield
     finally:
-        gc.freeze()
         gc.enable()

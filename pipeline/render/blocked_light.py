@@ -54,21 +54,21 @@ def measure_blocked_light(
     xyz, seen = observed
     photos = sum((np.bincount(np.unique(rows), minlength=len(xyz)) for rows in seen), np.zeros(len(xyz), np.int64))
     sure = (photos >= SUPPORT_TRACK) & np.isfinite(xyz).all(axis=1)  # a two-ray point may lie behind the surface
-    veils: dict[str, float] = {}
+    shares: dict[str, float] = {}
     points = 0
     for place in asked:
         small, rows = reduced_camera(cameras[place], LARGEST_MEGAPIXELS), seen[place]
         stopped = blocked_shares(gaussians, small, xyz[rows[sure[rows]]], options)
         if len(stopped) >= MIN_POINTS:
-            veils[small.name] = float(stopped.mean())
+            shares[small.name] = float(stopped.mean())
             points += len(stopped)
-    worst = max(veils, key=lambda name: veils[name], default=None)
+    worst = max(shares, key=lambda name: shares[name], default=None)
     return {
         "held_out": of_held_out,
-        "mean": round(sum(veils.values()) / len(veils), 6) if veils else None,
-        "worst": None if worst is None else round(veils[worst], 6),
+        "mean": round(sum(shares.values()) / len(shares), 6) if shares else None,
+        "worst": None if worst is None else round(shares[worst], 6),
         "worst_photo": worst,
-        "photos": len(veils),
+        "photos": len(shares),
         "points": points,
     }
 

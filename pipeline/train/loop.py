@@ -150,7 +150,7 @@ def train_whole(
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     (out / "history.json").write_text(state.whole_history().to_json(), encoding="utf-8")
-    write_side_models(out, state.techniques)
+    write_auxiliary_models(out, state.techniques)
     return state, {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
 
 
@@ -184,7 +184,7 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
     return state
 
 
-def write_side_models(out: Path, techniques: Techniques) -> None:
+def write_auxiliary_models(out: Path, techniques: Techniques) -> None:
     """Write the auxiliary models (sky, exposures); a model that was not trained is written as absent."""
     sky = techniques.find(SkyModel)
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)

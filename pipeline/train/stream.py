@@ -104,7 +104,7 @@ class PhotoStream:
         self.go_on(order, first)
 
     def go_on(self, order: TrainingOrder, first: int) -> None:
-        """Switch to another order, as if the stream had started with them; photos read ahead are dropped.
+        """Switch to another order, as if the stream had started with it; photos read ahead are dropped.
 
         Args:
             order: What each iteration trains on, from 1.

@@ -8,8 +8,7 @@
 
 namespace splat {
 
-constexpr int kMostHalved =
-    6;  // maximum number of halvings: finer photos than 64 times the cells are halved no further
+constexpr int kMostHalved = 6;  // maximum number of halvings: photos up to 64 times finer than the cells
 
 // The mapping from a pinhole's pixels to a photo's: columns and rows of the photo at every `step` pixels of the
 // pinhole's, linear in between.

@@ -100,8 +100,8 @@ void sample(const Halved& part, int64_t count, const double* column, const doubl
     const double scale = 1.0 / static_cast<double>(1 << part.times);
     for (int64_t k = 0; k < count; ++k) {
         if (times[k] != part.times) continue;
-        const double x = column[k] * scale + 0.5,
-                     y = row[k] * scale + 0.5;  // shifted by a pixel, so that truncation rounds down
+        // Shifted by a pixel: positive, so that truncation rounds down.
+        const double x = column[k] * scale + 0.5, y = row[k] * scale + 0.5;
         const int left = static_cast<int>(x), top = static_cast<int>(y);
         float across[4], down[4];
         int columns[4];

@@ -158,7 +158,7 @@ def block_forecasts(
     footage, most = footage_on(config, [view.camera for view in views], window_pixels)
     cut = WindowScheme.of(config, footage, most)
     shown = [visible_windows(partition, coverage, xyz, cut) for coverage in seen]
-    return [_outlook(config, footage, cut, views, parts_of(shown, block)) for block in range(len(partition.cells))]
+    return [_forecast(config, footage, cut, views, parts_of(shown, block)) for block in range(len(partition.cells))]
 
 
 def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> tuple[PhotoSizes, float | None]:
@@ -170,7 +170,7 @@ def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: in
     return footage_of(sizes, most, window_pixels), most
 
 
-def _outlook(
+def _forecast(
     config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: Sequence[View], parts: Parts
 ) -> BlockForecast:
     each = block_lengths(config, footage, {level: len(pairs) for level, pairs in parts.items()})
