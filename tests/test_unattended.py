@@ -231,6 +231,18 @@ def test_no_name_sends_colours_or_commands_to_the_terminal(capfd: pytest.Capture
     assert not {"\x1b", "\x07", "\x9b"} & set(shown) and shown.count("[bold]") >= 5
 
 
+def test_time_left_is_that_of_the_step_and_unknown_until_it_advances(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A resumed training begins in the middle; counts start again in each step, and in a step that is repeated."""
+    console, clock_s = RunConsole(), iter(range(1000, 2000, 20))
+    monkeypatch.setattr("splatpipe.pipeline.app.console.time.monotonic", lambda: float(next(clock_s)))
+    for what, done in (("a", 80), ("a", 90), ("b", 0), ("b", 50), ("b", 0), ("b", 20), ("b", 100)):
+        console(Event("progress", "sparse", {"done": done, "total": 100, "what": what, "unit": "photos"}))
+    lines = [line.partition("photos")[2] for line in capfd.readouterr().err.splitlines()]
+    assert lines == ["", ", about 20.0 s left", "", ", about 20.0 s left", "", ", about 1 min 20 s left", ""]
+
+
 @pytest.mark.parametrize(("stages", "mentions_rest"), [(["blocks", "train"], True), (["train.2"], False)])
 def test_time_left_is_that_of_all_shards_unless_one_is_made_alone(
     stages: list[str], mentions_rest: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -61,6 +62,27 @@ def _count(value: float) -> str:
     return f"{value:,.0f}"
 
 
+@dataclass(frozen=True)
+class Step:
+    """A step of a stage, whose progress is counted by itself.
+
+    Attributes:
+        what: What is being done.
+        began_s: When it was first reported, ``time.monotonic()``.
+        done: How much of it was done then: a resumed training begins in the middle.
+    """
+
+    what: str = ""
+    began_s: float = 0.0
+    done: float = 0.0
+
+    def left_s(self, now_s: float, done: float, total: float) -> float | None:
+        """Seconds left at the rate until now; None if nothing was done since it began, or nothing is left."""
+        if not self.done < done < total:
+            return None
+        return (now_s - self.began_s) * (total - done) / (done - self.done)
+
+
 class RunConsole:
     """Shows a run's events on stderr; a sink for the runner."""
 
@@ -71,7 +93,7 @@ class RunConsole:
         self._task: TaskID | None = None
         self._stage_started_s = time.monotonic()
         self._plain_printed_s = 0.0
-        self._what = ""
+        self._step, self._done = Step(), 0.0
         self._shards = ShardTimes()
 
     def __call__(self, event: Event) -> None:
@@ -91,7 +113,7 @@ class RunConsole:
 
     def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
         self._stage_started_s = self._plain_printed_s = time.monotonic()
-        self._what = ""
+        self._step, self._done = Step(), 0.0
         self._shards.begin(stage, None if stage in self._order else data.get("shard"))  # None: the shard is run alone
         if not self._console.is_terminal:
             self._console.print(f"{self._label(stage)} started ({data['reason']})", markup=False)
@@ -113,25 +135,24 @@ class RunConsole:
 
     def _progress(self, stage: str, data: Mapping[str, JSON]) -> None:
         done, total, what, unit = data["done"], data["total"], str(data["what"]), str(data["unit"])
+        now_s = time.monotonic()
+        begins = what != self._step.what or done < self._done
+        self._done = done
+        if begins:
+            self._step = Step(what, now_s, done)
+        of_all = self._shards.left(now_s - self._stage_started_s, done, total) if unit == "iterations" else ""
         if self._live is not None and self._task is not None:
-            of_all = (
-                self._shards.left(time.monotonic() - self._stage_started_s, done, total) if unit == "iterations" else ""
-            )
             description = escape(f"{self._label(stage)} {what}{of_all}")
-            if what != self._what:
+            if begins:
                 self._live.reset(self._task, total=total)
             self._live.update(self._task, completed=done, total=total, description=description, unit=unit)
-        elif not self._console.is_terminal and time.monotonic() - self._plain_printed_s > PLAIN_INTERVAL_S:
-            now = time.monotonic()
-            self._plain_printed_s = now
-            left = (now - self._stage_started_s) * (total - done) / done if done else 0.0
-            of_all = self._shards.left(now - self._stage_started_s, done, total) if unit == "iterations" else ""
+        elif not self._console.is_terminal and now_s - self._plain_printed_s > PLAIN_INTERVAL_S:
+            self._plain_printed_s = now_s
+            left_s = self._step.left_s(now_s, done, total)
+            left = "" if left_s is None else f", about {_duration(left_s)} left"
             self._console.print(
-                f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}, "
-                f"about {_duration(left)} left{of_all}",
-                markup=False,
+                f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}{left}{of_all}", markup=False
             )
-        self._what = what
 
     def _stage_finished(self, stage: str, data: Mapping[str, JSON]) -> None:
         self.close()
