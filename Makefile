@@ -1,6 +1,7 @@
 # make run                     sets up, then processes the demo capture into out/demo
 # make run PHOTOS=dir OUT=dir  the same on your photos (PRESET=preview|standard|high)
-# make test                    sets up, then runs all tests
+# make test                    sets up, then runs the tests: unit, parts, and the slow groups whose sources changed
+# make test-all                all slow groups as well; make test ONLY="unit kills": only these
 # make develop                 editable install: edited sources take effect at once; make test reverts to the wheel
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            generates the tables of docs/options.md from the code
@@ -43,10 +44,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-# The tests of a file share fixtures, so each file is run by one worker.
-WORKERS = -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
-
-.PHONY: run test aarch64 release sdist test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-all aarch64 release sdist test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -59,17 +57,19 @@ else
 endif
 
 test: .venv/.tested
-	@echo "== tests"
-	@$(BIN)/python -m pytest -q -m "not captures and not cuda" $(WORKERS)
+	@$(BIN)/python tests/records/suite.py $(ONLY)
+
+test-all: .venv/.tested
+	@$(BIN)/python tests/records/suite.py --all
 
 # The kernels' tests use each instruction set that this CPU has; all other tests use the best. Here training and the
 # whole pipeline are run with the others, too.
 test-isa: .venv/.tested
 	@isas=$$($(BIN)/python -c 'from splatpipe.pipeline.raster.isa import isa_names; print(*isa_names()[1:])') || exit 1; \
 	for isa in $$isas; do \
-	  echo "== training on $$isa" && SPLATPIPE_ISA=$$isa $(BIN)/python -m pytest -q tests/test_train.py || exit 1; done
+	  echo "== training on $$isa" && SPLATPIPE_ISA=$$isa $(BIN)/python -m pytest -q tests/parts/train/test_train.py || exit 1; done
 	@echo "== the line on baseline"
-	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/test_line.py -k test_a_run_leaves_what_is_promised
+	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/slow/kills/test_line.py -k test_a_run_leaves_what_is_promised
 
 # Builds the cpu image without a container daemon, and runs the demo in it: see docs/containers.md. Requires root.
 test-image: | .venv/bin/python
@@ -77,8 +77,7 @@ test-image: | .venv/bin/python
 	@$(BIN)/python tests/image $(if $(filter cpu,$(TORCH)),--torch-index https://download.pytorch.org/whl/cpu)
 
 test-captures: .venv/.tested
-	@echo "== the line on real photos"
-	@$(BIN)/python -m pytest -q -m captures --captures=../shared/data
+	@$(BIN)/python -m pytest -q tests/slow/captures --captures=../shared/data
 
 # The C++ tests (tests/native), once per group of compatible sanitizers; any finding aborts them.
 sanitize: sanitize-address sanitize-thread
@@ -116,7 +115,7 @@ aarch64: .venv/.dependencies
 
 # No weak symbols in code compiled per instruction set; only the C interface of CUDA, for every requested device.
 symbols: .venv/.tested
-	@$(BIN)/python -m pytest -q tests/test_native_symbols.py tests/test_cuda_shipped.py
+	@$(BIN)/python -m pytest -q tests/parts/project/test_native_symbols.py tests/parts/project/test_cuda_shipped.py
 
 setup: $(EITHER)
 
@@ -129,7 +128,7 @@ imports: .venv/.developed
 
 # The sources that each stage's version covers; see docs/working.md.
 versions: $(EITHER) .venv/.dev
-	@$(WITH_HEADERS) $(BIN)/python tests/versions $(if $(SINCE),--since $(SINCE))
+	@$(WITH_HEADERS) $(BIN)/python tests/records/versions.py $(if $(SINCE),--since $(SINCE))
 
 # The tables in docs/options.md, from the options' types, defaults and help.
 options-page: $(EITHER)

@@ -16,13 +16,12 @@ import kornia  # noqa: F401
 import pycolmap  # noqa: F401
 import pytest
 import torch  # noqa: F401
+from finished_run import folder_digest, linked_copy
 from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
+from timeouts import TIMEOUT_S
 
 from splatpipe.pipeline.engine.heap import importing
-
-sys.path.insert(0, str(Path(__file__).parent / "scenes"))
-from timeouts import TIMEOUT_S
 
 DEMO = (
     "features.extractor=opencv-sift",
@@ -118,8 +117,12 @@ def demo_options() -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def demo_run(demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of the whole demo capture with its control, at 0.1 megapixels: 26 dB. To be read only."""
+def demo_run(demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A finished run of the whole demo capture with its control, at 0.1 megapixels: 26 dB. To be read only.
+
+    One for all workers of a test run. Whoever continues it takes a ``demo_copy``; that nobody writes into the run is
+    checked at the end, since root may write into read-only files.
+    """
     from splatpipe.demo import capture_path
 
     out = shared_folder(tmp_path_factory) / "demo_run"
@@ -129,8 +132,18 @@ def demo_run(demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) 
         if not os.fstat(lock.fileno()).st_size:
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
-            lock.write("done")
-    return out
+            lock.write(folder_digest(out))
+            lock.flush()
+        lock.seek(0)
+        made = lock.read()
+    yield out
+    assert folder_digest(out) == made, "a test wrote into demo_run"
+
+
+@pytest.fixture
+def demo_copy(demo_run: Path, tmp_path: Path) -> Path:
+    """A copy of ``demo_run`` that a test may continue."""
+    return linked_copy(demo_run, tmp_path / "out")
 
 
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

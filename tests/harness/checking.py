@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
 from agreement import gradient_complaints, picture_complaints
 from frames import ORDERS, RenderCase, RenderOutcome, controls, run
 from training import Draws, Loss, step_complaints

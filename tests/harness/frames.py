@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from building import FORWARD, REVERSE, SHUFFLED
 
 from splatpipe.pipeline.raster.cuda_api import (
     SplatFrame,
@@ -18,9 +18,6 @@ from splatpipe.pipeline.raster.cuda_api import (
     SplatShot,
 )
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
-
-sys.path.insert(0, str(Path(__file__).parent))
-from building import FORWARD, REVERSE, SHUFFLED
 
 ORDERS = ((FORWARD, 0), (REVERSE, 0), (SHUFFLED, 1))
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh")

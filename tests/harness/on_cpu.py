@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import functools
-import sys
-from pathlib import Path
 
 import torch
+from building import build_on_cpu
 
 from splatpipe.pipeline.raster.cuda import CudaKernels
 from splatpipe.pipeline.raster.cuda_api import SplatShot
 from splatpipe.pipeline.raster.cuda_library import CudaLibrary
-
-sys.path.insert(0, str(Path(__file__).parent))
-from building import build_on_cpu
 
 
 @functools.cache

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -16,7 +15,6 @@ from pathlib import Path
 
 from timeouts import TIMEOUT_S
 
-WRITTEN_INTO = ("events.jsonl", "splatpipe.log", ".lock")
 ADDRESS = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)")
 
 
@@ -116,12 +114,3 @@ def serving(out: Path, *options: object) -> Iterator[Served]:
             process.communicate(timeout=TIMEOUT_S)
         finally:
             process.kill()  # no effect if it has ended
-
-
-def linked_copy(run: Path, target: Path) -> Path:
-    """Copy a run so that it can be continued: files are hard links unless a run writes into them."""
-
-    def copy(source: str, place: str) -> None:
-        (shutil.copy2 if Path(source).name in WRITTEN_INTO else os.link)(source, place)
-
-    return Path(shutil.copytree(run, target, copy_function=copy))

@@ -1,0 +1,66 @@
+"""`splatpipe export` and `splatpipe convert`: finished runs and files in more formats."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import command
+import laspy
+import numpy as np
+import pytest
+
+from splatpipe.pipeline.app.formats import check_possible, with_formats
+from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.splat.formats.files import read_scene
+
+
+def splatpipe(*arguments: str) -> tuple[int, dict[str, Any]]:
+    done = command.splatpipe(*arguments, "--json")
+    return done.returncode, json.loads(done.stdout)
+
+
+def test_a_finished_run_is_exported_in_more_formats_and_keeps_earlier_ones(demo_copy: Path) -> None:
+    out = demo_copy
+    before = (out / "splat.ply").read_bytes()
+    code, output = splatpipe("export", str(out), "--format", "laz,model")
+    assert code == 0
+    assert [stage["name"] for stage in output["stages"] if stage["state"] != "reused"] == ["export"]
+    assert (out / "splat.ply").read_bytes() == before
+    place = read_scene(out / "splat.ply").facts.place
+    assert place is not None and place.crs == "EPSG:32633"
+    assert read_scene(out / "export/model").facts.place == place
+    crs = json.loads((out / "georef.json").read_text())["origin"]["in_crs"]
+    centres = laspy.read(out / "export/centres.laz")
+    assert abs(float(np.mean(centres.x)) - crs[0]) < 200.0 and abs(float(np.mean(centres.y)) - crs[1]) < 200.0
+    code, output = splatpipe("export", str(out), "-f", "colmap")
+    assert code == 0
+    assert (out / "export/dataset/sparse/0/images.bin").is_file() and (out / "export/model").is_dir()
+
+
+def test_unknown_or_impossible_formats_are_reported_at_once(demo_copy: Path) -> None:
+    out = demo_copy
+    with pytest.raises(UsageError, match="no format 'obj'"):
+        with_formats(out, "obj")
+    with pytest.raises(UsageError, match="No format is given"):
+        with_formats(out, " , ")
+    check_possible(out, "laz,tiles")
+
+
+def test_a_file_is_converted_and_the_result_is_reported(demo_run: Path, tmp_path: Path) -> None:
+    code, output = splatpipe("convert", str(demo_run / "splat.ply"), str(tmp_path / "made.viewer.ply"))
+    assert code == 0
+    read = read_scene(tmp_path / "made.viewer.ply")
+    assert output["convert"]["gaussians"] == len(read.gaussians)
+    assert output["convert"]["bytes"] == (tmp_path / "made.viewer.ply").stat().st_size
+    assert read.facts.axes == "y down" and read.facts.place == read_scene(demo_run / "splat.ply").facts.place
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "code"), [("no.ply", "a.ply", 1), ("bad.ply", "a.ply", 1), ("bad.ply", "a.xyz", 2)]
+)
+def test_files_that_cannot_be_converted_are_reported(tmp_path: Path, source: str, target: str, code: int) -> None:
+    (tmp_path / "bad.ply").write_bytes(b"ply\nnonsense\n")
+    found, output = splatpipe("convert", str(tmp_path / source), str(tmp_path / target))
+    assert found == code
+    assert output["error"]["message"]
+    assert not (tmp_path / target).exists()

@@ -1,0 +1,67 @@
+"""A user's type checker finds splatpipe's types in what a wheel installs."""
+
+import subprocess
+import sys
+import tomllib
+import venv
+from pathlib import Path
+
+import pytest
+from mypy.fscache import FileSystemCache
+from mypy.modulefinder import FindModuleCache, SearchPaths, get_search_dirs
+from mypy.options import Options
+from repository import ROOT
+
+PACKAGES = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["scikit-build"]["wheel"][
+    "packages"
+]
+GOOD = """
+import splatpipe
+from splatpipe.pipeline.engine import quantities
+from splatpipe.pipeline.engine.errors import UsageError
+
+error: Exception = UsageError("What is wrong.", hint="What helps.")
+length: float = quantities.parse_length("2cm", "--gsd")
+"""
+BAD = """
+from splatpipe.pipeline.engine.quantities import parse_length
+
+length: str = parse_length("2cm", "--gsd")
+"""
+
+
+@pytest.fixture(scope="module")
+def user_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Python of an environment in which the wheel's folders lie where its table has them."""
+    environment = tmp_path_factory.mktemp("user") / "venv"
+    venv.create(environment, with_pip=False)
+    (site,) = environment.glob("lib/python3*/site-packages")
+    for installed, source in PACKAGES.items():
+        place = site / installed
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.symlink_to(ROOT / source)
+    return environment / "bin" / "python"
+
+
+def mypy(python: Path, folder: Path, text: str) -> subprocess.CompletedProcess[str]:
+    (folder / "mine.py").write_text(text)
+    how = ["--strict", "--config-file=", "--python-executable", str(python)]
+    command = [sys.executable, "-m", "mypy", *how, "mine.py"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_a_users_mypy_finds_splatpipe_and_its_modules(user_python: Path, tmp_path: Path) -> None:
+    done = mypy(user_python, tmp_path, GOOD)
+    assert done.returncode == 0, done.stdout
+
+
+def test_a_users_mypy_notices_a_wrong_use(user_python: Path, tmp_path: Path) -> None:
+    done = mypy(user_python, tmp_path, BAD)
+    assert 'expression has type "float", variable has type "str"' in done.stdout
+
+
+def test_the_namespace_itself_can_be_checked(user_python: Path) -> None:
+    search, _ = get_search_dirs(str(user_python))
+    finder = FindModuleCache(SearchPaths((), (), tuple(search), ()), FileSystemCache(), Options())
+    found = {source.module for source in finder.find_modules_recursive("splatpipe")}  # as mypy -p does
+    assert {"splatpipe", "splatpipe.pipeline.app.cli", "splatpipe.stages.line", "splatpipe.demo.scene"} <= found

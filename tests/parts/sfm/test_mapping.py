@@ -1,0 +1,127 @@
+"""Mapping from the strongest keypoints, completed by all: accurate cameras, bit-identical on repetition."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from flight_scene import FOCAL_PX, GSD_M, SyntheticFlight, make_flight, write_database
+from mapped_apart import centre_errors, centres, oracle
+
+from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
+from splatpipe.pipeline.sfm.reduction import PAIR_FLOOR, best_keypoints, write_reduced
+from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
+
+PHOTOS, SEED, OBSERVATIONS = 48, 1, 500
+
+
+@pytest.fixture(scope="module")
+def flight() -> SyntheticFlight:
+    return make_flight(PHOTOS, SEED, OBSERVATIONS)
+
+
+@pytest.fixture(scope="module")
+def database(flight: SyntheticFlight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("flight") / "database.db"
+    write_database(flight, path, SEED)
+    return path
+
+
+@pytest.fixture(scope="module")
+def mapped(database: Path, tmp_path_factory: pytest.TempPathFactory) -> list[pycolmap.Reconstruction]:
+    return map_incremental(database, tmp_path_factory.mktemp("scratch"), MappingOptions(), lambda *_: None)
+
+
+def error_gsd(model: pycolmap.Reconstruction, flight: SyntheticFlight) -> float:
+    numbers, found = centres(model)
+    errors, _ = centre_errors(found, flight.centres_m[np.array(numbers) - 1])
+    return float(np.sqrt(np.mean(errors**2))) / GSD_M
+
+
+def test_cameras_are_accurate_despite_wrong_matches_and_focal_length(
+    mapped: list[pycolmap.Reconstruction], flight: SyntheticFlight
+) -> None:
+    """Although a fifth of the matches is wrong and the focal length starts 3 % off."""
+    assert [model.num_reg_images() for model in mapped] == [PHOTOS]
+    camera = mapped[0].cameras[1]
+    assert camera.mean_focal_length() == pytest.approx(FOCAL_PX, rel=0.005)
+    # Without wrong matches, starting at the truth, noise leaves some; wrong ones that only two views see add to it.
+    assert error_gsd(mapped[0], flight) < 2.0 * error_gsd(oracle(flight), flight)
+
+
+def test_all_true_tracks_are_in_the_final_model(mapped: list[pycolmap.Reconstruction], flight: SyntheticFlight) -> None:
+    model = mapped[0]
+    starts = np.searchsorted(flight.photo, np.arange(PHOTOS))
+    votes, observed = [], 0
+    for point in model.points3D.values():
+        rows = [int(starts[each.image_id - 1]) + each.point2D_idx for each in point.track.elements]
+        observed += len(rows)
+        numbers, counts = np.unique(flight.point[rows], return_counts=True)
+        votes.append((int(numbers[counts.argmax()]), int(counts.max()), len(rows)))
+    right = sum(vote for _, vote, _ in votes)
+    assert right > 0.97 * observed
+    lengths = np.bincount(flight.point, minlength=len(flight.points_m))
+    long = set(np.flatnonzero(lengths >= 4).tolist())
+    assert len(long & {number for number, _, _ in votes}) > 0.97 * len(long)
+    assert observed > 0.9 * lengths[lengths >= 3].sum()
+
+
+def test_mapping_starts_from_a_subset_of_the_matches(database: Path, tmp_path: Path) -> None:
+    chosen = best_keypoints(read_verified(database), 100)
+    kept, total = write_reduced(database, tmp_path / "best.db", chosen)
+    whole, part = read_verified(database), read_verified(tmp_path / "best.db")
+    assert kept == sum(len(rows) for rows in part.matches.values()) < 0.7 * total
+    assert set(part.matches) == set(whole.matches)
+    for pair, rows in whole.matches.items():
+        assert len(part.matches[pair]) >= min(PAIR_FLOOR, len(rows))
+        assert set(map(tuple, part.matches[pair].tolist())) <= set(map(tuple, rows.tolist()))
+    for number, places in whole.keypoints.items():
+        assert (part.keypoints[number] == places).all()  # under the same numbers
+
+
+def test_the_best_keypoints_are_spread_and_bring_their_partners() -> None:
+    side = np.arange(40) + 0.5
+    places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2).astype(np.float32)
+    matches = {(1, 2): np.stack([np.arange(1600), np.arange(1600)[::-1]], axis=1).astype(np.uint32)}
+    matches[1, 3] = matches[1, 2][700:720]  # these are verified twice: in the middle, and the first in their cells
+    chosen = best_keypoints(ViewGraph({}, {}, {}, {1: places, 2: places, 3: places}, matches), 128)
+    cells = np.bincount((places[chosen[1]] // 5).astype(int) @ [1, 8], minlength=64)
+    assert cells.min() == 2
+    assert chosen[1][700:720].all()
+    assert chosen[1].sum() < 200  # of 1600; more than requested, since photo 2 has its own cells
+    with_partner = chosen[2][::-1] >= chosen[1]
+    with_partner[700:720] = True  # photo 3 brought some of these in
+    assert with_partner.all()
+    assert set(np.flatnonzero(chosen[3])) == set(matches[1, 3][:, 1].tolist())
+
+
+def test_photos_without_matches_have_none_chosen() -> None:
+    places = np.zeros((3, 2), np.float32)
+    chosen = best_keypoints(ViewGraph({}, {}, {}, {1: places, 2: places[:0]}, {}), 10)
+    assert chosen[1].tolist() == [False, False, False] and len(chosen[2]) == 0
+
+
+@pytest.mark.parametrize("mapper", [map_incremental, map_global])
+def test_the_same_seed_gives_the_same_bits(mapper: object, tmp_path: Path) -> None:
+    small = make_flight(10, 2, 500)
+    write_database(small, tmp_path / "database.db", 2)
+    found = []
+    for name in ("once", "again"):
+        (tmp_path / name).mkdir()
+        models = mapper(tmp_path / "database.db", tmp_path, MappingOptions(seed=3), lambda *_: None)  # type: ignore[operator]
+        models[0].write(tmp_path / name)
+        found.append([(tmp_path / name / f"{part}.bin").read_bytes() for part in ("cameras", "images", "points3D")])
+    assert found[0] == found[1]
+    assert not list(tmp_path.glob("mapping-*"))
+
+
+def test_progress_is_reported_and_an_interruption_ends_it(database: Path, tmp_path: Path) -> None:
+    reports: list[tuple[int, int, str]] = []
+
+    def tell(placed: int, total: int, what: str) -> None:
+        reports.append((placed, total, what))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        map_incremental(database, tmp_path, MappingOptions(), tell)
+    assert reports[0][1] == PHOTOS

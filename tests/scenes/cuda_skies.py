@@ -1,0 +1,43 @@
+"""Shared by the tests of cuda sky."""
+
+import numpy as np
+import skies
+import torch
+from torch import Tensor
+
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.raster.rasterizer import Render
+from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
+from splatpipe.pipeline.train.photo_sky import PhotoSky
+from splatpipe.pipeline.train.sky import SkyModel
+
+CPU = torch.device("cpu")
+
+
+BACKGROUND, ELSEWHERE = (0.2, 0.5, 0.1), (0.9, 0.3, 0.6)
+
+
+def composed(camera: Camera, mask: Tensor | None, device: torch.device = CPU) -> list[Tensor]:
+    """The composite, and the gradients by the render's colour and alpha and by the cells; brought to the CPU."""
+    generator = torch.Generator().manual_seed(camera.width)
+    sky = SkyModel(skies.UP, np.zeros((ROWS * COLUMNS, 3), np.float32), {})
+    with torch.no_grad():
+        sky.panorama.colours.copy_(torch.rand(ROWS * COLUMNS, 3, generator=generator))
+    sky.move_to(device)
+    shape = (camera.height, camera.width)
+    colour = torch.rand(*shape, 3, generator=generator).to(device).requires_grad_()
+    alpha = torch.rand(shape, generator=generator).to(device).requires_grad_()
+    weight = torch.rand(*shape, 3, generator=generator).to(device)
+    none, mask = torch.zeros(0, device=device), None if mask is None else mask.to(device)
+    if device.type == "cuda":
+        torch.cuda.set_sync_debug_mode("error")
+    rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
+    seen = None if mask is None else PhotoSky(mask, mask | mask.roll(1, 0))
+    picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
+    (weight * picture).sum().backward()
+    if device.type == "cuda":
+        torch.cuda.set_sync_debug_mode("default")
+    cells = sky.tensors["colours"].grad
+    assert colour.grad is not None and alpha.grad is not None
+    found = [picture.detach(), colour.grad, alpha.grad, torch.zeros(()) if cells is None else cells]
+    return [tensor.cpu() for tensor in found]

@@ -1,0 +1,16 @@
+"""Folders of the repository, for tests that start programs or read sources."""
+
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+BENCHMARKS = ROOT / "benchmarks"
+HARNESS = ROOT / "tests" / "harness"
+LINES = ROOT / "tests" / "lines"
+SCENES = ROOT / "tests" / "scenes"
+
+
+def environment(*folders: Path, **variables: str) -> dict[str, str]:
+    """Return the environment of a program that also imports modules of the given folders."""
+    known = os.environ.get("PYTHONPATH", "")
+    return {**os.environ, **variables, "PYTHONPATH": os.pathsep.join([*map(str, folders), *filter(None, [known])])}

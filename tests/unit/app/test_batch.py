@@ -1,0 +1,127 @@
+"""A batch of captures on Snakemake: each in the right state, nothing repeated or left behind, honest reports."""
+
+import csv
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from batch_captures import call_of, demo, link, planned
+
+from splatpipe.pipeline.app.batch.attempts import AttemptLog, AttemptResult
+from splatpipe.pipeline.app.batch.capture_list import read_captures
+from splatpipe.pipeline.app.batch.driver import STOPPED_NOTICE_S, Driver, Notifications, fresh_call
+from splatpipe.pipeline.app.batch.monitor import BatchMonitor
+from splatpipe.pipeline.app.batch.planning import Settings, make_plan
+from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
+from splatpipe.pipeline.app.batch.snakemake_process import open_profile
+from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
+from splatpipe.pipeline.app.batch.workflow import workflow_text
+from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED, StopSignal
+from splatpipe.stages.line import LINE
+
+BAD = AttemptResult(EXIT_STAGE, "The stage train died.", "See the log.")
+
+
+PERMANENT = AttemptResult(EXIT_INPUT, "No two photos overlap.", "Fly again.", final=True)
+
+
+FULL = AttemptResult(EXIT_MACHINE, "The disk is full.", "Make room.")
+
+
+@pytest.mark.parametrize(
+    ("tries", "ended", "expected"),
+    [
+        ([], False, ("waiting", "ingest", 0.0, 0, "")),
+        ([], True, ("stopped", "ingest", 0.0, 0, "It was stopped with the batch.")),
+        ([("ingest", AttemptResult(0))], False, ("waiting", "train", 0.25, 0, "")),
+        ([("ingest", AttemptResult(0)), ("train", None)], False, ("running", "train", 0.25, 1, "")),
+        ([("ingest", AttemptResult(0)), ("train", BAD)], False, ("waiting", "train", 0.25, 1, "")),
+        (
+            [("ingest", AttemptResult(0)), ("train", BAD), ("train", FULL)],
+            False,
+            ("failed", "train", 0.25, 2, FULL.message),
+        ),
+        ([("ingest", PERMANENT)], False, ("failed", "ingest", 0.0, 1, PERMANENT.message)),
+        ([("ingest", AttemptResult(0)), ("train", BAD), ("train", AttemptResult(0))], True, ("done", "", 1.0, 2, "")),
+    ],
+)
+def test_a_captures_state_follows_from_its_attempts_alone(
+    tmp_path: Path, tries: Sequence[tuple[str, AttemptResult | None]], ended: bool, expected: tuple[object, ...]
+) -> None:
+    call = call_of(tmp_path, planned("house", "ingest", "train"))
+    log = AttemptLog(call.attempts_file("0001-house"))
+    for stage, ending in tries:
+        log.begin(stage)
+        if ending is not None:
+            log.end(ending)
+    if tries:
+        with call.attempts_file("0001-house").open("ab") as file:
+            file.write(b'{"ended": {"exit_c')  # as after a power cut
+    if ended:
+        call.write_end(time.time(), 0, "")
+    (house,) = BatchMonitor(call).state().captures
+    assert (house.state, house.stage, house.progress, house.tries, house.reason) == expected
+    assert house.earlier == (("train: The stage train died.",) if ("train", BAD) in tries else ())
+
+
+def test_the_workflow_has_a_rule_for_each_stage_that_runs_with_its_resources(tmp_path: Path) -> None:
+    call = call_of(tmp_path / "a b{c}", planned("house", "georef", "train"), replace(planned("barn"), key="0002-barn"))
+    text = workflow_text(call, replace(call.plan(), gpu=True), LINE)
+    assert [line for line in text.splitlines() if line.startswith("rule ")] == [
+        "rule all:",
+        "rule georef:",
+        "rule train_shard:",
+        "rule train:",
+    ]
+    assert text.count("gpu=1") == 2 and "0002-barn" not in text  # without blocks the last one trains everything
+    assert '"train": [2, 900, 21, 50]' in text
+    assert "gpu" not in workflow_text(call, call.plan(), LINE)
+
+
+def test_an_unreadable_control_file_is_reported_without_a_job_until_it_is_corrected(tmp_path: Path) -> None:
+    house = link(tmp_path / "captures" / "house", demo()[:2])
+    (house / "gcp_list.txt").write_text("EPSG:4326\n1 2 three 4 5 a.jpg\n")
+    call = fresh_call(tmp_path / "out")
+    for settings in (Settings("preview"), Settings("preview", retry_failed=True)):
+        (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, settings).captures
+        assert "three" in planned.message and planned.jobs == () and planned.photo_count == 2
+    (house / "gcp_list.txt").unlink()
+    (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, Settings("preview")).captures
+    assert planned.message == "" and len(planned.jobs) == len(LINE) - 2  # nobody reads depths
+
+
+def test_a_stopped_batch_notifies_only_of_itself_and_waits_for_no_notice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Docker kills ten seconds after SIGTERM, and the jobs may have taken eight of them."""
+    call = call_of(tmp_path, planned("house", "train"), planned("barn", "train"))
+    said: list[str] = []
+    hangs = "echo $SPLATPIPE_STATE,$SPLATPIPE_CAPTURE >> notice; sleep 99"
+    driver = Driver(call, open_profile(None), Notifications(said.append, hangs))
+
+    def stop(_lock: int) -> None:
+        raise StopSignal(EXIT_TERMINATED)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(driver, "_work", stop)
+    with pytest.raises(StopSignal):
+        driver.run(0)
+    assert (tmp_path / "notice").read_text() == f"stopped,{tmp_path.name}\n"
+    assert [line for line in said if "--notify" in line] == [
+        f"The --notify command did not end within {STOPPED_NOTICE_S:.0f} s and was killed."
+    ]
+
+
+def test_a_cell_of_the_table_is_never_a_formula() -> None:
+    state = BatchState("night", (CaptureState("=1+1", reason="@SUM(A1)"),), as_of_s=0.0, began_s=0.0)
+    (row,) = csv.DictReader(table_text(state).splitlines())
+    assert tuple(row) == COLUMNS and row["capture"] == "'=1+1" and row["reason"] == "'@SUM(A1)"
+
+
+def test_a_time_budget_includes_the_captures_earlier_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    for value, expected in (("90.5", 90.5), ("-3", 0.0), ("soon", 0.0)):
+        monkeypatch.setenv(SPENT_VARIABLE, value)
+        assert spent_s() == expected

@@ -1,0 +1,187 @@
+"""Forecasts: what they depend on, where they are shown, and that they are cheap."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from typing import Any
+
+import forecast as benchmark
+import pytest
+from forecast_fit import compared, fit, left_out, scene_of
+
+from splatpipe.pipeline.engine.config import load_preset, resolve
+from splatpipe.pipeline.engine.needs import Need, whole
+from splatpipe.pipeline.train.blocks.division import Division, SceneSize
+from splatpipe.pipeline.train.limits import bytes_per_gaussian
+from splatpipe.pipeline.web.options import FORMATS
+from splatpipe.stages import work as work_module
+from splatpipe.stages.block_work import START_S
+from splatpipe.stages.costs import FORMAT_COSTS, REFERENCE, WITH_PHOTOS
+from splatpipe.stages.forecast import (
+    CaptureSize,
+    Forecaster,
+    forecast,
+    needs_of_blocks,
+    seconds,
+    work_as_decided,
+)
+from splatpipe.stages.line import LINE
+from splatpipe.stages.options import LineConfig
+from splatpipe.stages.work import CaptureWork
+
+SIZE = CaptureSize(photos=80, megapixels=12.0, positions=True)
+
+
+def configured(preset: str, **train: Any) -> LineConfig:
+    return resolve(LineConfig, [load_preset(preset), {"train": train}])
+
+
+def test_every_stage_has_a_forecast_that_grows_with_the_preset() -> None:
+    preview, standard, high = (forecast(SIZE, configured(name)) for name in ("preview", "standard", "high"))
+    assert {stage.name for stage in LINE} <= set(preview)
+    for less, more in ((preview, standard), (standard, high)):
+        assert whole(less).cpu_seconds < whole(more).cpu_seconds
+        assert whole(less).memory_bytes < whole(more).memory_bytes
+        assert whole(less).disk_bytes < whole(more).disk_bytes
+        assert all(less[name].cpu_seconds <= more[name].cpu_seconds for name in less)
+
+
+def test_disabled_stages_cost_nothing() -> None:
+    off, on = (
+        forecast(SIZE, resolve(LineConfig, [{"mesh": {"enabled": enabled}}]))["mesh"] for enabled in (False, True)
+    )
+    assert off == Need(0, 0.0, 0)
+    assert min(on.memory_bytes, on.cpu_seconds, on.disk_bytes) > 0
+
+
+def test_each_further_format_takes_its_time_and_disk_of_the_export_alone() -> None:
+    def needs(formats: str) -> dict[str, Need]:
+        return forecast(SIZE, resolve(LineConfig, [load_preset("preview"), {"export": {"formats": formats}}]))
+
+    plain = needs("")
+    each = {name: needs(name) for name in FORMATS}
+    assert set(FORMATS) == set(FORMAT_COSTS) | WITH_PHOTOS
+    for found in each.values():
+        assert found["export"].disk_bytes > plain["export"].disk_bytes
+        assert {**found, "export": plain["export"]} == plain
+    assert all(each[name]["export"].cpu_seconds > plain["export"].cpu_seconds for name in FORMAT_COSTS)
+    both = needs("tiles,web")["export"].cpu_seconds  # the levels are made once
+    assert both < each["tiles"]["export"].cpu_seconds + each["web"]["export"].cpu_seconds - plain["export"].cpu_seconds
+    assert needs("colmap,transforms") == each["colmap"]  # one folder of photos
+
+
+def test_more_and_larger_photos_cost_more() -> None:
+    config = configured("standard")
+    base = whole(forecast(SIZE, config))
+    for larger in (replace(SIZE, photos=160), replace(SIZE, megapixels=24.0)):
+        more = whole(forecast(larger, config))
+        assert more.cpu_seconds > base.cpu_seconds and more.disk_bytes >= base.disk_bytes
+    without = forecast(replace(SIZE, positions=False), resolve(LineConfig, [{"matches": {"pairing": "exhaustive"}}]))
+    assert without["matches"].cpu_seconds > 2 * forecast(SIZE, config)["matches"].cpu_seconds
+
+
+def test_threads_divide_parallel_work_and_cost_memory() -> None:
+    one, four = (forecast(SIZE, configured("standard"), threads) for threads in (1, 4))
+    assert one["train"].cpu_seconds == four["train"].cpu_seconds
+    assert one["features"].memory_bytes < four["features"].memory_bytes
+    need = Need(1, 100.0, 1, parallel=0.8)
+    assert seconds(need, 1) == pytest.approx(100.0) and seconds(need, 4) == pytest.approx(40.0)
+    fast = forecast(SIZE, configured("standard"), speed=2.0)
+    assert fast["train"].cpu_seconds == pytest.approx(one["train"].cpu_seconds / 2)
+
+
+def test_limits_of_memory_and_of_gaussians_bound_the_training() -> None:
+    free = forecast(SIZE, configured("high"))["train"]
+    limit = free.memory_bytes // 2
+    for bounds in ({"max_memory_bytes": limit}, {"max_gaussians": 100_000}):
+        bound = forecast(SIZE, configured("high", **bounds))["train"]
+        assert bound.memory_bytes <= limit
+    assert bound.disk_bytes < free.disk_bytes and bound.cpu_seconds < free.cpu_seconds
+
+
+@pytest.mark.parametrize("budget", [120.0, 1800.0, 36_000.0])
+def test_a_time_budget_is_the_forecast_time(budget: float) -> None:
+    needs = forecast(CaptureSize(20, 2.0, True), configured("preview", time_budget_s=budget), threads=4)
+    assert sum(seconds(need, 4) for need in needs.values()) == pytest.approx(budget, rel=0.15)
+
+
+def test_a_run_forecasts_from_ingests_counts() -> None:
+    forecaster = Forecaster(configured("preview"), 2)
+    assert forecaster({}) == {}
+    assert forecaster({"ingest": {"photos": 0, "positions": 0, "camera_groups": []}}) == {}
+    groups = [{"photos": 3, "size": [640, 480]}, {"photos": 77, "size": [3000, 4000]}]
+    needs = forecaster({"ingest": {"photos": 80, "positions": 80, "camera_groups": groups}})
+    assert needs == forecast(replace(SIZE, shape=0.75), configured("preview"), 2, speed=forecaster.speed)
+
+
+LARGE = CaptureSize(photos=1000, megapixels=1.1, positions=True)
+
+
+LIMITED = {"max_gaussians": 4_000_000, "max_memory_bytes": 1_500_000_000}
+
+
+def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> None:
+    work = CaptureWork.of(LARGE, configured("standard", **LIMITED), REFERENCE, 1)
+    assert work.blocks is not None
+    most, limit = work.blocks.division.need.trained, LIMITED["max_memory_bytes"]
+    output = {
+        "iterations": [1000, 1000, 1000, 2000],
+        "start": [10_000, 20_000, 10 * most, 10_000],
+        "steps": [4, 4, 4, 4],
+        "trained": [most] * 4,
+        "frozen": [50_000, 50_000, most, 90_000],
+        "disk_bytes": [10**8, 10**8, 10**8, 3 * 10**8],
+    }
+    needs = needs_of_blocks(work, output, 1.0)
+    few, more, full, longer = (needs[f"train.{number}"] for number in (1, 2, 3, 4))
+    assert few.memory_bytes < more.memory_bytes < full.memory_bytes <= limit
+    assert more.memory_bytes - few.memory_bytes == pytest.approx(10_000 * 1.25**4 * bytes_per_gaussian(3), rel=0.01)
+    assert full.memory_bytes > 0.8 * work.blocks.division.memory_bytes - 240_000_000  # the bound counts more libraries
+    assert 1.9 * few.cpu_seconds < longer.cpu_seconds + START_S and longer.scratch_bytes > few.scratch_bytes + 10**8
+    assert few.disk_bytes < more.disk_bytes and needs["train"].memory_bytes == full.memory_bytes
+    assert needs["train"].cpu_seconds == pytest.approx(sum(need.cpu_seconds for need in (few, more, full, longer)))
+    assert needs_of_blocks(work, {}, 1.0) == {}
+
+
+def test_a_run_follows_the_decision_of_blocks_which_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    divide = work_module.divided
+
+    def counting(*arguments: Any) -> Division:
+        asked.append(1)
+        return divide(*arguments)
+
+    monkeypatch.setattr(work_module, "divided", counting)
+    forecaster = Forecaster(configured("standard", **LIMITED), 2)
+    groups = [{"photos": 1000, "size": [1200, 900]}]
+    before = {"ingest": {"photos": 1000, "positions": 1000, "camera_groups": groups}}
+    needs = [forecaster(before) for _ in range(3)]
+    assert len(asked) == 1 and needs[0] == needs[1] == needs[2]
+    division = divide(SceneSize(4_000_000, 1e7, 500_000, 3, 1000), 1_500_000_000, 40)
+    decided = {"blocks": 40, "division": json.loads(json.dumps(asdict(division)))}
+    work = work_as_decided(LARGE, forecaster.config, 2, decided)
+    assert len(asked) == 1 and work.blocks is not None and work.blocks.division == division
+    assert work_as_decided(LARGE, forecaster.config, 2, {"blocks": 1}).blocks is None
+    free = configured("standard", max_gaussians=4_000_000)
+    kept = work_as_decided(LARGE, free, 2, {"blocks": 1, "limit_bytes": 1_500_000_000})
+    assert (
+        kept.needs(1.0)["train"].memory_bytes
+        <= 1_500_000_000
+        < CaptureWork.of_whole(LARGE, free, REFERENCE, 2).needs(1.0)["train"].memory_bytes
+    )
+
+
+def test_the_costs_fit_the_runs_and_hold_for_captures_left_out() -> None:
+    rows = json.loads(benchmark.TABLE.read_text(encoding="utf-8"))
+    runs, _others = benchmark.runs_of(rows)
+    assert len(runs) >= 6
+    fitted = fit(runs)
+    assert benchmark.costs_text(fitted) == benchmark.costs_text(REFERENCE)
+    held = [benchmark.holds(outcome) for outcome in left_out(runs)]
+    for each in zip(*held, strict=True):  # memory, CPU time
+        assert sum(each) >= 5 / 6 * len(runs)
+    # A fit is exact for the one run that it is of, where that run's scene is known.
+    run = runs[0]
+    alone = compared(run, scene_of(run, fit([run])))
+    assert (alone.memory, alone.cpu, alone.disk) == pytest.approx((1.0, 1.0, 1.0), rel=0.02)

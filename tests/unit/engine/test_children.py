@@ -1,0 +1,13 @@
+"""A stage's child processes: they run in parallel, and none survives, whatever ends the stage."""
+
+from __future__ import annotations
+
+from splatpipe.pipeline.engine.children import run_children
+
+CODE = "timeit"  # runs its arguments as statements; the first of them is our process number, which does no harm
+
+
+def test_they_run_to_completion_and_their_memory_is_reported() -> None:
+    looks = []
+    peak = run_children([(CODE, "pass"), (CODE, "pass")], lambda: looks.append(1), "idling")
+    assert looks and peak > 2 * 4 << 20  # two interpreters
