@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import answered
 from finished_run import linked_copy
-from marked_points import TRUTH, by_gps_alone, marks_in, read_points, splatpipe
+from marked_points import TRUTH, by_gps_alone, marks_in, read_points
 from PIL import Image
 from playwright.sync_api import Page
 from served import Served, reserved_port, serving
@@ -110,7 +111,7 @@ def test_twelve_points_marked_in_the_browser_georeference_the_demo(
         np.testing.assert_allclose(pixel, TRUTH[name]["seen_px"][photo], atol=0.3)
     command = shlex.split(overview["command"])
     assert command[0] == "splatpipe"
-    splatpipe(*command[1:])
+    answered(*command[1:])
     metrics = json.loads((gps_run / "metrics.json").read_text())["accuracy"]
     control, check = (metrics["tables"][role] for role in ("control", "check"))
     assert (control["count"], check["count"]) == (8, 4)
@@ -320,7 +321,7 @@ def found_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (out / "config.toml").unlink()
     (out / "config.toml").write_text(config)
     for stage in ("control", "georef"):  # the points are the demo's, and so are the targets that were found
-        splatpipe("stage", stage, out)
+        answered("stage", stage, out)
     return out
 
 

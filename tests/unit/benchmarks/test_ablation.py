@@ -17,9 +17,6 @@ from timeouts import wait_until
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.train.options import TrainConfig
 
-KEYS |= {"psnr", "psnr_cc", "ssim", "train_seconds", "loss"}
-
-
 TINY = "ingest.min_size=50"  # the line leaves out thumbnails
 
 
