@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 from groups import OLD_DAYS, ROOT, Group, groups, passes, record_pass
 
@@ -42,8 +43,11 @@ def main() -> int:
     unknown = [name for name in given.only if name not in (*RINGS, *every)]
     if unknown:
         parser.error(f"there is no ring or group {unknown[0]}")
-    left_out = {} if given.all else {name: why for name, group in every.items() if (why := _why_left_out(group))}
-    left_out |= {name: f"there is no {group.needs}" for name, group in every.items() if not _can_run(group)}
+    today = datetime.datetime.now(datetime.UTC).date()
+    left_out = {
+        name: why for name, group in every.items() if not given.all and (why := why_left_out(group, ROOT, today))
+    }
+    left_out |= {name: f"there is no {group.needs}" for name, group in every.items() if not can_run(group, ROOT)}
     names = given.only or [name for name in (*RINGS, *every) if name not in left_out]
     costs: list[Cost] = []
     for name in names:
@@ -56,17 +60,18 @@ def main() -> int:
     return 0
 
 
-def _can_run(group: Group) -> bool:
-    return not group.needs or (ROOT / group.needs).exists()
+def can_run(group: Group, root: Path) -> bool:
+    """Whether what a group needs exists."""
+    return not group.needs or (root / group.needs).exists()
 
 
-def _why_left_out(group: Group) -> str:
-    """Return why a group need not run, or ""."""
-    last = passes().get(group.name)
-    if last is None or last.sources != group.digest(ROOT):
+def why_left_out(group: Group, root: Path, today: datetime.date) -> str:
+    """Return why a group need not run; empty if it has to."""
+    last = passes(root).get(group.name)
+    if last is None or last.sources != group.digest(root):
         return ""
-    days = (datetime.datetime.now(datetime.UTC).date() - last.day).days
-    old = f": {days} days ago, run `make test-all` some time" if days > OLD_DAYS else ""
+    days = (today - last.day).days
+    old = f", {days} days ago: run `make test-all` some time" if days > OLD_DAYS else ""
     return f"its sources are those of its last pass on {last.day}{old}"
 
 

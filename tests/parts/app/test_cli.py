@@ -7,14 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from command import splatpipe
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.isa import choose_isa, isa_names
 
 
-def splatpipe(*arguments: object, **how: object) -> subprocess.CompletedProcess[str]:
+def in_a_process(*arguments: object, **variables: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, **how)
+    return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **variables})
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def photos(tmp_path: Path) -> Path:
 
 
 def test_help_names_every_command_and_imports_nothing_heavy() -> None:
-    done = splatpipe("--help")
+    done = in_a_process("--help")
     assert done.returncode == 0
     for command in ("run", "stage", "demo", "georef", "render", "status", "clean", "doctor", "options"):
         assert command in done.stdout
@@ -94,10 +95,11 @@ def test_json_is_one_object_on_stdout_even_on_failure(tmp_path: Path, photos: Pa
 
 
 def test_doctor_names_the_instruction_set_in_use_and_those_available() -> None:
-    done = splatpipe("doctor", "--json", env={**os.environ, "SPLATPIPE_ISA": ""})
+    done = splatpipe("doctor", "--json")
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["rasterizer"] == f"native, {isa_names()[0]} (of {', '.join(isa_names())})"
-    done = splatpipe("doctor", "--json", env={**os.environ, "SPLATPIPE_ISA": "baseline"})
+    chosen = os.environ.get("SPLATPIPE_ISA") or isa_names()[0]
+    assert json.loads(done.stdout)["rasterizer"] == f"native, {chosen} (of {', '.join(isa_names())})"
+    done = in_a_process("doctor", "--json", SPLATPIPE_ISA="baseline")
     assert json.loads(done.stdout)["rasterizer"].startswith("native, baseline ")
 
 
@@ -107,22 +109,18 @@ def unwrapped(panel: str) -> str:
 
 
 def test_cuda_is_refused_at_once_with_the_same_reason_as_in_doctor(tmp_path: Path, photos: Path) -> None:
-    hidden = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}  # with a GPU or without
-    output = json.loads(splatpipe("doctor", "--json", env=hidden).stdout)["CUDA"]
+    hidden = {"CUDA_VISIBLE_DEVICES": ""}  # with a GPU or without
+    output = json.loads(in_a_process("doctor", "--json", **hidden).stdout)["CUDA"]
     assert output.startswith("not used. ")
-    done = splatpipe("run", photos, tmp_path / "out", "--device", "cuda", env=hidden)
+    done = in_a_process("run", photos, tmp_path / "out", "--device", "cuda", **hidden)
     assert done.returncode == 4, done.stderr
     assert "CUDA does not work here. " + output.removeprefix("not used. ").split(". ")[0] in unwrapped(done.stderr)
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("arguments", [("doctor",), ("run", "{photos}", "{out}")])
-def test_an_unknown_instruction_set_is_reported_before_anything_runs(
-    tmp_path: Path, photos: Path, arguments: tuple[str, ...]
-) -> None:
-    arguments = tuple(text.format(photos=photos, out=tmp_path / "out") for text in arguments)
-    done = splatpipe(*arguments, env={**os.environ, "SPLATPIPE_ISA": "sse9"})
+def test_an_unknown_instruction_set_is_reported_before_anything_runs(tmp_path: Path, photos: Path) -> None:
+    done = in_a_process("run", photos, tmp_path / "out", SPLATPIPE_ISA="sse9")
     assert done.returncode == 2, done.stderr
     assert 'SPLATPIPE_ISA asks for "sse9"' in unwrapped(done.stderr)
     assert "Traceback" not in done.stderr
@@ -138,8 +136,9 @@ def test_an_instruction_set_that_the_machine_lacks_is_a_machine_error() -> None:
     assert "avx2, baseline" in caught.value.hint
 
 
-def test_options_lists_every_option() -> None:
-    done = splatpipe("options", "--preset", "preview", env={**os.environ, "COLUMNS": "200"})
+def test_options_lists_every_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    done = splatpipe("options", "--preset", "preview")
     assert done.returncode == 0, done.stderr
     assert "train.iterations" in done.stdout
 

@@ -175,7 +175,7 @@ def loss_of(scene: Gaussians, options: RenderOptions, probe: Tensor) -> Tensor:
     return sum((p * torch.randn(p.shape, generator=generator, dtype=torch.float64)).sum() for p in pictures)  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize(("sh_degree", "antialias"), [(0, False), (1, False), (2, False), (3, False), (3, True)])
+@pytest.mark.parametrize(("sh_degree", "antialias"), [(0, False), (3, True)])
 def test_gradients_agree_with_finite_differences(sh_degree: int, antialias: bool) -> None:
     options = RenderOptions(sh_degree, background=(0.3, 0.1, 0.6), antialias=antialias, near=0.2, depth_origin=2.0)
     scene, probe = random_scene(sh_degree).requires_grad_(), torch.zeros(8, 2, dtype=torch.float64, requires_grad=True)
