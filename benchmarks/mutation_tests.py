@@ -310,10 +310,8 @@ def _say(row: dict[str, object]) -> None:
 def summarize(rows: Sequence[dict[str, object]]) -> None:
     """Print how many mutations each ring noticed."""
     counts = {ring: sum(row["ring"] == ring for row in rows) for ring in ("rings", "slow", "not compiled", "")}
-    print(
-        f"\n{len(rows)} mutations, noticed by the first two rings: {counts['rings']}, only by slow tests: {counts['slow']}"
-    )
-    print(f"by the compiler: {counts['not compiled']}, by nothing: {counts['']}")
+    print(f"\n{len(rows)} mutations, noticed by the first two rings: {counts['rings']}, only by slow tests:")
+    print(f"{counts['slow']}, by the compiler: {counts['not compiled']}, by nothing: {counts['']}")
     share = counts["rings"] / max(counts["rings"] + counts["slow"], 1)
     print(f"The first two rings notice {100.0 * share:.0f} % of what any test notices.")
 

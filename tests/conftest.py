@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import checked_on_call
 import kornia  # noqa: F401
 import pycolmap  # noqa: F401
 import pytest
@@ -52,6 +53,7 @@ def _modules_with_shapes() -> Iterator[str]:
 
 # Tests check these annotations. All other modules are left to mypy: to instrument them, too, doubles the import time.
 # Libraries are imported before: from within an instrumented module, they would be compiled again.
+checked_on_call.install()
 install_import_hook(list(_modules_with_shapes()), "beartype.beartype")
 
 

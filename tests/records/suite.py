@@ -50,14 +50,16 @@ def main() -> int:
     left_out |= {name: f"there is no {group.needs}" for name, group in every.items() if not can_run(group, ROOT)}
     names = given.only or [name for name in (*RINGS, *every) if name not in left_out]
     costs: list[Cost] = []
+    code = 0
     for name in names:
         code, cost = _run(name, every.get(name))
         costs.append(cost)
         if code:
-            _say(f"== {name} failed")
-            return code
-    _summarize(costs, {name: why for name, why in left_out.items() if name not in names} if not given.only else {})
-    return 0
+            break
+    _summarize(costs, {} if given.only else left_out)
+    if code:
+        _say(f"{costs[-1].name} FAILED")
+    return code
 
 
 def can_run(group: Group, root: Path) -> bool:
