@@ -14,7 +14,7 @@ surface there. All choices favour keeping real objects over finding every floate
 - Two photos have to agree, and a well-observed point right beside the Gaussian overrules them: a post in front of a
   wall is thinner than a cell, but has points of its own.
 
-`tests/test_truth.py` checks this against the true surface of the demo capture.
+`tests/slow/truth/test_truth.py` checks this against the true surface of the demo capture.
 
 Close to a camera two photos rarely overlap, so one is enough: anything nearer than a fifth of the depth at which its
 points begin, and nearer than all of them, is a floater.

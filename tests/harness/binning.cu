@@ -1,4 +1,4 @@
-// The sort and the plan by themselves, and where a frame's lists lie, for tests/test_cuda_sort.py.
+// The sort and the plan by themselves, and where a frame's lists lie, for tests/slow/harness/test_cuda_sort.py.
 #include "api.h"
 #include "bin.cuh"
 

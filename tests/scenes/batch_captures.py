@@ -1,4 +1,4 @@
-"""Shared by the tests of batch."""
+"""Captures of a batch, its jobs and calls."""
 
 import time
 from collections.abc import Iterable

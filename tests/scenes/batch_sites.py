@@ -1,4 +1,4 @@
-"""Shared by the tests of batch shards."""
+"""Captures for the small pipeline whose stage has shards."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Shared by the tests of blocks stage."""
+"""A tiny scene whose training is divided into blocks."""
 
 import json
 from collections.abc import Mapping
@@ -12,9 +12,7 @@ from splatpipe.stages import initialize
 
 QUICK = tiny_scene.plain(iterations=80, max_gaussians=6000, sh_degree=0).model_dump()
 
-
 OPTIONS: Mapping[str, object] = {"train": QUICK, "blocks": {"least": 3}}
-
 
 SHARDS = ("train.1", "train.2", "train.3")
 

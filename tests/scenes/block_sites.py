@@ -1,4 +1,4 @@
-"""Shared by the tests of block training."""
+"""A tiny site of two blocks, and their training."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,17 +25,13 @@ from splatpipe.pipeline.train.stream import TrainingPhoto
 
 WINDOW = 1000  # of 72 × 54 pixels: four windows a photo, and one at half the size
 
-
 CELLS = (Cell((-3.0, -1.5), (0.0, 3.0)), Cell((0.0, -1.5), (3.0, 3.0)))
 
-
 PARTITION = Partition(GroundPlan(np.array([[1.0, 0, 0], [0, 0, 1.0]]), np.array([0, -1.0, 0])), CELLS, 0.25)
-
 
 CONFIG = TrainConfig(
     iterations=450, least_iterations=1, sh_degree=1, prune_free_space=2, exposure="affine", max_gaussians=400
 )
-
 
 TASK = BlockTask(0, share=160, trained=230, frozen=120, window_pixels=WINDOW)
 

@@ -1,4 +1,4 @@
-"""Shared by the tests of check page."""
+"""What a check finds of photos in a grid."""
 
 import time
 from dataclasses import replace

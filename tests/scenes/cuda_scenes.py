@@ -1,4 +1,4 @@
-"""Shared by the tests of cuda render."""
+"""Renders and steps of a random scene, by CUDA kernels or the CPU's."""
 
 from dataclasses import replace
 
@@ -19,15 +19,11 @@ from splatpipe.pipeline.train.dropout import _DropoutLogits
 # gradient near zero differs in the third of its first step.
 STEP_SHARE = 2e-2
 
-
 RATES = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": sh_rates(16, 2.5e-3, 1e-4)}
-
 
 LIMITS = {"log_scales": (-2.5, -1.0)}
 
-
 OPTIONS = RenderOptions(3, background=(0.2, 0.3, 0.4), depth=False)
-
 
 CAMERA = random_camera(0)
 

@@ -1,4 +1,4 @@
-"""Shared by the tests of cuda sky."""
+"""A render composited over the sky, by CUDA kernels or the CPU's."""
 
 import numpy as np
 import skies
@@ -12,7 +12,6 @@ from splatpipe.pipeline.train.photo_sky import PhotoSky
 from splatpipe.pipeline.train.sky import SkyModel
 
 CPU = torch.device("cpu")
-
 
 BACKGROUND, ELSEWHERE = (0.2, 0.5, 0.1), (0.9, 0.3, 0.6)
 

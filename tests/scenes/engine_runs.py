@@ -1,4 +1,4 @@
-"""Shared by the tests of engine."""
+"""Runs of a small pipeline, in this process or another."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Shared by the tests of poor positions."""
+"""Flights with positions worse than stated."""
 
 import json
 import math
@@ -18,18 +18,13 @@ from splatpipe.pipeline.survey.model import SparseModel
 
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
 
-
 PLACE = Origin(**TRUTH["frame"]["origin"])
-
 
 NAMES = [photo["name"] for photo in TRUTH["photos"]]
 
-
 CENTRES = np.array([photo["centre_m"] for photo in TRUTH["photos"]])
 
-
 TURNS = np.array([np.array(photo["cam_from_world"])[:3, :3] for photo in TRUTH["photos"]])
-
 
 MODEL_FROM_WORLD = Similarity(0.137, rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([0.3, -0.2, 1.4]))
 

@@ -1,4 +1,4 @@
-"""Shared by the tests of shards."""
+"""Runs of a small pipeline with a stage in shards."""
 
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from splatpipe.pipeline.engine.session import Request, open_session, status_of
 from splatpipe.pipeline.engine.stage import Machine
 
 NUMBERS = (3, 14, 15, 92, 65, 35)
-
 
 SHARDS = ("sum.1", "sum.2", "sum.3")
 

@@ -1,4 +1,4 @@
-"""Shared by the tests of versions."""
+"""Copies of the sources, to be changed."""
 
 import re
 import shutil

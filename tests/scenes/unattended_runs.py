@@ -1,4 +1,4 @@
-"""Shared by the tests of unattended."""
+"""Runs of a small pipeline, and what is left of them."""
 
 import resource
 from collections.abc import Callable, Iterator

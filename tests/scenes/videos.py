@@ -1,4 +1,4 @@
-"""Shared by the tests of video."""
+"""A short video of a moving texture."""
 
 from collections.abc import Iterator
 from pathlib import Path

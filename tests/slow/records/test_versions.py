@@ -42,7 +42,7 @@ def test_an_option_without_docs_is_noticed(copy: Path) -> None:
     replace(copy / "pipeline/sfm/options.py", r'(^    min_model_size: .*\n)    """[^"]*"""\n', r"\1")
     test = "test_every_option_has_a_help_text"
     done = run(
-        ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_config.py", "-k", test],
+        ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/unit/engine/test_config.py", "-k", test],
         ROOT,
         {"PYTHONPATH": str(copy.parent), "PYTHONDONTWRITEBYTECODE": "1"},
     )
