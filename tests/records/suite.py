@@ -100,7 +100,8 @@ def _run(name: str, group: Group | None) -> tuple[int, Cost]:
 def _pytest(folder: str) -> list[str]:
     """Return the command that runs a folder's tests, on all cores: a file's in one worker, as they share fixtures."""
     workers = ["-n", "logical", "--maxprocesses", str(MAX_WORKERS), "--dist", "loadfile", "--no-loadscope-reorder"]
-    return [sys.executable, "-m", "pytest", "-q", *workers, folder]
+    chosen = [] if folder.endswith("device") else ["-m", "not cuda"]
+    return [sys.executable, "-m", "pytest", "-q", *chosen, *workers, folder]
 
 
 def _summarize(costs: list[Cost], left_out: dict[str, str]) -> None:

@@ -1,13 +1,11 @@
 """Control points marked in a real browser, against the demo's truth; and everything that a mark must survive."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from marked_points import POINTS, TRUTH, by_gps_alone, marks_in, read_points
-from served import Served, serving
 
 from splatpipe.pipeline.app.view.marking import Marking, WrongRequestError
 from splatpipe.pipeline.app.view.marking_job import open_job
@@ -22,18 +20,6 @@ from splatpipe.stages.line import LINE
 @pytest.fixture(scope="module")
 def gps_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return by_gps_alone(demo_run, tmp_path_factory.mktemp("survey"))
-
-
-@pytest.fixture
-def marking(gps_run: Path) -> Iterator[tuple[Served, Path]]:
-    """The server with the control file that it writes, which does not exist at first."""
-    file = gps_run.parent / "photos of a house" / "gcp_list.txt"
-    file.unlink(missing_ok=True)
-    config = (gps_run / "config.toml").read_bytes()
-    with serving(gps_run, "--mark", "--points", gps_run.parent / "points.csv") as server:
-        assert server.start == "mark"
-        yield server, file
-    (gps_run / "config.toml").write_bytes(config)
 
 
 def test_the_page_says_what_cannot_be_marked(gps_run: Path, tmp_path: Path) -> None:

@@ -30,10 +30,6 @@ from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.verdict import judge
 
 
-def headline(watched: object) -> str:
-    return str(watched.page.locator(".verdict h2").inner_text())  # type: ignore[attr-defined]
-
-
 @pytest.fixture(scope="module")
 def finished(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the finished run, whose report this test's own code wrote."""

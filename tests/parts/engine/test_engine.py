@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,14 +15,10 @@ from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, Stage
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter
 from splatpipe.pipeline.engine.line import Line, line_status
 from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.engine.runner import Outcome
 from splatpipe.pipeline.engine.session import open_session, status_of
 from splatpipe.pipeline.engine.store import open_store
 
 pytestmark = pytest.mark.usefixtures("lines")
-
-
-Walk = Callable[..., Outcome]
 
 
 @pytest.fixture

@@ -3,10 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import building_site
 import numpy as np
-import pytest
-from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_views
@@ -17,30 +14,8 @@ from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
 from splatpipe.pipeline.train.blocks.partition import Border, Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, photo_coverages
+from splatpipe.pipeline.train.blocks.photo_coverage import photo_coverages
 from splatpipe.pipeline.train.blocks.visibility import block_views, windows
-
-EVERY = 7  # of the surface's points is a sparse one
-
-
-@pytest.fixture(scope="module")
-def surface() -> Float64[np.ndarray, "n 3"]:
-    return building_site.surface()
-
-
-@pytest.fixture(scope="module")
-def coarse(surface: Float64[np.ndarray, "n 3"]) -> Gaussians:
-    return building_site.model(surface)
-
-
-@pytest.fixture(scope="module")
-def sparse(surface: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "p 3"]:
-    return surface[::EVERY].copy()
-
-
-@pytest.fixture(scope="module")
-def seen(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> list[PhotoCoverage]:
-    return building_site.site_coverages(coarse, sparse)
 
 
 def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:

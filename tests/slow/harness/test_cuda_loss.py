@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.random_numbers import DROPOUT, SPLIT_POSITION, uniform
 from splatpipe.pipeline.train.schedule import resolve_schedule
 
-# Relative, the gradient in L2, against float64: those of the CPU's kernel, for the same reason (tests/unit/raster/test_loss.py).
+# Relative, the gradient in L2, against float64: those of the CPU's kernel, for the reason given in test_loss.py.
 LOSS_RTOL = 1e-5
 GRADIENT_RTOL = 5e-5
 CPU_RTOL = 2e-5  # against the CPU's kernel, whose sums have another order

@@ -1,17 +1,14 @@
 """The sky by the CUDA backend's kernels, in the harness: orders of threads, training, limits."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import skies
 import torch
 from building import FORWARD, REVERSE, SHUFFLED, build_on_cpu, load
-from cuda_skies import BACKGROUND, CPU, ELSEWHERE, composed
+from cuda_skies import BACKGROUND, ELSEWHERE, composed
 from on_cpu import kernels_on_cpu
 
 from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_library import why_not
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes
 from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
@@ -22,19 +19,6 @@ from splatpipe.pipeline.train.sky import SkyModel
 @pytest.fixture(scope="module")
 def kernels() -> CudaKernels:
     return kernels_on_cpu()
-
-
-@pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
-def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
-    """Where the kernels run; on a real device, nothing may wait."""
-    if request.param == "harness":
-        with use_kernels(kernels_on_cpu()):
-            yield CPU
-        return
-    if why_not() is not None:
-        pytest.skip("no CUDA device")
-    yield torch.device("cuda", 0)
-    torch.cuda.set_sync_debug_mode("default")
 
 
 def test_gradients_of_the_nodes_have_the_same_bits_in_every_order_of_threads(kernels: CudaKernels) -> None:
