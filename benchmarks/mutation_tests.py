@@ -2,12 +2,16 @@
 
     python benchmarks/mutation_tests.py WORK [--count 40] [--seed 1]
 
-WORK gets a clone of this checkout's last commit with links to its sources (`make develop`), in which the lines are
-changed, and ``mutations.jsonl``, a row per mutation: a run that was stopped goes on after the last one. At least two
-mutations in each room and four in the kernels (two of the CPU's, two of CUDA's, which the harness runs).
+WORK gets a clone of this checkout's last commit, in which the lines are changed, and ``mutations.jsonl``: a run that was
+stopped goes on where it was. At least two mutations in each room and four in the kernels (two of the CPU's, two of
+CUDA's, which the harness runs).
 
-A mutation meets first the unit tests and tests of parts that reach its file, the nearest by imports first; then the
-rest of both; what survives meets the slow groups' tests that reach it. What survives these, too, may be equivalent.
+1. Each mutation meets the unit tests and tests of parts that reach its file by imports, the nearest first, up to the
+   first failure; the farther ones only in the next step.
+2. Those not noticed so far are applied together, and both rings run whole. Each test that fails runs again on each of
+   the mutations alone; those noticed are taken out, until both rings pass.
+3. The same with the slow tests. What survives these, too, may be equivalent.
+
 Tests that compare the sources with a record (`stages/versions.toml`) do not count: they notice every change.
 """
 
@@ -15,9 +19,12 @@ from __future__ import annotations
 
 import argparse
 import ast
+import importlib.util
 import json
+import os
 import random
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -37,7 +44,9 @@ NATIVE = "pipeline/raster/native"
 KERNELS = ((f"{NATIVE}/*.cpp", 2), (f"{NATIVE}/cuda/*.cu*", 2))
 UNTESTABLE = ("bindings", "sbom", "options.py", "__init__.py")  # glue, defaults
 TEXT_CHECKS = ("test_every_version_matches_the_present_sources", "test_every_name_imported")
-TIMEOUT_S = 240  # of a test: a mutation may make a loop endless
+NEAREST = 12  # test files that a mutation meets alone
+TIMEOUT_S = 300  # of a test: a mutation may make a loop endless
+NO_TESTS = 5  # pytest's exit code
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 COMPARED = {ast.Lt: ">=", ast.GtE: "<", ast.Gt: "<=", ast.LtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
 COMPUTED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
@@ -209,68 +218,129 @@ def choose(root: Path, count: int, seed: int) -> list[Mutation]:
     return chosen
 
 
-def make_clone(work: Path) -> Path:
-    """Return a clone of the last commit with an environment of its own, linked to its sources."""
-    clone = work / "clone"
-    if not clone.exists():
-        work.mkdir(parents=True, exist_ok=True)
-        subprocess.run(["git", "clone", "-q", str(ROOT), str(clone)], check=True)
-    build(clone)
-    subprocess.run(["make", "-s", ".venv/.browser"], cwd=clone, check=True)
-    return clone
+@dataclass(frozen=True)
+class Workshop:
+    """A clone whose sources are imported instead of the installed ones.
+
+    Attributes:
+        folder: Holds the clone, its kernels and the log.
+    """
+
+    folder: Path
+
+    @property
+    def clone(self) -> Path:
+        """The checkout in which lines are changed."""
+        return self.folder / "clone"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Variables with which Python imports the clone's ``splatpipe``."""
+        return {**os.environ, "PYTHONPATH": str(self.folder / "path"), "PYTHONDONTWRITEBYTECODE": "1"}
+
+    def prepare(self) -> None:
+        """Clone the last commit, once, with the installed kernels and pages."""
+        if self.clone.exists():
+            return
+        links = self.folder / "path" / "splatpipe"
+        links.mkdir(parents=True)
+        subprocess.run(["git", "clone", "-q", str(ROOT), str(self.clone)], check=True)
+        for name in ("pipeline", "stages", "configs", "demo"):
+            (links / name).symlink_to(self.clone / name)
+        found = importlib.util.find_spec("splatpipe.pipeline")
+        assert found is not None and found.origin is not None
+        installed = Path(found.origin).resolve().parent
+        for library in (installed / "raster").glob("*.so"):
+            shutil.copy2(library, self.clone / "pipeline" / "raster")
+        shutil.copytree(installed / "web" / "dist", self.clone / "pipeline" / "web" / "dist")
+        self.build()
+
+    def build(self) -> bool:
+        """Compile the CPU's kernels where they changed; return whether they compiled."""
+        programs, work = Path(sys.prefix) / "bin", self.folder / "kernels"
+        if not (work / "build.ninja").exists():
+            nanobind = subprocess.check_output([sys.executable, "-m", "nanobind", "--cmake_dir"], text=True).strip()
+            defines = {"CMAKE_BUILD_TYPE": "Release", "CMAKE_MAKE_PROGRAM": programs / "ninja"}
+            defines |= {"Python_EXECUTABLE": sys.executable, "nanobind_DIR": nanobind}
+            made = [programs / "cmake", "-S", self.clone / NATIVE, "-B", work, "-G", "Ninja"]
+            subprocess.run([*made, *(f"-D{name}={value}" for name, value in defines.items())], check=True)
+        done = subprocess.run([programs / "ninja", "-C", work, "_native"], capture_output=True, check=False)
+        for library in work.glob("_native*.so"):
+            target = self.clone / "pipeline" / "raster" / library.name
+            target.unlink(missing_ok=True)  # not overwritten: a running program may have it mapped
+            shutil.copy2(library, target)
+        return done.returncode == 0
+
+    def change(self, mutations: Sequence[Mutation]) -> bool:
+        """Apply mutations; return whether the kernels compiled."""
+        for mutation in mutations:
+            mutation.apply(self.clone)
+        return self._built(mutations)
+
+    def restore(self, mutations: Sequence[Mutation]) -> None:
+        """Take mutations back."""
+        for mutation in reversed(mutations):
+            mutation.revert(self.clone)
+        self._built(mutations)
+
+    def _built(self, mutations: Sequence[Mutation]) -> bool:
+        compiled = [each for each in mutations if each.file.startswith(NATIVE) and "/cuda/" not in each.file]
+        return self.build() if compiled else True
+
+    def failures(self, tests: Sequence[str], first: bool) -> list[str]:
+        """Run test files or single tests; return those that failed: only the first, or all."""
+        if not tests:
+            return []
+        workers = ["-n", "logical", "--maxprocesses", "8", "--dist", "loadfile", "--no-loadscope-reorder"]
+        skipped = ["-m", "not cuda", "-k", " and ".join(f"not {name}" for name in TEXT_CHECKS)]
+        limits = ["-o", f"timeout={TIMEOUT_S}", "-o", "timeout_method=thread", *(["-x"] if first else [])]
+        command = [sys.executable, "-m", "pytest", "-q", *workers, *skipped, *limits, *tests]
+        done = subprocess.run(
+            command, cwd=self.clone, env=self.environment, capture_output=True, text=True, check=False
+        )
+        if done.returncode in (0, NO_TESTS):
+            return []
+        return FAILED.findall(done.stdout) or [f"pytest ended with {done.returncode}: {done.stdout[-300:]}"]
 
 
-def build(clone: Path) -> bool:
-    """Compile what changed and link the sources; return whether it compiled."""
-    done = subprocess.run(["make", "-s", "develop", "SPLATPIPE_CUDA=off"], cwd=clone, capture_output=True, check=False)
-    return done.returncode == 0
-
-
-def run_tests(clone: Path, files: Sequence[str]) -> tuple[str, float]:
-    """Run test files up to the first failure; return the test that failed, or "", and the seconds."""
-    if not files:
-        return "", 0.0
-    begin = time.monotonic()
-    workers = ["-n", "logical", "--maxprocesses", "8", "--dist", "loadfile", "--no-loadscope-reorder"]
-    skipped = ["-k", " and ".join(f"not {name}" for name in TEXT_CHECKS)]
-    limits = ["-o", f"timeout={TIMEOUT_S}", "-o", "timeout_method=thread"]
-    command = [clone / ".venv/bin/python", "-m", "pytest", "-q", "-x", "-m", "not cuda", *workers, *skipped, *limits]
-    done = subprocess.run([*command, *files], cwd=clone, capture_output=True, text=True, check=False)
-    seconds = time.monotonic() - begin
-    if done.returncode in (0, 5):
-        return "", seconds
-    failed = FAILED.search(done.stdout)
-    return failed[1] if failed else f"pytest ended with {done.returncode}: {done.stdout[-200:]!r}", seconds
-
-
-def search(mutation: Mutation, clone: Path, reach: Reach) -> Finding:
-    """Apply a mutation, and look for a test that notices it."""
-    finding = Finding(mutation)
-    is_native = mutation.file.startswith(NATIVE)
-    mutation.apply(clone)
+def meet_nearest(workshop: Workshop, reach: Reach, mutation: Mutation) -> Finding:
+    """Run the nearest test files on a mutation, up to the first failure."""
+    finding, begin = Finding(mutation), time.monotonic()
+    compiled = workshop.change([mutation])
     try:
-        if is_native and not mutation.file.startswith(f"{NATIVE}/cuda"):
-            begin = time.monotonic()
-            if not build(clone):
-                finding.ring = "not compiled"
-                return finding
-            finding.seconds["build"] = time.monotonic() - begin
-        near = reach.rings(mutation.file)
-        rest = [name for name in reach.all_rings() if name not in near]
-        for part, ring, files in (
-            ("near", "rings", near),
-            ("rest", "rings", rest),
-            ("slow", "slow", reach.slow(mutation.file)),
-        ):
-            finding.test, finding.seconds[part] = run_tests(clone, files)
-            if finding.test:
-                finding.ring = ring
-                break
+        if not compiled:
+            finding.ring = "not compiled"
+            return finding
+        failed = workshop.failures(reach.rings(mutation.file)[:NEAREST], first=True)
+        if failed:
+            finding.ring, finding.test = "rings", failed[0]
     finally:
-        mutation.revert(clone)
-        if is_native:
-            build(clone)
+        workshop.restore([mutation])
+        finding.seconds["nearest"] = time.monotonic() - begin
     return finding
+
+
+def meet_all(workshop: Workshop, findings: Sequence[Finding], tests: Sequence[str], ring: str) -> None:
+    """Run tests on all mutations that were not noticed, together, and tell which of these each failure notices."""
+    begin = time.monotonic()
+    while left := [each for each in findings if not each.ring]:
+        workshop.change([each.mutation for each in left])
+        failed = workshop.failures(tests, first=False)
+        workshop.restore([each.mutation for each in left])
+        if not failed:
+            break
+        print(f"{len(left)} together: {len(failed)} failures, such as {failed[0]}", flush=True)
+        for finding in left:
+            workshop.change([finding.mutation])
+            alone = workshop.failures(failed, first=True)
+            workshop.restore([finding.mutation])
+            if alone:
+                finding.ring, finding.test = ring, alone[0]
+        assert any(each.ring for each in left), f"only together: {failed}"
+        tests = failed  # what they hid shows when they run again
+    for finding in findings:
+        if finding.ring in ("", ring):
+            finding.seconds[ring] = (time.monotonic() - begin) / max(len(findings), 1)
 
 
 def main() -> None:
@@ -284,33 +354,54 @@ def main() -> None:
         for each in choose(ROOT, given.count, given.seed):
             print(f"{each.file}:{each.line}\n  - {each.before.strip()}\n  + {each.after.strip()}")
         return
-    clone = make_clone(given.work.resolve())
-    mutations = choose(clone, given.count, given.seed)
-    log = given.work / "mutations.jsonl"
-    rows = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
-    reach = Reach(clone)
-    for mutation in mutations[len(rows) :]:
-        finding = search(mutation, clone, reach)
-        rows.append(asdict(finding))
-        with log.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
-        _say(rows[-1])
-    summarize(rows)
+    workshop = Workshop(given.work.resolve())
+    workshop.prepare()
+    mutations = choose(workshop.clone, given.count, given.seed)
+    reach = Reach(workshop.clone)
+    log = Log(given.work / "mutations.jsonl")
+    findings = log.read()
+    for mutation in mutations[len(findings) :]:
+        findings.append(meet_nearest(workshop, reach, mutation))
+        log.write(findings)
+        _say(findings[-1])
+    for ring, tests in (("rings", reach.all_rings()), ("slow", reach.all_slow())):
+        left = [each for each in findings if not each.ring]
+        meet_all(workshop, left, tests, ring)
+        log.write(findings)
+        for each in left:
+            _say(each)
+    summarize(findings)
 
 
-def _say(row: dict[str, object]) -> None:
-    place = row["mutation"]
-    assert isinstance(place, dict) and isinstance(row["seconds"], dict)
-    seconds = ", ".join(f"{part} {value:.0f} s" for part, value in row["seconds"].items())
-    print(f"{row['ring'] or 'SURVIVED':12} {place['file']}:{place['line']}  {seconds}  {row['test']}")
-    print(f"  - {place['before'].strip()}\n  + {place['after'].strip()}")
-    sys.stdout.flush()
+@dataclass(frozen=True)
+class Log:
+    """The findings so far, a row per mutation."""
+
+    path: Path
+
+    def read(self) -> list[Finding]:
+        """Return the findings of an earlier call."""
+        rows = [json.loads(line) for line in self.path.read_text().splitlines()] if self.path.exists() else []
+        return [Finding(Mutation(**row.pop("mutation")), **row) for row in rows]
+
+    def write(self, findings: Sequence[Finding]) -> None:
+        """Write all findings."""
+        beside = self.path.with_suffix(".new")
+        beside.write_text("".join(json.dumps(asdict(each)) + "\n" for each in findings))
+        beside.replace(self.path)
 
 
-def summarize(rows: Sequence[dict[str, object]]) -> None:
+def _say(finding: Finding) -> None:
+    place = finding.mutation
+    seconds = ", ".join(f"{part} {value:.0f} s" for part, value in finding.seconds.items())
+    print(f"{finding.ring or 'not noticed':12} {place.file}:{place.line}  {seconds}  {finding.test}")
+    print(f"  - {place.before.strip()}\n  + {place.after.strip()}", flush=True)
+
+
+def summarize(findings: Sequence[Finding]) -> None:
     """Print how many mutations each ring noticed."""
-    counts = {ring: sum(row["ring"] == ring for row in rows) for ring in ("rings", "slow", "not compiled", "")}
-    print(f"\n{len(rows)} mutations, noticed by the first two rings: {counts['rings']}, only by slow tests:")
+    counts = {ring: sum(each.ring == ring for each in findings) for ring in ("rings", "slow", "not compiled", "")}
+    print(f"\n{len(findings)} mutations, noticed by the first two rings: {counts['rings']}, only by slow tests:")
     print(f"{counts['slow']}, by the compiler: {counts['not compiled']}, by nothing: {counts['']}")
     share = counts["rings"] / max(counts["rings"] + counts["slow"], 1)
     print(f"The first two rings notice {100.0 * share:.0f} % of what any test notices.")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 RINGS = ("tests/unit", "tests/parts")
 SLOW = "tests/slow"
+ELSEWHERE = ("tests/slow/captures", "tests/slow/device")
 PLAIN = ("tests", "tests/scenes", "tests/harness", "tests/lines", "tests/records", "benchmarks")
 NATIVE = "pipeline/raster/native"
 HARNESS = ("tests/harness/building.py", "tests/harness/on_cpu.py")  # a test that imports these runs CUDA's sources
@@ -36,9 +37,9 @@ class Reach:
         """Return the files of the first two rings that reach a source, the nearest first."""
         return [name for name in self._near(source) if name.startswith(RINGS)]
 
-    def slow(self, source: str) -> list[str]:
-        """Return the slow groups' files that reach a source, the nearest first; not those that need other machines."""
-        return [name for name in self._near(source) if name.startswith(SLOW)]
+    def all_slow(self) -> list[str]:
+        """Return the files of the slow groups that need neither real photos nor a CUDA device."""
+        return [name for name in self._distances if name.startswith(SLOW) and not name.startswith(ELSEWHERE)]
 
     def _near(self, source: str) -> list[str]:
         targets = self._targets(source)
