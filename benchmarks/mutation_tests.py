@@ -2,12 +2,12 @@
 
     python benchmarks/mutation_tests.py WORK [--count 40] [--seed 1]
 
-WORK gets a clone of this checkout's last commit, in which the lines are changed, and ``mutations.jsonl``: a run that was
-stopped goes on where it was. At least two mutations in each room and four in the kernels (two of the CPU's, two of
+WORK gets a clone of this checkout's last commit, in which the lines are changed, and ``mutations.jsonl``: a run that
+was stopped goes on where it was. At least two mutations in each room and four in the kernels (two of the CPU's, two of
 CUDA's, which the harness runs).
 
 1. Each mutation meets the unit tests and tests of parts that reach its file by imports, the nearest first, up to the
-   first failure; the farther ones only in the next step.
+   first failure; those farther away, and those that wait for a run of the demo, only in the next step.
 2. Those not noticed so far are applied together, and both rings run whole. Each test that fails runs again on each of
    the mutations alone; those noticed are taken out, until both rings pass.
 3. The same with the slow tests. What survives these, too, may be equivalent.
@@ -44,7 +44,7 @@ NATIVE = "pipeline/raster/native"
 KERNELS = ((f"{NATIVE}/*.cpp", 2), (f"{NATIVE}/cuda/*.cu*", 2))
 UNTESTABLE = ("bindings", "sbom", "options.py", "__init__.py")  # glue, defaults
 TEXT_CHECKS = ("test_every_version_matches_the_present_sources", "test_every_name_imported")
-NEAREST = 12  # test files that a mutation meets alone
+NEAREST = 6  # test files that a mutation meets alone
 TIMEOUT_S = 300  # of a test: a mutation may make a loop endless
 NO_TESTS = 5  # pytest's exit code
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
@@ -311,7 +311,8 @@ def meet_nearest(workshop: Workshop, reach: Reach, mutation: Mutation) -> Findin
         if not compiled:
             finding.ring = "not compiled"
             return finding
-        failed = workshop.failures(reach.rings(mutation.file)[:NEAREST], first=True)
+        nearest = [name for name in reach.rings(mutation.file) if not reach.waits_for_demo(name)][:NEAREST]
+        failed = workshop.failures(nearest, first=True)
         if failed:
             finding.ring, finding.test = "rings", failed[0]
     finally:

@@ -13,6 +13,7 @@ ELSEWHERE = ("tests/slow/captures", "tests/slow/device")
 PLAIN = ("tests", "tests/scenes", "tests/harness", "tests/lines", "tests/records", "benchmarks")
 NATIVE = "pipeline/raster/native"
 HARNESS = ("tests/harness/building.py", "tests/harness/on_cpu.py")  # a test that imports these runs CUDA's sources
+RUNS_ALL = ("demo_run", "demo_copy", "splatpipe.pipeline.app.cli", "from command import")
 WHOLE_LINE = "stages/line.py"  # what starts the command, or reads its finished run, runs all stages
 
 
@@ -40,6 +41,11 @@ class Reach:
     def all_slow(self) -> list[str]:
         """Return the files of the slow groups that need neither real photos nor a CUDA device."""
         return [name for name in self._distances if name.startswith(SLOW) and not name.startswith(ELSEWHERE)]
+
+    def waits_for_demo(self, name: str) -> bool:
+        """Whether a test file uses the finished run of the demo, which takes minutes to make."""
+        text = (self._root / name).read_text(encoding="utf-8")
+        return "demo_run" in text or "demo_copy" in text
 
     def _near(self, source: str) -> list[str]:
         targets = self._targets(source)
@@ -86,7 +92,7 @@ class Reach:
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("splatpipe."):
                 found.add(node.value.partition(":")[0])
         files = {file for module in found if (file := self._file(module))}
-        if name.startswith("tests/") and ("demo_run" in text or "splatpipe.pipeline.app.cli" in text):
+        if name.startswith("tests/") and (any(word in text for word in RUNS_ALL)):
             files.add(WHOLE_LINE)
         return tuple(sorted(files))
 
