@@ -11,15 +11,14 @@ from batch_captures import call_of, demo, link, planned
 
 from splatpipe.pipeline.app.batch.attempts import AttemptLog, AttemptResult
 from splatpipe.pipeline.app.batch.capture_list import read_captures
-from splatpipe.pipeline.app.batch.driver import STOPPED_NOTICE_S, Driver, Notifications, fresh_call
+from splatpipe.pipeline.app.batch.driver import fresh_call
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
-from splatpipe.pipeline.app.batch.snakemake_process import open_profile
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
-from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED, StopSignal
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE
 from splatpipe.stages.line import LINE
 
 BAD = AttemptResult(EXIT_STAGE, "The stage train died.", "See the log.")
@@ -91,28 +90,6 @@ def test_an_unreadable_control_file_is_reported_without_a_job_until_it_is_correc
     (house / "gcp_list.txt").unlink()
     (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, Settings("preview")).captures
     assert planned.message == "" and len(planned.jobs) == len(LINE) - 2  # nobody reads depths
-
-
-def test_a_stopped_batch_notifies_only_of_itself_and_waits_for_no_notice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Docker kills ten seconds after SIGTERM, and the jobs may have taken eight of them."""
-    call = call_of(tmp_path, planned("house", "train"), planned("barn", "train"))
-    said: list[str] = []
-    hangs = "echo $SPLATPIPE_STATE,$SPLATPIPE_CAPTURE >> notice; sleep 99"
-    driver = Driver(call, open_profile(None), Notifications(said.append, hangs))
-
-    def stop(_lock: int) -> None:
-        raise StopSignal(EXIT_TERMINATED)
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(driver, "_work", stop)
-    with pytest.raises(StopSignal):
-        driver.run(0)
-    assert (tmp_path / "notice").read_text() == f"stopped,{tmp_path.name}\n"
-    assert [line for line in said if "--notify" in line] == [
-        f"The --notify command did not end within {STOPPED_NOTICE_S:.0f} s and was killed."
-    ]
 
 
 def test_a_cell_of_the_table_is_never_a_formula() -> None:

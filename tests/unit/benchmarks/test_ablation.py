@@ -10,14 +10,11 @@ import comparison
 import pytest
 import tiny_scene
 import variants
-from commands import Command, CommandEnd, run_all, splatpipe
+from commands import Command, CommandEnd
 from finished import ResultLog, figures, work_folder
-from timeouts import wait_until
 
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.train.options import TrainConfig
-
-TINY = "ingest.min_size=50"  # the line leaves out thumbnails
 
 
 @pytest.fixture(scope="module")
@@ -128,33 +125,3 @@ def test_results_survive_a_truncated_line(tmp_path: Path) -> None:
 def test_a_work_folder_is_used_by_one_process_at_a_time(tmp_path: Path) -> None:
     with work_folder(tmp_path), pytest.raises(UsageError, match="Another run works"), work_folder(tmp_path):
         pass
-
-
-def test_ending_early_leaves_no_process(dataset: Path, tmp_path: Path) -> None:
-    long = ("--threads", "1", "--set", "train.iterations=1000000", "--set", TINY)
-    commands = [
-        splatpipe("long", ("run", str(dataset), str(tmp_path / "out"), *long), tmp_path / "long.log"),
-        splatpipe("fails", ("run", str(tmp_path / "nowhere"), str(tmp_path / "no")), tmp_path / "fails.log"),
-        splatpipe("never", ("run", str(dataset), str(tmp_path / "never"), *long), tmp_path / "never.log"),
-    ]
-    ends = run_all(commands, 2)
-    ended = next(ends)
-    assert ended.command.name == "fails" and "There is no folder" in ended.failure
-    running = processes_with(str(tmp_path / "out"))
-    wait_until(lambda: any(processes_with(pid) for pid in running), "a worker")  # which names its parent
-    ends.close()
-    assert not processes_with(str(tmp_path / "out")) and not (tmp_path / "never").exists()
-    assert not any(processes_with(pid) for pid in running)
-
-
-def processes_with(word: str) -> list[str]:
-    """Ids of the processes that have a word in their command line."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = path.read_bytes().split(b"\0")
-        except OSError:
-            continue
-        if word.encode() in words:
-            found.append(path.parent.name)
-    return found
