@@ -1,7 +1,7 @@
 # make run                     sets up, then processes the demo capture into out/demo
 # make run PHOTOS=dir OUT=dir  the same on your photos (PRESET=preview|standard|high)
 # make test                    sets up, then runs the tests: unit, parts, and the slow groups whose sources changed
-# make test-all                all slow groups as well; make test ONLY="unit kills": only these
+# make test-all                all slow groups as well; make test ONLY=kills: only that ring or group
 # make develop                 editable install: edited sources take effect at once; make test reverts to the wheel
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            generates the tables of docs/options.md from the code

@@ -21,6 +21,12 @@ def linked_copy(run: Path, target: Path) -> Path:
     return Path(shutil.copytree(run, target, copy_function=copy))
 
 
+def write_apart(path: Path, text: str) -> None:
+    """Write a file of a linked copy, and leave the file that it was linked to."""
+    path.unlink()
+    path.write_text(text, encoding="utf-8")
+
+
 def folder_digest(folder: Path) -> str:
     """Return the sha256 (hex) of the names and contents of all files below a folder."""
     total = hashlib.sha256()

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from command import splatpipe
-from finished_run import linked_copy
+from finished_run import linked_copy, write_apart
 from PIL import Image
 
 from splatpipe.demo import capture_path
@@ -82,7 +82,7 @@ def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_
 )
 def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, part: str) -> None:
     path = read_report_inputs(copy_of_run).part(part)
-    path.write_text("[" + " " * (path.stat().st_size - 2) + "]")  # of the same length, with other content
+    write_apart(path, "[" + " " * (path.stat().st_size - 2) + "]")  # of the same length, with other content
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert page.count("This part could not be read") == 1
     assert "Processing</h2>" in page
@@ -91,7 +91,7 @@ def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, 
 def test_a_damaged_artifact_of_a_finished_run_is_not_reported_as_a_requested_end(
     copy_of_run: Path,
 ) -> None:
-    (read_report_inputs(copy_of_run).part("sparse.summary").parent / "manifest.json").write_text("{")
+    write_apart(read_report_inputs(copy_of_run).part("sparse.summary").parent / "manifest.json", "{")
     verdict = judge(read_report_inputs(copy_of_run))
     assert verdict.level == "bad"
     assert verdict.headline == "Finished, but its results are damaged"
@@ -103,9 +103,9 @@ def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
     data = json.loads(path.read_text())
     size = path.stat().st_size
     change(data)
-    path.write_text(json.dumps(data))
+    write_apart(path, json.dumps(data))
     manifest = path.parent / "manifest.json"
-    manifest.write_text(manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
+    write_apart(manifest, manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
 
 
 def show_nothing_inside(data: dict[str, Any]) -> None:
@@ -248,7 +248,7 @@ def test_no_folder_outside_out_is_named(copy_of_run: Path) -> None:
     config = config.replace(photos, f"{secret}/photos").replace(
         'control = "auto"', f'control = "{secret}/points 2.csv"'
     )
-    (copy_of_run / "config.toml").write_text(config)
+    write_apart(copy_of_run / "config.toml", config)
     message = (
         f"{secret}/photos/a.jpg and {copy_of_run}/x and {secret}/points 2.csv and /srv/backup/y and {Path.home()}/z"
     )

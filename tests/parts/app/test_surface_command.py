@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import rasterio
 from command import splatpipe
+from finished_run import write_apart
 
 from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measurement_lines
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
@@ -120,12 +121,14 @@ def test_a_mesh_without_its_library_is_refused_and_the_request_not_stored(
     assert (demo_run / "config.toml").read_bytes() == before
 
 
-def test_a_run_without_scale_is_refused_at_once_unless_it_is_georeferenced_again(demo_copy: Path) -> None:
+def test_a_run_without_scale_is_refused_at_once_unless_it_is_georeferenced_again(
+    demo_run: Path, demo_copy: Path
+) -> None:
     out = demo_copy
     for path in (out / "stages").glob("georef-*/frame.json"):
         text = path.read_text()
         placed = {**json.loads(text), "kind": "arbitrary", "origin": None}
-        path.write_text(json.dumps(placed).ljust(len(text)))  # of its size, or the artifact would count as damaged
+        write_apart(path, json.dumps(placed).ljust(len(text)))  # of its size, or the artifact would count as damaged
     check_possible(demo_run, options_for("ortho", None, None))
     check_possible(out, options_for("ortho", None, None), {"georef": {"max_position_error_m": 5.0}})
     with pytest.raises(SplatpipeError, match="no metric scale"):

@@ -55,16 +55,18 @@ def test_a_full_disk_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
     code = f"""
 import resource, signal, sys
 from pathlib import Path
-import test_video
+import videos
 from splatpipe.pipeline.engine.errors import MachineError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 try:
-    test_video.write(Path({str(tmp_path)!r}) / "film.webm", 40)
+    videos.write(Path({str(tmp_path)!r}) / "film.webm", 40)
 except MachineError as error:
     print(error.message, error.hint)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment(SCENES)
+    )
     assert "could not be written completely" in done.stdout and "disk" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
@@ -78,9 +80,9 @@ def test_sides_are_even_and_suffixes_known(tmp_path: Path) -> None:
 
 def test_nothing_is_printed_on_stderr(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; import test_video\n"
-        f"test_video.write(Path({str(tmp_path)!r}) / 'film.webm', 3); print('still heard', file=sys.stderr)"
+        "import sys; from pathlib import Path; import videos\n"
+        f"videos.write(Path({str(tmp_path)!r}) / 'film.webm', 3); print('still heard', file=sys.stderr)"
     )
-    env = environment(Path(__file__).parent, SCENES, PYTHONWARNINGS="ignore")
+    env = environment(SCENES, PYTHONWARNINGS="ignore")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env)
     assert done.stderr.split() == ["still", "heard"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import tiny_scene
 import torch
-from repository import SCENES
+from repository import SCENES, environment
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.heap import return_free_heap
@@ -437,8 +437,8 @@ from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, lengths_
 from splatpipe.pipeline.train.limits import FIXED_BYTES
 from splatpipe.pipeline.train.memory import resident_bytes
 
-scene, out = Path(sys.argv[2]), Path(sys.argv[3])
-limit = resident_bytes() + FIXED_BYTES + int(sys.argv[4])
+scene, out = Path(sys.argv[1]), Path(sys.argv[2])
+limit = resident_bytes() + FIXED_BYTES + int(sys.argv[3])
 parts = {"undistort.dataset": scene / "dataset", "initialize.splat": scene / "init.ply"}
 parts |= tiny_scene.split_part(scene / "dataset", 4)
 inputs = Inputs(parts, scene, machine=Machine("cpu", 1))
@@ -452,9 +452,8 @@ print(json.dumps({"limit": limit, "peak": peak_memory_bytes(), **summary, "warni
 
 def in_little_memory(scene: Path, out: Path, room: int) -> dict[str, object]:
     out.mkdir()
-    scenes = SCENES
-    command = [sys.executable, "-c", TRAIN_IN_LITTLE_MEMORY, scenes, scene, out, room]
-    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", TRAIN_IN_LITTLE_MEMORY, str(scene), str(out), str(room)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment(SCENES))
     assert done.returncode == 0, done.stderr
     output: dict[str, object] = json.loads(done.stdout)
     return output

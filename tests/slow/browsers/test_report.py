@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from command import splatpipe
-from finished_run import linked_copy
+from finished_run import linked_copy, write_apart
 from PIL import Image
 from timeouts import TIMEOUT_S, wait_until
 
@@ -266,6 +266,6 @@ def rewrite(path: Path, change: Callable[[dict[str, object]], None]) -> None:
     data = json.loads(path.read_text())
     size = path.stat().st_size
     change(data)
-    path.write_text(json.dumps(data))
+    write_apart(path, json.dumps(data))
     manifest = path.parent / "manifest.json"
-    manifest.write_text(manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
+    write_apart(manifest, manifest.read_text().replace(f'"size": {size},', f'"size": {path.stat().st_size},'))
