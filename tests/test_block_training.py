@@ -22,7 +22,7 @@ from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_split, load_views
-from splatpipe.pipeline.raster.cuda import use_kernels
+from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.splat.backdrop import backdrop_limit
 from splatpipe.pipeline.splat.free_space import free_space
@@ -375,7 +375,13 @@ def test_a_cell_that_no_photo_sees_keeps_the_coarse_passs_gaussians(site: SitePa
 
 
 def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
+    """With the fused step, which stores no gradient of a parameter."""
     frozen, models = read_splat(undisturbed / "frozen.ply"), []
+    calls, call = Counter[str](), CudaKernels.call
+
+    def counted(kernels: CudaKernels, name: str, *arguments: object) -> None:
+        calls[name] += 1
+        call(kernels, name, *arguments)
 
     def look(state: TrainState, photo: TrainingPhoto) -> None:
         if state.iteration == 8:  # density control has not acted yet
@@ -390,8 +396,10 @@ def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturb
         for name in ("plan.json", "frozen.ply"):
             (out / name).write_bytes((undisturbed / name).read_bytes())
         with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill), use_kernels(kernels):
+            patch.setattr(CudaKernels, "call", counted)
             step_with(patch, look)
             trained(site, out)
+    assert calls["splat_step"] == calls["splat_forward"] == 8 and calls["splat_project_backward"] == 0
     begun = Block.of(CONFIG, site, TASK, cpu()).start()
     for name in PARAMETERS:
         ours, theirs, before = (getattr(model, name).double() for model in (*models, begun))

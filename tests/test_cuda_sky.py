@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent / "scenes"))
 import skies
 from building import FORWARD, REVERSE, SHUFFLED, build_on_cpu, load
 from on_cpu import kernels_on_cpu
+from waiting import never_waiting
 
 ATOL = 2e-6  # of colours up to 1, and of sums over 15 x 15 pixels with weights up to 1
 DEVICE_ATOL = 1e-3  # there the place between two cells is float32, the CPU's is float64; of sums of hundreds
@@ -39,7 +40,7 @@ def kernels() -> CudaKernels:
 
 @pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
-    """Where the kernels run; on a real device, nothing may wait."""
+    """Where the kernels run."""
     if request.param == "harness":
         with use_kernels(kernels_on_cpu()):
             yield CPU
@@ -47,7 +48,6 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     if why_not() is not None:
         pytest.skip("no CUDA device")
     yield torch.device("cuda", 0)
-    torch.cuda.set_sync_debug_mode("default")
 
 
 def composed(camera: Camera, mask: Tensor | None, device: torch.device = CPU) -> list[Tensor]:
@@ -62,14 +62,11 @@ def composed(camera: Camera, mask: Tensor | None, device: torch.device = CPU) ->
     alpha = torch.rand(shape, generator=generator).to(device).requires_grad_()
     weight = torch.rand(*shape, 3, generator=generator).to(device)
     none, mask = torch.zeros(0, device=device), None if mask is None else mask.to(device)
-    if device.type == "cuda":
-        torch.cuda.set_sync_debug_mode("error")
-    rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
-    seen = None if mask is None else PhotoSky(mask, mask | mask.roll(1, 0))
-    picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
-    (weight * picture).sum().backward()
-    if device.type == "cuda":
-        torch.cuda.set_sync_debug_mode("default")
+    with never_waiting(device):
+        rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
+        seen = None if mask is None else PhotoSky(mask, mask | mask.roll(1, 0))
+        picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
+        (weight * picture).sum().backward()
     cells = sky.tensors["colours"].grad
     assert colour.grad is not None and alpha.grad is not None
     found = [picture.detach(), colour.grad, alpha.grad, torch.zeros(()) if cells is None else cells]

@@ -156,7 +156,7 @@ class UnfinishedBackward:
     logits_are_leaf: bool
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
-        """Whether the pass can be fused with a step: of what was rendered, or its first rows, without other gradients."""
+        """Whether the pass can be fused with a step: of all or the first rendered rows, without other gradients."""
         if tuple(parameters) != PARAMETERS:
             return False
         rendered = dict(zip(PARAMETERS, self.frame.parameters, strict=True))
