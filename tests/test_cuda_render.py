@@ -138,44 +138,6 @@ def test_the_fused_step_is_the_backward_pass_and_the_step(kernels, sparse, dropo
     assert_stepped_alike(trained(kernels, sparse, dropout), trained(None, sparse, dropout))
 
 
-@pytest.mark.parametrize("dropout", [False, True], ids=("whole", "dropout"))
-@pytest.mark.parametrize("sparse", [True, False], ids=("seen", "all"))
-def test_only_the_first_rows_can_be_stepped_without_storing_gradients(kernels, sparse, dropout, monkeypatch):
-    """As in a block's training: the others are rendered around it."""
-    count, found, called = 35, [], []
-    call = CudaKernels.call
-    monkeypatch.setattr(CudaKernels, "call", lambda self, name, *given: (called.append(name), call(self, name, *given)))
-    for fused in (True, False):
-        whole = random_scene(0).requires_grad_()
-        scene, buffers = whole.detach().first(count), GradientBuffers() if fused else None
-        optimizer, probe = Adam(scene.tensors()), torch.zeros(1, 2).expand(len(whole), 2).requires_grad_()
-        model = whole
-        if dropout:
-            kept = torch.arange(len(whole)) % 4 > 0
-            model = replace(whole, opacity_logits=_DropoutLogits.apply(whole.opacity_logits, kept, 0.25))
-        called.clear()
-        with use_kernels(kernels):
-            rendered = render(model, CAMERA, OPTIONS, means2d_probe=probe, buffers=buffers)
-            weighted(rendered).backward()
-            for name, tensor in scene.tensors().items():
-                gradient = whole.tensors()[name].grad
-                tensor.grad = None if gradient is None else gradient[:count]
-            rows = rendered.visible[:count] if sparse else None
-            optimizer.step(scene.tensors(), RATES, rows, buffers, {"log_scales": (-2.5, -1.5)})
-        assert ("splat_step" in called, "splat_project_backward" in called) == (fused, not fused)
-        assert int(rendered.visible[count:].sum()) > 5
-        assert all(torch.equal(ours[count:], rest[count:]) for ours, rest in rows_of(whole, random_scene(0)))
-        assert not (fused and bool(probe.grad[count:].any()))
-        found.append([*scene.tensors().values(), *optimizer.mean.values(), *optimizer.square.values()])
-        found[-1].append(probe.grad[:count])
-    for ours, expected in zip(*found, strict=True):
-        torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-6)
-
-
-def rows_of(one: Gaussians, other: Gaussians) -> list[tuple[Tensor, Tensor]]:
-    return list(zip(one.detach().tensors().values(), other.tensors().values(), strict=True))
-
-
 def test_training_leaves_no_gradient_but_the_probes(kernels):
     scene, buffers, probe = random_scene(0).requires_grad_(), GradientBuffers(), torch.zeros(60, 2, requires_grad=True)
     optimizer = Adam(scene.tensors())

@@ -57,10 +57,9 @@ def use_all(kernels: CudaKernels) -> None:
 def called(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The functions of the library that were called, in order."""
     names: list[str] = []
-    call = CudaKernels.call
+    call, harness = CudaKernels.call, load(build_on_cpu())
 
     def recorded(kernels: CudaKernels, name: str, *arguments: object) -> None:
-        harness = load(build_on_cpu())
         before = harness.harness_used(1 - kernels.index)
         call(kernels, name, *arguments)
         names.append(name)

@@ -103,8 +103,8 @@ const char* name_of(Operation operation) {
 }
 
 const char* name_of(Barrier barrier) {
-    static const char* const names[] = {"__syncthreads", "__syncthreads_count", "__syncthreads_or",
-                                        "__syncthreads_and", "sync_grid"};
+    static const char* const names[] = {"__syncthreads", "__syncthreads_count", "__syncthreads_or", "__syncthreads_and",
+                                        "sync_grid"};
     return names[static_cast<int>(barrier)];
 }
 

@@ -164,7 +164,8 @@ int slot_floats_of(const SplatShot& shot) { return shot.depths ? kDepthSlotFloat
 
 bool is_aligned(const void* memory) { return memory && reinterpret_cast<uintptr_t>(memory) % 256 == 0; }
 
-// Chunks with launches of their own. A chunk has kChunkTiles tiles at most: as many rounds as that takes are always foreseen.
+// Chunks with launches of their own. A chunk has kChunkTiles tiles at most: as many rounds as that takes are always
+// foreseen.
 int passes_of(const Job& job, const SplatFrame& frame) {
     const int least = static_cast<int>(divide_up(job.tiles, kChunkTiles));
     return frame.passes > least ? frame.passes : least;

@@ -7,8 +7,8 @@
 namespace splat {
 namespace cuda {
 
-// Makes the stream's device this thread's for what follows: cudart is linked statically, so that it has a current device
-// of its own, whatever the caller's library has. Returns a code of api.h.
+// Makes the stream's device this thread's for what follows: cudart is linked statically, so that it has a current
+// device of its own, whatever the caller's library has. Returns a code of api.h.
 inline int32_t enter(const SplatStream* given, cudaStream_t* stream) {
     *stream = given ? static_cast<cudaStream_t>(given->stream) : nullptr;
     const cudaError_t error = given ? cudaSetDevice(given->device) : cudaSuccess;
