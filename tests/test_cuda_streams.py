@@ -106,13 +106,17 @@ def devices(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     return log
 
 
-def test_torchs_current_device_is_the_tensors_during_a_call_and_its_own_afterwards(devices: list[object]) -> None:
+def test_torchs_current_device_is_the_tensors_during_a_call_and_its_own_afterwards(
+    devices: list[object], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def call(name: str, number: int, stream: object) -> None:
         where = stream._obj  # type: ignore[attr-defined]
         devices.append((name, number, where.stream, where.device))
 
-    library = SimpleNamespace(device=lambda index: (0, SimpleNamespace(memory_bytes=0, name="")), call=call)
-    CudaKernels(library, SECOND).call("splat_uniform", 5)  # type: ignore[arg-type]
+    kernels = kernels_on_cpu()
+    kernels.device, kernels.index = SECOND, 1
+    monkeypatch.setattr(kernels, "_library", SimpleNamespace(call=call))
+    kernels.call("splat_uniform", 5)
     assert devices == ["at cuda:1", ("splat_uniform", 5, 41, 1), "back"]
 
 
@@ -144,6 +148,7 @@ def test_facts_are_awaited_on_the_stream_of_their_device(
 
 
 def test_a_tensor_without_a_number_is_on_torchs_current_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    second = kernels_on_cpu()
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
-    monkeypatch.setattr(cuda, "_on_cuda", lambda index: index)
-    assert cuda.kernels_of(torch.device("cuda")) == 1 and cuda.kernels_of(torch.device("cuda", 0)) == 0
+    monkeypatch.setattr(cuda, "_on_cuda", lambda index: second if index == 1 else None)
+    assert cuda.kernels_of(torch.device("cuda")) is second and cuda.kernels_of(torch.device("cuda", 0)) is None
