@@ -433,8 +433,9 @@ def main() -> NoReturn:
     except Exception as error:
         from splatpipe.pipeline.app.console import show_error
 
-        show_error(for_the_user(error))
-        sys.exit(exit_code(error))
+        shown = for_the_user(error)
+        show_error(shown)
+        sys.exit(exit_code(shown))
     sys.exit(0)
 
 

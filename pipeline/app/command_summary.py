@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, State, check_command, notify
-from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, StopSignal, exit_code
+from splatpipe.pipeline.engine.errors import (
+    MachineError,
+    SplatpipeError,
+    StageError,
+    StopSignal,
+    card_fault,
+    exit_code,
+)
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.verdict import Verdict
@@ -179,6 +186,8 @@ def for_the_user(error: Exception) -> SplatpipeError:
         return error
     if isinstance(error, OSError):
         return MachineError(str(error), "Check the free space and the permissions.")
+    if (fault := card_fault(error)) is not None:
+        return fault
     hint = "Please report it."
     with suppress(OSError):  # a container may have no writable folder for it
         with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:

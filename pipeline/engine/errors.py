@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 EXIT_INPUT = 1
@@ -44,6 +45,22 @@ class MachineError(SplatpipeError):
     """This machine lacks something: space, permission, memory, a device."""
 
     exit_code = EXIT_MACHINE
+
+
+CARD_HINT = "Run the command again: it resumes from its last checkpoint. --device cpu does not use the card."
+_CARD_ERROR = re.compile(r"CUDA (?:driver )?error: (?!out of memory)([^\n]+)")  # as torch words it
+
+
+def card_fault(error: BaseException) -> MachineError | None:
+    """The error to show for a fault of the graphics card; None for any other error.
+
+    Kernels run while the program goes on, so torch raises their faults as a bare RuntimeError wherever it waits for the
+    card next. The card then refuses all further work of this process.
+    """
+    said = _CARD_ERROR.search(str(error)) if isinstance(error, RuntimeError) else None
+    return (
+        None if said is None else MachineError(f"The graphics card failed: {said[1].strip().rstrip('.')}.", CARD_HINT)
+    )
 
 
 ERRORS = {error.__name__: error for error in (SplatpipeError, UsageError, StageError, MachineError)}

@@ -24,12 +24,24 @@ from types import FrameType
 from typing import IO
 
 from splatpipe.pipeline.engine.children import CHILDREN_MEMORY, die_with_parent
-from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, SplatpipeError, StageError
+from splatpipe.pipeline.engine.errors import (
+    ERRORS,
+    EXIT_TERMINATED,
+    MachineError,
+    SplatpipeError,
+    StageError,
+    card_fault,
+)
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.heap import importing, return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Shard, StageConfig, load_body
 
-NO_MEMORY = ("not enough memory", "bad_alloc", "cuda out of memory")  # in libraries' error messages, lower case
+NO_MEMORY = (
+    "not enough memory",
+    "bad_alloc",
+    "cuda out of memory",
+    "cuda error: out of memory",
+)  # in libraries' errors
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
 BAD_DISK = {errno.EIO, errno.ESTALE, errno.ENXIO, errno.ENODEV}  # a failing disk, or a network share that went away
 
@@ -151,6 +163,8 @@ def as_splatpipe_error(stage: str, error: BaseException) -> SplatpipeError:
             f"The stage {stage} ran out of memory.",
             "Close other programs, or lower train.max_megapixels or train.max_gaussians.",
         )
+    if (fault := card_fault(error)) is not None:
+        return fault
     return StageError(
         f"The stage {stage} failed: {type(error).__name__}: {error}",
         "The log has the details; please report it.",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
 
@@ -14,7 +14,14 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster.cuda_api import ADAM_TENSORS, SplatAdam, SplatRectangle, SplatRows, SplatShot
+from splatpipe.pipeline.raster.cuda_api import (
+    ADAM_TENSORS,
+    SplatAdam,
+    SplatRectangle,
+    SplatRows,
+    SplatShot,
+    SplatStream,
+)
 from splatpipe.pipeline.raster.cuda_forecast import Forecast, most_pairs_of
 from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaLibrary, load, why_not
 from splatpipe.pipeline.splat.upload import upload
@@ -23,31 +30,31 @@ ALIGNMENT = 256  # bytes, of memory passed to kernels
 
 
 class CudaKernels:
-    """The library on a device. Nothing synchronizes, and everything runs in order on torch's current stream.
+    """The library on a device. Nothing synchronizes, and everything runs in order on torch's current stream there.
 
     Args:
         library: The loaded library.
-        device: The current CUDA device; the CPU for a library that runs there, in tests.
+        device: A CUDA device, torch's current one or another; the CPU for a library that runs there, in tests.
 
     Attributes:
         device: As given.
+        index: Its number.
         forecast: Forecast of frame allocations.
         facts: The device, as the library sees it.
     """
 
     def __init__(self, library: CudaLibrary, device: torch.device) -> None:
         self._library = library
-        self.device = device
-        code, self.facts = library.device(device.index or 0)
+        self.device, self.index = device, device.index or 0
+        code, self.facts = library.device(self.index)
         if code:
             raise MachineError(f"The CUDA kernels cannot use {self.facts.name or device}: {library.error(code)}.")
         self.forecast = Forecast(most_pairs_of(self.facts.memory_bytes))
 
-    def stream(self) -> int | None:
-        """Torch's current stream, as a pointer."""
-        if self.device.type != "cuda":
-            return None
-        return int(torch.cuda.current_stream(self.device).cuda_stream) or None
+    def stream(self) -> SplatStream:
+        """Torch's current stream on the device."""
+        on_cuda = self.device.type == "cuda"
+        return SplatStream(torch.cuda.current_stream(self.device).cuda_stream if on_cuda else None, self.index)
 
     def empty(self, size_bytes: int) -> Tensor:
         """Uninitialized memory from torch, aligned for kernels.
@@ -76,7 +83,9 @@ class CudaKernels:
 
     def call(self, name: str, *arguments: object) -> None:
         """Call a function of ``cuda_api.CALLS`` with the current stream as last argument; errors as ``CudaLibrary``."""
-        self._library.call(name, *arguments, self.stream())
+        # The library makes the device the thread's current one: what torch has as such is restored afterwards.
+        with torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext():
+            self._library.call(name, *arguments, ctypes.byref(self.stream()))
 
     def frame_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
         """Memory of a frame, from its render onward, bytes."""

@@ -6,12 +6,16 @@ import ctypes
 from ctypes import POINTER, c_char, c_double, c_float, c_int32, c_int64, c_uint64, c_void_p
 from typing import Any
 
-ABI = 3
+ABI = 4
 """Version of the interface mirrored here, SPLAT_CUDA_ABI."""
 NO_KERNEL = -3
 """SPLAT_NO_KERNEL: this binary has no kernel for the device."""
 ADAM_TENSORS = 8
 """Maximum number of tensors in one call of ``splat_adam``."""
+
+
+class SplatStream(ctypes.Structure):
+    _fields_ = (("stream", c_void_p), ("device", c_int32), ("reserved", c_int32))
 
 
 class SplatDevice(ctypes.Structure):
@@ -88,6 +92,7 @@ class SplatStep(ctypes.Structure):
         ("values", SplatRows),
         ("means", SplatRows),
         ("squares", SplatRows),
+        ("rows", c_int64),
         ("rates", c_float * 5),
         ("rate_sh_rest", c_float),
         ("beta1", c_double),
@@ -141,6 +146,7 @@ class SplatSky(ctypes.Structure):
 
 
 STRUCTURES = (
+    SplatStream,
     SplatDevice,
     SplatShot,
     SplatRows,
@@ -154,7 +160,7 @@ STRUCTURES = (
     SplatSky,
 )
 
-_SHOT, _ROWS, _FRAME = POINTER(SplatShot), POINTER(SplatRows), POINTER(SplatFrame)
+_SHOT, _ROWS, _FRAME, _ON = POINTER(SplatShot), POINTER(SplatRows), POINTER(SplatFrame), POINTER(SplatStream)
 _RENDER = (_SHOT, _ROWS, _FRAME)
 _DRAW = (c_uint64, c_uint64, c_uint64)
 
@@ -167,24 +173,24 @@ SIZES: dict[str, tuple[Any, ...]] = {
 """Arguments of the functions that return a number of bytes."""
 CALLS: dict[str, tuple[Any, ...]] = {
     "splat_device": (c_int32, POINTER(SplatDevice)),
-    "splat_forward": (*_RENDER, POINTER(SplatPictures), c_void_p, c_void_p, c_void_p),
-    "splat_blend_backward": (*_RENDER, POINTER(SplatPictureGradients), c_void_p),
-    "splat_project_backward": (*_RENDER, _ROWS, c_void_p, c_void_p),
-    "splat_step": (_SHOT, _FRAME, POINTER(SplatStep), c_void_p, c_void_p),
+    "splat_forward": (*_RENDER, POINTER(SplatPictures), c_void_p, c_void_p, _ON),
+    "splat_blend_backward": (*_RENDER, POINTER(SplatPictureGradients), _ON),
+    "splat_project_backward": (*_RENDER, _ROWS, c_void_p, _ON),
+    "splat_step": (_SHOT, _FRAME, POINTER(SplatStep), c_void_p, _ON),
     "splat_photo_loss": (
         *(c_void_p, c_void_p, c_void_p, c_int32, c_int32, POINTER(SplatRectangle), c_double),
-        *(c_void_p, c_void_p, c_void_p, c_int64, c_void_p),
+        *(c_void_p, c_void_p, c_void_p, c_int64, _ON),
     ),
-    "splat_affine_colour": (c_void_p, c_void_p, c_int64, c_void_p, c_void_p),
+    "splat_affine_colour": (c_void_p, c_void_p, c_int64, c_void_p, _ON),
     "splat_affine_colour_backward": (
         *(c_void_p, c_void_p, c_void_p, c_int64),
-        *(c_void_p, c_void_p, c_void_p, c_int64, c_void_p),
+        *(c_void_p, c_void_p, c_void_p, c_int64, _ON),
     ),
-    "splat_sky": (POINTER(SplatSky), c_void_p, c_void_p),
-    "splat_sky_backward": (POINTER(SplatSky), c_void_p, c_void_p, c_void_p, c_void_p),
-    "splat_adam": (POINTER(SplatAdam), c_void_p),
-    "splat_uniform": (*_DRAW, c_int64, c_void_p, c_void_p),
-    "splat_split_offsets": (*_DRAW, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p),
-    "splat_morton": (c_void_p, c_int64, POINTER(c_float), POINTER(c_float), c_void_p, c_void_p),
+    "splat_sky": (POINTER(SplatSky), c_void_p, _ON),
+    "splat_sky_backward": (POINTER(SplatSky), c_void_p, c_void_p, c_void_p, _ON),
+    "splat_adam": (POINTER(SplatAdam), _ON),
+    "splat_uniform": (*_DRAW, c_int64, c_void_p, _ON),
+    "splat_split_offsets": (*_DRAW, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, _ON),
+    "splat_morton": (c_void_p, c_int64, POINTER(c_float), POINTER(c_float), c_void_p, _ON),
 }
 """Arguments of the functions that return a code: 0, or an error."""

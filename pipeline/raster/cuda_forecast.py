@@ -1,6 +1,6 @@
 """Forecast of the next frame's Gaussian-tile pairs from earlier frames, so that the host never waits for a count.
 
-Pairs beyond the forecast are still rendered, with identical bits, but slowly (see native/cuda).
+Pairs beyond the forecast are still rendered, with identical bits, a little more slowly (see native/cuda).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from splatpipe.pipeline.raster.cuda_api import SplatFrameFacts
 
 FIRST_PAIRS_A_GAUSSIAN = 8  # for a first frame; a trained Gaussian touches 3 to 10 tiles
 FIRST_PAIRS_A_TILE = 64  # for a start with few, large Gaussians, which fill the tiles
-FIRST_PASSES = 8  # once: a wrong guess then costs empty launches, not one block working off the rest alone
+FIRST_PASSES = 8  # once: a wrong guess then costs empty launches, and the launch for the rest is slower
 MARGIN = 1.25  # over the recent maximum: views differ, and the model grows
 WINDOW = 512  # frames after which older maxima start to be forgotten: more than most trainings have photos
 PAIR_BYTES = 64  # per pair, in the frame and its backward pass
@@ -45,7 +45,7 @@ class FrameAllocation:
 
     Attributes:
         capacity: Number of pairs that it holds at a time.
-        passes: Number of chunks that the whole device processes.
+        passes: Number of chunks that get launches of their own.
     """
 
     capacity: int
@@ -73,7 +73,7 @@ class PendingFacts:
     """Facts being copied from the device.
 
     Args:
-        memory: The frame's memory, which begins with the facts; the frame is enqueued on the current stream.
+        memory: The frame's memory, which begins with the facts; the frame is enqueued on its device's current stream.
         size: Size of the frame.
         capacity: Capacity of the frame.
     """
@@ -86,7 +86,7 @@ class PendingFacts:
         self._numbers.copy_(memory[: 8 * numbers].view(torch.int64), non_blocking=True)
         self._event = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
         if self._event is not None:
-            self._event.record()
+            self._event.record(torch.cuda.current_stream(memory.device))
 
     def arrived(self) -> bool:
         """Whether the facts can be read without waiting."""

@@ -41,7 +41,7 @@ class CudaFrame:
         parameters: The rendered parameters, in the order of ``PARAMETERS``.
         memory: The frame's memory.
         capacity: Number of pairs that it holds at a time.
-        passes: Number of chunks that the whole device processes.
+        passes: Number of chunks that get launches of their own.
     """
 
     kernels: CudaKernels
@@ -156,20 +156,20 @@ class UnfinishedBackward:
     logits_are_leaf: bool
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
-        """Whether the pass can be fused with a step: of the rendered parameters, without other gradients."""
+        """Whether the pass can be fused with a step: of all or the first rendered rows, without other gradients."""
         if tuple(parameters) != PARAMETERS:
             return False
         rendered = dict(zip(PARAMETERS, self.frame.parameters, strict=True))
         stepped = [name for name in PARAMETERS if self.logits_are_leaf or name != "opacity_logits"]
         same = all(
-            parameters[name].data_ptr() == rendered[name].data_ptr() and len(parameters[name]) == len(rendered[name])
+            parameters[name].data_ptr() == rendered[name].data_ptr() and len(parameters[name]) <= len(rendered[name])
             for name in stepped
         )
         alone = all(parameters[name].grad is None for name in stepped)
         return same and alone and (visible is None or visible.data_ptr() == self.visible.data_ptr())
 
     def step(self, step: SplatStep, logits: Tensor) -> None:
-        """Finish the pass and step the parameters; the probe gets its gradient.
+        """Finish the pass and step the parameters; the probe gets their gradient, and zeros for other rows.
 
         Args:
             step: Adam's step; its logit fields are filled in here.
@@ -180,7 +180,9 @@ class UnfinishedBackward:
             step.logit_gain = self.frame.kernels.at(logits.grad)
             step.logits = self.frame.kernels.at(self.frame.parameters[PARAMETERS.index("opacity_logits")])
         self.frame.step(self.back, step, self.means2d)
-        if self.probe is not None:
+        if self.probe is not None and self.means2d is not None:
+            if step.rows < len(self.means2d):
+                self.means2d[step.rows :] = 0.0
             self.probe.grad = self.means2d
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:

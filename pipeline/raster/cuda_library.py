@@ -12,7 +12,7 @@ from ctypes import c_char_p, c_int32, c_int64
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.errors import CARD_HINT, MachineError
 from splatpipe.pipeline.raster.cuda_api import ABI, CALLS, NO_KERNEL, SIZES, SplatDevice
 from splatpipe.pipeline.raster.cuda_driver import driver, driver_release
 
@@ -100,7 +100,7 @@ class CudaLibrary:
         if code > 0:
             raise MachineError(
                 f"The graphics card failed in {name}: {self.error(code)}.",
-                hint="Run the command again: it resumes from its last checkpoint. --device cpu does not use the card.",
+                hint=CARD_HINT,
             )
 
     def error(self, code: int) -> str:

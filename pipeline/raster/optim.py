@@ -181,6 +181,7 @@ class Adam:
             values=kernels.rows([parameters[name] for name in PARAMETERS]),
             means=kernels.rows([self.mean[name] for name in PARAMETERS]),
             squares=kernels.rows([self.square[name] for name in PARAMETERS]),
+            rows=len(self),
             rate_sh_rest=float(sh[-1]),
             epsilon=self.epsilon,
             step=self.step_count,

@@ -17,6 +17,12 @@ Gradients are never stored. On a CUDA device density control moves one tensor at
 | **training state** | **720** |
 | a frame with its pairs in the smallest chunks (see `frame.h`), radii, screen-space gradients | 201 |
 | or, later, density control: a copy of SH, positions, scores, an index and its sort | 320 |
+
+| per frozen Gaussian around a block on a CUDA device | bytes |
+|---|---|
+| parameters | 236 |
+| a frame | 201 |
+| or, later, density control: a copy | 236 |
 """
 
 from __future__ import annotations
@@ -29,6 +35,7 @@ STATE_COPIES = 3  # a parameter and its two moments
 STATISTICS_BYTES = 12
 PEAK_SHARE = 0.8  # of the state: a frame of all, or density control's copies; measured: 0.6 to 0.76, with waste
 PIXEL_BYTES = 300  # per pixel of an iteration: three photos read ahead, render and loss, with gradients
+FRAME_BYTES = 201  # of a CUDA device's frame
 DEVICE_PASSING_BYTES = 320  # transient: the larger of a frame and density control
 FIXED_BYTES = 120_000_000  # buffers of the kernels, torch and decoders, whatever the size
 
@@ -58,6 +65,11 @@ def bytes_per_gaussian(sh_degree: int) -> int:
 def device_bytes_per_gaussian(sh_degree: int) -> int:
     """The same on a CUDA device."""
     return STATE_COPIES * FLOAT_BYTES * numbers_of(sh_degree) + STATISTICS_BYTES + DEVICE_PASSING_BYTES
+
+
+def device_frozen_passing_bytes(sh_degree: int) -> int:
+    """Transient memory per frozen Gaussian on a CUDA device, bytes: a frame, or density control's copy."""
+    return max(FRAME_BYTES, FLOAT_BYTES * numbers_of(sh_degree))
 
 
 def window_within(room_bytes: int, window_pixels: int) -> int:

@@ -16,6 +16,7 @@ from splatpipe.pipeline.train.limits import (
     PIXEL_BYTES,
     bytes_per_gaussian,
     device_bytes_per_gaussian,
+    device_frozen_passing_bytes,
     window_within,
 )
 from splatpipe.pipeline.train.options import TrainConfig
@@ -63,15 +64,21 @@ def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bo
     return plan.of(plan.options.model_copy(update={"max_gaussians": cap}))
 
 
-def within_room(wanted: int, gaussians: Gaussians) -> int:
+def within_room(wanted: int, gaussians: Gaussians, frozen: int = 0) -> int:
     """Number of Gaussians, at most ``wanted``, that fit in the free memory of their device; ``wanted`` on the CPU.
 
     If it is fewer, growth ends for the rest of the training and its checkpoints, and that is reported.
+
+    Args:
+        wanted: Number of trained Gaussians.
+        gaussians: The trained Gaussians now.
+        frozen: Number of those rendered around them.
     """
     free, count = free_bytes(gaussians.means.device), len(gaussians)
     if free is None:
         return wanted
-    passing = DEVICE_PASSING_BYTES * count  # existing Gaussians already have their state
+    # All of them already have what they hold between two iterations.
+    passing = DEVICE_PASSING_BYTES * count + device_frozen_passing_bytes(gaussians.sh_degree) * frozen
     more = (free - passing) // device_bytes_per_gaussian(gaussians.sh_degree)
     return min(wanted, count + max(0, int(more)))
 

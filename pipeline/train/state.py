@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatpipe.pipeline.engine.errors import card_fault
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.device import CPU, take_rows
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
@@ -191,7 +192,7 @@ class TrainState:
                 limit = 0
                 if not self.history.growth_ended:
                     wanted = room_at(density, plan.initial_gaussians, iteration)
-                    limit = within_room(wanted, self.gaussians)
+                    limit = within_room(wanted, self.gaussians, len(self.drawn) - len(self.gaussians))
                     self.history.growth_ended = iteration if limit < wanted else 0
                 self._densify(plan, limit, iteration)
             elif not self.history.flat_at:
@@ -305,6 +306,7 @@ class TrainState:
         Raises:
             BrokenCheckpointError: if something is missing or does not match.
             torch.OutOfMemoryError: if the device has no room for it; the checkpoint itself is fine then.
+            RuntimeError: if the graphics card failed; likewise.
         """
         try:
             tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
@@ -320,6 +322,8 @@ class TrainState:
         except torch.OutOfMemoryError:
             raise
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            if card_fault(error) is not None:  # the checkpoint is fine, and must not be replaced
+                raise
             raise BrokenCheckpointError(f"it is incomplete ({error})") from error
         return state
 

@@ -86,6 +86,8 @@ def load(library: Path) -> ctypes.CDLL:
     loaded.harness_message.restype = ctypes.c_char_p
     loaded.harness_launches.restype = ctypes.c_int64
     loaded.harness_switches.restype = ctypes.c_int64
+    loaded.harness_switches_alone.restype = ctypes.c_int64
+    loaded.harness_used.argtypes, loaded.harness_used.restype = [ctypes.c_int], ctypes.c_int64
     return loaded
 
 

@@ -18,6 +18,9 @@ namespace harness {
 namespace {
 
 constexpr int kMaxThreads = 1024, kMaxWarps = kMaxThreads / kLanes;
+constexpr int kMaxTogether = 40;  // blocks of a cooperative launch
+constexpr int kMaxFibers = kMaxTogether * kMaxThreads / 4;
+constexpr int kDevices = 2;
 constexpr size_t kStackBytes = 128 << 10;  // a thread's; kernels keep a few hundred floats
 constexpr size_t kPage = 4096;
 constexpr size_t kGuardBytes = 64;         // beside every piece of shared memory
@@ -47,12 +50,13 @@ struct Meeting {
     int arrived, predicates;
 };
 
-// The one block that runs.
+// The block that runs.
 struct Block {
     const char* kernel;
     void (*body)(const void*);
     const void* context;
     int threads, warps, ended;
+    bool together;  // with all others of its launch, which may wait for each other
     bool failed;
     Warp warp[kMaxWarps];
     Meeting meeting;
@@ -63,13 +67,17 @@ struct Block {
 
 Settings settings;
 Block block;
-Fiber host, fibers[kMaxThreads];
-int started = 0;  // fibers that have a stack
+Fiber host, all_fibers[kMaxFibers];
+Fiber* fibers = all_fibers;  // the block's
+int started = 0;             // fibers that have a stack
 char* stacks = nullptr;
-alignas(256) char arena[kArenaBytes];
+alignas(256) char arenas[kMaxTogether][kArenaBytes];
+char* arena = arenas[0];  // the block's
 cudaError_t last_error = cudaSuccess;
 char message[1024] = "";
-int64_t launches = 0, switches = 0;
+int64_t launches = 0, switches = 0, switches_alone = 0;
+int64_t used[kDevices] = {};  // launches and other work
+thread_local int current_device = 0;
 uint64_t random_state = 0;
 
 uint32_t random_number() {  // SplitMix64
@@ -95,8 +103,8 @@ const char* name_of(Operation operation) {
 }
 
 const char* name_of(Barrier barrier) {
-    static const char* const names[] = {"__syncthreads", "__syncthreads_count", "__syncthreads_or",
-                                        "__syncthreads_and"};
+    static const char* const names[] = {"__syncthreads", "__syncthreads_count", "__syncthreads_or", "__syncthreads_and",
+                                        "sync_grid"};
     return names[static_cast<int>(barrier)];
 }
 
@@ -177,16 +185,22 @@ void explain_deadlock() {
              name_of(block.meeting.barrier), base_name(block.meeting.place.file), block.meeting.place.line, ended);
 }
 
+bool all_have_met() { return block.meeting.arrived == block.threads; }
+bool waits_for_grid() { return all_have_met() && block.meeting.barrier == Barrier::grid; }
+
+// The warp that runs first after a barrier.
+int pass_barrier() {
+    finish_barrier();
+    return choose_warp(settings.order == shuffled_by_seed ? -1 : settings.order == forward ? 0 : block.warps - 1);
+}
+
 // Switches to the next runnable thread; to the host if there is none.
 void go_on() {
     const int here = static_cast<int>(threadIdx.x);
     int warp = choose_warp(here / kLanes);
-    if (warp < 0 && block.meeting.arrived == block.threads) {
-        finish_barrier();
-        warp = choose_warp(settings.order == shuffled_by_seed ? -1 : settings.order == forward ? 0 : block.warps - 1);
-    }
+    if (warp < 0 && all_have_met() && !waits_for_grid()) warp = pass_barrier();
     if (warp < 0) {
-        if (block.ended < block.threads) explain_deadlock();
+        if (block.ended < block.threads && !waits_for_grid()) explain_deadlock();
         fibers[here].go_to(host);
         return;
     }
@@ -208,18 +222,19 @@ void live() {
     }
 }
 
-void start_fibers() {
+void start_fibers(int count) {
     if (!stacks) {
-        void* memory = mmap(nullptr, kStackBytes * kMaxThreads, PROT_READ | PROT_WRITE,
+        void* memory = mmap(nullptr, kStackBytes * kMaxFibers, PROT_READ | PROT_WRITE,
                             MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
         stacks = static_cast<char*>(memory);
-        for (int thread = 0; thread < kMaxThreads; ++thread)
-            mprotect(stacks + thread * kStackBytes, kPage, PROT_NONE);  // an overflow ends the process
     }
-    // Stacks begin in different sets of the cache, or the threads of a block would drive each other out.
-    for (int thread = 0; thread < block.threads; ++thread)
-        fibers[thread].start(stacks + thread * kStackBytes, kStackBytes - thread * 5 % 64 * 64, live);
-    started = block.threads;
+    for (int thread = 0; thread < count; ++thread) {
+        char* stack = stacks + thread * kStackBytes;
+        mprotect(stack, kPage, PROT_NONE);  // an overflow ends the process
+        // Stacks begin in different sets of the cache, or the threads of a block would drive each other out.
+        all_fibers[thread].start(stack, kStackBytes - thread * 5 % 64 * 64, live);
+    }
+    started = count;
 }
 
 void poison(size_t begin, size_t end) {
@@ -240,6 +255,14 @@ void check_guards() {
     }
 }
 
+// Runs the block from a warp on, to its end or to the grid's barrier.
+void run_from(int warp) {
+    const int thread = warp * kLanes + choose(block.warp[warp].ready);
+    enter(thread);
+    host.go_to(fibers[thread]);
+    if (!block.failed && block.ended == block.threads) check_guards();
+}
+
 void run_block(unsigned number) {
     blockIdx = {number, 0, 0};
     block.ended = 0, block.meeting.arrived = 0;
@@ -249,11 +272,7 @@ void run_block(unsigned number) {
         block.warp[w].ready = lanes == kLanes ? ~0u : (1u << lanes) - 1;
         block.warp[w].waiting = block.warp[w].at_barrier = block.warp[w].ended = 0;
     }
-    const int first = choose_warp(-1) * kLanes;
-    const int thread = first + choose(block.warp[first / kLanes].ready);
-    enter(thread);
-    host.go_to(fibers[thread]);
-    if (!block.failed) check_guards();
+    run_from(choose_warp(-1));
 }
 
 // A permutation of 0..count-1: a step coprime to the count.
@@ -267,6 +286,39 @@ struct Permutation {
     }
     uint64_t at(uint64_t i) const { return (begin + i * (step % count)) % count; }
 };
+
+// The blocks of a cooperative launch, each with fibers and shared memory of its own: in turns, all of them up to the
+// grid's next barrier, before the first goes on.
+void run_together(int count) {
+    std::vector<Block> blocks(static_cast<size_t>(count), block);
+    for (bool begun = false;; begun = true) {
+        const Permutation order(static_cast<uint64_t>(count));
+        int ended = 0;
+        const Meeting* met = nullptr;
+        for (int i = 0; i < count; ++i) {
+            const auto number = static_cast<unsigned>(order.at(static_cast<uint64_t>(i)));
+            fibers = all_fibers + number * block.threads, arena = arenas[number];
+            block = blocks[number], blockIdx = {number, 0, 0};
+            if (begun)
+                run_from(pass_barrier());
+            else
+                run_block(number);
+            if (block.failed) return;
+            blocks[number] = block;
+            ended += block.ended == block.threads;
+            const Meeting& meeting = blocks[number].meeting;
+            if (block.ended < block.threads && met && met->place.line != meeting.place.line)
+                return fail("blocks meet at different barriers of the grid, %s:%d and %s:%d",
+                            base_name(met->place.file), met->place.line, base_name(meeting.place.file),
+                            meeting.place.line);
+            if (block.ended < block.threads) met = &meeting;
+        }
+        if (ended == count) return;
+        if (ended > 0)
+            return fail("%d of %d blocks have returned, and the others wait for the grid at %s:%d", ended, count,
+                        base_name(met->place.file), met->place.line);
+    }
+}
 
 // Whether all lanes of a request's mask agree; reports an error if not.
 bool agree(const Warp& warp, const Request& request) {
@@ -305,6 +357,11 @@ uint64_t at_warp(const Request& request, uint64_t value, int argument) {
 
 int at_barrier(Barrier barrier, int predicate, Place place) {
     Meeting& meeting = block.meeting;
+    if (barrier == Barrier::grid && !block.together) {
+        fail("block %u waits for the grid at %s:%d in a launch that is not cooperative", blockIdx.x,
+             base_name(place.file), place.line);
+        abandon();
+    }
     if (meeting.arrived == 0) {
         meeting = {barrier, place, 0, 0};
     } else if (meeting.barrier != barrier || meeting.place.line != place.line) {
@@ -337,10 +394,11 @@ void* shared(const void* site, size_t bytes, const char* name) {
     return arena + begin;
 }
 
-void run(const char* kernel, int64_t blocks, int threads, void (*body)(const void*), const void* context) {
+void run(const char* kernel, int64_t blocks, int threads, bool together, void (*body)(const void*),
+         const void* context) {
     static std::mutex one_at_a_time;  // autograd calls from threads of its own
     const std::lock_guard<std::mutex> lock(one_at_a_time);
-    block.kernel = kernel, block.body = body, block.context = context;
+    block.kernel = kernel, block.body = body, block.context = context, block.together = together;
     block.threads = threads, block.warps = (threads + kLanes - 1) / kLanes;
     if (last_error != cudaSuccess) return;  // as after a real error, nothing runs until the error is queried
     if (blocks < 1 || blocks > INT32_MAX || threads < 1 || threads > kMaxThreads) {
@@ -348,17 +406,31 @@ void run(const char* kernel, int64_t blocks, int threads, void (*body)(const voi
                threads);
         return;
     }
-    ++launches;
-    random_state = settings.seed ^ static_cast<uint64_t>(launches);
-    if (started != threads || block.failed) start_fibers();
+    if (together && (blocks > settings.multiprocessors * together_each() || blocks * threads > kMaxFibers)) {
+        record(cudaErrorCooperativeLaunchTooLarge, "%lld blocks do not fit on the device together",
+               static_cast<long long>(blocks));
+        return;
+    }
+    ++launches, ++used[current_device];
+    random_state = settings.seed * 0xd1342543de82ef95u + static_cast<uint64_t>(launches);
+    const int needed = together ? static_cast<int>(blocks) * threads : threads;
+    if (started < needed || block.failed) start_fibers(needed);
     block.failed = false;
     blockDim = {static_cast<unsigned>(threads), 1, 1}, gridDim = {static_cast<unsigned>(blocks), 1, 1};
-    const Permutation order(static_cast<uint64_t>(blocks));
-    for (int64_t i = 0; i < blocks && !block.failed; ++i)
-        run_block(static_cast<unsigned>(order.at(static_cast<uint64_t>(i))));
+    const int64_t before = switches;
+    if (together) {
+        run_together(static_cast<int>(blocks));
+        fibers = all_fibers, arena = arenas[0];
+    } else {
+        const Permutation order(static_cast<uint64_t>(blocks));
+        for (int64_t i = 0; i < blocks && !block.failed; ++i)
+            run_block(static_cast<unsigned>(order.at(static_cast<uint64_t>(i))));
+    }
+    if (blocks == 1) switches_alone += switches - before;
 }
 
 int fault() { return settings.fault; }
+int together_each() { return 2 * settings.multiprocessors <= kMaxTogether ? 2 : 1; }
 
 }  // namespace harness
 
@@ -366,17 +438,29 @@ cudaError_t cudaPeekAtLastError() { return harness::last_error; }
 cudaError_t cudaGetLastError() { return std::exchange(harness::last_error, cudaSuccess); }
 const char* cudaGetErrorString(cudaError_t error) { return error == cudaSuccess ? "no error" : harness::message; }
 const char* cudaGetErrorName(cudaError_t error) { return cudaGetErrorString(error); }
-cudaError_t cudaGetDevice(int* device) { return *device = 0, cudaSuccess; }
-cudaError_t cudaGetDeviceCount(int* count) { return *count = 1, cudaSuccess; }
+cudaError_t cudaGetDevice(int* device) { return *device = harness::current_device, cudaSuccess; }
+cudaError_t cudaGetDeviceCount(int* count) { return *count = harness::kDevices, cudaSuccess; }
+static cudaError_t is_device(int device) {
+    return device >= 0 && device < harness::kDevices ? cudaSuccess : cudaErrorInvalidDevice;
+}
+cudaError_t cudaSetDevice(int device) {
+    if (const cudaError_t error = is_device(device)) return error;
+    return harness::current_device = device, cudaSuccess;
+}
+cudaError_t cudaMemsetAsync(void* at, int value, size_t bytes, cudaStream_t) {
+    ++harness::used[harness::current_device];
+    if (bytes > 0) memset(at, value, bytes);
+    return cudaSuccess;
+}
 cudaError_t cudaGetDeviceProperties(cudaDeviceProp* properties, int device) {
     *properties = {"CPU (the tests' harness)", size_t{8} << 30, harness::settings.multiprocessors, 8, 0};
-    return cudaSetDevice(device);
+    return is_device(device);
 }
 cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, int device) {
     *value = attribute == cudaDevAttrMultiProcessorCount      ? harness::settings.multiprocessors
              : attribute == cudaDevAttrComputeCapabilityMajor ? 8
                                                               : 0;
-    return cudaSetDevice(device);
+    return is_device(device);
 }
 cudaError_t cudaMemGetInfo(size_t* unused, size_t* total) {
     return *unused = size_t{6} << 30, *total = size_t{8} << 30, cudaSuccess;
@@ -394,3 +478,5 @@ HARNESS_API void harness_fault(int fault) { harness::settings.fault = fault; }
 HARNESS_API const char* harness_message() { return harness::message; }
 HARNESS_API int64_t harness_launches() { return harness::launches; }
 HARNESS_API int64_t harness_switches() { return harness::switches; }
+HARNESS_API int64_t harness_switches_alone() { return harness::switches_alone; }  // in launches of one block
+HARNESS_API int64_t harness_used(int device) { return harness::used[device]; }

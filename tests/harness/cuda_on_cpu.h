@@ -31,7 +31,7 @@ struct Index {
 };
 
 enum class Operation : int { syncwarp, shuffle, shuffle_up, shuffle_down, shuffle_xor, ballot, any, all, match };
-enum class Barrier : int { plain, count, any, all };
+enum class Barrier : int { plain, count, any, all, grid };
 
 // Where a thread waits: the same line, or the threads do not meet.
 struct Place {
@@ -50,17 +50,20 @@ HARNESS_LOCAL uint64_t at_warp(const Request& request, uint64_t value, int argum
 HARNESS_LOCAL int at_barrier(Barrier barrier, int predicate, Place place);
 HARNESS_LOCAL int fault();  // the active one of the faults planted in the sources, 0: none
 HARNESS_LOCAL void* shared(const void* site, size_t bytes, const char* name);
-HARNESS_LOCAL void run(const char* kernel, int64_t blocks, int threads, void (*body)(const void*), const void* context);
+HARNESS_LOCAL int together_each();  // blocks that a multiprocessor holds at once
+HARNESS_LOCAL void run(const char* kernel, int64_t blocks, int threads, bool together, void (*body)(const void*),
+                       const void* context);
 
 template <class... Values, class... Arguments>
-void launch(const char* name, void (*kernel)(Values...), int64_t blocks, int threads, const Arguments&... arguments) {
+void launch(const char* name, void (*kernel)(Values...), int64_t blocks, int threads, bool together,
+            const Arguments&... arguments) {
     struct Context {
         void (*kernel)(Values...);
         std::tuple<Values...> values;
     } context{kernel, std::tuple<Values...>(arguments...)};
     static_assert(sizeof(context.values) <= 4096, "CUDA passes at most 4 KiB to a kernel");
     run(
-        name, blocks, threads,
+        name, blocks, threads, together,
         [](const void* it) {
             const auto* c = static_cast<const Context*>(it);
             std::apply(c->kernel, c->values);
@@ -106,7 +109,9 @@ constexpr int warpSize = 32;
         }(),                                            \
         sizeof(Type), #name))
 #define SPLAT_LAUNCH(kernel, blocks, stream, ...) \
-    ((void)(stream), ::harness::launch(#kernel, kernel, (blocks), ::splat::cuda::kThreads, __VA_ARGS__))
+    ((void)(stream), ::harness::launch(#kernel, kernel, (blocks), ::splat::cuda::kThreads, false, __VA_ARGS__))
+#define SPLAT_LAUNCH_TOGETHER(kernel, blocks, stream, ...) \
+    ((void)(stream), ::harness::launch(#kernel, kernel, (blocks), ::splat::cuda::kThreads, true, __VA_ARGS__))
 
 // Synchronisation and warps.
 #define HARNESS_PLACE const char *file = __builtin_FILE(), int line = __builtin_LINE()
@@ -121,6 +126,7 @@ inline int __syncthreads_or(int predicate, HARNESS_PLACE) {
 inline int __syncthreads_and(int predicate, HARNESS_PLACE) {
     return harness::at_barrier(harness::Barrier::all, predicate, {file, line});
 }
+inline void sync_grid(HARNESS_PLACE) { harness::at_barrier(harness::Barrier::grid, 0, {file, line}); }
 inline void __syncwarp(unsigned mask = 0xffffffffu, HARNESS_PLACE) {
     harness::at_warp({harness::Operation::syncwarp, warpSize, mask, {file, line}}, 0, 0);
 }
@@ -329,7 +335,8 @@ HARNESS_VECTORS(unsigned long long, ulonglong)
 using cudaStream_t = void*;
 using cudaError_t = int;
 constexpr cudaError_t cudaSuccess = 0, cudaErrorInvalidValue = 1, cudaErrorInvalidConfiguration = 9,
-                      cudaErrorLaunchFailure = 719;
+                      cudaErrorInvalidDevice = 101, cudaErrorLaunchFailure = 719,
+                      cudaErrorCooperativeLaunchTooLarge = 720;
 enum cudaMemcpyKind { cudaMemcpyHostToHost, cudaMemcpyHostToDevice, cudaMemcpyDeviceToHost, cudaMemcpyDeviceToDevice };
 enum cudaDeviceAttr {
     cudaDevAttrMultiProcessorCount,
@@ -357,13 +364,10 @@ HARNESS_LOCAL cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attr
 HARNESS_LOCAL cudaError_t cudaMemGetInfo(size_t* unused, size_t* total);
 HARNESS_LOCAL cudaError_t cudaDriverGetVersion(int* version);
 HARNESS_LOCAL cudaError_t cudaRuntimeGetVersion(int* version);
-inline cudaError_t cudaSetDevice(int device) { return device == 0 ? cudaSuccess : cudaErrorInvalidValue; }
+HARNESS_LOCAL cudaError_t cudaSetDevice(int device);
 inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return cudaSuccess; }
 inline cudaError_t cudaDeviceSynchronize() { return cudaSuccess; }
-inline cudaError_t cudaMemsetAsync(void* at, int value, size_t bytes, cudaStream_t = nullptr) {
-    if (bytes > 0) memset(at, value, bytes);
-    return cudaSuccess;
-}
+HARNESS_LOCAL cudaError_t cudaMemsetAsync(void* at, int value, size_t bytes, cudaStream_t = nullptr);
 inline cudaError_t cudaMemcpyAsync(void* to, const void* from, size_t bytes, cudaMemcpyKind, cudaStream_t = nullptr) {
     if (bytes > 0) memmove(to, from, bytes);
     return cudaSuccess;
@@ -375,6 +379,6 @@ cudaError_t cudaFuncGetAttributes(cudaFuncAttributes* attributes, Kernel*) {
 }
 template <class Kernel>
 cudaError_t cudaOccupancyMaxActiveBlocksPerMultiprocessor(int* blocks, Kernel*, int, size_t) {
-    *blocks = 1;
+    *blocks = harness::together_each();
     return cudaSuccess;
 }

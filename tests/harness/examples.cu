@@ -1,5 +1,5 @@
 // Kernels that do what test_cuda_harness.py says of them, rightly and wrongly.
-#include "device.h"
+#include "grid.cuh"
 
 namespace splat {
 namespace cuda {
@@ -48,6 +48,32 @@ __global__ void reuse(float* out, int met) {
 __global__ void read_neighbour(float* out) {
     if (threadIdx.x != 0) return;
     out[blockIdx.x] = blockIdx.x == 0 ? 1.0f : out[blockIdx.x - 1] + 1.0f;
+}
+
+// Three rounds in which a block adds what the next one has written; with `met`, all wait for each other.
+__global__ void add_next_block(float* sums, int met) {
+    SPLAT_SHARED(Values, shared);
+    shared.of[threadIdx.x] = static_cast<float>(blockIdx.x);  // stays the block's own
+    __syncthreads();
+    for (int round = 0; round < 3; ++round) {
+        if (threadIdx.x == 255) sums[blockIdx.x] = shared.of[0] + static_cast<float>(round);
+        if (met) sync_grid();
+        const float next = sums[(blockIdx.x + 1) % gridDim.x];
+        if (met) sync_grid();
+        __syncthreads();
+        shared.of[threadIdx.x] += next;
+        __syncthreads();
+    }
+    if (threadIdx.x == 0) sums[blockIdx.x] = shared.of[0];
+}
+
+// Blocks that do not all come to the grid's barrier, or not to the same.
+__global__ void miss_grid(int which) {
+    if (which == 0 && blockIdx.x == 1) return;
+    if (which == 1 && blockIdx.x == 1) sync_grid();
+    if (which == 2 && threadIdx.x == 7) return;
+    sync_grid();
+    if (which == 1 && blockIdx.x != 1) sync_grid();
 }
 
 // Who comes first gets the lowest number.
@@ -135,6 +161,18 @@ EXAMPLE example_read_neighbour(float* out, int blocks) {
     SPLAT_LAUNCH(read_neighbour, blocks, nullptr, out);
     return cudaGetLastError();
 }
+EXAMPLE example_add_next_block(float* sums, int blocks, int met) {
+    SPLAT_LAUNCH_TOGETHER(add_next_block, blocks, nullptr, sums, met);
+    return cudaGetLastError();
+}
+EXAMPLE example_miss_grid(int which, int together) {
+    if (together)
+        SPLAT_LAUNCH_TOGETHER(miss_grid, 3, nullptr, which);
+    else
+        SPLAT_LAUNCH(miss_grid, 3, nullptr, which);
+    return cudaGetLastError();
+}
+EXAMPLE example_together(void) { return static_cast<int>(blocks_together(miss_grid)); }
 EXAMPLE example_take_numbers(int* counter, int* out) {
     SPLAT_LAUNCH(take_numbers, 1, nullptr, counter, out);
     return cudaGetLastError();

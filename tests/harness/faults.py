@@ -135,6 +135,30 @@ FAULTS = (
         "if (FAULT) return;\n        bin_chunk(job, chunk);\n        blend_tiles<kDepth>",
     ),
     KernelFault(
+        "no barrier of the grid between counting and scanning the pairs that nobody foresaw",
+        "frame.cu",
+        "sync_grid();\n    if (blockIdx.x == 0) scan_pairs(job);",
+        "if (!FAULT) sync_grid();\n    if (blockIdx.x == 0) scan_pairs(job);",
+    ),
+    KernelFault(
+        "no barrier of the grid before the lists that nobody foresaw are blended",
+        "frame.cu",
+        "scatter_digits(tile_pass(job.at, pass));\n    }\n    sync_grid();",
+        "scatter_digits(tile_pass(job.at, pass));\n    }\n    if (!FAULT) sync_grid();",
+    ),
+    KernelFault(
+        "no barrier of the grid between gradients that nobody foresaw and their sums",
+        "frame.cu",
+        "sync_grid();\n        sum_slots<kDepth>(job, chunk);",
+        "if (!FAULT) sync_grid();\n        sum_slots<kDepth>(job, chunk);",
+    ),
+    KernelFault(
+        "no barrier of the grid before the next chunk that nobody foresaw",
+        "frame.cu",
+        "sum_slots<kDepth>(job, chunk);\n        sync_grid();",
+        "sum_slots<kDepth>(job, chunk);\n        if (!FAULT) sync_grid();",
+    ),
+    KernelFault(
         "the last Gaussian's slots end where they begin",
         "blend_back.cuh",
         "job.at.offsets[rank + 1] : header.chunk_pairs;",
@@ -211,6 +235,12 @@ FAULTS = (
         "step.cu",
         "sh_count); });\n        __syncthreads();",
         "sh_count); });\n        if (!FAULT) __syncthreads();",
+    ),
+    KernelFault(
+        "Gaussians around those that are trained step, too",
+        "step.cu",
+        "const int64_t n = step.rows;",
+        "const int64_t n = FAULT ? job.model.count : step.rows;",
     ),
     KernelFault(
         "Gaussians that are not visible step, too",

@@ -71,6 +71,7 @@ def step_complaints(library: CudaLibrary, case: RenderCase, exact: RenderOutcome
     }
     skipped = frame.at.put("skipped", np.zeros(1, np.int64))
     step = SplatStep(*map(rows_of, now.values()), rate_sh_rest=RATE_SH_REST, skipped=pointer(skipped), sparse=1)
+    step.rows = case.count
     step.rates[:] = list(RATES.values())
     step.beta1, step.beta2, step.epsilon, step.step = *BETAS, EPSILON, COUNT
     step.log_scale_min, step.log_scale_max = SCALES

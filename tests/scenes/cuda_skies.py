@@ -4,6 +4,7 @@ import numpy as np
 import skies
 import torch
 from torch import Tensor
+from waiting import never_waiting
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render
@@ -28,14 +29,11 @@ def composed(camera: Camera, mask: Tensor | None, device: torch.device = CPU) ->
     alpha = torch.rand(shape, generator=generator).to(device).requires_grad_()
     weight = torch.rand(*shape, 3, generator=generator).to(device)
     none, mask = torch.zeros(0, device=device), None if mask is None else mask.to(device)
-    if device.type == "cuda":
-        torch.cuda.set_sync_debug_mode("error")
-    rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
-    seen = None if mask is None else PhotoSky(mask, mask | mask.roll(1, 0))
-    picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
-    (weight * picture).sum().backward()
-    if device.type == "cuda":
-        torch.cuda.set_sync_debug_mode("default")
+    with never_waiting(device):
+        rendered = Render(colour, alpha, alpha, alpha, alpha, none.bool(), none)
+        seen = None if mask is None else PhotoSky(mask, mask | mask.roll(1, 0))
+        picture = sky.composite(rendered, camera, seen, BACKGROUND, ELSEWHERE)
+        (weight * picture).sum().backward()
     cells = sky.tensors["colours"].grad
     assert colour.grad is not None and alpha.grad is not None
     found = [picture.detach(), colour.grad, alpha.grad, torch.zeros(()) if cells is None else cells]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, card_fault
 from splatpipe.pipeline.engine.run_folder import Contents
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
@@ -232,8 +233,13 @@ def _render_on_gpu(shown: LoadedModel, camera: Camera) -> Pixels | None:
         return _render(shown, camera, device)
     except (torch.OutOfMemoryError, MachineError):
         return None
+    except RuntimeError as error:
+        if card_fault(error) is None:
+            raise
+        return None
     finally:
-        torch.cuda.empty_cache()  # does nothing if CUDA was not used
+        with suppress(RuntimeError):  # again, of a card that failed
+            torch.cuda.empty_cache()  # does nothing if CUDA was not used
 
 
 def _render(shown: LoadedModel, camera: Camera, device: Device) -> Pixels:

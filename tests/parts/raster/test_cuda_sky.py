@@ -22,7 +22,7 @@ SIZES = [(81, 57), (82, 50), (33, 5), (1, 9)]  # a last node at the last pixel, 
 
 @pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
-    """Where the kernels run; on a real device, nothing may wait."""
+    """Where the kernels run."""
     if request.param == "harness":
         with use_kernels(kernels_on_cpu()):
             yield CPU
@@ -30,7 +30,6 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     if why_not() is not None:
         pytest.skip("no CUDA device")
     yield torch.device("cuda", 0)
-    torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.parametrize("size", SIZES)

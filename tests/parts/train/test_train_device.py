@@ -12,8 +12,10 @@ import torch
 from on_cpu import kernels_on_cpu
 from torch import Tensor
 
-from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.app.command_summary import for_the_user
+from splatpipe.pipeline.engine.errors import EXIT_MACHINE, MachineError, UsageError, card_fault, exit_code
 from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.engine.worker import as_splatpipe_error
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import View
 from splatpipe.pipeline.raster import cuda_driver, cuda_library
@@ -21,7 +23,7 @@ from splatpipe.pipeline.raster import device as devices
 from splatpipe.pipeline.raster.cuda import use_kernels
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows, taken_in_place
 from splatpipe.pipeline.train import limits, memory, planning, state
-from splatpipe.pipeline.train.checkpoint import HostArrays, load_checkpoint, save_checkpoint
+from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, HostArrays, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.densify import DensifiedGaussians, along_curve
 from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.iteration import iterate
@@ -143,13 +145,68 @@ def test_the_cpus_rows_are_copied(monkeypatch: pytest.MonkeyPatch) -> None:
     assert torch.equal(tensors["a"], values[rows])
 
 
+def test_memory_for_growth_counts_the_gaussians_around_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Density control copies their parameters; free memory is what all of them leave between two iterations."""
+    model = tiny_scene.true_model(100)
+    each, around = limits.device_bytes_per_gaussian(3), limits.device_frozen_passing_bytes(3)
+    assert around == 236 and limits.device_frozen_passing_bytes(0) == limits.FRAME_BYTES == 201
+    free = 100 * limits.DEVICE_PASSING_BYTES + 40 * around + 50 * each
+    monkeypatch.setattr(memory, "free_bytes", lambda device: free)
+    assert [memory.within_room(500, model, frozen) for frozen in (40, 41)] == [150, 149]
+    asked: list[int] = []
+    monkeypatch.setattr(state, "within_room", lambda wanted, gaussians, frozen: asked.append(frozen) or wanted)
+    plan = make_small_plan(ALL)
+    training = TrainState.begin(tiny_scene.true_model(), plan, Techniques(), tiny_scene.true_model(70))
+    training.control_density(plan, plan.schedule.density.first)
+    assert asked == [70] and training.whole is not None
+
+
+FAULTS = [
+    "CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be asynchronously reported at ...",
+    "CUDA driver error: unspecified launch failure",
+]
+
+
+@pytest.mark.parametrize("text", FAULTS)
+@pytest.mark.parametrize("kind", [RuntimeError, getattr(torch, "AcceleratorError", RuntimeError)])
+def test_a_fault_of_the_card_says_what_to_do(kind: type[RuntimeError], text: str) -> None:
+    """Torch raises it where it waits next; the error of our own calls reads the same."""
+    for shown in (as_splatpipe_error("train", kind(text)), for_the_user(kind(text))):
+        assert type(shown) is MachineError and exit_code(shown) == EXIT_MACHINE
+        assert shown.message in (
+            "The graphics card failed: an illegal memory access was encountered.",
+            "The graphics card failed: unspecified launch failure.",
+        )
+        assert "resumes from its last checkpoint" in shown.hint and "--device cpu" in shown.hint
+
+
+def test_other_errors_are_not_faults_of_the_card() -> None:
+    for error in (RuntimeError("The size of tensor a"), ValueError("CUDA error: no"), torch.OutOfMemoryError("CUDA")):
+        assert card_fault(error) is None
+    for text in ("CUDA out of memory. Tried to allocate", "CUDA error: out of memory"):
+        assert as_splatpipe_error("train", RuntimeError(text)).message == "The stage train ran out of memory."
+
+
+def test_a_fault_of_the_card_does_not_discard_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = make_small_plan(ALL)
+    saved = TrainState.begin(tiny_scene.true_model(), plan, Techniques()).checkpoint("")
+
+    def failing(said: str) -> TrainState:
+        raise RuntimeError(said)
+
+    for text, expected in ((FAULTS[0], RuntimeError), ("another shape", BrokenCheckpointError)):
+        monkeypatch.setattr(TrainState, "of", staticmethod(lambda *given, text=text: failing(text)))
+        with pytest.raises(expected):
+            TrainState.restore(saved, plan, Techniques())
+
+
 def test_growth_ends_when_the_device_has_no_memory_left(monkeypatch: pytest.MonkeyPatch) -> None:
     model = tiny_scene.true_model(100)
     each = limits.device_bytes_per_gaussian(3)
     for free, room in ((None, 500), (10**9, 500), (100 * limits.DEVICE_PASSING_BYTES + 50 * each, 150), (0, 100)):
         monkeypatch.setattr(memory, "free_bytes", lambda device, free=free: free)
         assert memory.within_room(500, model) == room
-    monkeypatch.setattr(state, "within_room", lambda wanted, gaussians: len(gaussians) + 3)
+    monkeypatch.setattr(state, "within_room", lambda wanted, gaussians, frozen: len(gaussians) + 3)
     plan = make_small_plan(ALL)
     training = TrainState.begin(tiny_scene.true_model(), plan, Techniques())
     training.density.statistics.add(torch.ones(len(training.gaussians)), torch.ones(len(training.gaussians)) > 0.0)

@@ -147,7 +147,7 @@ def test_chunks_do_not_change_a_bit(device: torch.device, most_pairs: int) -> No
     kernels = cuda.kernels_of(device)
     assert kernels is not None
     kernels.forecast.most_pairs = most_pairs
-    for _ in range(2):  # not forecast at first, so that one block does the rest; then forecast
+    for _ in range(2):  # not forecast at first, so that a cooperative launch does the rest; then forecast
         assert digest(everything(scene(), device, depth=False)) == expected
         torch.cuda.synchronize(device)
 

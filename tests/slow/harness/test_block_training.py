@@ -1,5 +1,6 @@
 """A block trained with the CUDA kernels, in the harness."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from on_cpu import kernels_on_cpu
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.raster.cuda import use_kernels
+from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
 from splatpipe.pipeline.splat.ply import read_splat
@@ -45,7 +46,13 @@ def undisturbed(site: SiteParts, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturbed: Path, tmp_path: Path) -> None:
+    """With the fused step, which stores no gradient of a parameter."""
     frozen, models = read_splat(undisturbed / "frozen.ply"), []
+    calls, call = Counter[str](), CudaKernels.call
+
+    def counted(kernels: CudaKernels, name: str, *arguments: object) -> None:
+        calls[name] += 1
+        call(kernels, name, *arguments)
 
     def look(state: TrainState, photo: TrainingPhoto) -> None:
         if state.iteration == 8:  # density control has not acted yet
@@ -60,8 +67,10 @@ def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturb
         for name in ("plan.json", "frozen.ply"):
             (out / name).write_bytes((undisturbed / name).read_bytes())
         with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill), use_kernels(kernels):
+            patch.setattr(CudaKernels, "call", counted)
             step_with(patch, look)
             trained(site, out)
+    assert calls["splat_step"] == calls["splat_forward"] == 8 and calls["splat_project_backward"] == 0
     begun = Block.of(CONFIG, site, TASK, cpu()).start()
     for name in PARAMETERS:
         ours, theirs, before = (getattr(model, name).double() for model in (*models, begun))

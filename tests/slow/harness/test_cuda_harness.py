@@ -10,7 +10,7 @@ import pytest
 from building import FORWARD, HARNESS, REVERSE, SHUFFLED, build_on_cpu, load
 
 THREADS, WARP = 256, 32
-LAUNCH_FAILURE, BAD_CONFIGURATION = 719, 9
+LAUNCH_FAILURE, BAD_CONFIGURATION, TOO_LARGE = 719, 9, 720
 ORDERS = [(FORWARD, 0), (REVERSE, 0), (SHUFFLED, 1), (SHUFFLED, 2)]
 
 
@@ -71,6 +71,51 @@ def test_missing_barrier_before_memory_is_used_again_is_found(examples):
 
 def test_blocks_that_wait_for_each_other_give_other_results_in_other_orders(examples):
     assert distinct(in_every_order(examples, "example_read_neighbour", 40, count=40)) > 1
+
+
+def rounds_of(blocks: int) -> np.ndarray:
+    """What ``example_add_next_block`` gives if blocks wait for each other."""
+    held = np.arange(blocks, dtype=np.float32)
+    for number in range(3):
+        held += np.roll(held + number, -1)
+    return held
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 6])
+def test_blocks_of_a_cooperative_launch_wait_for_each_other(examples, blocks):
+    for result in in_every_order(examples, "example_add_next_block", blocks, 1, count=blocks):
+        np.testing.assert_array_equal(result, rounds_of(blocks))
+
+
+def test_missing_barrier_of_the_grid_is_found(examples):
+    raced = in_every_order(examples, "example_add_next_block", 6, 0, count=6)
+    assert all((result != rounds_of(6)).any() for result in raced)
+    assert distinct(raced) > 1
+
+
+@pytest.mark.parametrize(
+    ("which", "says"),
+    [
+        (0, "1 of 3 blocks have returned, and the others wait for the grid at examples.cu:"),
+        (1, "different barriers of the grid"),
+        (2, "only 255 of 256 threads reached sync_grid"),
+    ],
+)
+def test_blocks_that_do_not_meet_are_reported(examples, which, says):
+    for order, seed in ORDERS:
+        examples.harness_order(order, seed)
+        assert examples.example_miss_grid(which, 1) == LAUNCH_FAILURE
+        assert says in examples.harness_message().decode()
+        assert example_ok(examples, "example_miss_grid", 3, 1)  # the next launch is not affected
+
+
+def test_grids_barrier_needs_a_cooperative_launch_that_fits_the_device(examples):
+    assert examples.example_miss_grid(3, 0) == LAUNCH_FAILURE
+    assert b"in a launch that is not cooperative" in examples.harness_message()
+    most = examples.example_together()
+    sums = np.zeros(most + 1, np.float32)
+    assert example_ok(examples, "example_add_next_block", pointer(sums), most, 1)
+    assert examples.example_add_next_block(pointer(sums), most + 1, 1) == TOO_LARGE
 
 
 def test_order_of_threads_is_as_requested(examples):

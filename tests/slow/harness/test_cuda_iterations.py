@@ -1,7 +1,7 @@
 """Whole iterations on a CUDA device against the CPU's; without one, the kernels' sources on the CPU."""
 
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import pytest
@@ -9,6 +9,7 @@ import torch
 from on_cpu import kernels_on_cpu
 from random_scene import random_camera, random_scene
 from torch import Tensor
+from waiting import never_waiting
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.colour import affine_colour
@@ -42,17 +43,6 @@ class DeviceSetup:
     device: torch.device
     scene: Gaussians
     camera: Camera
-
-    @contextmanager
-    def never_waiting(self) -> Iterator[None]:
-        """Raise where torch would wait for the device."""
-        if self.device.type == "cuda":
-            torch.cuda.set_sync_debug_mode("error")
-        try:
-            yield
-        finally:
-            if self.device.type == "cuda":
-                torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.fixture(params=["harness", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -107,7 +97,7 @@ def train(place: DeviceSetup | None, given: DeviceSetup) -> list[Tensor]:
     scene = given.scene.to(device).detach().clone().requires_grad_()
     affine = torch.eye(3, 4).to(device).requires_grad_()
     optimizer, beside, buffers = Adam(scene.tensors()), Adam({"affine": affine[None]}), GradientBuffers()
-    with use_kernels(None if place is None else place.kernels), place.never_waiting() if place else nullcontext():
+    with use_kernels(None if place is None else place.kernels), never_waiting(device):
         for _ in range(STEPS):
             probe = torch.zeros(len(scene), 2, device=device, requires_grad=True)
             rendered = render(scene, given.camera, RenderOptions(3, depth=False), means2d_probe=probe, buffers=buffers)
@@ -142,3 +132,20 @@ def test_the_device_is_named(place):
         assert kernels is not None
         assert kernels_name(place.device) == kernels.facts.described()
     assert kernels_name(place.device).startswith("cuda sm_") == (place.device.type == "cuda")
+
+
+def test_waiting_is_forbidden_despite_torchs_note_and_allowed_again_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    modes: list[str] = []
+
+    def set_mode(mode: str) -> None:
+        if mode != "default" and not modes:
+            warnings.warn("Synchronization debug mode is a prototype feature", UserWarning, stacklevel=1)
+        modes.append(mode)
+
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", set_mode)
+    with pytest.raises(RuntimeError, match="it waited"), never_waiting(torch.device("cuda", 0)):
+        assert modes == ["error"]
+        raise RuntimeError("it waited")
+    with never_waiting(torch.device("cpu")):
+        pass
+    assert modes == ["error", "default"]

@@ -151,6 +151,19 @@ def test_chunks_and_passes_give_the_same_bits(library: CudaLibrary, name: str) -
     assert len(chunks) > 1 or pairs <= least
 
 
+@pytest.mark.parametrize("passes", [1, 2])
+def test_what_exceeds_the_forecast_is_the_work_of_all_blocks(
+    library: CudaLibrary, as_it_was: ctypes.CDLL, passes: int
+) -> None:
+    """Only prefix sums are one block's; a whole backward pass by one would take seconds on a card."""
+    case, ours, _ = settled(library, "thousands")
+    before = as_it_was.harness_switches(), as_it_was.harness_switches_alone()
+    again = run(library, case, case.count, passes)
+    work, alone = as_it_was.harness_switches() - before[0], as_it_was.harness_switches_alone() - before[1]
+    assert again.facts[2] > passes and again.differs(ours) == []
+    assert alone < 0.25 * work
+
+
 def peeked(frame: DeviceFrame, what: int, kind: type, count: int) -> np.ndarray:
     """A copy of a piece of the frame's memory."""
     harness = controls(frame.library)

@@ -60,6 +60,7 @@ class StepSettings:
     sparse: bool = True
     gain: np.ndarray | None = None
     unaligned: bool = False
+    rows: int | None = None  # of those rendered, all
 
     def moments(self, case: RenderCase) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         rng = np.random.default_rng(8)
@@ -96,6 +97,7 @@ def fused_step(library: CudaLibrary, case: RenderCase, how: StepSettings) -> Ste
     squares = {name: put(frame.at, f"square {name}", squares[name], how.unaligned) for name in PARAMETERS}
     skipped, means2d = np.full(1, 5, np.int64), frame.at.empty("means2d", (case.count, 2))
     step = SplatStep(rows_of(values), rows_of(means), rows_of(squares), rate_sh_rest=SH_REST)
+    step.rows = case.count if how.rows is None else how.rows
     step.rates[:] = list(RATES.values())
     step.beta1, step.beta2, step.epsilon, step.step = *BETAS, EPSILON, STEPS_BEFORE + 1
     step.sparse, step.log_scale_min, step.log_scale_max = int(how.sparse), *LIMITS
@@ -232,6 +234,27 @@ def test_rows_with_gradients_that_are_not_finite_are_left_out_and_counted(librar
     ours = fused_step(library, case, how)
     assert 5 < ours.skipped < case.count / 2
     assert_same(ours, separate_step(library, case, how))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 130, 256, 299])
+def test_step_of_the_first_rows_leaves_the_others_alone(library: CudaLibrary, rows: int) -> None:
+    """Those of a block's training are the first; the others are rendered around it and have no moments."""
+    case = small_case(14)
+    how = StepSettings(rows=rows)
+    ours, whole = fused_step(library, case, how), fused_step(library, case, StepSettings())
+    before = dict(zip(("mean", "square"), how.moments(case), strict=True)) | {"value": case.rows}
+    for name, array in ours.arrays.items():
+        kind, tensor = name.split()
+        assert array[:rows].tobytes() == whole.arrays[name][:rows].tobytes(), name
+        assert array[rows:].tobytes() == before[kind][tensor][rows:].tobytes(), name
+    assert ours.means2d[:rows].tobytes() == whole.means2d[:rows].tobytes()
+    assert np.isnan(ours.means2d[rows:]).all()  # not written
+
+
+@pytest.mark.parametrize("rows", [-1, 301])
+def test_step_refuses_rows_that_were_not_rendered(library: CudaLibrary, rows: int) -> None:
+    with pytest.raises(ValueError, match="splat_step"):
+        fused_step(library, small_case(), StepSettings(rows=rows))
 
 
 def test_step_gives_the_same_bits_in_every_order_of_threads(library: CudaLibrary) -> None:

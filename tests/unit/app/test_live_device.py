@@ -88,6 +88,26 @@ def test_if_the_card_turns_out_full_the_cpu_renders(
     assert card == ["cpu", "cuda", "cpu"]
 
 
+def test_if_the_card_fails_the_cpu_renders(view: View, card: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = pictures(shown(), view, 1, "cpu")
+    watched, said = checkpoint_render.placed, ["CUDA error: unspecified launch failure\nCUDA kernel errors might be"]
+
+    def fails(*given: object) -> None:
+        raise RuntimeError(said[0])
+
+    def failing(model: Model, device: Device) -> Model:
+        there = watched(model, device)
+        return there if device.name == "cpu" else fails()
+
+    monkeypatch.setattr(checkpoint_render, "placed", failing)
+    monkeypatch.setattr(torch.cuda, "empty_cache", fails)
+    assert pictures(shown(), view, 1, "auto") == expected
+    assert card == ["cpu", "cuda", "cpu"]
+    said[0] = "The size of tensor a (3) must match"  # a mistake of ours is not hidden
+    with pytest.raises(RuntimeError, match="size of tensor"):
+        pictures(shown(), view, 1, "auto")
+
+
 def test_the_device_is_that_of_the_training_then_that_of_the_run() -> None:
     assert device_of(Contents(), "cpu") == "cpu"
     done = Artifact(Path("train"), {"machine": {"device": "cpu", "threads": 1}})

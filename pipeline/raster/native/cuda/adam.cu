@@ -2,6 +2,7 @@
 #include "../adam.h"
 #include "frame.h"
 #include "step.cuh"
+#include "stream.h"
 
 namespace splat {
 namespace cuda {
@@ -83,7 +84,9 @@ bool is_sound(const SplatAdam& adam) {
 using namespace splat;
 using namespace splat::cuda;
 
-int32_t splat_adam(const SplatAdam* adam, SplatStream stream) {
+int32_t splat_adam(const SplatAdam* adam, const SplatStream* on) {
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (!adam || !is_sound(*adam)) return SPLAT_BAD_ARGUMENT;
     if (adam->rows == 0 || adam->tensors == 0) return SPLAT_OK;
     const AdamCorrections corrections = corrections_of(adam->beta1, adam->beta2, adam->step);

@@ -15,7 +15,7 @@
 extern "C" {
 #endif
 
-#define SPLAT_CUDA_ABI 3 /* raised with every change of the interface; the caller rejects other versions */
+#define SPLAT_CUDA_ABI 4 /* raised with every change of the interface; the caller rejects other versions */
 #define SPLAT_API __attribute__((visibility("default")))
 
 enum {
@@ -25,7 +25,13 @@ enum {
     SPLAT_NO_KERNEL = -3     /* this binary has no kernel for the device */
 };
 
-typedef void* SplatStream; /* cudaStream_t; null is the default one */
+/* Where a call's kernels run; a null pointer is the default stream of the calling thread's current device. The device
+ * stays the thread's current one for this library. */
+typedef struct {
+    void* stream; /* cudaStream_t, null for the default one */
+    int32_t device;
+    int32_t reserved;
+} SplatStream;
 
 /* The device and the versions. */
 typedef struct {
@@ -81,8 +87,8 @@ typedef struct {
     int64_t back_bytes; /* at least splat_back_bytes */
     int64_t count;      /* number of Gaussians */
     int64_t capacity;   /* Gaussian-tile pairs held at a time, at least `count` */
-    int32_t passes;     /* chunks of tiles processed by the whole device, at least 1; if the view has more, one block
-                               does the rest: the same bits, slowly */
+    int32_t passes;     /* chunks of tiles forecast, at least 1; if the view has more, one more launch does the rest:
+                               the same bits, a little slower */
     int32_t reserved;
 } SplatFrame;
 
@@ -95,16 +101,17 @@ typedef struct {
 
 /* A step of Adam fused with the backward pass of the projection. */
 typedef struct {
-    SplatRows values;         /* stepped in place: the rendered rows, except for opacity_logits' gain */
-    SplatRows means, squares; /* moments, in the same layout */
+    SplatRows values;         /* the rendered rows, except for opacity_logits' gain; stepped in place */
+    SplatRows means, squares; /* moments (rows), in the same layout */
+    int64_t rows;             /* the first of the rendered rows; the others are left as they are */
     float rates[5];           /* of means, log_scales, quats, opacity_logits and SH degree 0; bias-corrected here */
     float rate_sh_rest;       /* of the higher SH degrees */
     double beta1, beta2, epsilon;
     int64_t step;   /* counted from 1 */
-    int32_t sparse; /* only visible rows are stepped; else all */
+    int32_t sparse; /* only the visible of these rows are stepped; else all */
     int32_t reserved;
     float log_scale_min, log_scale_max; /* log_scales are clamped to these after the step */
-    const float* logit_gain;            /* (n) d(rendered logit) / d(logit), null for 1 */
+    const float* logit_gain;            /* (rows) d(rendered logit) / d(logit), null for 1 */
     const float* logits;                /* (n) as rendered, null for values.opacity_logits */
     int64_t* skipped;                   /* counter, added to: visible rows skipped for non-finite gradients */
 } SplatStep;
@@ -148,16 +155,16 @@ SPLAT_API int64_t splat_frame_bytes(const SplatShot* shot, int64_t count, int64_
 SPLAT_API int64_t splat_back_bytes(const SplatShot* shot, int64_t count, int64_t capacity);
 /* Renders. radii (n) and visible (n) uint8 are written whole. */
 SPLAT_API int32_t splat_forward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
-                                const SplatPictures* pictures, float* radii, uint8_t* visible, SplatStream stream);
+                                const SplatPictures* pictures, float* radii, uint8_t* visible, const SplatStream* on);
 /* From images to each Gaussian's screen-space gradients, kept in `back` for one of the next two calls. */
 SPLAT_API int32_t splat_blend_backward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
-                                       const SplatPictureGradients* gradients, SplatStream stream);
+                                       const SplatPictureGradients* gradients, const SplatStream* on);
 /* From there to the parameters: writes every row of `gradients` and of means2d (n, 2). */
 SPLAT_API int32_t splat_project_backward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
-                                         const SplatRows* gradients, float* means2d, SplatStream stream);
-/* The same, fused with a step of Adam; stores no gradient except means2d (n, 2), null if not needed. */
+                                         const SplatRows* gradients, float* means2d, const SplatStream* on);
+/* The same, fused with a step of Adam; stores no gradient except means2d (rows, 2), null if not needed. */
 SPLAT_API int32_t splat_step(const SplatShot* shot, const SplatFrame* frame, const SplatStep* step, float* means2d,
-                             SplatStream stream);
+                             const SplatStream* on);
 
 /* Loss: (1 - w) L1 + w (1 - SSIM) of (h, w, 3) images, masked where `mask` (h, w) uint8 is zero, null for nowhere. Of
  * the unmasked pixels those in `inner` count, null for all; SSIM windows see everything. Writes its gradient for the
@@ -165,35 +172,35 @@ SPLAT_API int32_t splat_step(const SplatShot* shot, const SplatFrame* frame, con
 SPLAT_API int64_t splat_loss_bytes(int32_t width, int32_t height);
 SPLAT_API int32_t splat_photo_loss(const float* render, const float* photo, const uint8_t* mask, int32_t width,
                                    int32_t height, const SplatRectangle* inner, double ssim_weight, float* gradient,
-                                   double* value, void* memory, int64_t bytes, SplatStream stream);
+                                   double* value, void* memory, int64_t bytes, const SplatStream* on);
 
 /* Applies a (3, 4) affine map to the colours of `pixels` pixels; backward for the image and, to map_gradient, the map.
  */
 SPLAT_API int64_t splat_affine_bytes(int64_t pixels);
 SPLAT_API int32_t splat_affine_colour(const float* map, const float* in, int64_t pixels, float* out,
-                                      SplatStream stream);
+                                      const SplatStream* on);
 SPLAT_API int32_t splat_affine_colour_backward(const float* map, const float* in, const float* upstream, int64_t pixels,
                                                float* gradient, float* map_gradient, void* memory, int64_t bytes,
-                                               SplatStream stream);
+                                               const SplatStream* on);
 
 /* The render (h, w, 3) over the sky, and the gradients for its alpha and for the nodes (null: not needed); that for its
  * colour is `upstream`. */
-SPLAT_API int32_t splat_sky(const SplatSky* sky, float* out, SplatStream stream);
+SPLAT_API int32_t splat_sky(const SplatSky* sky, float* out, const SplatStream* on);
 SPLAT_API int32_t splat_sky_backward(const SplatSky* sky, const float* upstream, float* alpha_gradient,
-                                     float* node_gradient, SplatStream stream);
+                                     float* node_gradient, const SplatStream* on);
 
-SPLAT_API int32_t splat_adam(const SplatAdam* adam, SplatStream stream);
+SPLAT_API int32_t splat_adam(const SplatAdam* adam, const SplatStream* on);
 
 /* Density control. Random numbers are those of train/random_numbers.py. */
 SPLAT_API int32_t splat_uniform(uint64_t seed, uint64_t step, uint64_t stream_of_use, int64_t count, double* out,
-                                SplatStream stream);
+                                const SplatStream* on);
 /* Two positions within each parent, relative to its mean, (2 k, 3): all first ones, then all second ones. */
 SPLAT_API int32_t splat_split_offsets(uint64_t seed, uint64_t step, uint64_t stream_of_use, const int64_t* rows,
                                       int64_t count, const float* log_scales, const float* quats, float* out,
-                                      SplatStream stream);
+                                      const SplatStream* on);
 /* Morton codes in the box from `lowest` with sides of `size` (three floats on the host each). */
 SPLAT_API int32_t splat_morton(const float* means, int64_t count, const float* lowest, const float* size, int64_t* keys,
-                               SplatStream stream);
+                               const SplatStream* on);
 
 #if defined(__cplusplus)
 }

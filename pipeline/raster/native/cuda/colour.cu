@@ -2,6 +2,7 @@
 #include "../colour.h"
 #include "api.h"
 #include "frame.h"
+#include "stream.h"
 #include "sums.cuh"
 
 namespace splat {
@@ -90,8 +91,10 @@ int64_t splat_affine_bytes(int64_t pixels) {
     return carver.bytes();
 }
 
-int32_t splat_affine_colour(const float* map, const float* in, int64_t pixels, float* out, SplatStream stream) {
+int32_t splat_affine_colour(const float* map, const float* in, int64_t pixels, float* out, const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (pixels < 0) return SPLAT_BAD_ARGUMENT;
     if (pixels == 0) return SPLAT_OK;
     SPLAT_LAUNCH(map_colours, divide_up(pixels, kThreads), stream, map, in, pixels, out);
@@ -100,8 +103,10 @@ int32_t splat_affine_colour(const float* map, const float* in, int64_t pixels, f
 
 int32_t splat_affine_colour_backward(const float* map, const float* in, const float* upstream, int64_t pixels,
                                      float* gradient, float* map_gradient, void* memory, int64_t bytes,
-                                     SplatStream stream) {
+                                     const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (pixels <= 0) return SPLAT_BAD_ARGUMENT;
     if (bytes < splat_affine_bytes(pixels)) return SPLAT_TOO_LITTLE;
     const int blocks = static_cast<int>(divide_up(pixels, kBlockPixels));

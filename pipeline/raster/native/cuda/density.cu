@@ -3,7 +3,7 @@
 #include <math.h>
 
 #include "api.h"
-#include "device.h"
+#include "stream.h"
 
 namespace splat {
 namespace cuda {
@@ -110,8 +110,10 @@ __global__ void find_morton(const float* means, int64_t count, const Box box, in
 extern "C" {
 
 int32_t splat_uniform(uint64_t seed, uint64_t step, uint64_t stream_of_use, int64_t count, double* out,
-                      SplatStream stream) {
+                      const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (count < 0) return SPLAT_BAD_ARGUMENT;
     if (count == 0) return SPLAT_OK;
     const uint64_t key = key_of(seed, step, stream_of_use);
@@ -120,8 +122,10 @@ int32_t splat_uniform(uint64_t seed, uint64_t step, uint64_t stream_of_use, int6
 }
 
 int32_t splat_split_offsets(uint64_t seed, uint64_t step, uint64_t stream_of_use, const int64_t* rows, int64_t count,
-                            const float* log_scales, const float* quats, float* out, SplatStream stream) {
+                            const float* log_scales, const float* quats, float* out, const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (count < 0) return SPLAT_BAD_ARGUMENT;
     if (count == 0) return SPLAT_OK;
     const uint64_t key = key_of(seed, step, stream_of_use);
@@ -130,8 +134,10 @@ int32_t splat_split_offsets(uint64_t seed, uint64_t step, uint64_t stream_of_use
 }
 
 int32_t splat_morton(const float* means, int64_t count, const float* lowest, const float* size, int64_t* keys,
-                     SplatStream stream) {
+                     const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (count < 0) return SPLAT_BAD_ARGUMENT;
     if (count == 0) return SPLAT_OK;
     Box box;

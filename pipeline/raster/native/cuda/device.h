@@ -2,7 +2,8 @@
 // with threads in adversarial orders.
 //
 // Rules that keep both true: blocks are one-dimensional, of kThreads threads; shared memory is declared by
-// SPLAT_SHARED, never cleared by itself; kernels are launched by SPLAT_LAUNCH; warp operations name the whole warp.
+// SPLAT_SHARED, never cleared by itself; kernels are launched by SPLAT_LAUNCH, or SPLAT_LAUNCH_TOGETHER of grid.cuh;
+// warp operations name the whole warp.
 #pragma once
 
 #include <stdint.h>
@@ -18,7 +19,7 @@
 #define SPLAT_UNROLL _Pragma("unroll")  // for a loop over an array that has to be in registers
 #define SPLAT_ONCE __noinline__         // for a function compiled once for all kernels that call it
 #define SPLAT_LAUNCH(kernel, blocks, stream, ...) \
-    kernel<<<static_cast<unsigned>(blocks), splat::cuda::kThreads, 0, static_cast<cudaStream_t>(stream)>>>(__VA_ARGS__)
+    kernel<<<static_cast<unsigned>(blocks), splat::cuda::kThreads, 0, stream>>>(__VA_ARGS__)
 #endif
 
 namespace splat {

@@ -4,8 +4,10 @@
 #include "blend.cuh"
 #include "blend_back.cuh"
 #include "frame.h"
+#include "grid.cuh"
 #include "project.cuh"
 #include "sort.cuh"
+#include "stream.h"
 
 namespace splat {
 namespace cuda {
@@ -16,6 +18,7 @@ constexpr int kDepthPasses = 32 / kDigitBits, kTilePasses = 16 / kDigitBits;
 static_assert(kDepthPasses % 2 == 0 && kTilePasses % 2 == 0, "what is sorted ends where it began");
 constexpr int kProjectBlocks = 3;  // per multiprocessor: worth the three words spilled for it
 constexpr int kScatterBlocks = 3;  // with more, registers are spilled
+constexpr int kRestBlocks = 2;     // with more, registers are spilled
 constexpr int64_t kTurns = 8;      // blocks a multiprocessor of work that is done in turns: what it holds at once
 
 // Passes of the sorts, from one half of the memory to the other and back; the first takes places for values.
@@ -112,43 +115,44 @@ __global__ void __launch_bounds__(kThreads) sum_kernel(Job job, int chunk, bool 
     if (is_chunk(job, chunk) && !(only && job.at.header->facts.chunks > 1)) sum_slots<kDepth>(job, chunk);
 }
 
-// All of a chunk's lists, by one block.
+// All of a chunk's lists, by blocks that wait for each other.
 __device__ SPLAT_ONCE void bin_chunk(const Job& job, int chunk) {
     count_pairs(job, chunk);
-    __syncthreads();
-    scan_pairs(job);
-    __syncthreads();
+    sync_grid();
+    if (blockIdx.x == 0) scan_pairs(job);
+    sync_grid();
     emit_pairs(job, chunk);
     for (int pass = 0; pass < kTilePasses; ++pass) {
-        __syncthreads();
+        sync_grid();
         count_digits(tile_pass(job.at, pass));
-        __syncthreads();
+        sync_grid();
         scan_digits(tile_pass(job.at, pass));
-        __syncthreads();
+        sync_grid();
         scatter_digits(tile_pass(job.at, pass));
     }
-    __syncthreads();
+    sync_grid();
 }
 
-// What exceeds the forecast, by one block.
+// What exceeds the forecast, however many chunks: the host knows of none, and a launch for each that there might be
+// would cost more than the frame. Without any, the blocks return at once.
 template <bool kDepth>
-__global__ void __launch_bounds__(kThreads, 1) rest_kernel(const __grid_constant__ Job job, int first) {
+__global__ void __launch_bounds__(kThreads, kRestBlocks) rest_kernel(const __grid_constant__ Job job, int first) {
     for (int chunk = first; is_chunk(job, chunk); ++chunk) {
         bin_chunk(job, chunk);
         blend_tiles<kDepth>(job, chunk);
-        __syncthreads();
+        sync_grid();
     }
 }
 
 template <bool kDepth, bool kMagnitudes>
-__global__ void __launch_bounds__(kThreads, 1) rest_back_kernel(const __grid_constant__ Job job, int first) {
+__global__ void __launch_bounds__(kThreads, kRestBlocks) rest_back_kernel(const __grid_constant__ Job job, int first) {
     if (job.at.header->facts.chunks == 1) return;
     for (int chunk = first; is_chunk(job, chunk); ++chunk) {
         bin_chunk(job, chunk);
         blend_tiles_back<kDepth, kMagnitudes>(job, chunk);
-        __syncthreads();
+        sync_grid();
         sum_slots<kDepth>(job, chunk);
-        __syncthreads();
+        sync_grid();
     }
 }
 
@@ -160,13 +164,14 @@ int slot_floats_of(const SplatShot& shot) { return shot.depths ? kDepthSlotFloat
 
 bool is_aligned(const void* memory) { return memory && reinterpret_cast<uintptr_t>(memory) % 256 == 0; }
 
-// Rounds of the whole device. A chunk has kChunkTiles tiles at most: as many rounds as that takes are always foreseen.
+// Chunks with launches of their own. A chunk has kChunkTiles tiles at most: as many rounds as that takes are always
+// foreseen.
 int passes_of(const Job& job, const SplatFrame& frame) {
     const int least = static_cast<int>(divide_up(job.tiles, kChunkTiles));
     return frame.passes > least ? frame.passes : least;
 }
 
-void launch_sort_by_depth(const Job& job, SplatStream stream) {
+void launch_sort_by_depth(const Job& job, cudaStream_t stream) {
     const int64_t blocks = blocks_for(sort_blocks(job.model.count));
     for (int pass = 0; pass < kDepthPasses; ++pass) {
         const DepthPass of = depth_pass(job, pass);
@@ -176,7 +181,7 @@ void launch_sort_by_depth(const Job& job, SplatStream stream) {
     }
 }
 
-void launch_bin(const Job& job, const Turn& turn, SplatStream stream) {
+void launch_bin(const Job& job, const Turn& turn, cudaStream_t stream) {
     const int64_t ranks = blocks_for(divide_up(job.model.count, kScanBlock));
     const int64_t blocks = blocks_for(sort_blocks(job.capacity));
     SPLAT_LAUNCH(count_pairs_kernel, ranks, stream, job, turn);
@@ -194,17 +199,17 @@ void launch_bin(const Job& job, const Turn& turn, SplatStream stream) {
 int64_t tile_blocks(const Job& job) { return job.tiles < kChunkTiles ? job.tiles : kChunkTiles; }
 
 template <bool kDepth>
-void launch_chunks(const Job& job, int passes, SplatStream stream) {
+void launch_chunks(const Job& job, int passes, cudaStream_t stream) {
     for (int chunk = 0; chunk < passes; ++chunk) {
         launch_bin(job, {chunk, false}, stream);
         SPLAT_LAUNCH(blend_kernel<kDepth>, tile_blocks(job), stream, job, chunk);
     }
-    SPLAT_LAUNCH(rest_kernel<kDepth>, 1, stream, job, passes);
+    SPLAT_LAUNCH_TOGETHER(rest_kernel<kDepth>, blocks_together(rest_kernel<kDepth>), stream, job, passes);
 }
 
 // If one chunk is forecast, nothing bins it again: any further chunks belong to the rest.
 template <bool kDepth, bool kMagnitudes>
-void launch_chunks_back(const Job& job, int passes, SplatStream stream) {
+void launch_chunks_back(const Job& job, int passes, cudaStream_t stream) {
     const bool only = passes == 1;
     const int64_t ranks = blocks_for(divide_up(job.model.count, kSlotsAtOnce));
     for (int chunk = 0; chunk < passes; ++chunk) {
@@ -212,7 +217,8 @@ void launch_chunks_back(const Job& job, int passes, SplatStream stream) {
         SPLAT_LAUNCH((blend_back_kernel<kDepth, kMagnitudes>), tile_blocks(job), stream, job, chunk, only);
         SPLAT_LAUNCH(sum_kernel<kDepth>, ranks, stream, job, chunk, only);
     }
-    SPLAT_LAUNCH((rest_back_kernel<kDepth, kMagnitudes>), 1, stream, job, only ? 0 : passes);
+    const auto rest = rest_back_kernel<kDepth, kMagnitudes>;
+    SPLAT_LAUNCH_TOGETHER(rest, blocks_together(rest), stream, job, only ? 0 : passes);
 }
 
 bool has_pictures(const SplatShot& shot, const SplatPictures& to) {
@@ -301,7 +307,9 @@ int64_t splat_back_bytes(const SplatShot* shot, int64_t count, int64_t capacity)
 }
 
 int32_t splat_forward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
-                      const SplatPictures* pictures, float* radii, uint8_t* visible, SplatStream stream) {
+                      const SplatPictures* pictures, float* radii, uint8_t* visible, const SplatStream* on) {
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     Job job;
     const int32_t code = prepare(shot, model, frame, false, &job);
     if (code) return code;
@@ -310,9 +318,8 @@ int32_t splat_forward(const SplatShot* shot, const SplatRows* model, const Splat
     job.pictures = {pictures->colour, pictures->alpha, pictures->depth_sum, pictures->depth_square_sum,
                     pictures->median_depth};
     job.radii = radii, job.visible = visible;
-    const auto cuda_stream = static_cast<cudaStream_t>(stream);
-    cudaMemsetAsync(job.at.header, 0, sizeof(Header), cuda_stream);
-    cudaMemsetAsync(job.at.tile_counts, 0, (job.tiles + size_t{1}) * sizeof(int32_t), cuda_stream);
+    cudaMemsetAsync(job.at.header, 0, sizeof(Header), stream);
+    cudaMemsetAsync(job.at.tile_counts, 0, (job.tiles + size_t{1}) * sizeof(int32_t), stream);
     if (frame->count) {
         SPLAT_LAUNCH(project_kernel, divide_up(frame->count, kThreads), stream, job);
         launch_sort_by_depth(job, stream);
@@ -327,7 +334,9 @@ int32_t splat_forward(const SplatShot* shot, const SplatRows* model, const Splat
 }
 
 int32_t splat_blend_backward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
-                             const SplatPictureGradients* gradients, SplatStream stream) {
+                             const SplatPictureGradients* gradients, const SplatStream* on) {
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     Job job;
     const int32_t code = prepare(shot, model, frame, true, &job);
     if (code) return code;
@@ -336,7 +345,7 @@ int32_t splat_blend_backward(const SplatShot* shot, const SplatRows* model, cons
     job.gradients = {gradients->colour, gradients->alpha, gradients->depth_sum, gradients->depth_square_sum};
     if (frame->count == 0) return SPLAT_OK;
     const auto bytes = static_cast<size_t>(frame->count) * job.slot_floats * sizeof(float);
-    cudaMemsetAsync(job.back.sums, 0, bytes, static_cast<cudaStream_t>(stream));
+    cudaMemsetAsync(job.back.sums, 0, bytes, stream);
     const int passes = passes_of(job, *frame);
     if (shot->depths && shot->magnitudes)
         launch_chunks_back<true, true>(job, passes, stream);

@@ -2,9 +2,10 @@
 //
 // The order of work is that of the CPU (raster_cpu.cpp): project every Gaussian; stably sort the visible ones by depth;
 // build each tile's list by a stable sort of the depth-ordered pairs by tile; blend; and the backward pass. Pairs are
-// processed in chunks of consecutive tiles, each of at most `capacity` pairs: the first `passes` chunks by the whole
-// device, and any beyond the forecast by one block in one more launch, so that the host never waits for a count. A
-// phase is a device function over virtual blocks, which a kernel of any number of blocks, even one, can run:
+// processed in chunks of consecutive tiles, each of at most `capacity` pairs: the first `passes` chunks by launches of
+// their own, and any beyond the forecast by one more launch, whose blocks wait for each other between phases, so that
+// the host never waits for a count. A phase is a device function over virtual blocks, which a kernel of any number of
+// blocks, even one, can run:
 //
 //     for (int64_t block = blockIdx.x; block < blocks; block += gridDim.x) ...
 //

@@ -7,6 +7,7 @@
 #include "../loss_math.h"
 #include "api.h"
 #include "frame.h"
+#include "stream.h"
 #include "sums.cuh"
 
 namespace splat {
@@ -281,8 +282,10 @@ int64_t splat_loss_bytes(int32_t width, int32_t height) {
 
 int32_t splat_photo_loss(const float* render, const float* photo, const uint8_t* mask, int32_t width, int32_t height,
                          const SplatRectangle* inner, double ssim_weight, float* gradient, double* value, void* memory,
-                         int64_t bytes, SplatStream stream) {
+                         int64_t bytes, const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (width < splat::kLossMinSide || height < splat::kLossMinSide) return SPLAT_BAD_ARGUMENT;
     LossJob job{};
     if (bytes < lay_out_loss(memory, width, height, &job)) return SPLAT_TOO_LITTLE;

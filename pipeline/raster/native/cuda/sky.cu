@@ -1,6 +1,6 @@
 // Compositing a render over the sky, which is interpolated bilinearly from nodes some pixels apart.
 #include "api.h"
-#include "device.h"
+#include "stream.h"
 #include "sums.cuh"
 
 namespace splat {
@@ -100,8 +100,10 @@ bool is_sound(const SplatSky& sky) {
 
 extern "C" {
 
-int32_t splat_sky(const SplatSky* sky, float* out, SplatStream stream) {
+int32_t splat_sky(const SplatSky* sky, float* out, const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (!is_sound(*sky)) return SPLAT_BAD_ARGUMENT;
     const int64_t pixels = static_cast<int64_t>(sky->width) * sky->height;
     SPLAT_LAUNCH(lay_over, divide_up(pixels, kThreads), stream, *sky, out);
@@ -109,8 +111,10 @@ int32_t splat_sky(const SplatSky* sky, float* out, SplatStream stream) {
 }
 
 int32_t splat_sky_backward(const SplatSky* sky, const float* upstream, float* alpha_gradient, float* node_gradient,
-                           SplatStream stream) {
+                           const SplatStream* on) {
     using namespace splat::cuda;
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (!is_sound(*sky) || (node_gradient && !sky->mask)) return SPLAT_BAD_ARGUMENT;
     const int64_t pixels = static_cast<int64_t>(sky->width) * sky->height;
     SPLAT_LAUNCH(lay_over_back, divide_up(pixels, kThreads), stream, *sky, upstream, alpha_gradient);

@@ -6,6 +6,7 @@
 // gradients, and 192 that come from the cache a second time.
 #include "project.cuh"
 #include "step.cuh"
+#include "stream.h"
 
 namespace splat {
 namespace cuda {
@@ -145,6 +146,7 @@ __global__ void __launch_bounds__(kThreads, 2) gradient_kernel(const Job job, co
 
 // The other parameters of a step, by value.
 struct StepJob {
+    int64_t rows;  // the first of the rendered ones
     SplatRows values, means, squares;
     float rates[5], rate_sh_rest;  // with their bias correction
     float beta1, beta2, epsilon, inverse_root_correction;
@@ -193,7 +195,7 @@ __device__ __forceinline__ void step_tensors(const StepJob& step, const Staged& 
         [&](int column) { return column < 3 ? step.rates[4] : step.rate_sh_rest; });
 }
 
-// All rows, including those not stepped: density control may have made them smaller. NaN stays.
+// All of these rows, including those not visible: density control may have made them smaller. NaN stays.
 __device__ __forceinline__ void clamp_log_scales(const StepJob& step, int64_t first, int rows) {
     float* log_scales = step.values.log_scales + 3 * first;
     for (int j = threadIdx.x; j < 3 * rows; j += kThreads) {
@@ -206,7 +208,7 @@ __device__ __forceinline__ void clamp_log_scales(const StepJob& step, int64_t fi
 template <bool kDepth>
 __global__ void __launch_bounds__(kThreads, 2) step_kernel(const Job job, const StepJob step) {
     SPLAT_SHARED(Staged, staged);
-    const int64_t n = job.model.count;
+    const int64_t n = step.rows;
     const int thread = threadIdx.x;
     for (int64_t first = int64_t{blockIdx.x} * kThreads; first < n; first += int64_t{gridDim.x} * kThreads) {
         const int rows = rows_of_block(n, first);
@@ -228,6 +230,7 @@ int32_t make_step(const SplatStep& step, float* means2d, StepJob* job) {
     if (!are_adam_options({step.beta1, step.beta2, step.epsilon, step.step})) return SPLAT_BAD_ARGUMENT;
     const AdamCorrections corrections = corrections_of(step.beta1, step.beta2, step.step);
     const auto corrected = [&](float rate) { return static_cast<float>(corrections.rate * rate); };
+    job->rows = step.rows;
     job->values = step.values, job->means = step.means, job->squares = step.squares;
     for (int t = 0; t < 5; ++t) job->rates[t] = corrected(step.rates[t]);
     job->rate_sh_rest = corrected(step.rate_sh_rest);
@@ -247,7 +250,9 @@ using namespace splat;
 using namespace splat::cuda;
 
 int32_t splat_project_backward(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame,
-                               const SplatRows* gradients, float* means2d, SplatStream stream) {
+                               const SplatRows* gradients, float* means2d, const SplatStream* on) {
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     Job job;
     const int32_t code = prepare(shot, model, frame, true, &job);
     if (code != SPLAT_OK || job.model.count == 0) return code;
@@ -261,17 +266,21 @@ int32_t splat_project_backward(const SplatShot* shot, const SplatRows* model, co
 }
 
 int32_t splat_step(const SplatShot* shot, const SplatFrame* frame, const SplatStep* step, float* means2d,
-                   SplatStream stream) {
+                   const SplatStream* on) {
+    cudaStream_t stream;
+    if (const int32_t error = enter(on, &stream)) return error;
     if (!step) return SPLAT_BAD_ARGUMENT;
     SplatRows rendered = step->values;
     if (step->logits) rendered.opacity_logits = const_cast<float*>(step->logits);
     Job job;
     StepJob what;
     int32_t code = prepare(shot, &rendered, frame, true, &job);
-    if (code != SPLAT_OK || job.model.count == 0) return code;
+    if (code != SPLAT_OK) return code;
+    if (step->rows < 0 || step->rows > job.model.count) return SPLAT_BAD_ARGUMENT;
+    if (step->rows == 0) return SPLAT_OK;
     code = make_step(*step, means2d, &what);
     if (code != SPLAT_OK) return code;
-    const int64_t blocks = blocks_for(divide_up(job.model.count, kThreads));
+    const int64_t blocks = blocks_for(divide_up(step->rows, kThreads));
     if (job.slot_floats == kDepthSlotFloats)
         SPLAT_LAUNCH(step_kernel<true>, blocks, stream, job, what);
     else
