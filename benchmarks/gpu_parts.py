@@ -263,9 +263,8 @@ def _taken(running: list[PartProcess]) -> Iterator[PartProcess]:
 
 def shown(row: Row) -> str:
     """Return a row as one line of text."""
-    return "  ".join(
-        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
-    )
+    texts = {key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in row.items()}
+    return "  ".join(f"{key} {text}" for key, text in texts.items())
 
 
 def read_lines(path: Path) -> list[Row]:

@@ -23,14 +23,14 @@ from gpu_parts import Row
 from gpu_visit import BUILT_PEERS, SEEDS, VisitScale
 from measure import DEFAULT_START, InitialSettings, prepare, size_factor
 
-from splatpipe.pipeline.photos.dataset import IMAGES, split_views
+from splatpipe.pipeline.photos.dataset import IMAGES, Split, split_views
 from splatpipe.pipeline.photos.options import SplitConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 DATASET, POINTS = "bench_sceaux", "sparse"
+DENSE_POINTS = "sparse_100k"  # of the trained scene, which has no more Gaussians: 24 MB
 QUALITY = 90  # of the transferred JPEGs: a third of PNG's size, and both devices train on the same
-TRAINED_ITERATIONS, MOST_TRAINED = 3000, 100_000  # of the trained scene: 24 MB at most
-GROWING_BELOW = 5e-5  # its threshold of density control, a quarter of the default: a training this short stays small
+TRAINED_ITERATIONS, MOST_TRAINED = 1500, 100_000  # of the trained scene
 MEBIBYTE = 1 << 20
 MAX_MEBIBYTES = 64  # limit for the tree and everything carried
 LONGEST_COMMAND = 2000  # characters
@@ -55,7 +55,7 @@ def main(data: Path, pack: Path, peers: Path | None, first: Path | None) -> None
         ("libraries", lambda: gpu_libraries.compile_beforehand(pack / "libraries", ROOT / "build" / "gpu_visit")),
         ("wheels", lambda: fetch_wheels(pack / "wheels")),
         ("capture", lambda: pack_capture(data / DATASET, pack / "captures" / gpu_scenes.CAPTURE)),
-        ("trained scene", lambda: train_scene(pack)),
+        ("trained scene", lambda: train_scene(data / DATASET, pack)),
         ("trainings on the CPU", lambda: train_on_cpu(pack, scale.iterations)),
         ("peers", lambda: gpu_peer_sources.pack_peers(peers, pack / "peers")),
     ):
@@ -72,12 +72,8 @@ def main(data: Path, pack: Path, peers: Path | None, first: Path | None) -> None
 def pack_capture(dataset: Path, target: Path) -> Row:
     """Pack an undistorted dataset at the measured size, with every eighth photo held out as the pipeline does."""
     if not target.exists():
-        names = [path.name for path in sorted((dataset / IMAGES).iterdir())]
-        split = split_views(names, SplitConfig().every, "")
         with tempfile.TemporaryDirectory() as scratch:
-            start = InitialSettings(DEFAULT_START.options, split.held_out)
-            factor = size_factor(dataset, gpu_scenes.MEGAPIXELS)
-            made = prepare(dataset, POINTS, factor, Path(scratch) / "made", start=start)
+            made, split = made_dataset(dataset, POINTS, Path(scratch))
             split_file = Path(scratch) / "split.json"
             split_file.write_text(split.to_json())
             shutil.rmtree(made / "whole")
@@ -85,6 +81,14 @@ def pack_capture(dataset: Path, target: Path) -> Row:
             (made / "split.json").unlink()
             copy_parts({"undistort.dataset": made, "split.views": split_file, "initialize.splat": start_file}, target)
     return {DATASET: f"{_mebibytes(target):.1f} MiB at {gpu_scenes.MEGAPIXELS} MP"}
+
+
+def made_dataset(dataset: Path, points: str, scratch: Path) -> tuple[Path, Split]:
+    """Write a dataset at the measured size, with initial Gaussians from some of its points; and its split."""
+    names = [path.name for path in sorted((dataset / IMAGES).iterdir())]
+    split = split_views(names, SplitConfig().every, "")
+    start = InitialSettings(DEFAULT_START.options, split.held_out)
+    return prepare(dataset, points, size_factor(dataset, gpu_scenes.MEGAPIXELS), scratch / "made", start=start), split
 
 
 def copy_parts(parts: dict[str, Path], target: Path) -> None:
@@ -106,22 +110,18 @@ def copy_parts(parts: dict[str, Path], target: Path) -> None:
     scratch.rename(target)
 
 
-def train_scene(pack: Path, iterations: int = TRAINED_ITERATIONS) -> Row:
-    """Train the capture on the CPU for the scene that is measured beside made ones."""
+def train_scene(dataset: Path, pack: Path) -> Row:
+    """Train the capture from many points, on the CPU, for the scene that is measured beside made ones."""
     target = pack / "captures" / gpu_scenes.CAPTURE / gpu_scenes.TRAINED
     if not target.exists():
         import gpu_proofs
 
         gpu_scenes.PACK = pack
-        options = {"grow_threshold": GROWING_BELOW, "max_gaussians": MOST_TRAINED, "seed": 0}
+        options = {"iterations": TRAINED_ITERATIONS, "max_gaussians": MOST_TRAINED, "densify": False}
         with tempfile.TemporaryDirectory() as scratch:
-            gpu_proofs.train_capture(
-                "cpu",
-                Path(scratch),
-                iterations=iterations,
-                max_megapixels=gpu_proofs.TRAINING_MP,
-                **options,
-            )
+            made, _ = made_dataset(dataset, DENSE_POINTS, Path(scratch))
+            options["max_megapixels"] = gpu_proofs.TRAINING_MP
+            gpu_proofs.train_capture("cpu", Path(scratch), start=made / "init.ply", **options)
             shutil.move(Path(scratch) / "model.ply", target)
     return {"model": f"{target.stat().st_size / MEBIBYTE:.1f} MiB"}
 

@@ -1,4 +1,4 @@
-"""Parts of a visit to a GPU: every kernel of ours on a small scene under compute-sanitizer, if the machine permits it."""
+"""Parts of a visit to a GPU: our kernels on a small scene under compute-sanitizer, if the machine permits it."""
 
 from __future__ import annotations
 
@@ -66,12 +66,8 @@ def sanitized(tool: str, entry: str = "gpu_sanitized:every_kernel", **arguments:
     if code and "kernel-name" in said and not SUMMARIES.search(said):  # another version's options
         code, said = _run([*options, *words])
     summary = SUMMARIES.findall(said)
-    yield {
-        "tool": tool,
-        "of": entry.partition(":")[2],
-        "found": int(summary[-1]) if summary else None,
-        "exit_code": code,
-    }
+    found = int(summary[-1]) if summary else None
+    yield {"tool": tool, "of": entry.partition(":")[2], "found": found, "exit_code": code}
     if code or not summary:
         raise SystemExit(f"{tool} found something" if code == FOUND else f"{tool} ended with {code}")
 

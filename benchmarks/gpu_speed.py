@@ -142,9 +142,8 @@ def iteration_times(count: int | None, what: Planned, megapixels: float, where: 
     views, warmup, host = gpu_scenes.views(), min(WARMUP, repeats), list[float]()
     with tempfile.TemporaryDirectory() as cache, choose_rules(where):
         state = begin(gpu_scenes.gaussians(count, where))
-        with PhotoStream.over(views, [TrainingSize()] * (warmup + repeats), 0, 1, Path(cache), megapixels).to(
-            where
-        ) as photos:
+        sizes = [TrainingSize()] * (warmup + repeats)
+        with PhotoStream.over(views, sizes, 0, 1, Path(cache), megapixels).to(where) as photos:
 
             def one() -> None:
                 photo = next(photos)

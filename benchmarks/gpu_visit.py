@@ -4,8 +4,9 @@ Where the line runs:   ``make gpu-visit``                             packs ever
 Where the GPU is:      ``gpu_visit.py first --out FOLDER``            420 s: proofs, speed, peers, trainings
                        ``gpu_visit.py second --out FOLDER``           200 s: what was red again, then the limits
 
-The machine with the GPU needs torch, nvcc, CMake, ninja and nanobind, but no network. All figures go to FOLDER/first.jsonl
-and FOLDER/second.jsonl, one line a row, written at once; the log lies beside. ``gpu_report.py`` makes tables of them.
+The machine with the GPU needs torch, nvcc, CMake, ninja and nanobind, but no network. All figures go to
+FOLDER/first.jsonl and FOLDER/second.jsonl, one line a row, written at once; the log lies beside. ``gpu_report.py`` makes
+tables of them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ import json
 import os
 import platform
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
