@@ -47,8 +47,11 @@ PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
     m.def("adam_step", &faster_gs::adam::adam_step_wrapper);
 }
 """
-CUB_MAX = "cub::Max()"  # which CUDA 13 no longer has
-LARGER = "[](uint one, uint other) { return one > other ? one : other; }"
+# What CUDA 13 no longer has, and a name that C++20's own function takes; torch's headers decide the standard.
+FASTER_GS_CHANGES = (
+    (r"cub::Max\(\)", "[](uint one, uint other) { return one > other ? one : other; }"),
+    (r"\blerp\b", "lerp_between"),
+)
 
 
 @dataclass(frozen=True)
@@ -135,16 +138,19 @@ def _pack_faster_gs(source: Path, target: Path) -> PeerBuild:
         _copy(package / room, made / room, lambda path: path.suffix in (".h", ".cuh", ".cu"))
     for file in ("rasterization.py", "adam.py"):
         _copy(package / "torch_bindings", made / "torch_bindings", lambda path, file=file: path.name == file)
-    for path in made.rglob("*.cu*"):
-        path.write_text(path.read_text().replace(CUB_MAX, LARGER))
+    for path in filter(Path.is_file, made.rglob("*")):
+        text = path.read_text()
+        for pattern, instead in FASTER_GS_CHANGES:
+            text = re.sub(pattern, instead, text)
+        path.write_text(text)
     (made / "__init__.py").touch()
     (made / "torch_bindings" / "__init__.py").touch()
     (made / "bindings.cpp").write_text(FASTER_GS_BINDINGS)
     sources = (made / "bindings.cpp", *sorted(made.rglob("*.cu")))
     listed = tuple(str(path.relative_to(target)) for path in sources)
     includes = (f"{name}/utils", f"{name}/adam/include", f"{name}/rasterization/include")
-    flags = ("-O3", "-std=c++17")
-    return PeerBuild("_C", name, (name,), listed, includes, flags, (*flags, "-use_fast_math"), (), _digest(made))
+    nvcc = ("-O3", "-use_fast_math")
+    return PeerBuild("_C", name, (name,), listed, includes, ("-O3",), nvcc, (), _digest(made))
 
 
 def _pack_fused_ssim(source: Path, target: Path) -> PeerBuild:

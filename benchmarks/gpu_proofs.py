@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,14 +84,17 @@ def random_model(count: int) -> Gaussians:
     return model
 
 
-def marked_tests() -> Iterator[Row]:
+def marked_tests(options: Sequence[str] = ()) -> Iterator[Row]:
     """Run the tests marked ``cuda``, without the conftest.py's, which want a browser and more.
+
+    Args:
+        options: Further ones of pytest.
 
     Raises:
         SystemExit: if a test fails.
     """
     words = [sys.executable, "-m", "pytest", "-v", "-m", "cuda", "--noconftest", "-p", "no:cacheprovider"]
-    words += [str(path) for path in marked_files()]
+    words += [*options, *map(str, marked_files())]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     last = ""
     with subprocess.Popen(

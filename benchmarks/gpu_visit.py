@@ -5,8 +5,8 @@ Where the GPU is:      ``gpu_visit.py first --out FOLDER``            420 s: pro
                        ``gpu_visit.py second --out FOLDER``           200 s: what was red again, then the limits
 
 The machine with the GPU needs torch, nvcc, CMake, ninja and nanobind, but no network. All figures go to
-FOLDER/first.jsonl and FOLDER/second.jsonl, one line a row, written at once; the log lies beside. ``gpu_report.py`` makes
-tables of them.
+FOLDER/first.jsonl and FOLDER/second.jsonl, one line a row, written at once; the log lies beside. ``gpu_report.py``
+makes tables of them.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ class VisitScale:
         twice: Of the two trainings with one seed.
         long: Of the long training, and how many there are between rows.
         pairs: Gaussians that each cover an image, and its size, for more pairs than 31 bits count.
+        pytest: Options of the tests on the device.
         smoke: Arguments of the smoke part.
         kernels: Arguments of the sanitizers' part.
     """
@@ -71,14 +72,15 @@ class VisitScale:
     twice: int = 200
     long: tuple[int, int] = (30_000, 1000)
     pairs: tuple[int, tuple[int, int]] = (70_000, (3840, 2160))
+    pytest: tuple[str, ...] = ()
     smoke: Row | None = None
     kernels: Row | None = None
 
 
 TOY = VisitScale(
-    *(300, 200, 400, 500, 0.003, 0.003, 2, 20, 10, (4, 2), (150, (64, 48))),
+    *(150, 100, 200, 250, 0.001, 0.002, 1, 20, 10, (4, 2), (60, (48, 32)), ("--collect-only", "-q")),
     smoke={"count": 300, "size": [51, 37]},
-    kernels={"count": 200, "size": [51, 37]},
+    kernels={"count": 100, "size": [35, 21]},
 )
 """To try the parts without a GPU, on the tests' harness."""
 
@@ -94,7 +96,7 @@ def first_call(scale: VisitScale, peers: Sequence[str]) -> list[GpuPart]:
         *compilations(peers),
         GpuPart("the card", "gpu_speed:card", {}, 3),
         smoke(scale),
-        GpuPart("tests marked cuda", "gpu_proofs:marked_tests", {}, 56),
+        GpuPart("tests marked cuda", "gpu_proofs:marked_tests", {"options": scale.pytest}, 56),
         GpuPart("agreement with the CPU", "gpu_proofs:agreement", {"megapixels": scale.agreed}, 26),
         GpuPart("the same bits twice", "gpu_proofs:same_bits_twice", {"iterations": scale.twice}, 16),
         sanitizer("memcheck", 15, scale),
@@ -150,9 +152,9 @@ def smoke(scale: VisitScale) -> GpuPart:
         "smoke under memcheck",
         "gpu_sanitized:sanitized",
         {"tool": "memcheck", "entry": "gpu_proofs:smoke"} | arguments,
-        10,
+        9,
     )
-    return GpuPart("smoke", "gpu_proofs:smoke", arguments, 12, on_failure=again)
+    return GpuPart("smoke", "gpu_proofs:smoke", arguments, 11, on_failure=again)
 
 
 def sanitizer(tool: str, limit_s: float, scale: VisitScale) -> GpuPart:

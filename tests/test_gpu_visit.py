@@ -1,0 +1,302 @@
+"""A visit to a GPU, both calls from end to end at toy size, as if on the bare machine: see tests/bare.
+
+Parts that only need kernels run on the harness; the others have stand-ins that succeed, fail, refuse and hang.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "harness"))
+sys.path.insert(0, str(Path(__file__).parent / "scenes"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+import gpu_libraries
+import gpu_parts
+import gpu_peer_sources
+import gpu_proofs
+import gpu_report
+import gpu_visit
+import tiny_scene
+from building import NATIVE, build_on_cpu
+from gpu_parts import Row
+
+from splatpipe.pipeline.splat.ply import write_splat
+
+BARE = Path(__file__).parent / "bare"
+CARRIED = ("pydantic", "pydantic_core", "annotated_types", "typing_inspection", "tomli_w")
+ENDED_S = 30.0  # within which a broken first kernel ends the visit
+# What needs a card, or a compiler of its own.
+STAND_INS = {
+    "tests marked cuda": "succeeds",
+    "the same bits twice": "succeeds",
+    "kernels": "succeeds",
+    **{f"{peer} compiled": "compiles" for peer in gpu_visit.BUILT_PEERS},
+    **{f"{peer}, ": "peer_speed" for peer in gpu_visit.TIMED_PEERS},
+    "training": "trains",
+}
+# Faults in a kernel of the loss, active where this variable names them.
+VARIABLE = "SPLATPIPE_PLANTED"
+SIGN = "v > 0.0f ? 1.0f : (v < 0.0f ? -1.0f : 0.0f)"
+PLANTED = '(planted("wrong") ? -v : v) > 0.0f ? 1.0f : ((planted("wrong") ? -v : v) < 0.0f ? -1.0f : 0.0f)'
+PLANT = f"""#include <cstdlib>
+#include <cstring>
+static bool planted(const char* fault) {{
+    const char* given = getenv("{VARIABLE}");
+    volatile bool spins = given && !strcmp(given, "hang");
+    while (spins) {{
+    }}
+    return given && !strcmp(given, fault);
+}}
+"""
+
+
+@dataclass
+class Visited:
+    """What a call left.
+
+    Attributes:
+        lines: Of its file.
+        printed: On its output.
+        seconds: How long it took.
+    """
+
+    lines: list[Row]
+    printed: str
+    seconds: float
+    states: dict[str, str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.states = {line["part"]: line["state"] for line in self.lines if "state" in line}
+
+    def rows(self, part: str) -> list[Row]:
+        return [line["row"] for line in self.lines if line.get("part") == part and "row" in line]
+
+    def error(self, part: str) -> str:
+        return next(line["error"] for line in self.lines if line.get("part") == part and "error" in line)
+
+
+@dataclass
+class Place:
+    """Where visits are made.
+
+    Attributes:
+        folder: For packs and files.
+        library: The harness's kernels.
+    """
+
+    folder: Path
+    library: Path
+
+    @property
+    def pack(self) -> Path:
+        return self.folder / "pack"
+
+    def visit(self, call: str, changes: Row, name: str = "", environment: Sequence[tuple[str, str]] = ()) -> Visited:
+        """Make a call in a process of its own, in the environment of the bare machine."""
+        out = self.folder / (name or call)
+        given = {
+            "PATH": os.pathsep.join([str(BARE / "programs"), os.environ["PATH"]]),
+            "PYTHONPATH": str(BARE),
+            "TMPDIR": str(self.folder),
+            "SPLATPIPE_HARNESS": str(self.library),
+            "OMP_NUM_THREADS": "1",
+            "HOME": str(self.folder),
+            **dict(environment),
+        }
+        words = [sys.executable, str(BARE / "visit.py"), call, str(self.pack), str(out), json.dumps(changes)]
+        began = time.monotonic()
+        done = subprocess.run(words, capture_output=True, text=True, check=False, env=given, cwd=self.folder)
+        assert done.returncode == 0, done.stderr
+        log = out / f"{call}.log"
+        lines = gpu_parts.read_lines(out / f"{call}.jsonl")
+        return Visited(lines, done.stdout + (log.read_text() if log.exists() else ""), time.monotonic() - began)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    folder = tmp_path_factory.mktemp("gpu_visit")
+    pack = folder / "pack"
+    capture = pack / "captures" / "sceaux"
+    dataset = tiny_scene.write_dataset(capture / "undistort.dataset")
+    shutil.copyfile(tiny_scene.split_part(dataset)["split.views"], capture / "split.views")
+    model = tiny_scene.true_model()
+    write_splat(capture / "initialize.splat", model)
+    model.sh[:, 0] += 0.3  # or the photos' differences from its renders are of rounding alone, and of either sign
+    write_splat(capture / "trained.ply", model)
+    (pack / "libraries").mkdir()
+    package = find_spec("splatpipe.pipeline.raster")
+    assert package is not None and package.submodule_search_locations is not None
+    for library in Path(package.submodule_search_locations[0]).glob("_native*.so"):
+        shutil.copyfile(library, pack / "libraries" / library.name)
+    (pack / "wheels").mkdir()
+    for name in CARRIED:
+        zip_package(name, pack / "wheels" / f"{name}-0-py3-none-any.whl")
+    for peer in gpu_visit.BUILT_PEERS:
+        (pack / "peers" / peer).mkdir(parents=True)
+    (pack / "cpu.json").write_text(json.dumps([{"seed": s, "psnr_cc": 20.0, "train_seconds": 9.0} for s in range(3)]))
+    (pack / "pack.json").write_text(json.dumps({"commit": "a commit"}))
+    return Place(folder, build_on_cpu())
+
+
+def zip_package(name: str, wheel: Path) -> None:
+    """Write an installed package as a wheel."""
+    package = find_spec(name)
+    assert package is not None and package.origin is not None
+    root = Path(package.origin).parent
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for path in root.rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts:
+                archive.write(path, path.relative_to(root.parent))
+
+
+@pytest.fixture(scope="module")
+def first(place: Place) -> Visited:
+    """The first call, all well."""
+    return place.visit("first", {"parts": STAND_INS})
+
+
+@pytest.fixture(scope="module")
+def troubled(place: Place) -> Visited:
+    """The first call, with every kind of trouble."""
+    parts = {"": "succeeds", "tests": "fails", "the same": "hangs", "memcheck": "refuses", "racecheck": "crashes"}
+    parts |= {"compilers ended": "quiet", "faster-gs compiled": "hangs", "gsplat, ": "fails", "few, made": "is_bare"}
+    limits = {"the same": 2.0, "compilers ended": 0.1, "faster-gs compiled": 1.0}
+    return place.visit("first", {"parts": parts, "limits": limits, "light": True, "seconds": 60.0}, "troubled")
+
+
+def test_the_first_call_runs_every_part_in_order(first: Visited) -> None:
+    planned = [line["part"] for line in first.lines[0]["plan"] if not line.get("beside")]
+    ended = [line["part"] for line in first.lines if "state" in line and not line["part"].endswith("compiled")]
+    assert ended == ["unpacked", *planned]
+    assert {name: state for name, state in first.states.items() if state != "done"} == {}, first.printed
+    assert first.lines[-1]["end"] == "green" and first.lines[-1]["red"] == []
+    names = list(first.states)
+    assert all(names.index(f"{peer} compiled") < names.index("compilers ended") for peer in gpu_visit.BUILT_PEERS)
+
+
+def test_its_parts_measure_what_they_are_to_measure(first: Visited) -> None:
+    assert first.rows("the card")[0]["driver_version"] == "580.159.04"
+    assert first.rows("smoke")[0]["psnr_db"] >= gpu_proofs.MIN_DB
+    assert len(first.rows("agreement with the CPU")) == 4
+    for tool in ("memcheck", "racecheck"):
+        assert [(row["of"], row["found"]) for row in first.rows(tool)] == [("every_kernel", 0)]
+    for name, scene, count in (("few, made", "made", gpu_visit.TOY.few), ("trained scene", "trained", 150)):
+        whole, alone = first.rows(name)
+        assert (whole["scene"], whole["count"], whole["preset"]) == (scene, count, False)
+        assert min(whole["iteration_ms"], whole["host_ms"], alone["raster_ms"], alone["forward_ms"]) > 0.0
+    assert first.rows("few, default preset")[0]["preset"]
+
+
+def test_the_tests_marked_cuda_are_collected_on_the_bare_machine(first: Visited) -> None:
+    (row,) = first.rows("tests marked cuda")
+    assert int(row["tests"].split("/")[0].split(" ")[0]) > 20, row
+    assert "error" not in row["tests"]
+    assert "test_a_training_has_the_same_bits_twice_and_the_cpus_loss" in first.printed
+
+
+def test_troubles_leave_what_was_measured_and_the_rest_runs(troubled: Visited) -> None:
+    states = {name: state for name, state in troubled.states.items() if state != "done"}
+    assert states == {
+        "tests marked cuda": "failed",
+        "the same bits twice": "late",
+        "memcheck": "refused",
+        "racecheck": "failed",
+        "faster-gs compiled": "late",
+        **{f"gsplat, {scene}": "failed" for scene in ("trained scene", "middle, made", "many, made")},
+    }
+    assert troubled.lines[-1]["red"] == ["tests marked cuda", "the same bits twice", "racecheck"]
+    assert troubled.error("tests marked cuda").endswith("it broke")
+    assert troubled.error("memcheck").endswith("refused: not on this machine")
+    assert troubled.rows("tests marked cuda") and troubled.rows("racecheck")
+    (hung,) = troubled.rows("the same bits twice")
+    assert not is_running(hung["child"])
+    imported = troubled.rows("few, made")[0]
+    assert {name for name, found in imported.items() if found} == {"pydantic", "tomli_w"}
+    assert all("splatpipe-gpu-visit" in found for found in imported.values() if found)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_the_second_call_repeats_what_was_red(troubled: Visited, first: Visited) -> None:
+    peers = gpu_visit.BUILT_PEERS
+    again = [part.name for part in gpu_visit.second_call(gpu_visit.TOY, peers, troubled.lines)]
+    limits = ["most, memory", "more than 2^31 pairs", "synccheck", "initcheck", "long training"]
+    assert again == ["smoke", "tests marked cuda", "the same bits twice", "racecheck", *limits]
+    assert [part.name for part in gpu_visit.second_call(gpu_visit.TOY, peers, first.lines)] == limits
+
+
+def test_the_second_call_after_a_green_one_measures_limits(place: Place, first: Visited) -> None:
+    shutil.copyfile(place.folder / "first" / "first.jsonl", place.pack / "first.jsonl")
+    second = place.visit("second", {}, environment=[("STAND_IN_SANITIZER", "refuses")])
+    states = {name: state for name, state in second.states.items() if state != "done"}
+    assert states == {"synccheck": "refused", "initcheck": "refused"}, second.printed
+    assert "Device not supported" in second.error("synccheck")
+    assert second.lines[-1]["end"] == "green"
+    assert second.rows("more than 2^31 pairs")[0]["same"]
+    assert [row["iterations"] for row in second.rows("long training")] == [2, 4]
+    record = gpu_report.VisitRecord(
+        [place.folder / "first" / "first.jsonl", place.folder / "second" / "second.jsonl"], []
+    )
+    text = "\n".join(gpu_report.tables(record))
+    assert "On NVIDIA H100 80GB HBM3, driver 580.159.04" in text and "4 of 4 iterations" in text
+
+
+def test_parts_without_time_are_not_begun(place: Place) -> None:
+    visited = place.visit("first", {"parts": {"": "succeeds"}, "light": True, "seconds": 1.0}, "short")
+    assert set(visited.states.values()) == {"done", "not begun"}
+    assert visited.states["smoke"] == "not begun" and visited.lines[-1]["end"] == "red"
+
+
+@pytest.fixture(scope="module")
+def planted(place: Place) -> Path:
+    source = NATIVE / "cuda" / "loss.cu"
+    text = source.read_text()
+    assert text.count(SIGN) == 1
+    return build_on_cpu(name="splat_cuda_planted", changed={source: PLANT + text.replace(SIGN, PLANTED)})
+
+
+@pytest.mark.parametrize("fault", ["wrong", "hang"])
+def test_a_broken_first_kernel_ends_the_visit_and_is_told(place: Place, planted: Path, fault: str) -> None:
+    environment = [("SPLATPIPE_HARNESS", str(planted)), (VARIABLE, fault)]
+    limits = {"smoke": 3.0} if fault == "hang" else {}
+    parts = {name: "succeeds" for name in STAND_INS if name.endswith("compiled")}
+    visited = place.visit("first", {"limits": limits, "parts": parts}, fault, environment)
+    states = {name: state for name, state in visited.states.items() if state != "done"}
+    told = {"wrong": ["failed", "failed"], "hang": ["late", "late"]}[fault]
+    assert list(states.values())[:2] == told and list(states)[:2] == ["smoke", "smoke under memcheck"]
+    assert set(list(states.values())[2:]) == {"not begun"}
+    assert visited.lines[-1]["red"][0] == "smoke"
+    if fault == "wrong":
+        assert "differ from the CPU's" in visited.error("smoke")
+    print(f"{fault}: ended after {visited.lines[-1]['seconds']} s")
+
+
+def test_the_limits_fit_the_calls() -> None:
+    scale, graces = gpu_visit.VisitScale(), 2 * gpu_parts.GRACE_S
+    first = gpu_visit.first_call(scale, gpu_visit.BUILT_PEERS)
+    second = gpu_visit.second_call(
+        scale, gpu_visit.BUILT_PEERS, [{"part": part.name, "state": "done"} for part in first]
+    )
+    for parts, seconds in ((first, gpu_visit.FIRST_S), (second, gpu_visit.SECOND_S)):
+        print("\n".join(f"{part.limit_s:4g} s  {part.name}{' (beside)' * part.beside}" for part in parts))
+        assert sum(part.limit_s for part in parts if not part.beside) <= seconds
+    waits = [part.entry for part in first].index(gpu_parts.QUIET)
+    assert sum(part.limit_s for part in first[: waits + 1] if not part.beside) <= 150.0
+    broken = next(part for part in first if part.on_failure)
+    assert broken.on_failure is not None
+    assert broken.limit_s + broken.on_failure.limit_s + 2 * graces <= ENDED_S
