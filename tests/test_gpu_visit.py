@@ -37,9 +37,9 @@ CARRIED = ("pydantic", "pydantic_core", "annotated_types", "typing_inspection", 
 ENDED_S = 30.0  # within which a broken first kernel ends the visit
 # What needs a card, or a compiler of its own.
 STAND_INS = {
-    "tests marked cuda": "succeeds",
-    "the same bits twice": "succeeds",
-    "kernels": "succeeds",
+    "the same bits twice": "same_bits",
+    "racecheck": "succeeds",
+    "kernels": "profiles",
     **{f"{peer} compiled": "compiles" for peer in gpu_visit.BUILT_PEERS},
     **{f"{peer}, ": "peer_speed" for peer in gpu_visit.TIMED_PEERS},
     "training": "trains",
@@ -170,7 +170,8 @@ def troubled(place: Place) -> Visited:
     """The first call, with every kind of trouble."""
     parts = {"": "succeeds", "tests": "fails", "the same": "hangs", "memcheck": "refuses", "racecheck": "crashes"}
     parts |= {"compilers ended": "quiet", "faster-gs compiled": "hangs", "gsplat, ": "fails", "few, made": "is_bare"}
-    limits = {"the same": 2.0, "compilers ended": 0.1, "faster-gs compiled": 1.0}
+    # What one part leaves of its limit is added to the next ones'.
+    limits = {"the card": 3.0, "smoke": 3.0, "tests": 0.1, "agreement": 0.1, "the same": 0.1, "faster-gs compiled": 1.0}
     return place.visit("first", {"parts": parts, "limits": limits, "light": True, "seconds": 60.0}, "troubled")
 
 
@@ -188,8 +189,7 @@ def test_its_parts_measure_what_they_are_to_measure(first: Visited) -> None:
     assert first.rows("the card")[0]["driver_version"] == "580.159.04"
     assert first.rows("smoke")[0]["psnr_db"] >= gpu_proofs.MIN_DB
     assert len(first.rows("agreement with the CPU")) == 4
-    for tool in ("memcheck", "racecheck"):
-        assert [(row["of"], row["found"]) for row in first.rows(tool)] == [("every_kernel", 0)]
+    assert [(row["of"], row["found"]) for row in first.rows("memcheck")] == [("every_kernel", 0)]
     for name, scene, count in (("few, made", "made", gpu_visit.TOY.few), ("trained scene", "trained", 150)):
         whole, alone = first.rows(name)
         assert (whole["scene"], whole["count"], whole["preset"]) == (scene, count, False)
@@ -277,9 +277,10 @@ def test_a_broken_first_kernel_ends_the_visit_and_is_told(place: Place, planted:
     parts = {name: "succeeds" for name in STAND_INS if name.endswith("compiled")}
     visited = place.visit("first", {"limits": limits, "parts": parts}, fault, environment)
     states = {name: state for name, state in visited.states.items() if state != "done"}
-    told = {"wrong": ["failed", "failed"], "hang": ["late", "late"]}[fault]
-    assert list(states.values())[:2] == told and list(states)[:2] == ["smoke", "smoke under memcheck"]
-    assert set(list(states.values())[2:]) == {"not begun"}
+    assert list(states)[:2] == ["smoke", "smoke under memcheck"]
+    assert states.pop("smoke") == {"wrong": "failed", "hang": "late"}[fault]
+    assert states.pop("smoke under memcheck") in ("failed", "late")  # by how busy the machine is
+    assert set(states.values()) == {"not begun"}
     assert visited.lines[-1]["red"][0] == "smoke"
     if fault == "wrong":
         assert "differ from the CPU's" in visited.error("smoke")
@@ -300,3 +301,92 @@ def test_the_limits_fit_the_calls() -> None:
     broken = next(part for part in first if part.on_failure)
     assert broken.on_failure is not None
     assert broken.limit_s + broken.on_failure.limit_s + 2 * graces <= ENDED_S
+
+
+def test_a_carried_library_that_does_not_fit_is_compiled_there(
+    place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (good,) = (place.pack / "libraries").glob("_native*.so")
+    carried, packages = tmp_path / "carried", tmp_path / "packages"
+    carried.mkdir()
+    (carried / "_native.abi3.so").write_bytes(b"of another machine")
+    shutil.copytree(NATIVE.parents[1], packages / "splatpipe" / "pipeline", ignore=gpu_visit.UNUSED)
+    monkeypatch.setenv("SPLATPIPE_HARNESS", str(place.library))
+    monkeypatch.setattr(gpu_libraries, "_compile_here", lambda scratch, target: good)
+    said = gpu_libraries.place(carried, packages, tmp_path)
+    assert said["_native.abi3.so"].startswith("compiled here, since the carried one does not fit: ImportError")
+    assert [path.name for path in (packages / "splatpipe" / "pipeline" / "raster").glob("*.so")] == [good.name]
+    (carried / "_native.abi3.so").unlink()
+    shutil.copy(good, carried)
+    assert gpu_libraries.place(carried, packages, tmp_path)["_native.abi3.so"] == "as carried"
+
+
+def test_peers_are_trimmed_to_what_is_timed(tmp_path: Path) -> None:
+    peers, packed = tmp_path / "peers", tmp_path / "packed"
+    gsplat = peers / "gsplat" / "gsplat"
+    files = {"version.py": '__version__ = "1.5.3"', "rendering.py": "", "cuda/ext.cpp": "all of them"}
+    files |= {"cuda/include/Ops.h": "", "cuda/csrc/third_party/glm/glm/vec3.hpp": ""}
+    files |= {f"cuda/csrc/{name}": "" for name in (*gpu_peer_sources.GSPLAT_SOURCES, "Relocation.cpp", "Common.h")}
+    files["cuda/csrc/Rasterization.cpp"] = "a\n        __LAUNCH_KERNEL__(3)\n        __LAUNCH_KERNEL__(33)\nb\n"
+    for name, text in files.items():
+        (gsplat / name).parent.mkdir(parents=True, exist_ok=True)
+        (gsplat / name).write_text(text)
+    said = gpu_peer_sources.pack_peers(peers, packed)
+    assert said["gsplat"] == "1.5.3" and said["faster-gs"].startswith("left out: there is no faster-gaussian-splatting")
+    made = packed / "gsplat" / "gsplat" / "cuda"
+    assert (made / "csrc" / "Rasterization.cpp").read_text() == "a\n        __LAUNCH_KERNEL__(3)\nb\n"
+    assert not (made / "csrc" / "Relocation.cpp").exists() and (made / "csrc" / "Common.h").exists()
+    assert "gsplat::adam" in (made / "ext.cpp").read_text()
+    assert gpu_visit.carried_peers(tmp_path) == [] and [path.name for path in packed.iterdir()] == ["gsplat"]
+    (gsplat / "version.py").write_text('__version__ = "1.6.0"')
+    assert gpu_peer_sources.pack_peers(peers, packed)["gsplat"] == "left out: it is not gsplat 1.5.3"
+    assert set(gpu_peer_sources.pack_peers(None, packed)) == set(gpu_visit.BUILT_PEERS)
+
+
+def test_a_missed_factor_is_a_finding_and_wrong_gradients_are_a_failure(tmp_path: Path) -> None:
+    lines: list[Row] = [{"call": "first", "began": "2027-01-02T03:04:05", "carried": {"commit": "1234567"}}]
+    view = {"psnr_db": 71.5, "gradients": {"means": 2e-4}}
+    ours = {"scene": "made", "count": 1_000_000, "preset": False, "host_ms": 1.0, "slowest_ms": 9.0, "peak_gb": 0.5}
+    theirs = {"peer": "gsplat", "scene": "made", "count": 1_000_000, "raster_ms": 8.0, "peak_gb": 1.0, "ssim": "fused"}
+    for part, row in (
+        ("the card", {"name": "NVIDIA H200", "driver_version": "580.1"}),
+        ("agreement with the CPU", view),
+        ("middle, made", ours | {"iteration_ms": 6.0}),
+        ("gsplat, middle, made", theirs | {"iteration_ms": 9.0, "optimiser": "SelectiveAdam"}),
+        *((f"training, seed {seed}", {"seed": seed, "psnr_cc": 20.1 + seed, "train_seconds": 5}) for seed in range(3)),
+    ):
+        lines += [{"part": part, "row": row}, {"part": part, "state": "done", "seconds": 1.0}]
+    lines.append({"part": "memcheck", "state": "refused", "seconds": 2.0, "error": "refused: Device not supported"})
+    file = tmp_path / "first.jsonl"
+    cpus = [{"seed": seed, "psnr_cc": 20.0 + seed, "train_seconds": 50} for seed in range(3)]
+
+    def states() -> dict[str, tuple[str, str]]:
+        file.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"part": "cut o')
+        record = gpu_report.VisitRecord([file], cpus)
+        print("\n".join(gpu_report.tables(record)))
+        return {each.demand: (each.measured, each.state) for each in gpu_report.verdicts(record)}
+
+    found = states()
+    assert found["renders ≥ 60 dB from the CPU's"] == ("71.5 dB", gpu_report.HOLDS)
+    assert found["≥ 2 times gsplat's iterations, 1,000,000 (made)"] == ("1.50 times", gpu_report.MISSED)
+    assert found["≤ 0.6 of gsplat's memory, 1,000,000 (made)"] == ("0.50", gpu_report.HOLDS)
+    assert found["≥ 1 times faster-gs's iterations"][1] == gpu_report.UNKNOWN
+    assert found["memcheck finds nothing"] == ("refused by the machine", gpu_report.UNKNOWN)
+    assert found["psnr_cc within 0.1 dB + 2 standard errors of the CPU's"][1] == gpu_report.HOLDS
+    assert gpu_report.FAILS not in {state for _, state in found.values()}
+    view["gradients"] = {"means": float("nan")}
+    assert states()["gradients within 0.001 of the CPU's"][1] == gpu_report.FAILS
+
+
+def test_what_is_carried_is_weighed_and_the_command_printed(
+    place: Place, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import gpu_prepare
+
+    gpu_prepare.print_commands(place.pack, again=False)
+    said = capsys.readouterr().out
+    assert "python3 benchmarks/gpu_visit.py first --pack " in said and "timeout_s 420" in said
+    print(next(line for line in said.splitlines() if "MiB, the tree's" in line))
+    monkeypatch.setattr(gpu_prepare, "MAX_MEBIBYTES", 1)
+    with pytest.raises(SystemExit, match="too much"):
+        gpu_prepare.print_commands(place.pack, again=True)
