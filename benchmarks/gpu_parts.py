@@ -87,10 +87,12 @@ class VisitFile:
 
     path: Path
 
-    @property
-    def log(self) -> Path:
-        """The log's path."""
-        return self.path.with_suffix(".log")
+    def log(self, part: GpuPart | None = None) -> Path:
+        """Return the path of the log, or of the own one of a part that runs alongside others."""
+        if part is None or not part.beside:
+            return self.path.with_suffix(".log")
+        stem = "".join(letter if letter.isalnum() else "-" for letter in part.name)
+        return self.path.with_name(f"{self.path.stem}.{stem}.log")
 
     def write(self, line: Mapping[str, Any]) -> None:
         """Append a line; several processes may do so."""
@@ -116,7 +118,8 @@ class PartProcess:
     def __init__(self, part: GpuPart, file: VisitFile) -> None:
         self.part, self._file = part, file
         self._began = time.monotonic()
-        self._log_from = file.log.stat().st_size if file.log.exists() else 0
+        self._log = file.log(part)
+        self._log_from = self._log.stat().st_size if self._log.exists() else 0
         sys.stdout.flush()
         sys.stderr.flush()
         with warnings.catch_warnings():  # threads of numpy's BLAS, which takes care of forks
@@ -132,7 +135,7 @@ class PartProcess:
             os.setsid()
             for number in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(number, signal.SIG_DFL)
-            log = os.open(self._file.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
             print(f"== {self.part.name}", flush=True)
@@ -158,8 +161,8 @@ class PartProcess:
         return PartOutcome(self.part.name, state, time.monotonic() - self._began, error)
 
     def _said(self) -> str:
-        """Return the end of what it printed, or what others printed meanwhile."""
-        with contextlib.suppress(FileNotFoundError), self._file.log.open("rb") as file:
+        """Return the end of what it printed."""
+        with contextlib.suppress(FileNotFoundError), self._log.open("rb") as file:
             file.seek(self._log_from)
             return file.read().decode(errors="replace").strip()[-LONGEST_ERROR:]
         return ""

@@ -13,6 +13,7 @@ import shutil
 import statistics
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from itertools import cycle
 from pathlib import Path
@@ -69,6 +70,7 @@ def compiled(peer: str) -> Iterator[Row]:
     build = json.loads((source / DESCRIPTION).read_text())
     from torch.utils import cpp_extension
 
+    began = time.monotonic()
     scratch = PEERS.parent / "compiled" / peer
     scratch.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("TORCH_CUDA_ARCH_LIST", "9.0")
@@ -85,7 +87,7 @@ def compiled(peer: str) -> Iterator[Row]:
     for package in build["packages"]:
         shutil.copytree(source / package, PEERS / package, dirs_exist_ok=True)
     shutil.copy2(module.__file__, PEERS / build["beside"])  # last: who finds it finds everything
-    yield {"peer": peer, "version": build["version"], "compiled": Path(module.__file__).name}
+    yield {"peer": peer, "version": build["version"], "seconds": round(time.monotonic() - began, 1)}
 
 
 def speed(peer: str, count: int | None, megapixels: float = MEGAPIXELS, repeats: int = REPEATS) -> Iterator[Row]:

@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import gpu_libraries
 import gpu_peer_sources
+import gpu_proofs
 import gpu_scenes
 from gpu_parts import Row
 from gpu_visit import BUILT_PEERS, SEEDS, VisitScale
@@ -114,9 +115,6 @@ def train_scene(dataset: Path, pack: Path) -> Row:
     """Train the capture from many points, on the CPU, for the scene that is measured beside made ones."""
     target = pack / "captures" / gpu_scenes.CAPTURE / gpu_scenes.TRAINED
     if not target.exists():
-        import gpu_proofs
-
-        gpu_scenes.PACK = pack
         options = {"iterations": TRAINED_ITERATIONS, "max_gaussians": MOST_TRAINED, "densify": False}
         with tempfile.TemporaryDirectory() as scratch:
             made, _ = made_dataset(dataset, DENSE_POINTS, Path(scratch))
@@ -128,9 +126,6 @@ def train_scene(dataset: Path, pack: Path) -> Row:
 
 def train_on_cpu(pack: Path, iterations: int) -> Row:
     """Run the trainings that the device's are compared with; each that is done is kept."""
-    import gpu_proofs
-
-    gpu_scenes.PACK = pack
     rows = [row for row in gpu_proofs.carried_trainings() if row["iterations"] == iterations]
     for seed in SEEDS:
         if not any(row["seed"] == seed for row in rows):

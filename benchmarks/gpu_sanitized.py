@@ -30,6 +30,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 
 KERNELS = "splat4cuda"  # in the mangled name of each kernel of ours, and of no other
 SMALL, SMALL_SIZE = 3000, (161, 117)  # Gaussians, and image size: a tool slows kernels down a hundredfold
+LARGER = 1.5  # of log-scales: several tiles a Gaussian, so that a chunk of one pair each is far too small
 FOUND = 3  # exit code of a run in which the tool found something
 PROBE_S = 5.0  # for a machine's refusal
 REFUSALS = ("Device not supported", "device is not supported", "not supported on")
@@ -105,7 +106,9 @@ def every_kernel(count: int = SMALL, size: Sequence[int] = SMALL_SIZE) -> Iterat
     with gpu_scenes.device() as where:
         kernels = cuda.kernels_of(where)
         assert kernels is not None
-        model, view = random_model(count).to(where).requires_grad_(), view_of(*size)
+        model, view = random_model(count), view_of(*size)
+        model.log_scales += LARGER
+        model = model.to(where).requires_grad_()
         for foreseen in (True, False):
             for depth in (False, True):
                 forget_frames(kernels, count, view, foreseen)
@@ -116,15 +119,20 @@ def every_kernel(count: int = SMALL, size: Sequence[int] = SMALL_SIZE) -> Iterat
         kernels.morton(model.means.detach(), (-1.0, -1.0, -1.0), (2.0, 2.0, 2.0))
         if where.type == "cuda":
             torch.cuda.synchronize(where)
-        yield {"gaussians": count, "finite": bool(torch.isfinite(model.means).all())}
+        chunks = kernels.forecast.room(FrameSize(count, tiles_of(view))).passes
+        yield {"gaussians": count, "chunks": chunks, "finite": bool(torch.isfinite(model.means).all())}
+
+
+def tiles_of(view: Camera) -> int:
+    """Return the number of a view's tiles."""
+    return -(-view.width // TILE_PX) * -(-view.height // TILE_PX)
 
 
 def forget_frames(kernels: cuda.CudaKernels, count: int, view: Camera, foreseen: bool) -> None:
     """Set the forecast to a new one, or to one that expects a single pair, so that most of a frame is unforeseen."""
     kernels.forecast = Forecast(count)
     if not foreseen:
-        tiles = -(-view.width // TILE_PX) * -(-view.height // TILE_PX)
-        kernels.forecast.learn(FrameFacts(FrameSize(count, tiles), count, 1, 1))
+        kernels.forecast.learn(FrameFacts(FrameSize(count, tiles_of(view)), count, 1, 1))
 
 
 def train_step(model: Gaussians, view: Camera, depth: bool) -> None:

@@ -238,8 +238,8 @@ def visit(call: str, parts: Sequence[GpuPart], out: Path, pack: Path, seconds: f
     began = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     file = VisitFile(out / f"{call}.jsonl")
-    for path in (file.path, file.log):
-        path.unlink(missing_ok=True)
+    for path in out.glob(f"{call}.*"):
+        path.unlink()
     carried = json.loads((pack / "pack.json").read_text()) if (pack / "pack.json").exists() else {}
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     plan = [{"part": part.name, "limit_s": part.limit_s} | ({"beside": True} if part.beside else {}) for part in parts]
@@ -248,7 +248,8 @@ def visit(call: str, parts: Sequence[GpuPart], out: Path, pack: Path, seconds: f
         file.write({"part": "unpacked", "row": unpack(pack)})
         file.ended(PartOutcome("unpacked", "done", time.monotonic() - began))
         outcomes = run_parts(parts, file, began + seconds, import_for_parts)
-    except SystemExit as error:
+    except (Exception, SystemExit) as error:
+        traceback.print_exc()
         outcomes = [PartOutcome("unpacked", "failed", time.monotonic() - began, str(error))]
         file.ended(outcomes[0])
     ours = {part.name for part in parts if part.ours} | {"unpacked"}
@@ -272,6 +273,7 @@ def main() -> None:
     options.add_argument("--toy", action="store_true", help="first, second: at toy size, for the harness")
     arguments = options.parse_args()
     if arguments.what == "prepare":
+        os.environ["SPLATPIPE_PACK"] = str(arguments.pack.resolve())
         import gpu_prepare
 
         gpu_prepare.main(arguments.data, arguments.pack, arguments.peers, arguments.first)

@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,11 +24,13 @@ import gpu_parts
 import gpu_peer_sources
 import gpu_proofs
 import gpu_report
+import gpu_sanitized
 import gpu_visit
 import tiny_scene
 from building import NATIVE, build_on_cpu
 from gpu_parts import Row
 
+from splatpipe.pipeline.raster import cuda, cuda_api
 from splatpipe.pipeline.splat.ply import write_splat
 
 BARE = Path(__file__).parent / "bare"
@@ -66,13 +67,11 @@ class Visited:
 
     Attributes:
         lines: Of its file.
-        printed: On its output.
-        seconds: How long it took.
+        printed: On its output, and in its logs.
     """
 
     lines: list[Row]
     printed: str
-    seconds: float
     states: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -114,12 +113,10 @@ class Place:
             **dict(environment),
         }
         words = [sys.executable, str(BARE / "visit.py"), call, str(self.pack), str(out), json.dumps(changes)]
-        began = time.monotonic()
         done = subprocess.run(words, capture_output=True, text=True, check=False, env=given, cwd=self.folder)
         assert done.returncode == 0, done.stderr
-        log = out / f"{call}.log"
         lines = gpu_parts.read_lines(out / f"{call}.jsonl")
-        return Visited(lines, done.stdout + (log.read_text() if log.exists() else ""), time.monotonic() - began)
+        return Visited(lines, done.stdout + "".join(log.read_text() for log in sorted(out.glob("*.log"))))
 
 
 @pytest.fixture(scope="module")
@@ -322,7 +319,7 @@ def test_a_carried_library_that_does_not_fit_is_compiled_there(
 
 
 def test_peers_are_trimmed_to_what_is_timed(tmp_path: Path) -> None:
-    peers, packed = tmp_path / "peers", tmp_path / "packed"
+    peers, packed = tmp_path / "sources", tmp_path / "pack" / "peers"
     gsplat = peers / "gsplat" / "gsplat"
     files = {"version.py": '__version__ = "1.5.3"', "rendering.py": "", "cuda/ext.cpp": "all of them"}
     files |= {"cuda/include/Ops.h": "", "cuda/csrc/third_party/glm/glm/vec3.hpp": ""}
@@ -337,7 +334,7 @@ def test_peers_are_trimmed_to_what_is_timed(tmp_path: Path) -> None:
     assert (made / "csrc" / "Rasterization.cpp").read_text() == "a\n        __LAUNCH_KERNEL__(3)\nb\n"
     assert not (made / "csrc" / "Relocation.cpp").exists() and (made / "csrc" / "Common.h").exists()
     assert "gsplat::adam" in (made / "ext.cpp").read_text()
-    assert gpu_visit.carried_peers(tmp_path) == [] and [path.name for path in packed.iterdir()] == ["gsplat"]
+    assert gpu_visit.carried_peers(tmp_path / "pack") == ["gsplat"]
     (gsplat / "version.py").write_text('__version__ = "1.6.0"')
     assert gpu_peer_sources.pack_peers(peers, packed)["gsplat"] == "left out: it is not gsplat 1.5.3"
     assert set(gpu_peer_sources.pack_peers(None, packed)) == set(gpu_visit.BUILT_PEERS)
@@ -390,3 +387,18 @@ def test_what_is_carried_is_weighed_and_the_command_printed(
     monkeypatch.setattr(gpu_prepare, "MAX_MEBIBYTES", 1)
     with pytest.raises(SystemExit, match="too much"):
         gpu_prepare.print_commands(place.pack, again=True)
+
+
+def test_every_kernel_is_run_under_the_sanitizers(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: set[str] = set()
+    call = cuda.CudaKernels.call
+
+    def noted(kernels: cuda.CudaKernels, name: str, *arguments: object) -> None:
+        called.add(name)
+        call(kernels, name, *arguments)
+
+    monkeypatch.setattr(cuda.CudaKernels, "call", noted)
+    monkeypatch.setenv("SPLATPIPE_HARNESS", str(place.library))
+    (row,) = gpu_sanitized.every_kernel(100, (51, 37))
+    assert called == {name for name in cuda_api.CALLS if name != "splat_device"}
+    assert row["chunks"] > 2 and row["finite"]
