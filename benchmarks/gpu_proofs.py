@@ -94,6 +94,7 @@ def marked_tests(options: Sequence[str] = ()) -> Iterator[Row]:
         SystemExit: if a test fails.
     """
     words = [sys.executable, "-m", "pytest", "-v", "-m", "cuda", "--noconftest", "-p", "no:cacheprovider"]
+    words += ["--continue-on-collection-errors"]
     words += [*options, *map(str, marked_files())]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     last = ""

@@ -62,7 +62,7 @@ def trains(seed: int, iterations: int) -> Iterator[Row]:
     yield {"seed": seed, "iterations": iterations, "psnr_cc": 20.0 + 0.01 * seed, "train_seconds": 1.0}
 
 
-def is_bare() -> Iterator[Row]:
+def is_bare(**arguments: object) -> Iterator[Row]:
     """Report which of the packages that the machine lacks can be imported, and from where the carried ones come."""
     import importlib
 
