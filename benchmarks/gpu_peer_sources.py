@@ -84,7 +84,7 @@ def pack_peers(folder: Path | None, target: Path) -> dict[str, str]:
 
     Args:
         folder: With ``gsplat`` (a 1.5.3 wheel's or source tree), ``faster-gaussian-splatting`` and ``fused-ssim``; None
-            for no peers.
+            for those that are packed already.
         target: Folder for one folder a peer.
 
     Returns:
@@ -92,6 +92,9 @@ def pack_peers(folder: Path | None, target: Path) -> dict[str, str]:
     """
     said = {}
     for name, (source, pack) in PEERS.items():
+        if folder is None and (target / name / DESCRIPTION).exists():
+            said[name] = "as before"
+            continue
         shutil.rmtree(target / name, ignore_errors=True)
         if folder is None or not (folder / source).is_dir():
             said[name] = f"left out: there is no {source} in the folder of peers"

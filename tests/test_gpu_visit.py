@@ -338,6 +338,7 @@ def test_peers_are_trimmed_to_what_is_timed(tmp_path: Path) -> None:
     assert not (made / "csrc" / "Relocation.cpp").exists() and (made / "csrc" / "Common.h").exists()
     assert "gsplat::adam" in (made / "ext.cpp").read_text()
     assert gpu_visit.carried_peers(tmp_path / "pack") == ["gsplat"]
+    assert gpu_peer_sources.pack_peers(None, packed)["gsplat"] == "as before"
     (gsplat / "version.py").write_text('__version__ = "1.6.0"')
     assert gpu_peer_sources.pack_peers(peers, packed)["gsplat"] == "left out: it is not gsplat 1.5.3"
     assert set(gpu_peer_sources.pack_peers(None, packed)) == set(gpu_visit.BUILT_PEERS)
