@@ -36,6 +36,7 @@ FIRST_S, SECOND_S = 414.0, 194.0  # of 420 and 200: what is left goes to the las
 IMPORTED = ("gpu_proofs", "gpu_speed", "gpu_sanitized", "gpu_peers")  # once, before the parts are forked
 SEEDS = (0, 1, 2)
 TIMED_PEERS = ("gsplat", "faster-gs")
+SMALL_SMOKE = {"count": 3000, "size": [161, 117]}  # under memcheck, which slows kernels down a hundredfold
 BUILT_PEERS = (*TIMED_PEERS, "fused-ssim")
 RED = ("failed", "late", "not begun")
 ROOMS = ("pipeline", "stages", "configs")
@@ -151,7 +152,7 @@ def smoke(scale: VisitScale) -> GpuPart:
     again = GpuPart(
         "smoke under memcheck",
         "gpu_sanitized:sanitized",
-        {"tool": "memcheck", "entry": "gpu_proofs:smoke"} | arguments,
+        {"tool": "memcheck", "entry": "gpu_proofs:smoke", **SMALL_SMOKE, **arguments},
         9,
     )
     return GpuPart("smoke", "gpu_proofs:smoke", arguments, 11, on_failure=again)
