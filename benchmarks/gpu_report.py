@@ -150,7 +150,7 @@ def named(row: Row) -> str:
 def as_the_cpu(record: VisitRecord) -> Verdict:
     """Compare the mean psnr_cc of the trainings with the carried one of the CPU's."""
     demand = f"psnr_cc within {MOST_APART_DB} dB + {STANDARD_ERRORS:g} standard errors of the CPU's"
-    ours = {row["seed"]: row["psnr_cc"] for row in record.rows("seed", "psnr_cc")}
+    ours = {row["seed"]: row["psnr_cc"] for row in record.rows("seed", "psnr_cc") if row["psnr_cc"] is not None}
     theirs = {row["seed"]: row["psnr_cc"] for row in record.carried if row["seed"] in ours}
     if len(theirs) < 2:
         return Verdict(demand, "", UNKNOWN)

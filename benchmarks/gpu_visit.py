@@ -102,7 +102,7 @@ def first_call(scale: VisitScale, peers: Sequence[str]) -> list[GpuPart]:
         GpuPart("the same bits twice", "gpu_proofs:same_bits_twice", {"iterations": scale.twice}, 16),
         sanitizer("memcheck", 15, scale),
         sanitizer("racecheck", 15, scale),
-        GpuPart("compilers ended", QUIET, {}, 7),
+        GpuPart("compilers ended", QUIET, {}, 2),
         speed("middle, made", 18, count=scale.middle),
         speed("few, made", 11, count=scale.few),
         speed("many, made", 18, count=scale.many),

@@ -46,6 +46,7 @@ STAND_INS = {
     **{f"{peer} compiled": "compiles" for peer in gpu_visit.BUILT_PEERS},
     **{f"{peer}, ": "peer_speed" for peer in gpu_visit.TIMED_PEERS},
     "training": "trains",
+    "training, seed 0": "trains_here",
 }
 # Faults in a kernel of the loss, active where this variable names them.
 VARIABLE = "SPLATPIPE_PLANTED"
@@ -127,7 +128,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     pack = folder / "pack"
     capture = pack / "captures" / "sceaux"
     dataset = tiny_scene.write_dataset(capture / "undistort.dataset")
-    shutil.copyfile(tiny_scene.split_part(dataset)["split.views"], capture / "split.views")
+    shutil.copyfile(tiny_scene.split_part(dataset, every=4)["split.views"], capture / "split.views")
     model = tiny_scene.true_model()
     write_splat(capture / "initialize.splat", model)
     model.sh[:, 0] += 0.3  # or the photos' differences from its renders are of rounding alone, and of either sign
@@ -194,6 +195,8 @@ def test_its_parts_measure_what_they_are_to_measure(first: Visited) -> None:
         assert (whole["scene"], whole["count"], whole["preset"]) == (scene, count, False)
         assert min(whole["iteration_ms"], whole["host_ms"], alone["raster_ms"], alone["forward_ms"]) > 0.0
     assert first.rows("few, default preset")[0]["preset"]
+    (trained,) = first.rows("training, seed 0")
+    assert (trained["device"], trained["iterations"]) == ("cpu", gpu_visit.TOY.iterations) and trained["psnr_cc"] > 5.0
 
 
 def test_the_tests_marked_cuda_are_collected_on_the_bare_machine(first: Visited) -> None:

@@ -62,6 +62,13 @@ def trains(seed: int, iterations: int) -> Iterator[Row]:
     yield {"seed": seed, "iterations": iterations, "psnr_cc": 20.0 + 0.01 * seed, "train_seconds": 1.0}
 
 
+def trains_here(seed: int, iterations: int) -> Iterator[Row]:
+    """Train and evaluate as on a card, on the CPU: everything that this imports has to be there."""
+    import gpu_proofs
+
+    yield from gpu_proofs.training(seed, iterations, on="cpu", megapixels=0.002)
+
+
 def is_bare(**arguments: object) -> Iterator[Row]:
     """Report which of the packages that the machine lacks can be imported, and from where the carried ones come."""
     import importlib
