@@ -104,7 +104,9 @@ def speed(peer: str, count: int | None, megapixels: float = MEGAPIXELS, repeats:
     where = torch.device("cuda", torch.cuda.current_device())
     made: Peer = {"gsplat": Gsplat, "faster-gs": FasterGs}[peer](count, where)
     ssim, name = _ssim()
-    views = cycle([(camera, photo.permute(2, 0, 1).to(where)) for camera, photo in gpu_scenes.photos(megapixels)])
+    views = cycle(
+        [(camera, photo.permute(2, 0, 1).contiguous().to(where)) for camera, photo in gpu_scenes.photos(megapixels)]
+    )
 
     def iteration() -> None:
         camera, photo = next(views)
