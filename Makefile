@@ -8,6 +8,7 @@
 # make release                 checks wheel and sdist in clean environments: licences, SBOM, types, the demo's bits
 # make aarch64                 builds the kernels and their C++ tests for 64-bit Arm, and runs them under QEMU
 # make test-image              builds the container image and runs the demo in it (Linux, root, buildah, runc)
+# make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/cuda.md
 # make sanitize                runs the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    installs torch without CUDA from PyTorch's own CPU index
 # SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or a list: "80;90"
@@ -44,7 +45,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-.PHONY: run test test-all aarch64 release sdist test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-all aarch64 gpu-visit release sdist test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -112,6 +113,10 @@ aarch64: .venv/.dependencies
 	@$(BIN)/ninja -j2 --quiet -C build/aarch64
 	@if command -v qemu-aarch64-static >/dev/null; then qemu-aarch64-static -L /usr/aarch64-linux-gnu build/aarch64/native_tests; \
 	  else echo "compiled; not run, for want of qemu-user-static"; fi
+
+# Libraries, captures, wheels and peers for a visit to a GPU on a bare machine, and the commands to run there.
+gpu-visit: $(EITHER)
+	@$(BIN)/python benchmarks/gpu_visit.py prepare $(PEERS:%=--peers %) $(FIRST:%=--first %)
 
 # No weak symbols in code compiled per instruction set; only the C interface of CUDA, for every requested device.
 symbols: .venv/.tested

@@ -1,137 +1,248 @@
-"""Parts of ``gpu_day.py measure``: gsplat on the same Gaussians and cameras, if it compiles.
+"""Parts of a visit to a GPU: other trainers' rasterizers on the same Gaussians, views and photos, with the same loss.
 
-gsplat 1.5.3 as its own trainer calls it: ``packed=False``, SelectiveAdam, and fused-ssim if it was carried and
-compiles; otherwise SSIM by torch's convolutions, which the row states.
+gsplat 1.5.3 as its own trainer calls it (``packed=False``, SelectiveAdam) and Faster-GS with its FusedAdam; both with
+fused-ssim, if it was carried and compiles, and otherwise with SSIM by torch's convolutions, which the row states.
 """
 
 from __future__ import annotations
 
 import importlib
+import json
+import os
+import shutil
 import statistics
-import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import gpu_scenes
 import torch
 from gpu_parts import Row
-from gpu_speed import CAPTURE, MEGAPIXELS, REPEATS, WARMUP, event_times, forget_peak, peak_gb
+from gpu_peer_sources import DESCRIPTION
+from gpu_proofs import SSIM_WEIGHT
+from gpu_scenes import MEGAPIXELS
+from gpu_speed import REPEATS, WARMUP, event_times, forget_peak, peak_gb
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-SSIM_WEIGHT = 0.2
+from splatpipe.pipeline.geometry.camera import Camera
+
 WINDOW, SIGMA = 11, 1.5  # of SSIM, as published
 C1, C2 = 0.01**2, 0.03**2
 BETAS, EPSILON = (0.9, 0.999), 1e-15
-RATES = {"means": 1.6e-5, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh": 2.5e-3}
-TARGET = Path(tempfile.gettempdir()) / "splatpipe-gpu-day" / "peers"
+RATES = {"means": 1.6e-5, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": 2.5e-3}
+SH_DEGREE = 3
+NEAR, FAR = 0.01, 1e10  # near as in our render options
+PEERS = Path(tempfile.gettempdir()) / "splatpipe-gpu-visit" / "peers"  # packages, each with its compiled module
 
 
-def compiled() -> Iterator[Row]:
-    """Compile what was carried: gsplat compiles itself on first use.
+class Peer(Protocol):
+    """Another trainer: its model, rasterizer and optimiser."""
+
+    optimiser: str
+
+    def render(self, camera: Camera) -> Tensor:
+        """Return the image, (3, h, w)."""
+        ...
+
+    def step(self) -> None:
+        """Step the parameters with the gradients of the last image, and clear these."""
+        ...
+
+    def forget(self) -> None:
+        """Clear the gradients."""
+        ...
+
+
+def compiled(peer: str) -> Iterator[Row]:
+    """Compile a peer that was carried.
 
     Raises:
-        SystemExit: if gsplat does not compile.
+        SystemExit: if it was not, or does not compile.
     """
-    yield {"fused_ssim": _install(gpu_scenes.PACK / "peers" / "fused-ssim")}
-    try:
-        backend = importlib.import_module("gsplat.cuda._backend")
-    except ImportError as error:
-        raise SystemExit(f"gsplat was not carried: {error}") from error
-    yield {"gsplat": importlib.import_module("gsplat").__version__, "compiled": backend._C is not None}
-    if backend._C is None:
-        raise SystemExit("gsplat does not compile here")
+    source = gpu_scenes.PACK / "peers" / peer
+    if not (source / DESCRIPTION).exists():
+        raise SystemExit(f"{peer} was not carried")
+    build = json.loads((source / DESCRIPTION).read_text())
+    from torch.utils import cpp_extension
+
+    began = time.monotonic()
+    scratch = PEERS.parent / "compiled" / peer
+    scratch.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("TORCH_CUDA_ARCH_LIST", "9.0")
+    module = cpp_extension.load(
+        build["extension"],
+        [str(source / path) for path in build["sources"]],
+        extra_cflags=build["cxx"],
+        extra_cuda_cflags=build["nvcc"],
+        extra_ldflags=build["linker"],
+        extra_include_paths=[str(source / path) for path in build["includes"]],
+        build_directory=str(scratch),
+        with_cuda=True,
+    )
+    for package in build["packages"]:
+        shutil.copytree(source / package, PEERS / package, dirs_exist_ok=True)
+    shutil.copy2(module.__file__, PEERS / build["beside"])  # last: who finds it finds everything
+    yield {"peer": peer, "version": build["version"], "seconds": round(time.monotonic() - began, 1)}
 
 
-def _install(source: Path) -> str:
-    if not source.is_dir():
-        return "not carried"
-    words = ["install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(TARGET), str(source)]
-    done = subprocess.run([sys.executable, "-m", "pip", *words], capture_output=True, text=True, check=False)
-    return "compiled" if done.returncode == 0 else done.stderr.strip()[-300:]
+def speed(peer: str, count: int | None, megapixels: float = MEGAPIXELS, repeats: int = REPEATS) -> Iterator[Row]:
+    """Time whole iterations and the rasterizer alone, as ``gpu_speed.speed`` does for ours.
 
-
-def speed(count: int, megapixels: float = MEGAPIXELS) -> Iterator[Row]:
-    """Time whole iterations and the rasterizer alone, as ``gpu_speed.speed`` does for ours."""
-    where = torch.device("cuda")
-    rasterization = importlib.import_module("gsplat").rasterization
-    given = _parameters(count, where)
-    views = cycle(_views(megapixels, where))
+    Raises:
+        SystemExit: if the peer was not compiled.
+    """
+    description = gpu_scenes.PACK / "peers" / peer / DESCRIPTION
+    build = json.loads(description.read_text()) if description.exists() else None
+    if build is None or not (PEERS / build["beside"] / f"{build['extension']}.so").exists():
+        raise SystemExit(f"{peer} was not compiled")
+    sys.path.insert(0, str(PEERS))
+    where = torch.device("cuda", torch.cuda.current_device())
+    made: Peer = {"gsplat": Gsplat, "faster-gs": FasterGs}[peer](count, where)
     ssim, name = _ssim()
-    optimisers = _optimisers(given)
-
-    def render() -> tuple[Tensor, dict[str, Any]]:
-        pose, matrix, size = next(views)
-        picture, _, facts = rasterization(
-            given["means"],
-            given["quats"],
-            given["scales"].exp(),
-            given["opacities"].sigmoid(),
-            given["sh"],
-            pose,
-            matrix,
-            *size,
-            sh_degree=3,
-            packed=False,
-        )
-        return picture, facts
+    eight_bits = [  # on the device, as ours
+        (camera, (255.0 * photo).round().to(torch.uint8).permute(2, 0, 1).contiguous().to(where))
+        for camera, photo in gpu_scenes.photos(megapixels)
+    ]
+    views = cycle(eight_bits)
 
     def iteration() -> None:
-        picture, facts = render()
+        camera, bits = next(views)
+        photo = bits.float() / 255.0
+        picture = made.render(camera)
         loss = (1 - SSIM_WEIGHT) * (picture - photo).abs().mean()
-        loss = loss + SSIM_WEIGHT * (1 - ssim(picture.permute(0, 3, 1, 2), photo.permute(0, 3, 1, 2)))
+        loss = loss + SSIM_WEIGHT * (1 - ssim(picture[None], photo[None]))
         loss.backward()  # type: ignore[no-untyped-call]
-        seen = (facts["radii"] > 0).all(-1).any(0)
-        for optimiser in optimisers:
-            optimiser.step(seen)
-            optimiser.zero_grad(set_to_none=True)
+        made.step()
 
     def alone() -> None:
-        for tensor in given.values():
-            tensor.grad = None
-        picture, _ = render()
-        picture.backward(upstream)
+        made.forget()
+        picture = made.render(next(views)[0])
+        picture.backward(upstream[: picture.shape[0], : picture.shape[1], : picture.shape[2]])
 
-    photo = torch.rand_like(render()[0])
-    upstream = torch.randn_like(photo)
-    row: Row = {"peer": "gsplat 1.5.3", "count": count, "megapixels": megapixels, "ssim": name}
-    for function, heading, memory in ((iteration, "iteration_ms", "peak_gb"), (alone, "raster_ms", "raster_peak_gb")):
+    upstream = torch.randn_like(made.render(next(views)[0]))
+    row: Row = {"peer": peer, "version": build["version"], "scene": "trained" if count is None else "made"}
+    row |= {"count": len(gpu_scenes.gaussians(count, torch.device("cpu"))) if count is None else count}
+    row |= {"megapixels": megapixels, "sh_degree": SH_DEGREE, "ssim": name, "optimiser": made.optimiser}
+    for function, heading, peak in ((iteration, "iteration_ms", "peak_gb"), (alone, "raster_ms", "raster_peak_gb")):
         event_times(function, WARMUP, where)
         forget_peak(where)
-        row[heading] = 1e3 * statistics.median(event_times(function, REPEATS, where))
-        row[memory] = peak_gb(where)
-    yield row
+        row[heading] = 1e3 * statistics.median(event_times(function, repeats, where))
+        row[peak] = peak_gb(where)
+        yield row | {"repeats": repeats}
 
 
-def _parameters(count: int, where: torch.device) -> dict[str, Tensor]:
-    ours = gpu_scenes.gaussians(CAPTURE, count, where)
-    tensors = (ours.means, ours.log_scales, ours.quats, ours.opacity_logits, ours.sh)
-    return {name: tensor.requires_grad_() for name, tensor in zip(RATES, tensors, strict=True)}
+class Gsplat:
+    """gsplat.
+
+    Args:
+        count: As for ``gpu_scenes.gaussians``.
+        where: The device.
+    """
+
+    optimiser = "SelectiveAdam"
+
+    def __init__(self, count: int | None, where: torch.device) -> None:
+        self._rasterization = importlib.import_module("gsplat").rasterization
+        self._given = _parameters(count, where)
+        adam = importlib.import_module("gsplat.optimizers").SelectiveAdam
+        groups = [{"params": [self._given[name]], "lr": rate} for name, rate in RATES.items()]
+        self._optimisers = [adam([group], eps=EPSILON, betas=BETAS) for group in groups]
+        self._seen = torch.ones(0)
+
+    def render(self, camera: Camera) -> Tensor:
+        given = self._given
+        pose, matrix = _pose(camera, given["means"].device)
+        picture, _, facts = self._rasterization(
+            given["means"],
+            given["quats"],
+            given["log_scales"].exp(),
+            given["opacity_logits"].sigmoid(),
+            given["sh"],
+            pose[None],
+            matrix[None],
+            camera.width,
+            camera.height,
+            near_plane=NEAR,
+            sh_degree=SH_DEGREE,
+            packed=False,
+        )
+        self._seen = (facts["radii"] > 0).all(-1).any(0)
+        return picture[0].permute(2, 0, 1)  # type: ignore[no-any-return]
+
+    def step(self) -> None:
+        for optimiser in self._optimisers:
+            optimiser.step(self._seen)
+            optimiser.zero_grad(set_to_none=True)
+
+    def forget(self) -> None:
+        _forget(self._given)
 
 
-def _optimisers(given: dict[str, Tensor]) -> list[Any]:
-    adam = importlib.import_module("gsplat.optimizers").SelectiveAdam
-    return [adam([{"params": [given[name]], "lr": rate}], eps=EPSILON, betas=BETAS) for name, rate in RATES.items()]
+class FasterGs:
+    """Faster-GS; arguments as for ``Gsplat``."""
+
+    optimiser = "FusedAdam"
+
+    def __init__(self, count: int | None, where: torch.device) -> None:
+        self._backend = importlib.import_module("FasterGSCudaBackend.torch_bindings.rasterization")
+        given = {name: tensor.detach() for name, tensor in _parameters(count, where).items()}
+        sh, logits = given.pop("sh"), given.pop("opacity_logits")
+        given |= {"opacity_logits": logits[:, None], "sh": sh[:, :1], "sh_rest": sh[:, 1:]}
+        self._given = {name: tensor.contiguous().requires_grad_() for name, tensor in given.items()}
+        adam = importlib.import_module("FasterGSCudaBackend.torch_bindings.adam").FusedAdam
+        rates = RATES | {"sh_rest": RATES["sh"] / 20}
+        groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in self._given.items()]
+        self._optimiser = adam(groups, lr=0.0, eps=EPSILON)
+
+    def render(self, camera: Camera) -> Tensor:
+        given, where = self._given, self._given["means"].device
+        pose, _ = _pose(camera, where)
+        position = -(pose[:3, :3].T @ pose[:3, 3])
+        settings = self._backend.RasterizerSettings(
+            *(pose, position.contiguous(), torch.zeros(3, device=where), (SH_DEGREE + 1) ** 2),
+            *(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
+            *(NEAR, FAR, False),
+        )
+        picture: Tensor = self._backend.diff_rasterize(
+            *(given["means"], given["log_scales"], given["quats"], given["opacity_logits"]),
+            *(given["sh"], given["sh_rest"], torch.empty(0), settings),
+        )
+        return picture
+
+    def step(self) -> None:
+        self._optimiser.step()
+        self._optimiser.zero_grad(set_to_none=True)
+
+    def forget(self) -> None:
+        _forget(self._given)
 
 
-def _views(megapixels: float, where: torch.device) -> list[tuple[Tensor, Tensor, tuple[int, int]]]:
-    found = []
-    for camera in gpu_scenes.cameras(CAPTURE, megapixels):
-        pose = torch.eye(4)
-        pose[:3] = torch.as_tensor(camera.cam_from_world[:3], dtype=torch.float32)
-        matrix = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        size = (camera.width, camera.height)
-        found.append((pose[None].to(where), matrix[None].to(where), size))
-    return found
+def _parameters(count: int | None, where: torch.device) -> dict[str, Tensor]:
+    model = gpu_scenes.gaussians(count, where)
+    return {name: tensor.requires_grad_() for name, tensor in model.tensors().items()}
+
+
+def _forget(tensors: dict[str, Tensor]) -> None:
+    for tensor in tensors.values():
+        tensor.grad = None
+
+
+def _pose(camera: Camera, where: torch.device) -> tuple[Tensor, Tensor]:
+    """Return a camera's pose, (4, 4), and intrinsics, (3, 3)."""
+    pose = torch.eye(4)
+    pose[:3] = torch.as_tensor(camera.cam_from_world[:3], dtype=torch.float32)
+    matrix = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    return pose.to(where), matrix.to(where)
 
 
 def _ssim() -> tuple[Callable[[Tensor, Tensor], Tensor], str]:
     try:
-        fused = importlib.import_module("fused_ssim").fused_ssim
+        fused: Any = importlib.import_module("fused_ssim").fused_ssim
     except (ImportError, OSError):
         return torch_ssim, "by torch"
     return lambda a, b: fused(a, b, padding="same"), "fused-ssim"

@@ -1,4 +1,4 @@
-"""Shared by the parts of a GPU session: packed captures, any number of Gaussians, and the device."""
+"""Shared by the parts of a visit to a GPU: the packed capture, any number of Gaussians, and the device."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_split, load_views
+from splatpipe.pipeline.photos.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.images import load_colour
 from splatpipe.pipeline.raster import cuda
 from splatpipe.pipeline.raster.cuda_library import load, why_not
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -22,7 +25,10 @@ from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 
-PACK = Path(os.environ.get("SPLATPIPE_PACK", ".gpu_day"))
+PACK = Path(os.environ.get("SPLATPIPE_PACK", ".gpu_visit"))
+CAPTURE = "sceaux"  # the packed capture
+TRAINED = "trained.ply"  # beside its parts: the model of a training
+MEGAPIXELS = 1.6  # of its photos
 HARNESS = "SPLATPIPE_HARNESS"  # a libsplat_cuda built for the CPU, to try the parts without a GPU
 PARTS = ("undistort.dataset", "split.views", "initialize.splat", "georef.frame", "georef.control", "georef.accuracy")
 # No technique beyond plain Gaussian splatting, as in every trainer.
@@ -55,25 +61,40 @@ def device() -> Iterator[torch.device]:
     yield torch.device("cuda", torch.cuda.current_device())
 
 
-def inputs(capture: str, device_name: str, threads: int = 2) -> Inputs:
-    """Return a packed capture's inputs for the stages, under the pipeline's names.
+def inputs(device_name: str, threads: int = 2) -> Inputs:
+    """Return the packed capture's inputs for the stages, under the pipeline's names.
 
     Raises:
         FileNotFoundError: if it is not packed.
     """
-    folder = PACK / "captures" / capture
+    folder = PACK / "captures" / CAPTURE
     if not folder.is_dir():
-        raise FileNotFoundError(f"{capture} is not in {PACK}: `gpu_day.py prepare` packs it, and it is carried here")
+        raise FileNotFoundError(f"{CAPTURE} is not in {PACK}: `make gpu-visit` packs it, and it is carried here")
     parts = {name: folder / name for name in PARTS if (folder / name).exists()}
     return Inputs(parts, folder, machine=Machine(device_name, threads))
 
 
-def cameras(capture: str, megapixels: float | None = None) -> list[Camera]:
-    """Return a packed capture's cameras, scaled to a size."""
-    found = [view.camera for view in load_views(inputs(capture, "cpu")["undistort.dataset"])]
-    if megapixels is None:
-        return found
+def views() -> list[View]:
+    """Return the packed capture's views that are trained on."""
+    given = inputs("cpu")
+    trained = set(load_split(given["split.views"]).train)
+    return [view for view in load_views(given["undistort.dataset"]) if view.camera.name in trained]
+
+
+def cameras(megapixels: float) -> list[Camera]:
+    """Return the cameras of these views, scaled to a size."""
+    found = [view.camera for view in views()]
     return [scaled(camera, math.sqrt(1e6 * megapixels / (camera.width * camera.height))) for camera in found]
+
+
+def photos(megapixels: float) -> Iterator[tuple[Camera, Tensor]]:
+    """Yield each of these views' cameras at a size, with its photo, (h, w, 3) of 0..1."""
+    import cv2
+
+    for view, camera in zip(views(), cameras(megapixels), strict=True):
+        photo = load_colour(view).astype(np.float32) / 255.0
+        photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        yield camera, torch.from_numpy(np.ascontiguousarray(photo))
 
 
 def scaled(camera: Camera, factor: float) -> Camera:
@@ -84,16 +105,19 @@ def scaled(camera: Camera, factor: float) -> Camera:
     return replace(camera, width=width, height=height, **focal)
 
 
-def gaussians(capture: str, count: int, where: torch.device, seed: int = 0) -> Gaussians:
-    """Return ``count`` Gaussians: the initial ones, each repeated next to itself, smaller the more there are.
+def gaussians(count: int | None, where: torch.device, seed: int = 0) -> Gaussians:
+    """Return the trained model, or ``count`` made Gaussians.
+
+    These are the initial ones, each repeated next to itself, smaller the more there are.
 
     Args:
-        capture: Name of the packed capture.
-        count: Number of Gaussians.
+        count: Number of Gaussians; None for the trained model.
         where: Device of the tensors.
         seed: Seed of the positions.
     """
-    start = read_splat(inputs(capture, "cpu")["initialize.splat"])
+    if count is None:
+        return read_splat(PACK / "captures" / CAPTURE / TRAINED).to(where)
+    start = read_splat(inputs("cpu")["initialize.splat"])
     generator = torch.Generator(where).manual_seed(seed)
     rows = torch.arange(count, device=where) % len(start)
     shrink = math.sqrt(min(1.0, len(start) / count))  # keeps the coverage of surfaces
@@ -110,9 +134,9 @@ def gaussians(capture: str, count: int, where: torch.device, seed: int = 0) -> G
     )
 
 
-def plain_plan(capture: str, count: int, **options: object) -> TrainingPlan:
+def plain_plan(count: int, **options: object) -> TrainingPlan:
     """Return the plan of a plain training, with all SH bands from the first iteration."""
     config = TrainConfig.model_validate({"iterations": PUBLISHED_ITERATIONS} | PLAIN | options)
-    given = inputs(capture, "cpu")
+    given = inputs("cpu")
     plan = make_plan(config, load_views(given["undistort.dataset"]), load_split(given["split.views"]), count)
     return replace(plan, schedule=replace(plan.schedule, sh_every=1))

@@ -1,38 +1,45 @@
-"""Parts of ``gpu_day.py measure``: speed and memory on a GPU. Times by CUDA events, medians."""
+"""Parts of a visit to a GPU that measure speed and memory. Times by CUDA events, medians."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import statistics
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import gpu_scenes
 import torch
 from gpu_parts import Row
-from gpu_proofs import train_capture
+from gpu_proofs import SilentReporter
+from gpu_scenes import MEGAPIXELS
+from torch.profiler import ProfilerActivity, profile
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_split, load_views
+from splatpipe.pipeline.photos.dataset import load_split
 from splatpipe.pipeline.raster import cuda, rasterizer
 from splatpipe.pipeline.raster.cuda_forecast import FrameFacts, FrameSize
 from splatpipe.pipeline.raster.cuda_frame import TILE_PX
 from splatpipe.pipeline.raster.definitions import RenderOptions
-from splatpipe.pipeline.raster.device import choose_device
+from splatpipe.pipeline.raster.device import Device, choose_device, cpu
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.train.brightness import decided_exposure
 from splatpipe.pipeline.train.iteration import iterate
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.state import TrainState
 from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
 from splatpipe.pipeline.train.windows import TrainingSize
 
-CAPTURE = "speed"  # as packed by `prepare`
-MEGAPIXELS = 1.6
 WARMUP, REPEATS = 30, 100  # iterations; the first ones determine how much room frames need
+PROFILED = 20  # iterations
+SHOWN_KERNELS = 25  # of the table
 COPY_BYTES = 1 << 32  # far larger than any cache
 # Minimum traffic of a whole iteration, float32: a visible Gaussian's 59 parameters and 118 moments are read and written
 # once, and the parameters read once more by the render; a pixel's colour, gradient and photo (8 bits) once each way.
@@ -42,6 +49,26 @@ MANY_PAIRS = 1 << 31
 FOUR_K = (3840, 2160)
 COVERING = 70_000  # Gaussians covering all of a 4K image: 2.27e9 pairs with its 32,400 tiles
 ENDING = 2000  # of these, more than any pixel blends: each takes a hundredth of the light
+FLUSHED = 1000  # iterations of the long training between rows
+
+
+def card() -> Iterator[Row]:
+    """Report what nvidia-smi says.
+
+    Raises:
+        SystemExit: if it finds no card.
+    """
+    fields = "name,driver_version,memory.total,compute_cap,clocks.sm,clocks.mem,power.limit"
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        raise SystemExit("there is no nvidia-smi")
+    done = subprocess.run(
+        [program, f"--query-gpu={fields}", "--format=csv,noheader"], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"nvidia-smi: {(done.stdout + done.stderr).strip()}")
+    values = [text.strip() for text in done.stdout.strip().splitlines()[0].split(",")]
+    yield dict(zip(fields.split(","), values, strict=False))
 
 
 def event_times(function: Callable[[], object], repeats: int, where: torch.device) -> list[float]:
@@ -57,70 +84,106 @@ def event_times(function: Callable[[], object], repeats: int, where: torch.devic
     return [1e-3 * before.elapsed_time(after) for before, after in pairwise(events)]
 
 
-def card() -> Iterator[Row]:
-    """Report the device and its copy bandwidth, bytes read and written both counted."""
-    with gpu_scenes.device() as where:
-        kernels = cuda.kernels_of(where)
-        assert kernels is not None
-        yield {"device": kernels.facts.described(), "memory_gb": 1e-9 * kernels.facts.memory_bytes}
-        yield {"copy_gb_s": 1e-9 * copy_bandwidth(where)}
-
-
 def copy_bandwidth(where: torch.device, size: int = COPY_BYTES) -> float:
-    """Return the bandwidth of a device-to-device copy, bytes per second."""
+    """Return the bandwidth of a device-to-device copy, bytes read and written per second."""
     source = torch.empty(size, dtype=torch.uint8, device=where).random_()
     target = torch.empty_like(source)
     return 2 * size / statistics.median(event_times(lambda: target.copy_(source), 10, where))
 
 
-def speed(count: int, megapixels: float = MEGAPIXELS, repeats: int = REPEATS) -> Iterator[Row]:
-    """Time whole iterations of training's own code, and the rasterizer alone, at a fixed number of Gaussians."""
+def speed(
+    count: int | None, preset: bool = False, megapixels: float = MEGAPIXELS, repeats: int = REPEATS
+) -> Iterator[Row]:
+    """Time whole iterations of training's own code at a fixed number of Gaussians, then the rasterizer alone.
+
+    Args:
+        count: Number of made Gaussians; None for the trained model.
+        preset: With the default preset's techniques, instead of plain splatting.
+        megapixels: Size of the photos.
+        repeats: Measured iterations.
+    """
     with gpu_scenes.device() as where:
-        row: Row = {"count": count, "megapixels": megapixels}
-        row |= iteration_times(count, megapixels, where, repeats)
-        yield row | {"least_ms": 1e3 * row["least_bytes"] / copy_bandwidth(where)} if where.type == "cuda" else row
-        yield {"count": count} | alone(count, megapixels, where, repeats)
+        number = len(gpu_scenes.gaussians(count, where))
+        row: Row = {"scene": "trained" if count is None else "made", "count": number, "preset": preset}
+        row |= {"megapixels": megapixels, "optimiser": "sparse Adam, fused with the backward pass"}
+        row |= iteration_times(count, planned(number, where, preset), megapixels, where, repeats)
+        if where.type == "cuda":
+            row["least_ms"] = 1e3 * row["least_bytes"] / copy_bandwidth(where)
+        yield row
+        if not preset:
+            yield {"scene": row["scene"], "count": number} | alone(count, megapixels, where, repeats)
 
 
-def iteration_times(count: int, megapixels: float, where: torch.device, repeats: int) -> Row:
-    """Return median device and wall-clock times of an iteration, and the peak tensor memory."""
-    given = gpu_scenes.inputs(CAPTURE, "cpu")
-    views, split = load_views(given["undistort.dataset"]), load_split(given["split.views"])
-    views = [view for view in views if view.camera.name in set(split.train)]
-    plan = gpu_scenes.plain_plan(CAPTURE, count)
-    steps = WARMUP + repeats
+Planned = tuple[TrainingPlan, Callable[[Gaussians], TrainState]]
+"""A plan, and what begins its training from a model, of which it keeps a copy."""
+
+
+def planned(number: int, where: torch.device, preset: bool = False, **options: object) -> Planned:
+    """Return the plan of a training of so many Gaussians, plain or with the default preset's techniques."""
+    if not preset:
+        plan = gpu_scenes.plain_plan(number, **options)
+        return plan, lambda start: TrainState.begin(start, plan, make_techniques(plan))
+    from splatpipe.pipeline.engine.config import load_preset
+
+    given, views = gpu_scenes.inputs("cpu", os.cpu_count() or 1), gpu_scenes.views()
+    dataset, threads, quiet = given["undistort.dataset"], given.machine.threads, SilentReporter()
+    fixed = {"iterations": gpu_scenes.PUBLISHED_ITERATIONS, "max_gaussians": number, "densify": False}
+    chosen = {name: value for name, value in load_preset("standard")["train"].items() if name != "least_iterations"}
+    config = TrainConfig.model_validate(chosen | fixed | options)
+    config = decided_exposure(config, views, dataset, threads, quiet)
+    sky = begin_sky(config, views, dataset, threads, quiet)
+    plan = make_plan(config, views, load_split(given["split.views"]), number)
+    return plan, lambda start: TrainState.begin(start, plan, make_techniques(plan, sky, views, dataset, where))
+
+
+def iteration_times(count: int | None, what: Planned, megapixels: float, where: torch.device, repeats: int) -> Row:
+    """Return median times of an iteration, on the device and on the host, and the peak tensor memory."""
+    plan, begin = what
+    views, warmup, host = gpu_scenes.views(), min(WARMUP, repeats), list[float]()
     with tempfile.TemporaryDirectory() as cache, choose_rules(where):
-        state = TrainState.begin(gpu_scenes.gaussians(CAPTURE, count, where), plan, make_techniques(plan))
-        with PhotoStream.over(views, [TrainingSize()] * steps, 0, 1, Path(cache), megapixels).to(where) as photos:
-            for photo in islice(photos, WARMUP):
+        state = begin(gpu_scenes.gaussians(count, where))
+        sizes = [TrainingSize()] * (warmup + repeats)
+        with PhotoStream.over(views, sizes, 0, 1, Path(cache), megapixels).to(where) as photos:
+
+            def one() -> None:
+                photo = next(photos)
+                began = time.perf_counter()
                 iterate(state, plan, photo)
+                host.append(time.perf_counter() - began)
+
+            event_times(one, warmup, where)
             forget_peak(where)
-            began = time.perf_counter()
-            times = event_times(lambda: iterate(state, plan, next(photos)), repeats, where)
-            wall = (time.perf_counter() - began) / repeats
+            host.clear()
+            times = event_times(one, repeats, where)
+        peak = peak_gb(where)
     visible = sum_visible(state.gaussians, views[0].camera, megapixels)
-    pixels = 1e6 * megapixels
     return {
         "iteration_ms": 1e3 * statistics.median(times),
         "slowest_ms": 1e3 * max(times),
-        "wall_ms": 1e3 * wall,
-        "peak_gb": peak_gb(where),
+        "host_ms": 1e3 * statistics.median(host),
+        "repeats": repeats,
+        "peak_gb": peak,
         "visible": visible,
-        "least_bytes": 4 * FLOATS_A_GAUSSIAN * visible + BYTES_A_PIXEL * pixels,
+        "least_bytes": 4 * FLOATS_A_GAUSSIAN * visible + BYTES_A_PIXEL * 1e6 * megapixels,
     }
 
 
 def choose_rules(where: torch.device) -> AbstractContextManager[None]:
     """Select torch's settings as training does on a device: a fixed order of summation."""
-    return choose_device("cuda" if where.type == "cuda" else "cpu").one_order()
+    return chosen(where).one_order()
 
 
-def alone(count: int, megapixels: float, where: torch.device, repeats: int) -> Row:
+def chosen(where: torch.device) -> Device:
+    """Return the trainer's device."""
+    return choose_device("cuda") if where.type == "cuda" else cpu()
+
+
+def alone(count: int | None, megapixels: float, where: torch.device, repeats: int) -> Row:
     """Time the rasterizer's forward pass, alone and with its backward pass to all parameters."""
-    model = gpu_scenes.gaussians(CAPTURE, count, where).requires_grad_()
-    views = gpu_scenes.cameras(CAPTURE, megapixels)
+    model = gpu_scenes.gaussians(count, where).requires_grad_()
+    views = gpu_scenes.cameras(megapixels)
     upstream = torch.randn(views[0].height, views[0].width, 3, device=where)
-    options = RenderOptions(sh_degree=3, depth=False)
+    options = RenderOptions(sh_degree=model.sh_degree, depth=False)
     turn = iter(range(1 << 30))
 
     def forward() -> torch.Tensor:
@@ -132,7 +195,7 @@ def alone(count: int, megapixels: float, where: torch.device, repeats: int) -> R
         colour = forward()
         colour.backward(upstream[: colour.shape[0], : colour.shape[1]])  # type: ignore[no-untyped-call]
 
-    event_times(both, WARMUP, where)
+    event_times(both, min(WARMUP, repeats), where)
     forget_peak(where)
     together = statistics.median(event_times(both, repeats, where))
     peak = peak_gb(where)
@@ -141,10 +204,38 @@ def alone(count: int, megapixels: float, where: torch.device, repeats: int) -> R
     return {"raster_ms": 1e3 * together, "forward_ms": 1e3 * once, "raster_peak_gb": peak}
 
 
-def memory(count: int, megapixels: float = MEGAPIXELS) -> Iterator[Row]:
+def kernels(count: int, megapixels: float = MEGAPIXELS, iterations: int = PROFILED) -> Iterator[Row]:
+    """Yield a table of kernels: each one's time in an iteration, by torch's profiler.
+
+    Raises:
+        SystemExit: if the profiler sees none.
+    """
+    with gpu_scenes.device() as where, tempfile.TemporaryDirectory() as cache, choose_rules(where):
+        plan, begin = planned(count, where)
+        state, steps = begin(gpu_scenes.gaussians(count, where)), WARMUP + iterations
+        stream = PhotoStream.over(gpu_scenes.views(), [TrainingSize()] * steps, 0, 1, Path(cache), megapixels)
+        with stream.to(where) as photos:
+            for _ in range(WARMUP):
+                iterate(state, plan, next(photos))
+            chosen(where).wait()
+            with profile(activities=[ProfilerActivity.CUDA, ProfilerActivity.CPU]) as profiled:
+                for _ in range(iterations):
+                    iterate(state, plan, next(photos))
+                chosen(where).wait()
+    found = [event for event in profiled.key_averages() if event.device_type != torch.autograd.DeviceType.CPU]
+    whole = sum(event.self_device_time_total for event in found)
+    for event in sorted(found, key=lambda event: -event.self_device_time_total)[:SHOWN_KERNELS]:
+        spent = event.self_device_time_total
+        row = {"kernel": event.key[:120], "calls": event.count / iterations, "us": spent / iterations}
+        yield row | {"share": spent / whole}
+    if not found:
+        raise SystemExit("the profiler saw no kernel")
+
+
+def memory(count: int, megapixels: float = MEGAPIXELS, repeats: int = 20) -> Iterator[Row]:
     """Measure the peak tensor memory of iterations at ``count`` Gaussians with all SH bands."""
     with gpu_scenes.device() as where:
-        row = iteration_times(count, megapixels, where, 20)
+        row = iteration_times(count, planned(count, where), megapixels, where, repeats)
         yield {"count": count} | {name: row[name] for name in ("peak_gb", "iteration_ms", "visible")}
 
 
@@ -176,8 +267,7 @@ def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterato
         pairs = count * tiles
         kernels = cuda.kernels_of(where)
         assert kernels is not None
-        # As after some training: an unforeseen count is one block's work, and would take minutes here.
-        most = kernels.forecast.most_pairs
+        most = kernels.forecast.most_pairs  # as after some training, which foresees the view
         kernels.forecast.learn(FrameFacts(FrameSize(count, tiles), most, pairs, -(-pairs // most)))
         forget_peak(where)
         took = event_times(lambda: rasterizer.render(model, camera, options), 3, where)
@@ -189,38 +279,31 @@ def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterato
             raise SystemExit("the view differs from that of its nearest Gaussians")
 
 
-def whole_training(count: int = 1_000_000, iterations: int = 30_000) -> Iterator[Row]:
-    """Train from start to end at 1.6 MP, including density control, with the cap's number of Gaussians."""
-    with gpu_scenes.device() as where, tempfile.TemporaryDirectory() as scratch:
-        start = Path(scratch) / "start.ply"
-        write_splat(start, gpu_scenes.gaussians(CAPTURE, count, where).to("cpu"))
-        began = time.perf_counter()
-        options = {"iterations": iterations, "max_gaussians": count}
-        trained, found = train_capture(CAPTURE, "cuda", Path(scratch), start=start, **options)
-        yield trained_row(trained, found) | {"seconds": time.perf_counter() - began}
+def long_training(
+    count: int, iterations: int = 30_000, megapixels: float = MEGAPIXELS, every: int = FLUSHED
+) -> Iterator[Row]:
+    """Train with the default preset and density control at the cap, with a row every thousand iterations.
 
-
-def line(capture: str) -> Iterator[Row]:
-    """Train and evaluate a packed run of the pipeline, with the preset's own options.
-
-    Raises:
-        SystemExit: if it is not packed.
+    Args:
+        count: Number of Gaussians at the start, and the cap.
+        iterations: As many of these as there is time for.
+        megapixels: Size of the photos.
+        every: Iterations between rows.
     """
-    from splatpipe.pipeline.engine.config import load_preset
-
-    if not (gpu_scenes.PACK / "captures" / capture).is_dir():
-        raise SystemExit(f"{capture} was not packed")
-    options = dict(load_preset(capture.partition("-")[2]).get("train", {}))
-    with tempfile.TemporaryDirectory() as scratch:
-        began = time.perf_counter()
-        trained, found = train_capture(capture, "cuda", Path(scratch), **options)
-        yield {"capture": capture} | trained_row(trained, found) | {"seconds": time.perf_counter() - began}
-
-
-def trained_row(trained: Row, found: Row) -> Row:
-    """Return a training's row."""
-    names = ("device", "iterations", "gaussians", "train_seconds", "train_megapixels")
-    return {name: trained[name] for name in names} | {name: found[name] for name in ("psnr", "psnr_cc", "ssim")}
+    with gpu_scenes.device() as where, tempfile.TemporaryDirectory() as cache, choose_rules(where):
+        plan, begin = planned(count, where, preset=True, iterations=iterations, densify=True)
+        state = begin(gpu_scenes.gaussians(count, where))
+        sizes = [TrainingSize()] * iterations
+        with PhotoStream.over(gpu_scenes.views(), sizes, 0, 1, Path(cache), megapixels).to(where) as photos:
+            forget_peak(where)
+            began = time.perf_counter()
+            for number in range(1, iterations + 1):
+                iterate(state, plan, next(photos))
+                if number % every == 0:
+                    chosen(where).wait()
+                    row: Row = {"iterations": number, "of": iterations, "seconds": time.perf_counter() - began}
+                    row |= {"gaussians": len(state.gaussians), "loss": state.history.last_loss()}
+                    yield row | {"peak_gb": peak_gb(where)}
 
 
 def sum_visible(model: Gaussians, camera: Camera, megapixels: float) -> int:

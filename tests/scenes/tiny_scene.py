@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
@@ -116,6 +115,8 @@ def photograph(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 def write_model(folder: Path, views: list[Camera], xyz: np.ndarray, rgb: np.ndarray) -> None:
     """Write a COLMAP model with PINHOLE cameras, one per view, every point seen in every view."""
+    import pycolmap  # which the bare GPU machine lacks, where other scenes are rendered
+
     model = pycolmap.Reconstruction()
     for number, view in enumerate(views, start=1):
         params = [view.fx, view.fy, view.cx, view.cy]
