@@ -135,12 +135,6 @@ FAULTS = (
         "if (FAULT) return;\n        bin_chunk(job, chunk);\n        blend_tiles<kDepth>",
     ),
     KernelFault(
-        "no barrier of the grid between counting and scanning the pairs that nobody foresaw",
-        "frame.cu",
-        "sync_grid();\n    if (blockIdx.x == 0) scan_pairs(job);",
-        "if (!FAULT) sync_grid();\n    if (blockIdx.x == 0) scan_pairs(job);",
-    ),
-    KernelFault(
         "no barrier of the grid before the lists that nobody foresaw are blended",
         "frame.cu",
         "scatter_digits(tile_pass(job.at, pass));\n    }\n    sync_grid();",
