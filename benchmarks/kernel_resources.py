@@ -16,6 +16,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 SOURCES = Path(__file__).resolve().parent.parent / "pipeline" / "raster" / "native" / "cuda"
@@ -60,8 +61,8 @@ class KernelResources:
 def resources_in(said: str, source: str) -> Iterator[KernelResources]:
     """Read the compiler's output for a source; names are still mangled."""
     begins = [*ENTRY.finditer(said)]
-    for entry, end in zip(begins, [*(after.start() for after in begins[1:]), len(said)], strict=True):
-        part = said[entry.end() : end]
+    for entry, after in zip_longest(begins, begins[1:]):
+        part = said[entry.end() : len(said) if after is None else after.start()]
         used = USED.search(part)
         assert used is not None, f"ptxas says nothing of {entry[1]}:\n{part}"
         spilled = sum(int(stores) + int(loads) for stores, loads in SPILLS.findall(part))

@@ -25,6 +25,7 @@ FOUND = [
 
 def test_output_of_the_compiler_is_read_with_the_functions_that_a_kernel_calls() -> None:
     assert list(resources_in(SAID, "frame.cu")) == FOUND
+    assert list(resources_in("ptxas info    : 0 bytes gmem", "device.cu")) == []  # no kernels
     with pytest.raises(AssertionError, match="says nothing of _Z4plain"):
         list(resources_in(SAID.replace("Used 24", "Took 24"), "frame.cu"))
 
