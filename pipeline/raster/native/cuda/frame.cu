@@ -18,7 +18,7 @@ constexpr int kDepthPasses = 32 / kDigitBits, kTilePasses = 16 / kDigitBits;
 static_assert(kDepthPasses % 2 == 0 && kTilePasses % 2 == 0, "what is sorted ends where it began");
 constexpr int kProjectBlocks = 3;  // per multiprocessor: worth the three words spilled for it
 constexpr int kScatterBlocks = 3;  // with more, registers are spilled
-constexpr int kRestBlocks = 2;     // with more, registers are spilled
+constexpr int kRestBlocks = 2;     // with more, more registers are spilled
 constexpr int64_t kTurns = 8;      // blocks a multiprocessor of work that is done in turns: what it holds at once
 
 // Passes of the sorts, from one half of the memory to the other and back; the first takes places for values.
