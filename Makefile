@@ -70,7 +70,7 @@ test-isa: .venv/.tested
 	for isa in $$isas; do \
 	  echo "== training on $$isa" && SPLATPIPE_ISA=$$isa $(BIN)/python -m pytest -q tests/parts/train/test_train.py || exit 1; done
 	@echo "== the line on baseline"
-	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/slow/kills/test_line.py -k test_a_run_leaves_what_is_promised
+	@SPLATPIPE_ISA=baseline $(BIN)/python -m pytest -q tests/slow/kills/test_line.py -k test_one_thread_and_two
 
 # Builds the cpu image without a container daemon, and runs the demo in it: see docs/containers.md. Requires root.
 test-image: | .venv/bin/python
