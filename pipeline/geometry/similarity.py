@@ -105,8 +105,8 @@ def fit_similarity(
     return np.asarray(scale), rotation, translation
 
 
-def rotation_from_vector(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The rotation matrix of a rotation vector in radians."""
+def rotation_from_vector(vector: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
+    """The rotation matrices of rotation vectors in radians."""
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 

@@ -1,0 +1,365 @@
+"""A photogrammetric block: photos, lenses and tie points as arrays, and the normal equations of its adjustment.
+
+The unknowns of all photos and lenses form one dense system, from which the tie points are eliminated (the reduced
+system of bundle adjustment: Brown 1958; Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6). All
+that depends on the cameras alone follows from it: their adjustment, their covariance, the covariance of ground points,
+and what another observation would change.
+
+Unknowns, in this order: a rotation vector of each photo (radians, in the camera's axes), the projection centre of each
+photo (metres), and the free parameters of each lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+import scipy.sparse
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.geometry.similarity import cross_matrix, rotation_from_vector
+from splatpipe.pipeline.sfm.lens_model import NAMES
+
+LENS_STEP = 1e-3  # of central differences, pixels at the corner
+LENGTHS = frozenset({"f", "cx", "cy"})  # parameters in pixels
+RAY_STEP = 1e-5
+MIN_DEPTH = 1e-6  # metres in front of a camera
+FLAT = 1e-12  # least ratio of a tie point's eigenvalues: nearly parallel rays
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens and what an adjustment may change in it.
+
+    Attributes:
+        camera: COLMAP's.
+        names: Of the free parameters: those of the wide models, but ``f`` for both focal lengths together and
+            ``aspect`` for the second one's relative excess.
+        directions: Change of the camera's parameters per unit of each.
+        values: Their present values.
+        mean: Prior means.
+        sigmas: Prior standard deviations; infinite for none.
+    """
+
+    camera: pycolmap.Camera
+    names: tuple[str, ...]
+    directions: Float64[np.ndarray, "k _"]
+    values: Float64[np.ndarray, " k"]
+    mean: Float64[np.ndarray, " k"]
+    sigmas: Float64[np.ndarray, " k"]
+
+    def moved(self, step: Float64[np.ndarray, " k"]) -> Lens:
+        """The same lens with its free parameters changed."""
+        return replace(self, camera=self._after(step), values=self.values + step)
+
+    def _after(self, step: Float64[np.ndarray, " k"]) -> pycolmap.Camera:
+        camera = pycolmap.Camera(self.camera.todict())
+        camera.params = np.asarray(self.camera.params, np.float64) + step @ self.directions
+        return camera
+
+
+def free_lens(
+    camera: pycolmap.Camera, names: Sequence[str], mean: Mapping[str, float], sigmas: Mapping[str, float]
+) -> Lens:
+    """A lens with some free parameters.
+
+    Args:
+        camera: Of a wide model.
+        names: Of the free parameters.
+        mean: Prior means by name; missing ones are the present values.
+        sigmas: Prior standard deviations by name; missing ones are infinite.
+    """
+    own, params = NAMES.get(camera.model_name, ()), np.asarray(camera.params, np.float64)
+    directions = np.zeros((len(names), len(params)))
+    values = np.zeros(len(names))
+    for row, name in enumerate(names):
+        if name == "f":
+            directions[row, :2], values[row] = (1.0, params[1] / params[0]), params[0]
+        elif name == "aspect":
+            directions[row, 1], values[row] = params[0], params[1] / params[0] - 1.0
+        else:
+            directions[row, own.index(name)], values[row] = 1.0, params[own.index(name)]
+    return Lens(
+        pycolmap.Camera(camera.todict()),
+        tuple(names),
+        directions,
+        values,
+        np.array([mean.get(name, value) for name, value in zip(names, values.tolist(), strict=True)]),
+        np.array([sigmas.get(name, np.inf) for name in names]),
+    )
+
+
+@dataclass(frozen=True)
+class Block:
+    """Photos, lenses and tie points in world metres.
+
+    Attributes:
+        rotations: World to camera.
+        centres: Projection centres.
+        lens_of: Index of each photo's lens.
+        lenses: The lenses.
+        points: Tie points and control points.
+        photo: Of each observation.
+        point: Of each observation, ascending.
+        pixels: Of each observation.
+        sigmas: Standard deviations of the observations, pixels.
+        stated: Surveyed positions of points; anything finite where unknown.
+        weights: Inverse variances of ``stated``; 0 where unknown.
+    """
+
+    rotations: Float64[np.ndarray, "n 3 3"]
+    centres: Float64[np.ndarray, "n 3"]
+    lens_of: Int64[np.ndarray, " n"]
+    lenses: tuple[Lens, ...]
+    points: Float64[np.ndarray, "p 3"]
+    photo: Int64[np.ndarray, " m"]
+    point: Int64[np.ndarray, " m"]
+    pixels: Float64[np.ndarray, "m 2"]
+    sigmas: Float64[np.ndarray, " m"]
+    stated: Float64[np.ndarray, "p 3"]
+    weights: Float64[np.ndarray, "p 3"]
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def lens_slices(self) -> list[slice]:
+        """The unknowns of each lens."""
+        ends = 6 * len(self) + np.cumsum([0] + [len(lens.names) for lens in self.lenses])
+        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    @property
+    def unknowns(self) -> int:
+        """The number of unknowns without the tie points."""
+        return 6 * len(self) + sum(len(lens.names) for lens in self.lenses)
+
+    def moved(self, step: Float64[np.ndarray, " q"], points: Float64[np.ndarray, "p 3"]) -> Block:
+        """The block after a step of its unknowns, with new tie points."""
+        n = len(self)
+        turns = rotation_from_vector(step[: 3 * n].reshape(n, 3))
+        return replace(
+            self,
+            rotations=turns @ self.rotations,
+            centres=self.centres + step[3 * n : 6 * n].reshape(n, 3),
+            lenses=tuple(lens.moved(step[where]) for lens, where in zip(self.lenses, self.lens_slices, strict=True)),
+            points=points,
+        )
+
+    def residuals(self) -> Float64[np.ndarray, "m 2"]:
+        """Projected less observed, over the standard deviations; not finite where a point is behind its camera."""
+        rays = self._rays()
+        projected = np.full((len(rays), 2), np.nan)
+        for number, lens in enumerate(self.lenses):
+            rows = (self.lens_of[self.photo] == number) & (rays[:, 2] > MIN_DEPTH)
+            projected[rows] = _project(lens.camera, rays[rows])
+        return np.asarray((projected - self.pixels) / self.sigmas[:, None])
+
+    def cost(self) -> float:
+        """Sum of squares of all weighted residuals, positions apart; infinite where the block has come apart."""
+        total = float((self.residuals() ** 2).sum()) + float((self.weights * (self.points - self.stated) ** 2).sum())
+        for lens in self.lenses:
+            total += float((((lens.values - lens.mean) / lens.sigmas) ** 2).sum())
+        return total if np.isfinite(total) else np.inf
+
+    def _rays(self) -> Float64[np.ndarray, "m 3"]:
+        return np.einsum("mij,mj->mi", self.rotations[self.photo], self.points[self.point] - self.centres[self.photo])
+
+
+@dataclass(frozen=True)
+class ReducedBlock:
+    """Normal equations of a block's cameras at its present state, for a sum of squares.
+
+    Attributes:
+        normal: (q, q) information of photos and lenses with the tie points eliminated, priors of lenses included.
+        gradient: (q,) half of the derivative of the sum of squares.
+        own: (p, 3, 3) covariance of each tie point for known cameras.
+        shift: (p, 3) step of each tie point for unmoved cameras.
+        carry: (3p, q) sparse derivative of the tie points by the unknowns.
+    """
+
+    normal: Float64[np.ndarray, "q q"]
+    gradient: Float64[np.ndarray, " q"]
+    own: Float64[np.ndarray, "p 3 3"]
+    shift: Float64[np.ndarray, "p 3"]
+    carry: scipy.sparse.csr_array
+
+    def points_after(self, step: Float64[np.ndarray, " q"]) -> Float64[np.ndarray, "p 3"]:
+        """Steps of the tie points that go with a step of the unknowns."""
+        return np.asarray(self.shift + (self.carry @ step).reshape(-1, 3))
+
+
+def reduce_block(block: Block) -> ReducedBlock:
+    """Linearise a block and eliminate its tie points."""
+    pose, lens_columns, point, residual = _jacobians(block)
+    q, p = block.unknowns, len(block.points)
+    starts = np.searchsorted(block.point, np.arange(p))
+    information = _summed(np.einsum("mka,mkb->mab", point, point), starts, block.point, p)
+    diagonal = np.arange(3)
+    information[:, diagonal, diagonal] += block.weights
+    gradient_points = _summed(np.einsum("mka,mk->ma", point, residual), starts, block.point, p)
+    gradient_points += block.weights * (block.points - block.stated)
+    information[:, diagonal, diagonal] += FLAT * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
+    root = np.linalg.cholesky(information)  # information = root root'
+    inverse_root = np.linalg.inv(root)
+    own = np.swapaxes(inverse_root, 1, 2) @ inverse_root
+    shift = -np.einsum("pab,pb->pa", own, gradient_points)
+
+    columns = _columns(block)  # (m, 6 + l), -1 for none
+    every = np.concatenate([pose, lens_columns], axis=2)
+    crossed = np.einsum("mka,mkc->mac", point, every)  # (m, 3, 6 + l)
+    whitened = inverse_root[block.point] @ crossed
+    rows = np.broadcast_to((3 * block.point)[:, None, None] + diagonal[:, None], whitened.shape)
+    cols = np.broadcast_to(columns[:, None, :], whitened.shape)
+    used = cols >= 0
+    half = scipy.sparse.csr_array((whitened[used], (rows[used], cols[used])), shape=(3 * p, q))
+    carried = (np.swapaxes(inverse_root, 1, 2)[block.point]) @ whitened
+    carry = scipy.sparse.csr_array((-carried[used], (rows[used], cols[used])), shape=(3 * p, q))
+
+    normal = _direct(every, columns, block) - np.asarray((half.T @ half).todense())
+    gradient = np.zeros(q)
+    direct = np.einsum("mkc,mk->mc", every, residual)
+    np.add.at(gradient, columns[columns >= 0], direct[columns >= 0])
+    gradient -= half.T @ np.einsum("pab,pb->pa", inverse_root, gradient_points).ravel()
+    for lens, where in zip(block.lenses, block.lens_slices, strict=True):
+        known = 1.0 / lens.sigmas**2
+        index = np.arange(where.start, where.stop)
+        normal[index, index] += known
+        gradient[where] += known * (lens.values - lens.mean)
+    return ReducedBlock(0.5 * (normal + normal.T), gradient, own, shift, carry)
+
+
+def settle_points(block: Block, rounds: int = 2) -> Block:
+    """Move the tie points to where their observations want them for the cameras as they are."""
+    p, diagonal = len(block.points), np.arange(3)
+    starts = np.searchsorted(block.point, np.arange(p))
+    for _ in range(rounds):
+        point, residual = _point_jacobian(block)
+        information = _summed(np.einsum("mka,mkb->mab", point, point), starts, block.point, p)
+        information[:, diagonal, diagonal] += block.weights
+        information[:, diagonal, diagonal] += FLAT * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
+        gradient = _summed(np.einsum("mka,mk->ma", point, residual), starts, block.point, p)
+        gradient += block.weights * (block.points - block.stated)
+        block = replace(block, points=block.points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0])
+    return block
+
+
+def _point_jacobian(block: Block) -> tuple[Float64[np.ndarray, "m 2 3"], Float64[np.ndarray, "m 2"]]:
+    unfree = replace(
+        block, lenses=tuple(replace(lens, names=(), directions=lens.directions[:0]) for lens in block.lenses)
+    )
+    _, _, point, residual = _jacobians(unfree)
+    return point, residual
+
+
+def _direct(
+    every: Float64[np.ndarray, "m 2 c"], columns: Int64[np.ndarray, "m c"], block: Block
+) -> Float64[np.ndarray, "q q"]:
+    """The cameras' own part of the normal matrix, summed photo by photo."""
+    normal = np.zeros((block.unknowns, block.unknowns))
+    order = np.argsort(block.photo, kind="stable")
+    starts = np.searchsorted(block.photo[order], np.arange(len(block) + 1))
+    for start, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        if start == end:
+            continue
+        rows = order[start:end]
+        used = columns[rows[0]] >= 0
+        design = every[rows][:, :, used].reshape(-1, int(used.sum()))
+        where = columns[rows[0]][used]
+        normal[np.ix_(where, where)] += design.T @ design
+    return normal
+
+
+def _columns(block: Block) -> Int64[np.ndarray, "m c"]:
+    """The unknowns that each observation depends on: rotation, centre, lens; -1 beyond its lens's parameters."""
+    n, widest = len(block), max((len(lens.names) for lens in block.lenses), default=0)
+    of_lens = np.full((len(block.lenses), widest), -1, dtype=np.int64)
+    for number, where in enumerate(block.lens_slices):
+        of_lens[number, : where.stop - where.start] = np.arange(where.start, where.stop)
+    axes = np.arange(3)
+    rotation = 3 * block.photo[:, None] + axes
+    return np.concatenate([rotation, rotation + 3 * n, of_lens[block.lens_of[block.photo]]], axis=1)
+
+
+def _jacobians(
+    block: Block,
+) -> tuple[
+    Float64[np.ndarray, "m 2 6"],
+    Float64[np.ndarray, "m 2 l"],
+    Float64[np.ndarray, "m 2 3"],
+    Float64[np.ndarray, "m 2"],
+]:
+    """Derivatives of the weighted residuals by pose, lens and point, and the residuals."""
+    rays = block._rays()
+    m, widest = len(rays), max((len(lens.names) for lens in block.lenses), default=0)
+    by_ray, by_lens, projected = np.zeros((m, 2, 3)), np.zeros((m, 2, widest)), np.zeros((m, 2))
+    for number, lens in enumerate(block.lenses):
+        rows = np.flatnonzero(block.lens_of[block.photo] == number)
+        by_ray[rows], by_lens[rows, :, : len(lens.names)], projected[rows] = _derivatives(lens, rays[rows])
+    turned = block.rotations[block.photo]
+    by_point = by_ray @ turned
+    by_turn = -by_ray @ cross_matrix(rays)
+    scale = 1.0 / block.sigmas[:, None, None]
+    residual = (projected - block.pixels) / block.sigmas[:, None]
+    sound = np.isfinite(residual).all(axis=1) & (rays[:, 2] > MIN_DEPTH)
+    scale = np.where(sound[:, None, None], scale, 0.0)
+    pose = scale * np.nan_to_num(np.concatenate([by_turn, -by_point], axis=2))
+    residual = np.where(sound[:, None], residual, 0.0)
+    return pose, scale * np.nan_to_num(by_lens), scale * np.nan_to_num(by_point), residual
+
+
+def _derivatives(
+    lens: Lens, rays: Float64[np.ndarray, "m 3"]
+) -> tuple[Float64[np.ndarray, "m 2 3"], Float64[np.ndarray, "m 2 k"], Float64[np.ndarray, "m 2"]]:
+    """Derivatives of pixels by the point in the camera's axes and by the free parameters, and the pixels."""
+    depth = rays[:, 2:]
+    flat = rays / np.where(depth > MIN_DEPTH, depth, np.nan)
+    columns = []
+    for axis in range(2):
+        step = np.zeros(3)
+        step[axis] = RAY_STEP
+        columns.append((_project(lens.camera, flat + step) - _project(lens.camera, flat - step)) / (2.0 * RAY_STEP))
+    by_flat = np.stack(columns, axis=2)
+    inner = np.zeros((len(rays), 2, 3))
+    inner[:, 0, 0] = inner[:, 1, 1] = 1.0
+    inner[:, :, 2] = -flat[:, :2]
+    by_ray = by_flat @ (inner / depth[:, :, None])
+    by_lens = np.zeros((len(rays), 2, len(lens.names)))
+    for k, name in enumerate(lens.names):
+        step = np.zeros(len(lens.names))
+        step[k] = LENS_STEP if name in LENGTHS else LENS_STEP / lens.camera.width
+        ahead, back = _project(lens._after(step), flat), _project(lens._after(-step), flat)
+        by_lens[:, :, k] = (ahead - back) / (2.0 * step[k])
+    return by_ray, by_lens, _project(lens.camera, flat)
+
+
+def _project(camera: pycolmap.Camera, rays: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 2"]:
+    if len(rays) == 0:
+        return np.zeros((0, 2))
+    sound = np.isfinite(rays).all(axis=1)
+    result = np.full((len(rays), 2), np.nan)
+    result[sound] = np.asarray(camera.img_from_cam(rays[sound]), np.float64)
+    return result
+
+
+def _summed(
+    values: Float64[np.ndarray, m * r], starts: Int64[np.ndarray, " p"], point: Int64[np.ndarray, " m"], p: int
+) -> Float64[np.ndarray, p * r]:
+    """Sums over each point's observations, which are contiguous; zeros for a point without any."""
+    result = np.zeros((p, *values.shape[1:]))
+    seen = np.bincount(point, minlength=p) > 0
+    if len(values):
+        result[seen] = np.add.reduceat(values, starts[seen], axis=0)
+    return result
+
+
+def ground_carry(reduced: ReducedBlock, points: Sequence[int]) -> Float64[np.ndarray, "k 3 q"]:
+    """Dense derivative of some tie points by the unknowns."""
+    rows = (3 * np.asarray(points, dtype=np.int64)[:, None] + np.arange(3)).ravel()
+    return np.asarray(reduced.carry[rows].todense()).reshape(len(points), 3, -1)
+
+
+def lens_values(block: Block) -> list[Mapping[str, float]]:
+    """The free parameters of each lens by name."""
+    return [dict(zip(lens.names, lens.values.tolist(), strict=True)) for lens in block.lenses]
