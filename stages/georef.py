@@ -15,19 +15,26 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
+from splatpipe.pipeline.sfm.lens_model import named_params, stated_lenses
 from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json, control_json, no_control
+from splatpipe.pipeline.survey.adjusted_positions import (
+    adjust_model,
+    adjusted_frame,
+    adjustment_json,
+)
 from splatpipe.pipeline.survey.blunders import gsd_m
 from splatpipe.pipeline.survey.boundary import lay_boundary
 from splatpipe.pipeline.survey.control import ControlResult, GeorefInput, place_by_control
 from splatpipe.pipeline.survey.crs import parse_vertical
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError, PositionFit
 from splatpipe.pipeline.survey.frames import Frame, save_frame
-from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit
+from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit, report_frame
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of
-from splatpipe.pipeline.survey.model import SparseModel, copy_model, read_model
+from splatpipe.pipeline.survey.model import SparseModel, copy_model, model_of, read_model
 from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.position_adjustment import LensKnowledge
 from splatpipe.pipeline.survey.scale_bars import ModelScale
 from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
 from splatpipe.pipeline.survey.target_finds import load_finds, load_wanted
@@ -43,6 +50,9 @@ from splatpipe.pipeline.survey.target_survey import (
 )
 from splatpipe.pipeline.survey.world import in_crs
 
+# Standard deviation of a focal length by its source, relative; a guess may be anything.
+FOCAL_SHARES = {"lens-file": 0.003, "xmp-dewarp": 0.01, "xmp-calibrated": 0.01, "guess": 0.3}
+OTHER_SHARE = 0.03
 DATUM_STEP_M = 1.0  # least offset that suggests another vertical datum; less may be the receiver's error
 
 
@@ -60,7 +70,20 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     model = read_model(source, photos)
     positions = read_positions(inputs["ingest.positions"])
     report.progress(1, 3, "fitting the positions", "steps")
-    frame = _by_positions(config, model, positions, photos, report)
+    frame, fit = _by_positions(config, model, positions, photos)
+    lenses = _lens_knowledge(inputs["ingest.cameras"], inputs["ingest.lenses"], model, photos)
+    held = inputs.settings.get("sparse.lens") == "held"
+    found = None
+    if isinstance(frame, Frame) and config.adjust == "auto":
+        found = adjust_model(model, frame, positions, photos, lenses, held, report)
+        if found is not None and found.adopted:
+            model, frame = model_of(found.done.reconstruction, photos), adjusted_frame(frame, found)
+    if isinstance(frame, Frame) and fit is not None:
+        if found is not None and found.adopted:
+            report.note(frame.note)
+            report_frame(frame, model, positions, report)
+        else:
+            report_fit(frame, fit, model, positions, report)
     report.progress(2, 3, "fitting the control", "steps")
     controlled = None
     targets = TargetSurvey(
@@ -73,8 +96,7 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     )
     survey, scale = _survey(targets, inputs, config, report)
     if survey is not None and any(point.sightings for point in survey.points):
-        priors = _focal_priors(inputs["ingest.cameras"], model, photos)
-        capture = GeorefInput(model, positions, photos, priors, inputs.settings.get("sparse.lens") == "held")
+        capture = GeorefInput(model, positions, photos, lenses, held, found)
         try:
             controlled = place_by_control(survey, capture, None if isinstance(frame, str) else frame, config, report)
         except FrameUndeterminedError as error:
@@ -97,11 +119,18 @@ def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     placed_points = (controlled.placed.model if controlled is not None else model).points
     bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
     control, accuracy = _accuracy(config, controlled, (model, positions, frame), photos, report)
+    if controlled is not None and controlled.block is not None:
+        accuracy["adjustment"] = controlled.block
+    elif found is not None:
+        accuracy["adjustment"] = adjustment_json(found, accuracy["gsd_m"])
+        _report_adjustment(accuracy["adjustment"], report)
     accuracy |= scale_json(targets.wanted.bars, scale, frame)
     for name, value in (("control.json", control), ("accuracy.json", accuracy)):
         write_json(out / name, value)
-    if controlled is not None and controlled.adjusted is not None:
-        write_model(controlled.adjusted, out / "sparse" / "0")
+    adjusted = found.done.reconstruction if found is not None and found.adopted else None
+    adjusted = controlled.adjusted if controlled is not None and controlled.adjusted is not None else adjusted
+    if adjusted is not None:
+        write_model(adjusted, out / "sparse" / "0")
     else:
         copy_model(source, out / "sparse" / "0", may_link=inputs.photos_dir not in source.parents)
     report.progress(3, 3, "fitting the control", "steps")
@@ -126,15 +155,13 @@ def _survey(
 
 
 def _by_positions(
-    config: GeorefConfig, model: SparseModel, positions: Positions, photos: Mapping[str, Photo], report: Reporter
-) -> Frame | str:
-    """Return the frame fitted to the positions, or the reason why there is none."""
+    config: GeorefConfig, model: SparseModel, positions: Positions, photos: Mapping[str, Photo]
+) -> tuple[Frame | str, PositionFit | None]:
+    """Return the frame fitted to the positions and that fit, or the reason why there is none."""
     try:
-        frame, fit = georeference(model, positions, config.max_position_error_m, photos)
+        return georeference(model, positions, config.max_position_error_m, photos)
     except FrameUndeterminedError as error:
-        return str(error)
-    report_fit(frame, fit, model, positions, report)
-    return frame
+        return str(error), None
 
 
 def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | None) -> Frame:
@@ -145,20 +172,29 @@ def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | No
     return in_crs(frame, config.crs, stated, config.approximate_crs)
 
 
-def _focal_priors(path: Path, model: SparseModel, photos: Mapping[str, Photo]) -> dict[int, float]:
-    """Focal lengths from the metadata, in the model's pixels, by COLMAP camera id."""
+def _lens_knowledge(
+    cameras: Path, lenses: Path, model: SparseModel, photos: Mapping[str, Photo]
+) -> dict[int, LensKnowledge]:
+    """What files and metadata say of the cameras, in the model's pixels, by COLMAP camera id."""
     try:
-        groups = json.loads(path.read_text(encoding="utf-8"))["cameras"]
-        known = {k: (group["focal_px"], group["width"]) for k, group in enumerate(groups) if group["has_prior"]}
+        groups = json.loads(cameras.read_text(encoding="utf-8"))["cameras"]
+        stated = stated_lenses(json.loads(lenses.read_text(encoding="utf-8"))["lenses"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SplatpipeError(f"The cameras {path} cannot be read: {error}", "Run with --rerun ingest.") from error
-    priors = {}
+        raise SplatpipeError(f"The cameras {cameras} cannot be read: {error}", "Run with --rerun ingest.") from error
+    known = {}
     for name, number in zip(model.names, model.image_ids, strict=True):
         camera = model.reconstruction.cameras[model.reconstruction.images[number].camera_id]
-        if name in photos and photos[name].camera in known:
-            focal, width = known[photos[name].camera]
-            priors[camera.camera_id] = focal * camera.width / width
-    return priors
+        if name not in photos or camera.camera_id in known or photos[name].camera >= len(groups):
+            continue
+        group, lens = groups[photos[name].camera], stated.get(photos[name].camera + 1)
+        scale = camera.width / group["width"]
+        centre = None
+        if lens is not None:
+            named = named_params(lens.colmap())
+            centre = (scale * named["cx"], scale * named["cy"])
+        focal = scale * group["focal_px"] if group["has_prior"] else None
+        known[camera.camera_id] = LensKnowledge(focal, FOCAL_SHARES.get(group["focal_source"], OTHER_SHARE), centre)
+    return known
 
 
 def _accuracy(
@@ -206,6 +242,15 @@ def _flight_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:
     """(f, 3) offset of each flight from the fit of positions, metres."""
     found = {int(flight["flight"]): flight["offset_m"] for flight in frame.residuals.get("flights", [])}
     return np.array([found.get(flight, [0.0, 0.0, 0.0]) for flight in flights], dtype=np.float64).reshape(-1, 3)
+
+
+def _report_adjustment(adjustment: JSON, report: Reporter) -> None:
+    """Report how well positions that the fit did not use are predicted, and what the ground's heights are worth."""
+    report.note(f"{adjustment['sentence'][0].upper()}{adjustment['sentence'][1:]}.")
+    sentence = (adjustment["heights"] or {}).get("sentence")
+    if sentence:
+        heights, _, remedy = sentence.partition("; ")
+        report.warning(f"{heights[0].upper()}{heights[1:]}.", f"{remedy[0].upper()}{remedy[1:]}.")
 
 
 def _summary(frame: Frame, controlled: ControlResult | None, accuracy: JSON) -> Summary:

@@ -87,13 +87,14 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=9,
+    version=10,
     config=GeorefConfig,
     reads=(
         "sparse.model",
         "ingest.positions",
         "ingest.photos",
         "ingest.cameras",
+        "ingest.lenses",
         "control.points",
         "targets.found",
         "source.control",

@@ -1,35 +1,35 @@
-"""Bundle adjustment with control, positions and lens priors: COLMAP's problem with additional residual blocks.
+"""Bundle adjustment with control: marks and surveyed points enter the block beside tie points and camera positions.
 
-COLMAP builds the reprojection errors of the features; pyceres adds marks, control points and positions. Everything is
-in world metres, in a fixed order and on one thread, so that results are bit-identical. Feature residuals stay in
-pixels; all others are in units of the features' standard deviation.
-
-Each flight's common position error is an unknown.
+Everything is in world metres, in a fixed order and on one thread, so that results are bit-identical. Each flight's
+common position error is an unknown.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-import pyceres
 import pycolmap
-import pycolmap.cost_functions
 from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
-from splatpipe.pipeline.geometry.similarity import Similarity, cross_matrix, fit_similarity
-from splatpipe.pipeline.sfm.focal import UNOBSERVED, keep_near, posterior_focal_sigmas, solver_options
-from splatpipe.pipeline.sfm.lens_blocks import hold, keep_shape
-from splatpipe.pipeline.survey.local_survey import Stations
+from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
+from splatpipe.pipeline.sfm.focal import UNOBSERVED
+from splatpipe.pipeline.survey.block import Block, Lens
+from splatpipe.pipeline.survey.block_adjustment import (
+    AdjustedBlock,
+    PositionObservations,
+    adjust_block,
+    joint_system,
+    solve,
+)
+from splatpipe.pipeline.survey.tie_points import TieTable, whole_model
 
-MIN_SIGMA_PX = 1.0  # of features: lens and shutter errors are correlated within a photo, and must not outweigh control
 UNBOUND_M = 1e4  # sigma of a height that was not measured
-FOCAL_SIGMA = 0.03  # of the focal length about its prior, relative
-DISTORTION_SIGMA = 0.2  # of a distortion coefficient about its estimate from SfM
+HELD_SHARE = 0.01  # of a focal length that nothing determines, about its prior
 ROUNDS = 10  # of reweighting
 
 
@@ -57,25 +57,63 @@ class ControlAdjustment:
     """The result of an adjustment.
 
     Attributes:
-        reconstruction: The adjusted model, in world metres.
+        adjusted: The block with the targets.
+        observed: The positions in it.
+        table: The observations of the whole model.
+        source: The model before, in its own frame.
+        world_from_model: Its approximate similarity.
         places: Adjusted positions of the targets, world frame.
         normed: Root mean square of each target's distance to its surveyed position, over its sigmas.
-        offsets: Offset of each flight's positions, stated minus true, metres.
-        feature_sigma_px: Standard deviation assumed for the features.
-        focal_sigmas: Relative standard deviation of each camera's focal length from photos and control, by COLMAP
-            camera id.
         held: Cameras whose focal length cannot be determined, so that it is held near its prior.
-        usable: Whether the solver found a usable solution.
+        focal_sigmas: Relative standard deviation of each camera's focal length, by COLMAP camera id.
     """
 
-    reconstruction: pycolmap.Reconstruction
+    adjusted: AdjustedBlock
+    observed: PositionObservations
+    table: TieTable
+    source: pycolmap.Reconstruction
+    world_from_model: Similarity
     places: Float64[np.ndarray, "n 3"]
     normed: Float64[np.ndarray, " n"]
-    offsets: Float64[np.ndarray, "k 3"]
-    feature_sigma_px: float
-    focal_sigmas: Mapping[int, float]
     held: tuple[int, ...]
-    usable: bool
+    focal_sigmas: Mapping[int, float]
+
+    @property
+    def offsets(self) -> Float64[np.ndarray, "k 3"]:
+        """Offset of each flight's positions, stated minus true, metres."""
+        return self.adjusted.offsets
+
+    @property
+    def usable(self) -> bool:
+        """Whether the adjustment found a solution."""
+        return bool(np.isfinite(self.places).all()) and math.isfinite(self.adjusted.cost)
+
+    @cached_property
+    def reconstruction(self) -> pycolmap.Reconstruction:
+        """The adjusted model, in the frame that it had."""
+        return whole_model(self.source, self.table, self.adjusted.block, self.world_from_model)
+
+
+@dataclass(frozen=True)
+class ControlStart:
+    """A model, its block, and the positions, before control enters.
+
+    Attributes:
+        source: The model, in its own frame.
+        world_from_model: Its approximate similarity.
+        table: All observations of its points.
+        block: Of well-spread tie points, world frame.
+        observed: The photos' positions.
+        focal_priors: Focal lengths from the metadata, in the model's pixels, by COLMAP camera id: where neither photos
+            nor control determine a focal length, it is held near these.
+    """
+
+    source: pycolmap.Reconstruction
+    world_from_model: Similarity
+    table: TieTable
+    block: Block
+    observed: PositionObservations
+    focal_priors: Mapping[int, float]
 
 
 def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
@@ -84,184 +122,79 @@ def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
     return reconstruction.num_points3D() > 0 and all(image.is_ref_in_frame() for image in images)
 
 
-def adjust(
-    reconstruction: pycolmap.Reconstruction,
-    world_from_model: Similarity,
-    targets: Sequence[Target],
-    stations: tuple[Stations, Float64[np.ndarray, "n 3"], Sequence[int]],
-    focal_priors: Mapping[int, float],
-    lenses_held: bool = False,
-) -> ControlAdjustment:
-    """Adjust a model to control.
-
-    Args:
-        reconstruction: In the model's frame; not modified.
-        world_from_model: Approximate similarity.
-        targets: Control points.
-        stations: The photos' stations, their positions in the world frame, and the COLMAP ids of these photos.
-        focal_priors: Focal lengths from the metadata, in the model's pixels, by camera id.
-        lenses_held: Keep the interior orientation fixed.
-    """
-    model = pycolmap.Reconstruction(reconstruction)
-    model.transform(
-        pycolmap.Sim3d(
-            world_from_model.scale, pycolmap.Rotation3d(world_from_model.rotation), world_from_model.translation
-        )
-    )
-    sigma = feature_sigma(model)
-    adjuster = _features(model)
-    problem = adjuster.problem
-    blocks = _Blocks(problem, sigma)
-    places = np.array([target.start for target in targets], dtype=np.float64).reshape(-1, 3)
-    for place, target in zip(places, targets, strict=True):
-        blocks.add_target(model, place, target)
-    offsets = _add_stations(blocks, model, stations)
-    if lenses_held:
-        focal_priors = {}
-        blocks.kept += [hold(problem, camera, [*range(len(camera.params))]) for camera in _seen(problem, model)]
-    else:
-        _add_lens(blocks, model, focal_priors)
-    solved = pyceres.SolverSummary()
-    pyceres.solve(solver_options(len(model.reg_image_ids())), problem, solved)
-    focal_sigmas = posterior_focal_sigmas(model, problem)
-    held = [n for n, focal in focal_priors.items() if focal_sigmas.get(n, 0.0) > UNOBSERVED]
+def adjust(start: ControlStart, targets: Sequence[Target]) -> ControlAdjustment:
+    """Adjust a block to control and positions."""
+    block = _with_targets(start.block, targets, start.table.numbers)
+    done = adjust_block(block, start.observed)
+    cameras = sorted(set(start.table.cameras))
+    focal_sigmas = _focal_sigmas(done, start.observed, cameras)
+    held = [n for n in cameras if n in start.focal_priors and focal_sigmas.get(n, 0.0) > UNOBSERVED]
     if held:
+        lenses = list(done.block.lenses)
         for number in held:
-            keep_near(problem, model.cameras[number], focal_priors[number], FOCAL_SIGMA)
-        pyceres.solve(solver_options(len(model.reg_image_ids())), problem, solved)
-    normed = np.array(
-        [
-            math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())
-            for p, t in zip(places, targets, strict=True)
-        ]
+            place = cameras.index(number)
+            lenses[place] = _near(lenses[place], start.focal_priors[number])
+        done = adjust_block(replace(done.block, lenses=tuple(lenses)), start.observed, done.offsets)
+    places = done.block.points[len(done.block.points) - len(targets) :]
+    normed = [
+        math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())
+        for p, t in zip(places, targets, strict=True)
+    ]
+    return ControlAdjustment(
+        done,
+        start.observed,
+        start.table,
+        start.source,
+        start.world_from_model,
+        places,
+        np.array(normed),
+        tuple(held),
+        focal_sigmas,
     )
-    model.update_point_3d_errors()
-    usable = bool(solved.IsSolutionUsable()) and bool(np.isfinite(places).all())
-    return ControlAdjustment(model, places, normed, offsets, sigma, focal_sigmas, tuple(held), usable)
 
 
-def feature_sigma(model: pycolmap.Reconstruction) -> float:
-    """Standard deviation of the features' image coordinates, from their residuals; at least one pixel."""
-    errors = []
-    for number in sorted(model.reg_image_ids()):
-        image = model.images[number]
-        camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
-        seen = [point for point in image.points2D if point.has_point3D()]
-        if not seen:
-            continue
-        xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
-        shown, _ = project_through_lens(camera, pose, xyz)
-        errors.append(np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1))
-    squares = np.concatenate([np.zeros(0), *errors]) ** 2
-    squares = squares[np.isfinite(squares)]
-    unknowns = 3 * model.num_points3D() + 6 * len(model.reg_image_ids())
-    degrees = max(2 * len(squares) - unknowns, 1)
-    return max(math.sqrt(float(squares.sum()) / degrees), MIN_SIGMA_PX)
+def _with_targets(block: Block, targets: Sequence[Target], numbers: Sequence[int]) -> Block:
+    """A block with the targets as its last points, their marks as observations."""
+    index, first = {number: k for k, number in enumerate(numbers)}, len(block.points)
+    marks = [
+        (index[number], first + k, *pixel, sigma)
+        for k, target in enumerate(targets)
+        for (number, pixel), sigma in zip(target.marks, target.mark_sigmas_px.tolist(), strict=True)
+        if number in index
+    ]
+    table = np.array(marks, dtype=np.float64).reshape(-1, 5)
+    places = np.array([target.place for target in targets]).reshape(-1, 3)
+    sigmas = np.minimum(np.array([target.sigmas for target in targets]).reshape(-1, 3), UNBOUND_M)
+    return replace(
+        block,
+        points=np.concatenate([block.points, np.array([target.start for target in targets]).reshape(-1, 3)]),
+        photo=np.concatenate([block.photo, table[:, 0].astype(np.int64)]),
+        point=np.concatenate([block.point, table[:, 1].astype(np.int64)]),
+        pixels=np.concatenate([block.pixels, table[:, 2:4]]),
+        sigmas=np.concatenate([block.sigmas, table[:, 4]]),
+        stated=np.concatenate([block.stated, places]),
+        weights=np.concatenate([block.weights, 1.0 / sigmas**2]),
+    )
 
 
-class _Blocks:
-    """Adds residual blocks, in units of the features' standard deviation, and keeps alive what Ceres points to."""
-
-    def __init__(self, problem: Any, sigma_px: float) -> None:
-        self.problem = problem
-        self.sigma_px = sigma_px
-        self.kept: list[object] = []
-
-    def add(self, cost: Any, parameters: list[Float64[np.ndarray, " _"]]) -> None:
-        self.kept += [cost, *parameters]
-        self.problem.add_residual_block(cost, None, parameters)
-
-    def add_prior(
-        self, parameter: Float64[np.ndarray, " k"], mean: Float64[np.ndarray, " k"], sigmas: Float64[np.ndarray, " k"]
-    ) -> None:
-        """Add a normal prior of a parameter."""
-        covariance = np.diag((sigmas / self.sigma_px) ** 2)
-        self.add(pyceres.factors.NormalPrior(mean, covariance), [parameter])
-
-    def add_target(self, model: pycolmap.Reconstruction, place: Float64[np.ndarray, " 3"], target: Target) -> None:
-        """Add a control point: its surveyed position and its marks."""
-        for (number, pixel), mark_sigma in zip(target.marks, target.mark_sigmas_px.tolist(), strict=True):
-            image = model.images[number]
-            camera = model.cameras[image.camera_id]
-            covariance = np.eye(2) * (mark_sigma / self.sigma_px) ** 2
-            cost = pycolmap.cost_functions.ReprojErrorCost(camera.model, covariance, pixel)
-            self.add(cost, [place, image.frame.rig_from_world.params, camera.params])
-        self.add_prior(place, target.place, np.minimum(target.sigmas, UNBOUND_M))
+def _focal_sigmas(done: AdjustedBlock, observed: PositionObservations, cameras: Sequence[int]) -> dict[int, float]:
+    """Relative standard deviation of each free focal length."""
+    normal, _ = joint_system(done.reduced, observed, done.block, done.offsets)
+    result = {}
+    for number, lens, where in zip(cameras, done.block.lenses, done.block.lens_slices, strict=True):
+        if "f" in lens.names:
+            unit = np.zeros(len(normal))
+            unit[where.start + lens.names.index("f")] = 1.0
+            result[number] = math.sqrt(max(float(unit @ solve(normal, unit)), 0.0)) / float(lens.camera.params[0])
+    return result
 
 
-class _StationCost(pyceres.CostFunction):  # type: ignore[misc]
-    """Residual of a camera centre plus its flight's offset against the photo's stated position."""
-
-    def __init__(self, stated: Float64[np.ndarray, " 3"], weights: Float64[np.ndarray, " 3"]) -> None:
-        super().__init__()
-        self.set_num_residuals(3)
-        self.set_parameter_block_sizes([7, 3])
-        self._stated, self._weights = stated, weights
-
-    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
-        """Ceres' interface. Parameters: cam_from_world as quaternion (x, y, z, w) and translation, and the offset."""
-        quat, t = np.asarray(parameters[0][:4]), np.asarray(parameters[0][4:])
-        axis, w = -quat[:3], quat[3]  # of the inverse rotation
-        turned = np.cross(axis, t)
-        centre = -(t + 2.0 * w * turned + 2.0 * np.cross(axis, turned))
-        residuals[:] = self._weights * (centre + np.asarray(parameters[1]) - self._stated)
-        if jacobians is not None:
-            if jacobians[0] is not None:
-                k, jacobian = cross_matrix(axis), np.zeros((3, 7))
-                jacobian[:, :3] = -2.0 * w * cross_matrix(t)
-                jacobian[:, :3] += 2.0 * (axis @ t * np.eye(3) + np.outer(axis, t) - 2.0 * np.outer(t, axis))
-                jacobian[:, 3] = -2.0 * turned
-                jacobian[:, 4:] = -(np.eye(3) + 2.0 * w * k + 2.0 * k @ k)
-                jacobians[0][:] = (self._weights[:, None] * jacobian).ravel()
-            if jacobians[1] is not None:
-                jacobians[1][:] = np.diag(self._weights).ravel()
-        return True
-
-
-def _features(model: pycolmap.Reconstruction) -> Any:
-    """Return COLMAP's bundle adjuster of all photos, without a fixed gauge: control defines the datum."""
-    options = pycolmap.BundleAdjustmentOptions()
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in sorted(model.reg_image_ids()):
-        config.add_image(number)
-    return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-
-
-def _add_stations(
-    blocks: _Blocks,
-    model: pycolmap.Reconstruction,
-    stations: tuple[Stations, Float64[np.ndarray, "n 3"], Sequence[int]],
-) -> Float64[np.ndarray, "k 3"]:
-    where, enu, numbers = stations
-    offsets = np.zeros((len(where.flights), 3))
-    for offset, sigmas in zip(offsets, where.offset_sigmas(), strict=True):
-        blocks.add_prior(offset, np.zeros(3), sigmas)
-    for k, number in enumerate(numbers):
-        cost = _StationCost(enu[k], blocks.sigma_px / where.sigmas[k])
-        blocks.add(cost, [model.images[number].frame.rig_from_world.params, offsets[where.group[k]]])
-    return offsets
-
-
-def _seen(problem: Any, model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
-    """Return the cameras that take part in a problem, by id."""
-    return [camera for _, camera in sorted(model.cameras.items()) if problem.has_parameter_block(camera.params)]
-
-
-def _add_lens(blocks: _Blocks, model: pycolmap.Reconstruction, focal_priors: Mapping[int, float]) -> None:
-    """Add lens priors from metadata and SfM, which keep parameters that neither photos nor control determine."""
-    for number, camera in sorted(model.cameras.items()):
-        params = camera.params
-        if not blocks.problem.has_parameter_block(params):
-            continue
-        mean = np.array(params, dtype=np.float64)
-        sigmas = np.full(len(mean), 1e6)
-        for index in camera.focal_length_idxs():
-            mean[index] = focal_priors.get(number, mean[index])
-            sigmas[index] = FOCAL_SIGMA * mean[index]
-        for index in camera.extra_params_idxs():
-            sigmas[index] = DISTORTION_SIGMA
-        blocks.add_prior(params, mean, sigmas)
-        blocks.kept += keep_shape(blocks.problem, camera)
+def _near(lens: Lens, focal_px: float) -> Lens:
+    """A lens that starts at a focal length and stays within three times ``HELD_SHARE`` of it."""
+    at = lens.names.index("f")
+    mean, sigmas, step = lens.mean.copy(), lens.sigmas.copy(), np.zeros(len(lens.names))
+    mean[at], sigmas[at], step[at] = focal_px, HELD_SHARE * focal_px, focal_px - lens.values[at]
+    return replace(lens.moved(step), mean=mean, sigmas=sigmas)
 
 
 def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> float:

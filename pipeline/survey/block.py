@@ -11,6 +11,7 @@ photo (metres), and the free parameters of each lens.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -128,7 +129,7 @@ class Block:
     def lens_slices(self) -> list[slice]:
         """The unknowns of each lens."""
         ends = 6 * len(self) + np.cumsum([0] + [len(lens.names) for lens in self.lenses])
-        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [slice(a, b) for a, b in itertools.pairwise(ends.tolist())]
 
     @property
     def unknowns(self) -> int:
@@ -235,7 +236,7 @@ def settle_points(block: Block, rounds: int = 2) -> Block:
     p, diagonal = len(block.points), np.arange(3)
     starts = np.searchsorted(block.point, np.arange(p))
     for _ in range(rounds):
-        point, residual = _point_jacobian(block)
+        _, _, point, residual = _jacobians(block, lenses=False)
         information = _summed(np.einsum("mka,mkb->mab", point, point), starts, block.point, p)
         information[:, diagonal, diagonal] += block.weights
         information[:, diagonal, diagonal] += FLAT * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
@@ -243,14 +244,6 @@ def settle_points(block: Block, rounds: int = 2) -> Block:
         gradient += block.weights * (block.points - block.stated)
         block = replace(block, points=block.points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0])
     return block
-
-
-def _point_jacobian(block: Block) -> tuple[Float64[np.ndarray, "m 2 3"], Float64[np.ndarray, "m 2"]]:
-    unfree = replace(
-        block, lenses=tuple(replace(lens, names=(), directions=lens.directions[:0]) for lens in block.lenses)
-    )
-    _, _, point, residual = _jacobians(unfree)
-    return point, residual
 
 
 def _direct(
@@ -283,20 +276,20 @@ def _columns(block: Block) -> Int64[np.ndarray, "m c"]:
 
 
 def _jacobians(
-    block: Block,
+    block: Block, lenses: bool = True
 ) -> tuple[
     Float64[np.ndarray, "m 2 6"],
     Float64[np.ndarray, "m 2 l"],
     Float64[np.ndarray, "m 2 3"],
     Float64[np.ndarray, "m 2"],
 ]:
-    """Derivatives of the weighted residuals by pose, lens and point, and the residuals."""
+    """Derivatives of the weighted residuals by pose, lens (zeros if not asked for) and point, and the residuals."""
     rays = block._rays()
     m, widest = len(rays), max((len(lens.names) for lens in block.lenses), default=0)
     by_ray, by_lens, projected = np.zeros((m, 2, 3)), np.zeros((m, 2, widest)), np.zeros((m, 2))
     for number, lens in enumerate(block.lenses):
         rows = np.flatnonzero(block.lens_of[block.photo] == number)
-        by_ray[rows], by_lens[rows, :, : len(lens.names)], projected[rows] = _derivatives(lens, rays[rows])
+        by_ray[rows], by_lens[rows, :, : len(lens.names)], projected[rows] = _derivatives(lens, rays[rows], lenses)
     turned = block.rotations[block.photo]
     by_point = by_ray @ turned
     by_turn = -by_ray @ cross_matrix(rays)
@@ -310,7 +303,7 @@ def _jacobians(
 
 
 def _derivatives(
-    lens: Lens, rays: Float64[np.ndarray, "m 3"]
+    lens: Lens, rays: Float64[np.ndarray, "m 3"], parameters: bool
 ) -> tuple[Float64[np.ndarray, "m 2 3"], Float64[np.ndarray, "m 2 k"], Float64[np.ndarray, "m 2"]]:
     """Derivatives of pixels by the point in the camera's axes and by the free parameters, and the pixels."""
     depth = rays[:, 2:]
@@ -326,7 +319,7 @@ def _derivatives(
     inner[:, :, 2] = -flat[:, :2]
     by_ray = by_flat @ (inner / depth[:, :, None])
     by_lens = np.zeros((len(rays), 2, len(lens.names)))
-    for k, name in enumerate(lens.names):
+    for k, name in enumerate(lens.names if parameters else ()):
         step = np.zeros(len(lens.names))
         step[k] = LENS_STEP if name in LENGTHS else LENS_STEP / lens.camera.width
         ahead, back = _project(lens._after(step), flat), _project(lens._after(-step), flat)

@@ -144,7 +144,8 @@ def joint_system(
 
 def solve(normal: Float64[np.ndarray, "r r"], right: Float64[np.ndarray, r * k]) -> Float64[np.ndarray, r * k]:
     """Solve a positive definite system whose unknowns differ in size; undetermined directions stay put."""
-    sizes = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    diagonal = np.diag(normal)
+    sizes = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = normal / sizes[:, None] / sizes[None, :]
     scale = sizes if right.ndim == 1 else sizes[:, None]
     ridge = 0.0

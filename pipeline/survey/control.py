@@ -10,11 +10,15 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.joint_fit import SIMILARITY, JointFit, fit_jointly
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel
-from splatpipe.pipeline.survey.adjustment import ControlAdjustment, Target, adjust, can_adjust, moved_px
+from splatpipe.pipeline.survey.adjusted_positions import AdjustedPositions, block_json
+from splatpipe.pipeline.survey.adjustment import ControlAdjustment, ControlStart, Target, adjust, can_adjust, moved_px
+from splatpipe.pipeline.survey.block import Lens
+from splatpipe.pipeline.survey.block_accuracy import accuracy_of
+from splatpipe.pipeline.survey.block_adjustment import PositionObservations
 from splatpipe.pipeline.survey.blunders import name_blunders, require_near, warn_of_datum_offset, warn_of_weak_control
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.frames import Frame
@@ -31,7 +35,9 @@ from splatpipe.pipeline.survey.local_survey import (
 )
 from splatpipe.pipeline.survey.model import SparseModel, model_of
 from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens, simple_lens
 from splatpipe.pipeline.survey.surveyed_points import Survey, locate
+from splatpipe.pipeline.survey.tie_points import MIN_SIGMA_PX, block_of, sizes_of, spread_points, tie_sigma, tie_table
 
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if control deforms the model by less, it is not adjusted
 QUIET = 2.0  # times the stated sigmas; control with residuals up to this keeps its sigmas
@@ -51,15 +57,17 @@ class GeorefInput:
         model: The sparse model.
         positions: The photos' stated positions.
         photos: All photos of the capture by name.
-        focal_priors: Focal lengths from the metadata, in the model's pixels, by COLMAP camera id.
+        lenses: What is known of the cameras, by COLMAP camera id.
         lenses_held: Whether the interior orientation is kept fixed.
+        adjusted: The adjustment of accurate positions, whose model this is; None without.
     """
 
     model: SparseModel
     positions: Positions
     photos: Mapping[str, Photo]
-    focal_priors: Mapping[int, float]
+    lenses: Mapping[int, LensKnowledge]
     lenses_held: bool = False
+    adjusted: AdjustedPositions | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +83,7 @@ class ControlResult:
         moved_px: How far the adjustment moved the images' content, RMS; None if nothing was adjusted.
         sigma_factor: Factor applied to the control's stated or assumed sigmas.
         focal_held: COLMAP ids of cameras whose focal length neither photos nor control determine.
+        block: Lens and heights after the adjustment, for ``accuracy.json``; None without one.
     """
 
     frame: Frame
@@ -85,6 +94,7 @@ class ControlResult:
     moved_px: float | None
     sigma_factor: float
     focal_held: tuple[int, ...] = ()
+    block: JSON = None
 
 
 def place_by_control(
@@ -116,7 +126,8 @@ def place_by_control(
     warn_of_weak_control(fit, observed, model, report)
     placed = GeoreferencedModel(model, fit.similarity, fit.offsets)
     result = ControlResult(_frame(frame, survey, site, fit, config), survey, site, placed, None, None, factor)
-    if config.adjust == "auto" and int(observed.is_control.sum()) >= MIN_CONTROL:
+    needed = MIN_CONTROL if capture.adjusted is None else 1
+    if config.adjust == "auto" and int(observed.is_control.sum()) >= needed:
         if can_adjust(model.reconstruction):
             result = _adjusted(result, capture, config, report)
         else:
@@ -159,13 +170,14 @@ class _TrustedAdjustment:
 
 def _settle(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> _TrustedAdjustment:
     """Adjust until the control agrees, leaving out single blunders or else enlarging the sigmas."""
-    best = _try(result.survey, 1.0, result, capture, config)
+    start = _start(result, capture)
+    best = _try(result.survey, 1.0, result, capture, config, start)
     for _ in range(ROUNDS):
-        better = _without_one(best, result, capture, config) if best.noise > SUSPICIOUS else None
+        better = _without_one(best, result, capture, config, start) if best.noise > SUSPICIOUS else None
         if better is None:
             if best.noise <= QUIET:
                 break
-            best = _try(best.survey, best.factor * best.noise, result, capture, config)
+            best = _try(best.survey, best.factor * best.noise, result, capture, config, start)
             continue
         index, off, best = better
         point = best.survey.points[index]
@@ -179,16 +191,25 @@ def _settle(result: ControlResult, capture: GeorefInput, config: GeorefConfig, r
 
 
 def _try(
-    survey: Survey, factor: float, result: ControlResult, capture: GeorefInput, config: GeorefConfig
+    survey: Survey,
+    factor: float,
+    result: ControlResult,
+    capture: GeorefInput,
+    config: GeorefConfig,
+    start: ControlStart,
 ) -> _TrustedAdjustment:
     chosen = _chosen(survey)
-    done = _adjust(survey, chosen, factor, result, capture, config)
+    done = adjust(start, _targets(survey, chosen, factor, result, capture, config))
     coordinates = np.array([3 if survey.points[k].surveyed.z is not None else 2 for k in chosen], dtype=np.int64)
     return _TrustedAdjustment(survey, done, factor, _noise(done.normed, coordinates))
 
 
 def _without_one(
-    settled: _TrustedAdjustment, result: ControlResult, capture: GeorefInput, config: GeorefConfig
+    settled: _TrustedAdjustment,
+    result: ControlResult,
+    capture: GeorefInput,
+    config: GeorefConfig,
+    start: ControlStart,
 ) -> tuple[int, float, _TrustedAdjustment] | None:
     """Return the point without which the others agree, its offset in metres, and that adjustment; None if there is
     none."""
@@ -199,13 +220,14 @@ def _without_one(
         index = chosen[worst]
         points = list(settled.survey.points)
         points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
-        rest = _try(settled.survey.with_points(points), settled.factor, result, capture, config)
+        rest = _try(settled.survey.with_points(points), settled.factor, result, capture, config, start)
         if rest.noise <= settled.noise / LONELY:
             model = model_of(rest.done.reconstruction, capture.photos)
             found = locate(settled.survey.points[index], model, capture.photos, config.mark_sigma_px).found
             if found is not None:
                 known = np.isfinite(result.site.targets.sigmas[index])
-                off = float(np.linalg.norm((found.xyz - result.site.targets.enu[index])[known]))
+                place = result.placed.world_from_model.apply(found.xyz[None])[0]
+                off = float(np.linalg.norm((place - result.site.targets.enu[index])[known]))
                 return index, off, rest
     return None
 
@@ -230,16 +252,16 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
         )
     _warn_of_focal_lengths(done, capture, report)
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
-    result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held)
+    accuracy = accuracy_of(done.adjusted, done.observed)
+    block = block_json(accuracy, done.observed, capture.model.gsd(result.placed.world_from_model.scale), None)
+    result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held, block=block)
     if moved < MIN_DEFORMATION_PX:
         return result
     report.note(
         f"Control moves what the photos show by {moved:.1f} px: the model is adjusted to it, and trained again."
     )
     world_from_model = result.placed.world_from_model
-    adjusted = pycolmap.Reconstruction(done.reconstruction)
-    back = world_from_model.inverse()
-    adjusted.transform(pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation))
+    adjusted = done.reconstruction
     model = model_of(adjusted, capture.photos)
     points = [
         locate(point, model, capture.photos, config.mark_sigma_px) if point.found is not None else point
@@ -252,7 +274,8 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
 def _warn_of_focal_lengths(done: ControlAdjustment, capture: GeorefInput, report: Reporter) -> None:
     """Warn of undetermined focal lengths, and of those that control moves far from the value in the metadata."""
     for number, camera in sorted(done.reconstruction.cameras.items()):
-        prior = capture.focal_priors.get(number)
+        known = capture.lenses.get(number)
+        prior = None if known is None else known.focal_px
         if number in done.held:
             report.warning(
                 f"Neither the photos nor the control determine the focal length (to {done.focal_sigmas[number]:.1%}):"
@@ -276,14 +299,63 @@ def _chosen(survey: Survey) -> list[int]:
     return [k for k, point in enumerate(survey.points) if point.role == "control" and point.found is not None]
 
 
-def _adjust(
+def _start(result: ControlResult, capture: GeorefInput) -> ControlStart:
+    """The block of the model, with its positions: by the noise that their own adjustment found, else as weighted."""
+    model, site = capture.model, result.site
+    table = tie_table(model.reconstruction, model.image_ids)
+    chosen = table.only(spread_points(table, sizes_of(table, model.reconstruction)))
+    whole = capture.adjusted is not None and not capture.lenses_held
+    priors = {} if capture.adjusted is not None or capture.lenses_held else _focal_priors(capture.lenses)
+
+    def lens_of(camera: pycolmap.Camera) -> Lens:
+        known = capture.lenses.get(camera.camera_id, LensKnowledge(None, 0.3))
+        if whole:
+            return prior_lens(camera, known, None)
+        return simple_lens(camera, model.reconstruction.cameras[camera.camera_id], known, capture.lenses_held)
+
+    start = result.placed.world_from_model
+    block = block_of(chosen, model.reconstruction, start, lens_of, MIN_SIGMA_PX)
+    sigma = tie_sigma(block)
+    block = replace(block, sigmas=np.full_like(block.sigmas, sigma))
+    return ControlStart(model.reconstruction, start, table, block, _positions(site, capture), priors)
+
+
+def _focal_priors(lenses: Mapping[int, LensKnowledge]) -> dict[int, float]:
+    return {number: known.focal_px for number, known in lenses.items() if known.focal_px is not None}
+
+
+def _positions(site: LocalSurvey, capture: GeorefInput) -> PositionObservations:
+    """The photos' positions, with an offset for each flight: control need not share their datum."""
+    stations = site.stations
+    count, groups = len(stations), stations.offset_sigmas()
+    precision = np.zeros((3, count, count))
+    for axis in range(3):
+        precision[axis] = np.diag(1.0 / stations.sigmas[:, axis] ** 2)
+    if capture.adjusted is None:
+        return PositionObservations(stations.indices, site.station_enu, precision, stations.group, groups)
+    done = capture.adjusted.done
+    place = {name: k for k, name in enumerate(stations.names)}
+    order = np.array([place[name] for name in done.names if name in place], dtype=np.int64)
+    used = np.array([name in place for name in done.names])
+    kept = replace(done.noise, of=done.noise.of[used])
+    return PositionObservations(
+        stations.indices[order],
+        site.station_enu[order],
+        kept.precision(done.positions.only(used)),
+        stations.group[order],
+        groups,
+    )
+
+
+def _targets(
     survey: Survey,
     chosen: Sequence[int],
     factor: float,
     result: ControlResult,
     capture: GeorefInput,
     config: GeorefConfig,
-) -> ControlAdjustment:
+) -> list[Target]:
+    """The control points as the adjustment takes them, with sigmas times a factor."""
     model, site = capture.model, result.site
     targets = []
     for k in chosen:
@@ -297,7 +369,4 @@ def _adjust(
                 sigmas.append(config.mark_sigma_px * scale)
         place = result.placed.world_from_model.apply(point.found.xyz[None])[0]
         targets.append(Target(site.targets.enu[k], factor * site.targets.sigmas[k], place, marks, np.array(sigmas)))
-    numbers = [model.image_ids[index] for index in site.stations.indices]
-    stations = (site.stations, site.station_enu, numbers)
-    start = result.placed.world_from_model
-    return adjust(model.reconstruction, start, targets, stations, capture.focal_priors, capture.lenses_held)
+    return targets

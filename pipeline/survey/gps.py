@@ -196,6 +196,11 @@ def report_fit(frame: Frame, fit: PositionFit, model: SparseModel, positions: Po
     report.note(f"By the photos' positions alone: {fit.uncertainty.sentence()}.")
     _warn_of_noise(fit, frame, positions, report)
     _warn_of_directions(fit, report)
+    report_frame(frame, model, positions, report)
+
+
+def report_frame(frame: Frame, model: SparseModel, positions: Positions, report: Reporter) -> None:
+    """Warn about flights in other datums, wrong positions, and heights that the drone knows otherwise."""
     warn_of_flight_offsets(frame.residuals["flights"], report)
     if frame.left_out:
         report.warning(

@@ -14,9 +14,8 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.sfm.lens_model import NAMES, WIDE, is_known, narrow, set_lens
-from splatpipe.pipeline.sfm.retriangulation import MAX_ERROR_PX
-from splatpipe.pipeline.survey.block import Block, Lens, free_lens, settle_points
+from splatpipe.pipeline.sfm.lens_model import PARAMETERS, WIDE, is_known
+from splatpipe.pipeline.survey.block import Block, Lens, free_lens
 from splatpipe.pipeline.survey.block_accuracy import BlockAccuracy, accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import AdjustedBlock, PositionObservations, adjust_block
 from splatpipe.pipeline.survey.position_noise import (
@@ -29,14 +28,27 @@ from splatpipe.pipeline.survey.position_noise import (
     predicted_errors,
     strip_pieces,
 )
-from splatpipe.pipeline.survey.tie_points import TieTable, block_of, image_errors, intersected, spread_points, tie_table
+from splatpipe.pipeline.survey.tie_points import (
+    MIN_SIGMA_PX,
+    TieTable,
+    block_of,
+    image_errors,
+    intersected,
+    observing,
+    sizes_of,
+    spread_points,
+    tie_sigma,
+    tie_table,
+    whole_model,
+)
 
 MAX_PHOTOS = 1000  # more are adjusted in a part: the system is dense
-MIN_SIGMA_PX = 1.0  # of tie points: the errors of a lens and of matching are shared by neighbours
-CELLS = 5  # a side, of the grid in which a photo's errors are averaged
 SIMPLE = ("f", "k1")
 ALL = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
 ALL_FISHEYE = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "k4")
+FOCAL_SHARE = 0.03  # standard deviation of a focal length about its prior, relative, without positions
+DISTORTION_SIGMA = 0.2  # likewise of a coefficient about its estimate from SfM
+FIXED = ("k4", "k5", "k6")  # the denominator of FULL_OPENCV
 WEAK = {"k1": 0.3, "k2": 0.3, "k3": 0.3, "k4": 0.3, "p1": 0.01, "p2": 0.01, "aspect": 0.005}
 CENTRE_SHARE = 0.02  # of the width: standard deviation of a principal point
 MIN_PHOTOS = 8  # of a camera whose lens is freed
@@ -45,6 +57,10 @@ HELD_OUT = 600  # tie points that judge the lens
 CAP = 4.0  # times the median error of such a point: a wrong match must not decide
 WORSE = 0.01  # relative, of predictions by a lens that is refused
 SETTLED = 0.03  # relative change of the noise
+
+
+def quietly(done: int, total: int) -> None:
+    """Report no progress."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +141,7 @@ def adjust_to_positions(
     lenses: Mapping[int, LensKnowledge],
     *,
     lenses_held: bool = False,
-    poll: Callable[[int, int], None] = lambda done, total: None,
+    poll: Callable[[int, int], None] = quietly,
 ) -> PositionAdjustment:
     """Adjust photos, lenses and tie points to positions.
 
@@ -141,8 +157,7 @@ def adjust_to_positions(
         poll: Called with what is done and the total of steps.
     """
     table = tie_table(reconstruction, numbers)
-    sizes = [(reconstruction.cameras[c].width, reconstruction.cameras[c].height) for c in table.cameras]
-    chosen = spread_points(table, sizes)
+    chosen = spread_points(table, sizes_of(table, reconstruction))
     counts = {c: table.cameras.count(c) for c in set(table.cameras)}
     poll(1, 6)
 
@@ -165,12 +180,12 @@ def adjust_to_positions(
         simple_block = block_with(chosen, False)
         simple_block = replace(simple_block, sigmas=np.full_like(simple_block.sigmas, sigma))
         simple = BlockFit(adjust_block(simple_block, fit.observed), positions, fit.kept, fit.noise)
-        judgement = _judged(simple, fit, table, chosen, reconstruction, world_from_model)
+        judgement = _judged(simple, fit, table, chosen, world_from_model)
         if not judgement.taken:
             fit = converge(simple.adjusted.block, positions, fit.kept, poll)
     poll(5, 6)
     kept = positions.only(fit.kept)
-    whole = _whole_model(reconstruction, table, fit.adjusted.block, world_from_model)
+    whole = whole_model(reconstruction, table, fit.adjusted.block, world_from_model)
     left_out = tuple(sorted(name for name, used in zip(names, fit.kept.tolist(), strict=True) if not used))
     return PositionAdjustment(
         fit.adjusted,
@@ -212,24 +227,22 @@ def prior_lens(camera: pycolmap.Camera, known: LensKnowledge, names: tuple[str, 
     return free_lens(camera, names, mean, sigmas)
 
 
-def tie_sigma(block: Block) -> float:
-    """Standard deviation of a tie point's observation, pixels: at least one, wider where neighbours share errors.
+def simple_lens(camera: pycolmap.Camera, own: pycolmap.Camera, known: LensKnowledge, held: bool) -> Lens:
+    """A lens with its focal length and the coefficients of its own model free, for photos without accurate positions.
 
-    Where the errors of a photo's cells do not average out as independent ones would, each observation is worth less.
+    Args:
+        camera: Of a wide model.
+        own: The same, of its own model.
+        known: Before its photos were looked at.
+        held: Keep it fixed.
     """
-    errors = image_errors(block)
-    sound = np.isfinite(errors).all(axis=1)
-    unknowns = 3 * len(block.points) + block.unknowns
-    degrees = max(2 * int(sound.sum()) - unknowns, 1)
-    own = float((errors[sound] ** 2).sum()) / degrees
-    size = np.array([[lens.camera.width, lens.camera.height] for lens in block.lenses])[block.lens_of[block.photo]]
-    cell = np.clip((CELLS * block.pixels / size).astype(np.int64), 0, CELLS - 1)
-    place = ((block.photo * CELLS + cell[:, 1]) * CELLS + cell[:, 0])[sound]
-    count = np.bincount(place)
-    sums = np.stack([np.bincount(place, weights=errors[sound, axis]) for axis in range(2)])
-    full = count >= 2
-    shared = float((sums[:, full] ** 2 / count[full]).sum()) / max(2 * int(full.sum()), 1)
-    return max(MIN_SIGMA_PX, max(own, shared) ** 0.5)
+    if held or not is_known(camera.model_name):
+        return free_lens(camera, (), {}, {})
+    names = ("f", *(name for name in PARAMETERS[own.model_name] if name.startswith(("k", "p")) and name not in FIXED))
+    focal = float(camera.params[0]) if known.focal_px is None else known.focal_px
+    return free_lens(
+        camera, names, {"f": focal}, {"f": FOCAL_SHARE * focal, **dict.fromkeys(names[1:], DISTORTION_SIGMA)}
+    )
 
 
 @dataclass(frozen=True)
@@ -257,7 +270,7 @@ def converge(
     block: Block,
     positions: StatedPositions,
     kept: Bool[np.ndarray, " k"],
-    poll: Callable[[int, int], None] = lambda done, total: None,
+    poll: Callable[[int, int], None] = quietly,
 ) -> BlockFit:
     """Adjust, look for blunders and estimate the noise until nothing changes.
 
@@ -291,7 +304,6 @@ def _judged(
     whole: BlockFit,
     table: TieTable,
     chosen: Bool[np.ndarray, " p"],
-    reconstruction: pycolmap.Reconstruction,
     world_from_model: Similarity,
 ) -> LensJudgement:
     """Compare two lenses on tie points and positions that their adjustments did not use."""
@@ -301,7 +313,7 @@ def _judged(
     picked[others[:: max(1, len(others) // HELD_OUT)]] = True
     errors = []
     for fit in (simple, whole):
-        block = _observing(table.only(picked), fit.adjusted.block, reconstruction, world_from_model)
+        block = observing(table.only(picked), fit.adjusted.block, world_from_model)
         size = np.linalg.norm(image_errors(intersected(block)), axis=1)
         errors.append(np.where(np.isfinite(size), size, np.inf))
     cap = CAP * float(np.median(np.minimum(*errors))) if picked.any() else 0.0
@@ -315,48 +327,3 @@ def _two(errors: Float64[np.ndarray, "k 3"]) -> tuple[float, float]:
     """Root mean square along a horizontal axis and in height."""
     squares = np.nanmean(errors**2, axis=0)
     return float(np.sqrt(squares[:2].mean())), float(np.sqrt(squares[2]))
-
-
-def _observing(
-    table: TieTable, block: Block, reconstruction: pycolmap.Reconstruction, world_from_model: Similarity
-) -> Block:
-    """A block's photos with other tie points."""
-    del reconstruction
-    place = world_from_model.apply(table.points)
-    return replace(
-        block,
-        points=place,
-        photo=table.photo,
-        point=table.point,
-        pixels=table.pixels,
-        sigmas=np.full(len(table.photo), float(block.sigmas.mean())),
-        stated=place,
-        weights=np.zeros_like(place),
-    )
-
-
-def _whole_model(
-    reconstruction: pycolmap.Reconstruction, table: TieTable, block: Block, world_from_model: Similarity
-) -> pycolmap.Reconstruction:
-    """Return the whole model with a block's photos and lenses and all points placed anew, in the model's own frame."""
-    every = settle_points(intersected(_observing(table, block, reconstruction, world_from_model)))
-    back = world_from_model.inverse()
-    result = pycolmap.Reconstruction(reconstruction)
-    used = sorted(set(table.cameras))
-    for number, lens in zip(used, block.lenses, strict=True):
-        camera = result.cameras[number]
-        if is_known(lens.camera.model_name):
-            names = NAMES[lens.camera.model_name]
-            set_lens(camera, lens.camera.model_name, dict(zip(names, map(float, lens.camera.params), strict=True)))
-            narrow(camera)
-    centres = back.apply(block.centres)
-    for place, number in enumerate(table.numbers):
-        rotation = block.rotations[place] @ world_from_model.rotation
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centres[place])
-        result.images[number].frame.set_cam_from_world(result.images[number].camera_id, pose)
-    for number, xyz in zip(table.ids.tolist(), back.apply(every.points), strict=True):
-        if np.isfinite(xyz).all():
-            result.points3D[number].xyz = xyz
-    pycolmap.ObservationManager(result).filter_all_points3D(MAX_ERROR_PX, 0.0)
-    result.update_point_3d_errors()
-    return result

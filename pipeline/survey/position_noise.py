@@ -96,6 +96,12 @@ class PositionNoise:
         """Standard deviation of each coordinate, metres."""
         return np.asarray(positions.sigmas * self.factors[self.of][:, [0, 0, 1]])
 
+    def white_correlations(self) -> Float64[np.ndarray, " 2"]:
+        """Correlations of first-order processes whose mean over many photos is as uncertain, horizontally and in
+        height."""
+        times = 1.0 - self.shares + self.shares * (1.0 + self.correlations) / (1.0 - self.correlations)
+        return np.asarray((times - 1.0) / (times + 1.0))
+
     def precision(self, positions: StatedPositions) -> Float64[np.ndarray, "3 k k"]:
         """Inverse covariance along each axis."""
         sizes = self.sizes(positions)

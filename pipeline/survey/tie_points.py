@@ -10,12 +10,15 @@ import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.sfm.lens_model import is_known, widen
+from splatpipe.pipeline.sfm.lens_model import NAMES, is_known, narrow, set_lens, widen
+from splatpipe.pipeline.sfm.retriangulation import MAX_ERROR_PX
 from splatpipe.pipeline.survey.block import Block, Lens, settle_points
 
 PER_PHOTO = 150  # tie points of a photo: errors within one are not independent, and more add cost, not accuracy
 PER_CELL = 2
 MIN_VIEWS = 2
+MIN_SIGMA_PX = 1.0  # of tie points: the errors of a lens and of matching are shared by neighbours
+CELLS = 5  # a side, of the grid in which a photo's errors are averaged
 SETTLING = 6  # rounds for points that start from where their rays meet
 NEAR_PARALLEL = 1e-7  # least ratio of the eigenvalues of a point's rays
 
@@ -147,6 +150,11 @@ def spread_points(
     return taken
 
 
+def sizes_of(table: TieTable, reconstruction: pycolmap.Reconstruction) -> list[tuple[int, int]]:
+    """Width and height of each photo of a table, in the model's pixels."""
+    return [(reconstruction.cameras[c].width, reconstruction.cameras[c].height) for c in table.cameras]
+
+
 def intersected(block: Block) -> Block:
     """Place all tie points where their rays meet, for the cameras as they are.
 
@@ -175,3 +183,65 @@ def intersected(block: Block) -> Block:
 def image_errors(block: Block) -> Float64[np.ndarray, "m 2"]:
     """Projected less observed, pixels."""
     return np.asarray(block.residuals() * block.sigmas[:, None])
+
+
+def tie_sigma(block: Block) -> float:
+    """Standard deviation of a tie point's observation, pixels: at least one, wider where neighbours share errors.
+
+    Where the errors of a photo's cells do not average out as independent ones would, each observation is worth less.
+    """
+    errors = image_errors(block)
+    sound = np.isfinite(errors).all(axis=1)
+    unknowns = 3 * len(block.points) + block.unknowns
+    degrees = max(2 * int(sound.sum()) - unknowns, 1)
+    own = float((errors[sound] ** 2).sum()) / degrees
+    size = np.array([[lens.camera.width, lens.camera.height] for lens in block.lenses])[block.lens_of[block.photo]]
+    cell = np.clip((CELLS * block.pixels / size).astype(np.int64), 0, CELLS - 1)
+    place = ((block.photo * CELLS + cell[:, 1]) * CELLS + cell[:, 0])[sound]
+    count = np.bincount(place)
+    sums = np.stack([np.bincount(place, weights=errors[sound, axis]) for axis in range(2)])
+    full = count >= 2
+    shared = float((sums[:, full] ** 2 / count[full]).sum()) / max(2 * int(full.sum()), 1)
+    return max(MIN_SIGMA_PX, max(own, shared) ** 0.5)
+
+
+def observing(table: TieTable, block: Block, world_from_model: Similarity) -> Block:
+    """A block's photos with other tie points."""
+    place = world_from_model.apply(table.points)
+    return replace(
+        block,
+        points=place,
+        photo=table.photo,
+        point=table.point,
+        pixels=table.pixels,
+        sigmas=np.ones(len(table.photo)),
+        stated=place,
+        weights=np.zeros_like(place),
+    )
+
+
+def whole_model(
+    reconstruction: pycolmap.Reconstruction, table: TieTable, block: Block, world_from_model: Similarity
+) -> pycolmap.Reconstruction:
+    """Return the whole model with a block's photos and lenses and all points placed anew, in the model's own frame."""
+    every = settle_points(intersected(observing(table, block, world_from_model)))
+    back = world_from_model.inverse()
+    result = pycolmap.Reconstruction(reconstruction)
+    used = sorted(set(table.cameras))
+    for number, lens in zip(used, block.lenses, strict=True):
+        camera = result.cameras[number]
+        if is_known(lens.camera.model_name):
+            names = NAMES[lens.camera.model_name]
+            set_lens(camera, lens.camera.model_name, dict(zip(names, map(float, lens.camera.params), strict=True)))
+            narrow(camera)
+    centres = back.apply(block.centres)
+    for place, number in enumerate(table.numbers):
+        rotation = block.rotations[place] @ world_from_model.rotation
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centres[place])
+        result.images[number].frame.set_cam_from_world(result.images[number].camera_id, pose)
+    for number, xyz in zip(table.ids.tolist(), back.apply(every.points), strict=True):
+        if np.isfinite(xyz).all():
+            result.points3D[number].xyz = xyz
+    pycolmap.ObservationManager(result).filter_all_points3D(MAX_ERROR_PX, 0.0)
+    result.update_point_3d_errors()
+    return result

@@ -47,9 +47,9 @@ class Uncertainty:
     def sentence(self) -> str:
         """The accuracy as a sentence for the user."""
         across, height = self.coordinates_m.tolist()
-        metres = f"about {_metres(across)}"
+        metres = f"about {metres_in_words(across)}"
         if not 0.67 < height / max(across, 1e-12) < 1.5:
-            metres += f" ({_metres(height)} in height)"
+            metres += f" ({metres_in_words(height)} in height)"
         angles = f"north to {_degrees(self.north_rad)}, up to {_degrees(self.up_rad)}"
         return f"coordinates good to {metres}, {angles}, scale to {_percent(self.scale)}"
 
@@ -126,7 +126,8 @@ def student_95(degrees: float) -> float:
     return z + first / n + second / n**2 + third / n**3
 
 
-def _metres(value: float) -> str:
+def metres_in_words(value: float) -> str:
+    """A length in cm or m, to two digits."""
     if value < 0.0995:
         return f"{max(100.0 * value, 0.1):.2g} cm"
     return f"{value:.2g} m" if value < 99.5 else f"{value:,.0f} m"

@@ -160,8 +160,9 @@ def capture_parts(
     save_photo_list(PhotoList(tuple(Photo(name, "0" * 64, WIDTH, HEIGHT, 0) for name in names)), folder)
     (folder / "positions.json").write_text(json.dumps({"positions": records, "orientations": {}}))
     (folder / "cameras.json").write_text(
-        json.dumps({"cameras": [{"focal_px": 853.0, "width": WIDTH, "has_prior": True}]})
+        json.dumps({"cameras": [{"focal_px": 853.0, "width": WIDTH, "has_prior": True, "focal_source": "35mm"}]})
     )
+    (folder / "lenses.json").write_text(json.dumps({"lenses": [None]}))
     (folder / "gcp_list.txt").write_text(control, encoding="utf-8")
     save_wanted(WantedTargets("", (), ()), folder / "points.json")
     save_finds((), folder / "targets.json")
@@ -170,6 +171,7 @@ def capture_parts(
         "ingest.positions": folder / "positions.json",
         "ingest.photos": folder,
         "ingest.cameras": folder / "cameras.json",
+        "ingest.lenses": folder / "lenses.json",
         "source.control": folder / "gcp_list.txt",
         "source.boundary": ABSENT,
         "control.points": folder / "points.json",

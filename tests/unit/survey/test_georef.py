@@ -123,7 +123,9 @@ def finds(scene: Survey) -> list[TargetFind]:
 def ingested(folder: Path, positions: list[dict[str, object]], names: list[str]) -> dict[str, Path]:
     """The parts that ingest would write."""
     (folder / "positions.json").write_text(json.dumps({"positions": positions, "orientations": {}}))
-    (folder / "cameras.json").write_text('{"cameras": [{"focal_px": 2300.0, "width": 4000, "has_prior": true}]}')
+    group = {"focal_px": 2300.0, "width": 4000, "has_prior": True, "focal_source": "35mm-equivalent"}
+    (folder / "cameras.json").write_text(json.dumps({"cameras": [group]}))
+    (folder / "lenses.json").write_text('{"lenses": [null]}')
     save_photo_list(PhotoList(tuple(Photo(name, "0" * 64, 4000, 3000, 0) for name in names)), folder)
     save_wanted(WantedTargets("", (), ()), folder / "points.json")
     save_finds((), folder / "targets.json")
@@ -131,6 +133,7 @@ def ingested(folder: Path, positions: list[dict[str, object]], names: list[str])
         "ingest.positions": folder / "positions.json",
         "ingest.photos": folder,
         "ingest.cameras": folder / "cameras.json",
+        "ingest.lenses": folder / "lenses.json",
         "source.control": ABSENT,
         "source.boundary": ABSENT,
         "control.points": folder / "points.json",
