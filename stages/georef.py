@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
@@ -34,7 +35,7 @@ from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of
 from splatpipe.pipeline.survey.model import SparseModel, copy_model, model_of, read_model
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.position_adjustment import LensKnowledge
+from splatpipe.pipeline.survey.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE, LensKnowledge
 from splatpipe.pipeline.survey.scale_bars import ModelScale
 from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
 from splatpipe.pipeline.survey.target_finds import load_finds, load_wanted
@@ -50,13 +51,16 @@ from splatpipe.pipeline.survey.target_survey import (
 )
 from splatpipe.pipeline.survey.world import in_crs
 
-# Standard deviation of a focal length by its source, relative; a guess may be anything.
-FOCAL_SHARES = {"lens-file": 0.003, "xmp-dewarp": 0.01, "xmp-calibrated": 0.01, "guess": 0.3}
-OTHER_SHARE = 0.03
 DATUM_STEP_M = 1.0  # least offset that suggests another vertical datum; less may be the receiver's error
 
 
 def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """As ``_run``, on one thread: BLAS with several rounds sums in another order."""
+    with threadpool_limits(limits=1):
+        return _run(config, inputs, out, report)
+
+
+def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write the parts frame (``frame.json``), model, control (``control.json``), accuracy (``accuracy.json``) and
     boundary (``boundary.json``).
 
@@ -193,7 +197,9 @@ def _lens_knowledge(
             named = named_params(lens.colmap())
             centre = (scale * named["cx"], scale * named["cy"])
         focal = scale * group["focal_px"] if group["has_prior"] else None
-        known[camera.camera_id] = LensKnowledge(focal, FOCAL_SHARES.get(group["focal_source"], OTHER_SHARE), centre)
+        known[camera.camera_id] = LensKnowledge(
+            focal, FOCAL_SHARES.get(group["focal_source"], OTHER_FOCAL_SHARE), centre
+        )
     return known
 
 

@@ -46,6 +46,9 @@ MAX_PHOTOS = 1000  # more are adjusted in a part: the system is dense
 SIMPLE = ("f", "k1")
 ALL = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
 ALL_FISHEYE = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "k4")
+# Standard deviation of a focal length by its source, relative; a guess may be anything.
+FOCAL_SHARES = {"lens-file": 0.003, "xmp-dewarp": 0.01, "xmp-calibrated": 0.01, "guess": 0.3}
+OTHER_FOCAL_SHARE = 0.03
 FOCAL_SHARE = 0.03  # standard deviation of a focal length about its prior, relative, without positions
 DISTORTION_SIGMA = 0.2  # likewise of a coefficient about its estimate from SfM
 FIXED = ("k4", "k5", "k6")  # the denominator of FULL_OPENCV
