@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,6 @@ from splatpipe.pipeline.survey.block_accuracy import (
     with_control,
     with_cross_strip,
 )
-from splatpipe.pipeline.survey.block_adjustment import PositionObservations
 from splatpipe.pipeline.survey.fitting import capture_order
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.level import Positions
@@ -32,7 +31,6 @@ from splatpipe.pipeline.survey.uncertainty import Uncertainty, metres_in_words
 ACCURATE_M = 0.5  # standard deviation up to which positions bend the model: RTK, PPK, also without a fix
 MIN_POSITIONS = 8
 MIN_TIES = 20  # points that a photo must have at the median, to be adjusted
-MAX_PHOTOS = 1000  # the system is dense
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if positions deform the model by less, it is not adjusted
 MANY_GSDS = 3.0  # ground sample distances up to which positions are accurate, and heights should be
 HEIGHTS_SHOWN = 400
@@ -79,12 +77,6 @@ def adjust_model(
     """
     stated = stated_positions(model, frame, positions, photos)
     if stated is None or not can_adjust(model.reconstruction) or _ties(model) < MIN_TIES:
-        return None
-    if len(model.names) > MAX_PHOTOS:
-        report.warning(
-            f"The positions of more than {MAX_PHOTOS} photos place the model, but do not adjust it.",
-            "Process the site in parts, or add control points.",
-        )
         return None
     names, observed = stated
     suspects = np.array([name in frame.left_out for name in names])
@@ -233,7 +225,7 @@ def adjustment_json(found: AdjustedPositions, gsd: float | None) -> dict[str, JS
             "positions_m": [list(judged.simple_m), list(judged.whole_m)],
             "whole": judged.taken,
         },
-        **block_json(done.accuracy, done.noise.observations(done.positions), gsd, stated_sigma(done.positions)),
+        **block_json(done.accuracy, gsd, stated_sigma(done.positions)),
     }
 
 
@@ -242,22 +234,14 @@ def stated_sigma(positions: StatedPositions) -> float:
     return float(np.median(positions.sigmas))
 
 
-def block_json(
-    accuracy: BlockAccuracy,
-    observed: PositionObservations,
-    gsd: float | None,
-    stated_m: float | None,
-    poll: Callable[[], None] = lambda: None,
-) -> dict[str, JSON]:
+def block_json(accuracy: BlockAccuracy, gsd: float | None, stated_m: float | None) -> dict[str, JSON]:
     """Lens and heights of an adjusted block, with their accuracy.
 
     Args:
         accuracy: By propagation.
-        observed: The positions in it.
         gsd: Ground sample distance, metres.
         stated_m: Typical stated standard deviation of the positions; None where control is in the adjustment, so that
             no remedy has to be named.
-        poll: Called between steps.
     """
     lenses = []
     for lens, covariance in zip(accuracy.adjusted.block.lenses, accuracy.lens_sigmas(), strict=True):
@@ -270,13 +254,10 @@ def block_json(
                 "correlations": np.round(covariance / np.maximum(np.outer(sigmas, sigmas), 1e-300), 3).tolist(),
             }
         )
-    poll()
-    return {"lenses": lenses, "heights": _heights_json(accuracy, observed, gsd, stated_m)}
+    return {"lenses": lenses, "heights": _heights_json(accuracy, gsd, stated_m)}
 
 
-def _heights_json(
-    accuracy: BlockAccuracy, observed: PositionObservations, gsd: float | None, stated_m: float | None
-) -> JSON:
+def _heights_json(accuracy: BlockAccuracy, gsd: float | None, stated_m: float | None) -> JSON:
     if not len(accuracy.points):
         return None
     together = accuracy.mean_sigmas()
@@ -287,7 +268,7 @@ def _heights_json(
     sentence = None
     if stated_m is not None:
         by_control = with_control(accuracy)
-        strip = with_cross_strip(accuracy, observed)
+        strip = with_cross_strip(accuracy)
         remedies = {
             **{f"control_{count}": remedy.as_json() for count, remedy in by_control.items()},
             "cross_strip": None if strip is None else strip.as_json(),

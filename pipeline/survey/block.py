@@ -14,11 +14,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pycolmap
 import scipy.sparse
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.similarity import cross_matrix, rotation_from_vector
 from splatpipe.pipeline.sfm.lens_model import NAMES
@@ -27,7 +28,12 @@ LENS_STEP = 1e-3  # of central differences, pixels at the corner
 LENGTHS = frozenset({"f", "cx", "cy"})  # parameters in pixels
 RAY_STEP = 1e-5
 MIN_DEPTH = 1e-6  # metres in front of a camera
+MAX_DENSE = 6000  # unknowns of a dense system: a thousand photos
 FLAT = 1e-12  # least ratio of a tie point's eigenvalues: nearly parallel rays
+
+
+# A symmetric matrix of normal equations: an array, or scipy's sparse array for very many unknowns.
+Normal = Any
 
 
 @dataclass(frozen=True)
@@ -173,14 +179,15 @@ class ReducedBlock:
     """Normal equations of a block's cameras at its present state, for a sum of squares.
 
     Attributes:
-        normal: (q, q) information of photos and lenses with the tie points eliminated, priors of lenses included.
+        normal: (q, q) information of photos and lenses with the tie points eliminated, priors of lenses included;
+            sparse for very many photos.
         gradient: (q,) half of the derivative of the sum of squares.
         own: (p, 3, 3) covariance of each tie point for known cameras.
         shift: (p, 3) step of each tie point for unmoved cameras.
         carry: (3p, q) sparse derivative of the tie points by the unknowns.
     """
 
-    normal: Float64[np.ndarray, "q q"]
+    normal: Normal
     gradient: Float64[np.ndarray, " q"]
     own: Float64[np.ndarray, "p 3 3"]
     shift: Float64[np.ndarray, "p 3"]
@@ -218,17 +225,19 @@ def reduce_block(block: Block) -> ReducedBlock:
     carried = (np.swapaxes(inverse_root, 1, 2)[block.point]) @ whitened
     carry = scipy.sparse.csr_array((-carried[used], (rows[used], cols[used])), shape=(3 * p, q))
 
-    normal = _direct(every, columns, block) - np.asarray((half.T @ half).todense())
+    normal = _direct(every, columns, block) - half.T @ half
     gradient = np.zeros(q)
     direct = np.einsum("mkc,mk->mc", every, residual)
     np.add.at(gradient, columns[columns >= 0], direct[columns >= 0])
     gradient -= half.T @ np.einsum("pab,pb->pa", inverse_root, gradient_points).ravel()
+    prior = np.zeros(q)
     for lens, where in zip(block.lenses, block.lens_slices, strict=True):
         known = 1.0 / lens.sigmas**2
-        index = np.arange(where.start, where.stop)
-        normal[index, index] += known
+        prior[where] = known
         gradient[where] += known * (lens.values - lens.mean)
-    return ReducedBlock(0.5 * (normal + normal.T), gradient, own, shift, carry)
+    normal = 0.5 * (normal + normal.T) + scipy.sparse.diags_array(prior)
+    dense = normal if q > MAX_DENSE else np.asarray(normal.todense())
+    return ReducedBlock(dense, gradient, own, shift, carry)
 
 
 def settle_points(block: Block, rounds: int = 2) -> Block:
@@ -248,9 +257,9 @@ def settle_points(block: Block, rounds: int = 2) -> Block:
 
 def _direct(
     every: Float64[np.ndarray, "m 2 c"], columns: Int64[np.ndarray, "m c"], block: Block
-) -> Float64[np.ndarray, "q q"]:
+) -> scipy.sparse.csr_array:
     """The cameras' own part of the normal matrix, summed photo by photo."""
-    normal = np.zeros((block.unknowns, block.unknowns))
+    rows_of, columns_of, values = [], [], []
     order = np.argsort(block.photo, kind="stable")
     starts = np.searchsorted(block.photo[order], np.arange(len(block) + 1))
     for start, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
@@ -260,8 +269,33 @@ def _direct(
         used = columns[rows[0]] >= 0
         design = every[rows][:, :, used].reshape(-1, int(used.sum()))
         where = columns[rows[0]][used]
-        normal[np.ix_(where, where)] += design.T @ design
-    return normal
+        values.append((design.T @ design).ravel())
+        rows_of.append(np.repeat(where, len(where)))
+        columns_of.append(np.tile(where, len(where)))
+    at = (np.concatenate(rows_of), np.concatenate(columns_of)) if values else (np.zeros(0, int), np.zeros(0, int))
+    flat = np.concatenate(values) if values else np.zeros(0)
+    return scipy.sparse.csr_array((flat, at), shape=(block.unknowns, block.unknowns))
+
+
+def part_of(block: Block, photos: Bool[np.ndarray, " n"]) -> Block:
+    """The block of some photos, with all its lenses and the points that two of them see or a survey knows."""
+    rows = photos[block.photo]
+    views = np.bincount(block.point[rows], minlength=len(block.points))
+    seen = (views >= 2) | ((block.weights > 0.0).any(axis=1) & (views > 0))
+    rows &= seen[block.point]
+    return replace(
+        block,
+        rotations=block.rotations[photos],
+        centres=block.centres[photos],
+        lens_of=block.lens_of[photos],
+        points=block.points[seen],
+        photo=(np.cumsum(photos) - 1)[block.photo[rows]],
+        point=(np.cumsum(seen) - 1)[block.point[rows]],
+        pixels=block.pixels[rows],
+        sigmas=block.sigmas[rows],
+        stated=block.stated[seen],
+        weights=block.weights[seen],
+    )
 
 
 def _columns(block: Block) -> Int64[np.ndarray, "m c"]:

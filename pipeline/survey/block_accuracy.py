@@ -16,12 +16,13 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.similarity import Similarity, similarity_jacobian
-from splatpipe.pipeline.survey.block import Block, ReducedBlock, ground_carry, reduce_block
+from splatpipe.pipeline.survey.block import Block, ReducedBlock, ground_carry, part_of, reduce_block
 from splatpipe.pipeline.survey.block_adjustment import AdjustedBlock, PositionObservations, joint_system, solve
 from splatpipe.pipeline.survey.uncertainty import NORMAL_95
 
 GROUND_POINTS = 400  # at which the ground's accuracy is evaluated
 MIN_VIEWS = 3  # of such a point
+MAX_PHOTOS = 500  # whose covariance is propagated together
 FAR = 2.0  # times the median distance from camera to point: the background is not the site
 MARK_SIGMA_PX = 0.5
 CONTROL_SIGMAS_M = (0.02, 0.02, 0.03)
@@ -35,6 +36,7 @@ class BlockAccuracy:
 
     Attributes:
         adjusted: The block.
+        observed: The positions in it.
         covariance: Of its unknowns, then of the flights' offsets.
         points: Indices of the ground points.
         carry: (k, 3, q) their derivatives by the unknowns.
@@ -42,6 +44,7 @@ class BlockAccuracy:
     """
 
     adjusted: AdjustedBlock
+    observed: PositionObservations
     covariance: Float64[np.ndarray, "r r"]
     points: Int64[np.ndarray, " k"]
     carry: Float64[np.ndarray, "k 3 q"]
@@ -73,7 +76,9 @@ class BlockAccuracy:
 
 
 def accuracy_of(adjusted: AdjustedBlock, observed: PositionObservations) -> BlockAccuracy:
-    """Propagate the errors of all observations."""
+    """Propagate the errors of all observations; of very many photos, those of a part, which knows a little less."""
+    if len(adjusted.block) > MAX_PHOTOS:
+        adjusted, observed = _middle(adjusted, observed)
     block = adjusted.block
     normal, _ = joint_system(adjusted.reduced, observed, block, adjusted.offsets)
     covariance = solve(normal, np.eye(len(normal)))
@@ -85,11 +90,28 @@ def accuracy_of(adjusted: AdjustedBlock, observed: PositionObservations) -> Bloc
     chosen = seen[:: max(1, math.ceil(len(seen) / GROUND_POINTS))]
     return BlockAccuracy(
         adjusted,
+        observed,
         0.5 * (covariance + covariance.T),
         chosen,
         ground_carry(adjusted.reduced, chosen.tolist()),
         adjusted.reduced.own[chosen],
     )
+
+
+def _middle(adjusted: AdjustedBlock, observed: PositionObservations) -> tuple[AdjustedBlock, PositionObservations]:
+    """The photos in the middle of the order of names, which is mostly that of capture, as a block of their own."""
+    first = (len(adjusted.block) - MAX_PHOTOS) // 2
+    photos = np.zeros(len(adjusted.block), dtype=bool)
+    photos[first : first + MAX_PHOTOS] = True
+    block, used = part_of(adjusted.block, photos), photos[observed.photo]
+    part = PositionObservations(
+        observed.photo[used] - first,
+        observed.stated[used],
+        observed.precision[:, used][:, :, used],
+        observed.group[used],
+        observed.offset_sigmas,
+    )
+    return replace(adjusted, block=block, reduced=reduce_block(block)), part
 
 
 def camera_accuracy(accuracy: BlockAccuracy) -> dict[str, float | list[float]]:
@@ -165,7 +187,7 @@ def _farthest(
     return int(np.argmax(np.where(ranked > -1e8, away, -1.0)))
 
 
-def with_cross_strip(accuracy: BlockAccuracy, observed: PositionObservations) -> Remedy | None:
+def with_cross_strip(accuracy: BlockAccuracy) -> Remedy | None:
     """Predict the accuracy with a strip of photos across the block at another height, positions as good as the others'.
 
     Returns:
@@ -174,6 +196,7 @@ def with_cross_strip(accuracy: BlockAccuracy, observed: PositionObservations) ->
     block = _with_strip(accuracy.adjusted.block)
     if block is None:
         return None
+    observed = accuracy.observed
     n, extra = len(accuracy.adjusted.block), len(block) - len(accuracy.adjusted.block)
     count = len(observed)
     precision = np.zeros((3, count + extra, count + extra))
@@ -193,7 +216,7 @@ def with_cross_strip(accuracy: BlockAccuracy, observed: PositionObservations) ->
     normal, _ = joint_system(reduced, joined, block, accuracy.adjusted.offsets)
     q = block.unknowns
     mean = ground_carry(wider.reduced, accuracy.points.tolist())[:, 2].mean(axis=0)
-    carried = solve(normal, np.concatenate([mean, np.zeros(len(normal) - q)]))[:q]
+    carried = solve(normal, np.concatenate([mean, np.zeros(normal.shape[0] - q)]))[:q]
     return Remedy(math.sqrt(max(float(mean @ carried), 0.0)))
 
 

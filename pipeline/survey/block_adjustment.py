@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.survey.block import Block, ReducedBlock, reduce_block, settle_points
+from splatpipe.pipeline.survey.block import Block, Normal, ReducedBlock, reduce_block, settle_points
 
 ROUNDS = 60
 SETTLED = 1e-3  # decrease of the sum of squares: a thirtieth of a standard deviation
@@ -89,8 +91,7 @@ def adjust_block(
     for _ in range(ROUNDS):
         poll()
         normal, gradient = joint_system(reduced, positions, block, offsets)
-        diagonal = np.diag(normal).copy()
-        step = solve(normal + np.diag(damping * diagonal), -gradient)
+        step = solve(_damped(normal, damping), -gradient)
         gain = -float(gradient @ step)
         if gain < SETTLED:
             settled = True
@@ -116,11 +117,14 @@ def adjust_block(
 
 def joint_system(
     reduced: ReducedBlock, positions: PositionObservations, block: Block, offsets: Float64[np.ndarray, "g 3"]
-) -> tuple[Float64[np.ndarray, "r r"], Float64[np.ndarray, " r"]]:
+) -> tuple[Normal, Float64[np.ndarray, " r"]]:
     """Normal matrix and gradient with positions: the block's unknowns, then the flights' offsets."""
     q, n, groups = block.unknowns, len(block), len(positions.offset_sigmas)
-    normal = np.zeros((q + 3 * groups, q + 3 * groups))
-    normal[:q, :q] = reduced.normal
+    if scipy.sparse.issparse(reduced.normal):
+        normal = scipy.sparse.lil_array((q + 3 * groups, q + 3 * groups))
+    else:
+        normal = np.zeros((q + 3 * groups, q + 3 * groups))
+        normal[:q, :q] = reduced.normal
     gradient = np.concatenate([reduced.gradient, np.zeros(3 * groups)])
     errors = positions.errors(block, offsets)
     member = (positions.group[:, None] == np.arange(groups)).astype(np.float64)
@@ -129,7 +133,11 @@ def joint_system(
         centres = 3 * n + 3 * positions.photo + axis
         shared = q + 3 * np.arange(groups) + axis
         crossed = precision @ member
-        normal[np.ix_(centres, centres)] += precision
+        if scipy.sparse.issparse(normal):
+            across, along = np.nonzero(precision)
+            normal[centres[across], centres[along]] = precision[across, along]
+        else:
+            normal[np.ix_(centres, centres)] += precision
         normal[np.ix_(centres, shared)] += crossed
         normal[np.ix_(shared, centres)] += crossed.T
         normal[np.ix_(shared, shared)] += member.T @ crossed
@@ -138,12 +146,18 @@ def joint_system(
         gradient[shared] += member.T @ weighted
     index = np.arange(q, q + 3 * groups)
     normal[index, index] += (1.0 / positions.offset_sigmas**2).ravel()
+    if scipy.sparse.issparse(normal):
+        wider = scipy.sparse.csr_array(reduced.normal)
+        wider.resize(normal.shape)
+        normal = normal.tocsr() + wider
     gradient[index] += (offsets / positions.offset_sigmas**2).ravel()
     return normal, gradient
 
 
-def solve(normal: Float64[np.ndarray, "r r"], right: Float64[np.ndarray, r * k]) -> Float64[np.ndarray, r * k]:
+def solve(normal: Normal, right: Float64[np.ndarray, r * k]) -> Float64[np.ndarray, r * k]:
     """Solve a positive definite system whose unknowns differ in size; undetermined directions stay put."""
+    if scipy.sparse.issparse(normal):
+        return _solve_sparse(normal, right)
     diagonal = np.diag(normal)
     sizes = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = normal / sizes[:, None] / sizes[None, :]
@@ -156,3 +170,25 @@ def solve(normal: Float64[np.ndarray, "r r"], right: Float64[np.ndarray, r * k])
             ridge = max(100.0 * ridge, 1e-13)
             continue
         return np.asarray(scipy.linalg.cho_solve(factor, right / scale, check_finite=False) / scale)
+
+
+def _solve_sparse(normal: scipy.sparse.csr_array, right: Float64[np.ndarray, r * _]) -> Float64[np.ndarray, r * _]:
+    diagonal = normal.diagonal()
+    sizes = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scale = scipy.sparse.diags_array(1.0 / sizes)
+    scaled = scale @ normal @ scale + 1e-13 * scipy.sparse.eye_array(len(sizes))
+    factor = scipy.sparse.linalg.splu(
+        scipy.sparse.csc_array(scaled),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    over = sizes if right.ndim == 1 else sizes[:, None]
+    return np.asarray(factor.solve(right / over) / over)
+
+
+def _damped(normal: Normal, damping: float) -> Normal:
+    """A normal matrix with its diagonal raised by a share."""
+    if scipy.sparse.issparse(normal):
+        return normal + scipy.sparse.diags_array(damping * normal.diagonal())
+    return normal + np.diag(damping * np.diag(normal))

@@ -253,7 +253,7 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
     _warn_of_focal_lengths(done, capture, report)
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
     accuracy = accuracy_of(done.adjusted, done.observed)
-    block = block_json(accuracy, done.observed, capture.model.gsd(result.placed.world_from_model.scale), None)
+    block = block_json(accuracy, capture.model.gsd(result.placed.world_from_model.scale), None)
     result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held, block=block)
     if moved < MIN_DEFORMATION_PX:
         return result

@@ -6,7 +6,7 @@ fitted to positions keeps both. Accurate positions (RTK, PPK) remove the bowl, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,10 +15,11 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.sfm.lens_model import PARAMETERS, WIDE, is_known
-from splatpipe.pipeline.survey.block import Block, Lens, free_lens
+from splatpipe.pipeline.survey.block import Block, Lens, free_lens, part_of, reduce_block
 from splatpipe.pipeline.survey.block_accuracy import BlockAccuracy, accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import AdjustedBlock, PositionObservations, adjust_block
 from splatpipe.pipeline.survey.position_noise import (
+    CentreSystem,
     PositionNoise,
     StatedPositions,
     as_stated,
@@ -26,6 +27,7 @@ from splatpipe.pipeline.survey.position_noise import (
     estimate_noise,
     find_blunders,
     predicted_errors,
+    settled_noise,
     strip_pieces,
 )
 from splatpipe.pipeline.survey.tie_points import (
@@ -42,7 +44,7 @@ from splatpipe.pipeline.survey.tie_points import (
     whole_model,
 )
 
-MAX_PHOTOS = 1000  # more are adjusted in a part: the system is dense
+PART = 200  # positions whose noise is estimated together: the system is dense
 SIMPLE = ("f", "k1")
 ALL = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
 ALL_FISHEYE = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "k4")
@@ -265,8 +267,46 @@ class BlockFit:
     def predicted(self) -> Float64[np.ndarray, "k 3"]:
         """Errors of the positions used, each predicted without the pieces of strips that it belongs to."""
         used = self.positions.only(self.kept)
-        system = centre_system(self.adjusted.reduced, len(self.adjusted.block))
-        return predicted_errors(system, self.adjusted.block, used, self.noise, strip_pieces(used))
+        result = np.zeros((len(used), 3))
+        for part in parts_of(self.adjusted, used):
+            noise = replace(self.noise, of=self.noise.of[part.chosen])
+            pieces = strip_pieces(part.positions)
+            result[part.chosen] = predicted_errors(part.system, part.block, part.positions, noise, pieces)
+        return result
+
+
+@dataclass(frozen=True)
+class BlockPart:
+    """Part of a block that is small enough for dense statistics.
+
+    Attributes:
+        chosen: Which positions it has.
+        block: Its photos and points.
+        system: What they say of the projection centres.
+        positions: Referring to its photos.
+    """
+
+    chosen: Bool[np.ndarray, " k"]
+    block: Block
+    system: CentreSystem
+    positions: StatedPositions
+
+
+def parts_of(adjusted: AdjustedBlock, positions: StatedPositions) -> Iterator[BlockPart]:
+    """Cut a block along the order of capture; a small one is its only part."""
+    count = max(1, round(len(positions) / PART))
+    if count == 1:
+        system = centre_system(adjusted.reduced, len(adjusted.block))
+        yield BlockPart(np.ones(len(positions), dtype=bool), adjusted.block, system, positions)
+        return
+    for chosen in np.array_split(np.arange(len(positions)), count):
+        inside = np.zeros(len(positions), dtype=bool)
+        inside[chosen] = True
+        photos = np.zeros(len(adjusted.block), dtype=bool)
+        photos[positions.photo[inside]] = True
+        block, mine = part_of(adjusted.block, photos), positions.only(inside)
+        mine = replace(mine, photo=(np.cumsum(photos) - 1)[mine.photo])
+        yield BlockPart(inside, block, centre_system(reduce_block(block), len(block)), mine)
 
 
 def converge(
@@ -288,18 +328,39 @@ def converge(
     adjusted = adjust_block(block, noise.observations(positions.only(kept)), offsets)
     for done in range(ROUNDS):
         poll(min(2 + done, 4), 6)
-        system = centre_system(adjusted.reduced, len(adjusted.block))
-        plain = as_stated(positions)
-        found = ~find_blunders(system, adjusted.block, positions, plain)
+        found = np.ones(len(positions), dtype=bool)
+        for part in parts_of(adjusted, positions):
+            plain = as_stated(part.positions)
+            found[part.chosen] = ~find_blunders(part.system, part.block, part.positions, plain)
         if found.sum() >= 3:
             kept = found
         used = positions.only(kept)
-        before, noise = noise, estimate_noise(system, adjusted.block, adjusted.offsets, used)
+        before, noise = noise, _noise_of(adjusted, used)
         adjusted = adjust_block(adjusted.block, noise.observations(used), adjusted.offsets)
         same = before.factors.shape == noise.factors.shape and len(before.of) == len(noise.of)
         if same and np.abs(before.factors / noise.factors - 1.0).max() < SETTLED:
             break
     return BlockFit(adjusted, positions, kept, noise)
+
+
+def _noise_of(adjusted: AdjustedBlock, positions: StatedPositions) -> PositionNoise:
+    """The noise of all positions; of very many, the drift is that of the part in the middle."""
+    parts = list(parts_of(adjusted, positions))
+    middle = parts[len(parts) // 2]
+    noise = estimate_noise(middle.system, middle.block, middle.positions)
+    if len(parts) == 1:
+        return noise
+    every = as_stated(positions)
+    factors, weights = np.zeros_like(every.factors), np.zeros(len(every.classes))
+    for part in parts:
+        found = noise if part is middle else settled_noise(part.system, part.block, part.positions, noise)
+        for own, name in enumerate(found.classes):
+            at = every.classes.index(name) if name in every.classes else len(every.classes) - 1
+            count = float((found.of == own).sum())
+            factors[at] += count * found.factors[own] ** 2
+            weights[at] += count
+    mean = np.sqrt(np.where(weights[:, None] > 0.0, factors / np.maximum(weights, 1.0)[:, None], 1.0))
+    return replace(every, factors=mean, shares=noise.shares, correlations=noise.correlations)
 
 
 def _judged(

@@ -23,6 +23,7 @@ AXES = ((0, 1), (2,))  # east and north; up
 SHARES = (0.5, 0.8)  # of the variance, that drifts
 CORRELATIONS = (0.5, 0.7, 0.8, 0.9, 0.95)
 UNPROVEN = 2.0  # least gain in minus twice the log-likelihood for a drift (Akaike 1974), for each of its parameters
+MAX_CHAIN = 200  # neighbours along a flight whose drift is modelled together
 MIN_CLASS = 10  # positions with a factor of their own
 PRIOR_DEGREES = 2.0  # weight of the stated standard deviation
 FACTOR_ROUNDS, SEARCHES = 12, 2
@@ -107,7 +108,7 @@ class PositionNoise:
         sizes = self.sizes(positions)
         result = []
         for half, axes in enumerate(AXES):
-            inverse = np.linalg.inv(_pattern(positions, float(self.shares[half]), float(self.correlations[half])))
+            inverse = _inverse_pattern(positions, float(self.shares[half]), float(self.correlations[half]))
             result += [inverse / np.outer(sizes[:, axis], sizes[:, axis]) for axis in axes]
         return np.stack(result)
 
@@ -184,15 +185,21 @@ class _Fit:
     cost: float
 
 
-def estimate_noise(
-    system: CentreSystem, block: Block, offsets: Float64[np.ndarray, "g 3"], positions: StatedPositions
+def settled_noise(
+    system: CentreSystem, block: Block, positions: StatedPositions, drift: PositionNoise
 ) -> PositionNoise:
+    """Estimate the factors of positions whose drift is known from others."""
+    errors = block.centres[positions.photo] - positions.stated
+    start = replace(as_stated(positions), shares=drift.shares, correlations=drift.correlations)
+    return _settled(system, errors, positions, start)
+
+
+def estimate_noise(system: CentreSystem, block: Block, positions: StatedPositions) -> PositionNoise:
     """Estimate the noise from what the photos say of the centres."""
     errors = block.centres[positions.photo] - positions.stated
     noise = _settled(system, errors, positions, as_stated(positions))
     if len(positions) < MIN_CLASS:
         return noise
-    del offsets
     best = _fit(system, errors, positions, noise).cost
     for _ in range(SEARCHES):
         before = best
@@ -275,18 +282,18 @@ def strip_pieces(positions: StatedPositions, length: int = 4, sets: int = 3) -> 
     return [np.asarray(place % sets == k) for k in range(sets)]
 
 
-def _pattern(positions: StatedPositions, share: float, correlation: float) -> Float64[np.ndarray, "k k"]:
-    """Correlations of the errors: along a flight, none between flights."""
-    count = len(positions)
+def _inverse_pattern(positions: StatedPositions, share: float, correlation: float) -> Float64[np.ndarray, "k k"]:
+    """Inverse of the errors' correlations: along a flight, none between flights."""
+    inverse = np.eye(len(positions))
     if share == 0.0:
-        return np.eye(count)
-    order = np.zeros(count, dtype=np.int64)
+        return inverse
     for group in np.unique(positions.group).tolist():
-        members = positions.group == group
-        order[members] = np.arange(int(members.sum()))
-    together = positions.group[:, None] == positions.group[None, :]
-    drift = np.where(together, correlation ** np.abs(order[:, None] - order[None, :]), 0.0)
-    return np.asarray((1.0 - share) * np.eye(count) + share * drift)
+        members = np.flatnonzero(positions.group == group)
+        for piece in np.array_split(members, -(-len(members) // MAX_CHAIN)):
+            order = np.arange(len(piece))
+            drift = correlation ** np.abs(order[:, None] - order[None, :])
+            inverse[np.ix_(piece, piece)] = np.linalg.inv((1.0 - share) * np.eye(len(piece)) + share * drift)
+    return inverse
 
 
 def _with_drift(noise: PositionNoise, half: int, share: float, correlation: float) -> PositionNoise:
