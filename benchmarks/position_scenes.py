@@ -1,7 +1,7 @@
 """Flights with known cameras, ground and position errors, drawn from a seed; geometry only, nothing is rendered.
 
-Strips of 48 photos straight down from 44 m (GSD 2.3 cm), and the demo's oblique photos of a house. World: east, north,
-up in metres.
+Strips of 48 photos straight down from 44 m (GSD 2.3 cm), and the demo's oblique photos of a house, which is a box here.
+World: east, north, up in metres.
 """
 
 from __future__ import annotations
@@ -23,44 +23,23 @@ from splatpipe.pipeline.survey.tie_points import intersected
 
 SCENES = ("flat", "relief", "alternating", "one heading", "demo")
 FAULTS = ("none", "wrong", "no fix", "datum", "too small", "too large")
-
-STRIPS, PER_STRIP = 6, 8
+STRIPS, PER_STRIP, ALONG, ACROSS = 6, 8, 0.8, 0.7  # photos, and their overlaps
 HEIGHT_M, FOCAL_PX, SIZE_PX = 44.0, 1920.0, (1600, 1300)
-ALONG, ACROSS = 0.8, 0.7  # overlaps
-APART_M = 8.0  # between the heights of alternating strips
-RELIEF_M = 5.0
-STEADY_M = np.array([0.2, 0.2, 0.1])  # of the aircraft about its plan
-TILT_DEG = 0.5
-TIES = 150  # of a photo
-TIE_PX = 1.0
+APART_M, RELIEF_M = 8.0, 5.0  # between the heights of alternating strips; of the hills, from foot to top
+STEADY_M, TILT_DEG = np.array([0.2, 0.2, 0.1]), 0.5  # of the aircraft about its plan
+TIES, TIE_PX = 150, 1.0  # of a photo, and their noise
+CANDIDATES = 5000
 WIDEST = 0.9  # tangent of a ray's angle up to which the lens is drawn
-CLUTCH = math.cos(math.radians(30.0))  # a point is matched among rays that differ by less
-
-HOUSE_M = np.array([6.0, 4.5, 7.0])  # half length, half width, height
-GARDEN_M, NEAR_M, FAR_M = 25.0, 5.0, 40.0
+MATCHED = math.cos(math.radians(30.0))  # a point is matched among rays that differ by less
 GRAZING = math.cos(math.radians(72.0))
-
-WHITE_M = np.array([0.01, 0.01, 0.018])
-DRIFT_M = np.array([0.01, 0.01, 0.018])
-DRIFT = 0.9  # correlation from photo to photo
-COMMON_M = np.array([0.01, 0.01, 0.015])
+HOUSE_M, GARDEN_M = np.array([6.0, 4.5, 7.0]), 25.0  # half length, half width, height
+NEAR_M, FAR_M = 5.0, 40.0
+WHITE_M, DRIFT_M = np.array([0.01, 0.01, 0.018]), np.array([0.01, 0.01, 0.018])  # of positions
+DRIFT, COMMON_M = 0.9, np.array([0.01, 0.01, 0.015])  # correlation from photo to photo; what a flight shares
 STATED_M = np.array([0.014, 0.014, 0.021])
-
-LENS_SPREAD = {"f": 0.01, "c": 20.0, "k1": 0.02, "k2": 0.02, "p": 0.001}
+LENS_SPREAD = {"f": 0.01, "c": 20.0, "k": 0.02, "p": 0.001}  # about the stated one: relative, pixels, and as they are
 START_M, START_DEG = 0.05, 0.1  # of the cameras before the adjustment
-
-WRONG_SHARE, WRONG_M = 0.1, (0.3, 5.0)
-NO_FIX_M, NO_FIX_DRIFT = 0.5, 0.98
-DATUM_M = 47.0
-
-
-@dataclass(frozen=True)
-class Flight:
-    """Cameras as flown: world to camera, centres (metres), the strip of each, and how far below them the ground is."""
-
-    rotations: Float64[np.ndarray, "n 3 3"]
-    centres: Float64[np.ndarray, "n 3"]
-    strip: Int64[np.ndarray, " n"]
+WRONG_SHARE, WRONG_M, NO_FIX_M, NO_FIX_DRIFT, DATUM_M = 0.1, (0.3, 5.0), 0.5, 0.98, 47.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +47,8 @@ class Scene:
     """A flight and what was observed of it.
 
     Attributes:
-        flight: The true cameras.
+        rotations: World to camera, true.
+        centres: True ones.
         camera: The true lens.
         stated: The stated lens.
         points: True tie points.
@@ -78,7 +58,8 @@ class Scene:
         gsd_m: Of a typical tie point.
     """
 
-    flight: Flight
+    rotations: Float64[np.ndarray, "n 3 3"]
+    centres: Float64[np.ndarray, "n 3"]
     camera: pycolmap.Camera
     stated: pycolmap.Camera
     points: Float64[np.ndarray, "p 3"]
@@ -89,7 +70,7 @@ class Scene:
 
 
 def draw_scene(name: str, fault: str, seed: int) -> Scene:
-    """Draw a scene; all but its fault is the same for one name and seed.
+    """Draw a scene; all but the fault is the same for one name and seed.
 
     Args:
         name: One of ``SCENES``.
@@ -97,18 +78,23 @@ def draw_scene(name: str, fault: str, seed: int) -> Scene:
         seed: Of everything drawn.
     """
     rng = np.random.default_rng([SCENES.index(name), seed])
-    flight = demo_flight() if name == "demo" else _strips(name, rng)
+    truth = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
+    if name == "demo":
+        rotations = np.array([photo["cam_from_world"] for photo in truth["photos"]])[:, :3, :3]
+        centres = np.array([photo["centre_m"] for photo in truth["photos"]])
+        points, normals = _garden(math.radians(truth["house_yaw_deg"]), rng)
+    else:
+        rotations, centres = _strips(name, rng)
+        points, normals = _ground(centres, RELIEF_M if name == "relief" else 0.0, rng)
     stated, camera = _lenses(name, rng)
-    points, normals = _garden(rng) if name == "demo" else _ground(name, flight, rng)
-    photo, point, pixels = _observed(flight, camera, points, normals, name == "demo", rng)
-    points, n = points[: point.max() + 1], len(flight.centres)
-    away = np.linalg.norm(points[point] - flight.centres[photo], axis=1)
-    turns = rotation_from_vector(math.radians(START_DEG) * rng.normal(size=(n, 3)))
+    rows, photo, point, pixels = _observed(rotations, centres, camera, points, normals, rng)
+    points, n = points[rows], len(centres)
+    known = LensKnowledge(float(stated.params[0]), LENS_SPREAD["f"])
     block = Block(
-        turns @ flight.rotations,
-        flight.centres + START_M * rng.normal(size=(n, 3)),
+        rotation_from_vector(math.radians(START_DEG) * rng.normal(size=(n, 3))) @ rotations,
+        centres + START_M * rng.normal(size=(n, 3)),
         np.zeros(n, dtype=np.int64),
-        (prior_lens(stated, LensKnowledge(float(stated.params[0]), LENS_SPREAD["f"]), None),),
+        (prior_lens(stated, known, None),),
         points,
         photo,
         point,
@@ -117,141 +103,95 @@ def draw_scene(name: str, fault: str, seed: int) -> Scene:
         points,
         np.zeros_like(points),
     )
-    positions, wrong = _positions(flight, fault, rng)
-    gsd_m = float(np.median(away)) / FOCAL_PX if name == "demo" else HEIGHT_M / FOCAL_PX
-    if name == "demo":
-        gsd_m = float(np.median(away)) / float(stated.params[0])
-    return Scene(flight, camera, stated, points, intersected(block), positions, wrong, gsd_m)
+    gsd_m = float(np.median(np.linalg.norm(points[point] - centres[photo], axis=1))) / float(stated.params[0])
+    positions, wrong = _positions(centres, fault, rng)
+    return Scene(rotations, centres, camera, stated, points, intersected(block), positions, wrong, gsd_m)
 
 
-def demo_flight() -> Flight:
-    """The demo's true cameras, in the order of their names."""
-    photos = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["photos"]
-    poses = np.array([photo["cam_from_world"] for photo in photos])[:, :3, :3]
-    centres = np.array([photo["centre_m"] for photo in photos])
-    return Flight(poses, centres, np.arange(len(photos)) * STRIPS // len(photos))
-
-
-def _strips(name: str, rng: np.random.Generator) -> Flight:
-    """Strips to and fro, the longer side of the photos across them."""
-    step = (1.0 - ALONG) * SIZE_PX[1] / FOCAL_PX * HEIGHT_M
-    apart = (1.0 - ACROSS) * SIZE_PX[0] / FOCAL_PX * HEIGHT_M
-    rotations, centres = [], []
-    for strip in range(STRIPS):
-        back = strip % 2 == 1
-        level = HEIGHT_M + (APART_M * (0.5 - back) if name == "alternating" else 0.0)
-        turned = -1.0 if back and name != "one heading" else 1.0
-        for place in range(PER_STRIP):
-            along = (place if not back else PER_STRIP - 1 - place) - 0.5 * (PER_STRIP - 1)
-            centres.append([apart * (strip - 0.5 * (STRIPS - 1)), step * along, level])
-            rotations.append(np.diag([turned, -turned, -1.0]))
-    n = len(centres)
-    tilts = np.column_stack([math.radians(TILT_DEG) * rng.normal(size=(n, 2)), np.zeros(n)])
-    moved = np.array(centres) + STEADY_M * rng.normal(size=(n, 3))
-    return Flight(rotation_from_vector(tilts) @ np.array(rotations), moved, np.arange(n) // PER_STRIP)
+def _strips(name: str, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]:
+    """Cameras of strips to and fro, the longer side of the photos across them."""
+    strip, place = np.divmod(np.arange(STRIPS * PER_STRIP), PER_STRIP)
+    back = strip % 2 == 1
+    along = np.where(back, -1.0, 1.0) * (place - 0.5 * (PER_STRIP - 1)) * (1.0 - ALONG) * SIZE_PX[1]
+    across = (strip - 0.5 * (STRIPS - 1)) * (1.0 - ACROSS) * SIZE_PX[0]
+    level = HEIGHT_M + (APART_M * (0.5 - back) if name == "alternating" else np.zeros(len(strip)))
+    centres = np.column_stack([across * HEIGHT_M / FOCAL_PX, along * HEIGHT_M / FOCAL_PX, level])
+    turned = np.where(back & (name != "one heading"), -1.0, 1.0)
+    rotations = np.stack([turned, -turned, -np.ones(len(strip))], axis=1)[:, :, None] * np.eye(3)
+    tilts = np.column_stack([math.radians(TILT_DEG) * rng.normal(size=(len(strip), 2)), np.zeros(len(strip))])
+    return rotation_from_vector(tilts) @ rotations, centres + STEADY_M * rng.normal(size=centres.shape)
 
 
 def _lenses(name: str, rng: np.random.Generator) -> tuple[pycolmap.Camera, pycolmap.Camera]:
     """The stated lens and the true one."""
-    size, focal, k1, k2 = (1200, 900), 851.3, -0.052, 0.0
-    if name != "demo":
-        size, focal, k1, k2 = SIZE_PX, FOCAL_PX, -0.1, 0.05
+    size, focal, k1, k2 = ((1200, 900), 851.3, -0.052, 0.0) if name == "demo" else (SIZE_PX, FOCAL_PX, -0.1, 0.05)
     params = np.array([focal, focal, 0.5 * size[0], 0.5 * size[1], k1, k2, *np.zeros(6)])
-    change = np.zeros(12)
-    change[:2] = focal * LENS_SPREAD["f"] * rng.normal()
-    change[2:4] = LENS_SPREAD["c"] * rng.normal(size=2)
-    change[4:6] = np.array([LENS_SPREAD["k1"], LENS_SPREAD["k2"]]) * rng.normal(size=2)
-    change[6:8] = LENS_SPREAD["p"] * rng.normal(size=2)
-    stated, true = (
-        pycolmap.Camera(camera_id=1, model="FULL_OPENCV", width=size[0], height=size[1], params=params + each)
-        for each in (np.zeros(12), change)
+    drawn = rng.normal(size=7) * [LENS_SPREAD[key] for key in ("f", "c", "c", "k", "k", "p", "p")]
+    true = params + np.array([focal * drawn[0], focal * drawn[0], *drawn[1:], *np.zeros(4)])
+    stated, camera = (
+        pycolmap.Camera(camera_id=1, model="FULL_OPENCV", width=size[0], height=size[1], params=each)
+        for each in (params, true)
     )
-    return stated, true
+    return stated, camera
 
 
 def _ground(
-    name: str, flight: Flight, rng: np.random.Generator
+    centres: Float64[np.ndarray, "n 3"], relief_m: float, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, "p 3"]]:
-    """Points of the ground below a flight, and its normals: level, or hills of ``RELIEF_M`` from foot to top."""
-    reach = np.abs(flight.centres[:, :2]).max(axis=0) + 0.5 * HEIGHT_M
-    plan = rng.uniform(-reach, reach, (4000, 2))
-    heights = np.zeros(len(plan))
-    if name == "relief":
-        for _ in range(4):
-            wave, phase = rng.normal(size=2) * 2.0 * math.pi / 60.0, rng.uniform(0.0, 2.0 * math.pi)
-            heights += np.sin(plan @ wave + phase)
-        heights = RELIEF_M * (heights - heights.min()) / np.ptp(heights) - 0.5 * RELIEF_M
-    return np.column_stack([plan, heights]), np.tile([0.0, 0.0, 1.0], (len(plan), 1))
+    """Points of the ground below a flight, and its normals, which are upright."""
+    reach = np.abs(centres[:, :2]).max(axis=0) + 0.5 * HEIGHT_M
+    plan = rng.uniform(-reach, reach, (CANDIDATES, 2))
+    heights = np.sin(plan @ (0.1 * rng.normal(size=(2, 4))) + rng.uniform(0.0, 2.0 * math.pi, 4)).sum(axis=1)
+    heights = relief_m * ((heights - heights.min()) / np.ptp(heights) - 0.5)
+    return np.column_stack([plan, heights]), np.tile([0.0, 0.0, 1.0], (CANDIDATES, 1))
 
 
-def _garden(rng: np.random.Generator) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, "p 3"]]:
+def _garden(yaw: float, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, "p 3"]]:
     """Points of the demo's ground, and of a box in place of its house, with their normals."""
-    count = 6000
-    kind = rng.integers(0, 8, count)  # 0 to 3 ground, then walls and roof
-    axis, side = np.where(kind == 7, 2, np.where(kind < 6, 0, 1)), np.where(rng.random(count) < 0.5, 1.0, -1.0)
-    points = HOUSE_M * np.column_stack([rng.uniform(-1.0, 1.0, (count, 2)), rng.random(count)])
-    side[kind == 7] = 1.0
-    rows = np.arange(count)
-    points[rows, axis] = side * HOUSE_M[axis]
-    normals = np.zeros((count, 3))
+    kind, rows = rng.integers(0, 8, CANDIDATES), np.arange(CANDIDATES)  # 0 to 3 ground; 4 to 6 walls; 7 roof
+    axis = np.select([kind == 7, kind == 6], [2, 1], 0)
+    side = np.where((kind == 7) | (rng.random(CANDIDATES) < 0.5), 1.0, -1.0)
+    points = HOUSE_M * np.column_stack([rng.uniform(-1.0, 1.0, (CANDIDATES, 2)), rng.random(CANDIDATES)])
+    points[rows, axis], normals = side * HOUSE_M[axis], np.zeros((CANDIDATES, 3))
     normals[rows, axis] = side
-    yaw = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["house_yaw_deg"]
-    turn = rotation_from_vector(np.array([0.0, 0.0, math.radians(yaw)]))
-    points, normals = points @ turn.T, normals @ turn.T
     ground = kind < 4
-    points[ground] = np.column_stack([rng.uniform(-GARDEN_M, GARDEN_M, (count, 2)), np.zeros(count)])[ground]
+    points[ground] = rng.uniform(-GARDEN_M, GARDEN_M, (int(ground.sum()), 3)) * [1.0, 1.0, 0.0]
     normals[ground] = [0.0, 0.0, 1.0]
-    inside = ground & (np.abs((points @ turn)[:, :2]) < HOUSE_M[:2]).all(axis=1)
-    return points[~inside], normals[~inside]
+    outside = ~ground | (np.abs(points[:, :2]) > HOUSE_M[:2]).any(axis=1)
+    turn = rotation_from_vector(np.array([0.0, 0.0, yaw]))
+    return points[outside] @ turn.T, normals[outside] @ turn.T
 
 
 def _observed(
-    flight: Flight,
+    rotations: Float64[np.ndarray, "n 3 3"],
+    centres: Float64[np.ndarray, "n 3"],
     camera: pycolmap.Camera,
     points: Float64[np.ndarray, "p 3"],
     normals: Float64[np.ndarray, "p 3"],
-    oblique: bool,
     rng: np.random.Generator,
-) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 2"]]:
-    """Photo, point and exact pixel of the first points that give the photos ``TIES`` each, sorted by point."""
-    n = len(flight.centres)
-    ways = points[:, None] - flight.centres  # (p, n, 3)
-    rays = np.einsum("nij,pnj->pni", flight.rotations, ways)
+) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 2"]]:
+    """The first points that give the photos ``TIES`` each; photo, point and exact pixel of what shows them."""
+    ways = points[:, None] - centres  # (p, n, 3)
+    rays = np.einsum("nij,pnj->pni", rotations, ways)
+    away = np.linalg.norm(ways, axis=2)
+    units = ways / away[..., None]
     seen = (rays[..., 2] > 1.0) & (np.hypot(rays[..., 0], rays[..., 1]) < WIDEST * rays[..., 2])
+    seen &= (away > NEAR_M) & (away < 2.0 * FAR_M) & (-np.einsum("pna,pa->pn", units, normals) > GRAZING)
     pixels = np.full((*seen.shape, 2), np.nan)
     pixels[seen] = np.asarray(camera.img_from_cam(rays[seen]), np.float64)
     seen &= ((pixels > 0.0) & (pixels < [camera.width, camera.height])).all(axis=2)
-    if oblique:
-        away = np.linalg.norm(ways, axis=2)
-        units = ways / away[..., None]
-        seen &= (away > NEAR_M) & (away < FAR_M) & (-np.einsum("pna,pa->pn", units, normals) > GRAZING)
-        seen &= ~_behind_house(flight.centres, points)
+    if not (rotations[:, 2, 2] < -0.9).all():  # oblique photos
         home = np.argmax(np.where(seen, rng.random(seen.shape), -1.0), axis=1)
-        seen &= np.einsum("pna,pa->pn", units, units[np.arange(len(points)), home]) > CLUTCH
+        near = np.einsum("pna,pa->pn", units, units[np.arange(len(points)), home]) > MATCHED
+        seen &= near & (away < FAR_M)
     seen[seen.sum(axis=1) < 3] = False
-    enough = int(np.searchsorted(np.cumsum(seen.sum(axis=1)), TIES * n))
-    kept = np.flatnonzero(seen[:enough].any(axis=1))
-    points[: len(kept)] = points[kept]
-    point, photo = np.nonzero(seen[kept])
-    return photo, point, pixels[kept][point, photo]
+    enough = int(np.searchsorted(np.cumsum(seen.sum(axis=1)), TIES * len(centres)))
+    rows = np.flatnonzero(seen[:enough].any(axis=1))
+    point, photo = np.nonzero(seen[rows])
+    return rows, photo, point, pixels[rows][point, photo]
 
 
-def _behind_house(
-    centres: Float64[np.ndarray, "n 3"], points: Float64[np.ndarray, "p 3"]
-) -> Bool[np.ndarray, "p n"]:
-    """Whether the line from a camera to a point passes through the house."""
-    yaw = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))["house_yaw_deg"]
-    turn = rotation_from_vector(np.array([0.0, 0.0, math.radians(yaw)]))
-    start, way = centres @ turn, (points @ turn)[:, None] - centres @ turn
-    low, high = np.array([-HOUSE_M[0], -HOUSE_M[1], -1.0]), HOUSE_M
-    with np.errstate(divide="ignore"):
-        first, second = (low - start) / way, (high - start) / way
-    enter = np.minimum(first, second).max(axis=2)
-    leave = np.maximum(first, second).min(axis=2)
-    return np.asarray((enter < leave) & (enter > 0.0) & (enter < 1.0 - 1e-6))
-
-
-def drift(count: int, correlation: float, rng: np.random.Generator) -> Float64[np.ndarray, "k 3"]:
+def _drift(count: int, correlation: float, rng: np.random.Generator) -> Float64[np.ndarray, "k 3"]:
     """Errors of unit size that drift from photo to photo."""
     errors = rng.normal(size=(count, 3))
     for k in range(1, count):
@@ -260,30 +200,28 @@ def drift(count: int, correlation: float, rng: np.random.Generator) -> Float64[n
 
 
 def _positions(
-    flight: Flight, fault: str, rng: np.random.Generator
+    centres: Float64[np.ndarray, "n 3"], fault: str, rng: np.random.Generator
 ) -> tuple[StatedPositions, Bool[np.ndarray, " n"]]:
     """The receiver's positions, and which of them have a blunder."""
-    n = len(flight.centres)
-    group = np.where(flight.strip >= STRIPS // 2, 1, 0) if fault == "datum" else np.zeros(n, dtype=np.int64)
+    n = len(centres)
+    group = 2 * np.arange(n) // n if fault == "datum" else np.zeros(n, dtype=np.int64)
     errors = WHITE_M * rng.normal(size=(n, 3))
-    for number in range(group.max() + 1):
+    for number in range(int(group.max()) + 1):
         mine = group == number
-        errors[mine] += DRIFT_M * drift(int(mine.sum()), DRIFT, rng) + COMMON_M * rng.normal(size=3)
-    wrong, state, sigmas = np.zeros(n, dtype=bool), np.full(n, "fixed", dtype=object), np.tile(STATED_M, (n, 1))
-    apart = np.zeros((group.max() + 1, 3), dtype=bool)
+        errors[mine] += DRIFT_M * _drift(int(mine.sum()), DRIFT, rng) + COMMON_M * rng.normal(size=3)
+    state, sigmas, wrong = np.full(n, "fixed", dtype=object), np.tile(STATED_M, (n, 1)), np.zeros(n, dtype=bool)
+    apart = np.zeros((int(group.max()) + 1, 3), dtype=bool)
     if fault == "wrong":
         wrong[rng.choice(n, round(WRONG_SHARE * n), replace=False)] = True
-        ways = rng.normal(size=(n, 3))
-        sizes = np.exp(rng.uniform(*np.log(WRONG_M), n))[:, None]
+        ways, sizes = rng.normal(size=(n, 3)), np.exp(rng.uniform(*np.log(WRONG_M), (n, 1)))
         errors[wrong] += (sizes * ways / np.linalg.norm(ways, axis=1, keepdims=True))[wrong]
     elif fault == "no fix":
-        unfixed = flight.strip == rng.integers(STRIPS)
+        unfixed = np.arange(n) // PER_STRIP == rng.integers(STRIPS)
         state[unfixed] = "single"
-        errors[unfixed] += NO_FIX_M * drift(int(unfixed.sum()), NO_FIX_DRIFT, rng)
+        errors[unfixed] += NO_FIX_M * _drift(int(unfixed.sum()), NO_FIX_DRIFT, rng)
     elif fault == "datum":
         errors[group == 1, 2] += DATUM_M
         apart[1, 2] = True
     elif fault in ("too small", "too large"):
         sigmas *= 0.1 if fault == "too small" else 10.0
-    stated = flight.centres + errors
-    return StatedPositions(np.arange(n), stated, sigmas, group, tuple(state.tolist()), apart), wrong
+    return StatedPositions(np.arange(n), centres + errors, sigmas, group, tuple(state.tolist()), apart), wrong

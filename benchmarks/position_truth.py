@@ -32,49 +32,43 @@ from splatpipe.pipeline.survey.block_accuracy import BlockAccuracy, accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import PositionObservations, adjust_block
 from splatpipe.pipeline.survey.position_adjustment import SIMPLE, LensKnowledge, converge, prior_lens
 from splatpipe.pipeline.survey.position_noise import PositionNoise, as_stated
+from splatpipe.pipeline.survey.uncertainty import NORMAL_95
 
 CONTROL_M = np.array([0.02, 0.02, 0.03])
 MARK_PX = 0.5
-CONTROL_AT = ((0.0, 0.0), (-0.6, -0.6), (0.6, -0.4))  # of half the ground's extent; one point alone is the first
-THREE_AT = ((-0.6, -0.6), (0.6, -0.4), (0.0, 0.6))
+ONE_AT, THREE_AT = ((0.0, 0.0),), ((-0.6, -0.6), (0.6, -0.4), (0.0, 0.6))  # of half the ground's extent
 WEAK_M = 100.0  # of positions that only hold the frame
 FAULTY = ("flat", "alternating")
+AXES = "ENU"
+
+
+def _axes(heading: str, key: str, how: str = ".2f") -> dict[str, str]:
+    """A column of each axis."""
+    return {f"{heading} {axis}": f"{key}_{axis}:{how}" for axis in AXES}
+
+
 COLUMNS = {
     "scene": "scene:",
     "seeds": "seeds:",
-    "E": "found_e:.2f",
-    "N": "found_n:.2f",
-    "U": "found_u:.2f",
-    "/told E": "told_e:.2f",
-    "N ": "told_n:.2f",
-    "U ": "told_u:.2f",
-    "/sigma E": "sigma_e:.2f",
-    "N  ": "sigma_n:.2f",
-    "U  ": "sigma_u:.2f",
+    **_axes("GSD", "found"),
+    **_axes("/told", "told"),
+    **_axes("/sigma", "sigma"),
     "off plane": "plane:.2f",
     "one point": "one:.2f",
     "three": "three:.2f",
-    "held E": "held_e:.2f",
-    "N   ": "held_n:.2f",
-    "U   ": "held_u:.2f",
-    "today E": "today_e:.1f",
-    "N    ": "today_n:.1f",
-    "U    ": "today_u:.1f",
+    "rim U": "rim:.2f",
+    **_axes("held", "held"),
+    **_axes("today", "today", ".0f"),
     "CPU s": "cpu:.1f",
 }
 FAULT_COLUMNS = {
     "scene": "scene:",
     "fault": "fault:",
     "seeds": "seeds:",
-    "E": "found_e:.2f",
-    "N": "found_n:.2f",
-    "U": "found_u:.2f",
-    "/none E": "none_e:.2f",
-    "N ": "none_n:.2f",
-    "U ": "none_u:.2f",
-    "/sigma E": "sigma_e:.2f",
-    "N  ": "sigma_n:.2f",
-    "U  ": "sigma_u:.2f",
+    **_axes("GSD", "found"),
+    **_axes("/none", "none"),
+    **_axes("/sigma", "sigma"),
+    **_axes("held", "held"),
     "wrong": "wrong:",
     "left out": "recall:",
     "sound left out": "false:",
@@ -83,13 +77,21 @@ FAULT_COLUMNS = {
 
 
 def compared(accuracy: BlockAccuracy, scene: Scene) -> dict[str, list[float]]:
-    """Compare ground points with the truth; mean squares in metres squared, means in metres."""
-    errors = accuracy.places - scene.points[accuracy.points]
-    design = np.column_stack([np.ones(len(errors)), scene.points[accuracy.points][:, :2]])
-    bent = errors[:, 2] - design @ np.linalg.lstsq(design, errors[:, 2], rcond=None)[0]
+    """Compare ground points with the truth; mean squares in metres squared, means in metres.
+
+    The ground's mean is that of all points; squares are of those below the flight, ``rim`` of the others.
+    """
+    true = scene.points[accuracy.points]
+    errors = accuracy.places - true
+    low, high = scene.centres[:, :2].min(axis=0), scene.centres[:, :2].max(axis=0)
+    below = ((true[:, :2] > low) & (true[:, :2] < high)).all(axis=1)
+    design = np.column_stack([np.ones(len(errors)), true[:, :2]])[below]
+    bent = errors[below, 2] - design @ np.linalg.lstsq(design, errors[below, 2], rcond=None)[0]
     return {
-        "squares": (errors**2).mean(axis=0).tolist(),
-        "expected": (accuracy.ground_sigmas() ** 2).mean(axis=0).tolist(),
+        "squares": (errors[below] ** 2).mean(axis=0).tolist(),
+        "expected": (accuracy.ground_sigmas()[below] ** 2).mean(axis=0).tolist(),
+        "own": np.diagonal(accuracy.own[below], axis1=1, axis2=2).mean(axis=0).tolist(),
+        "rim": (errors[~below] ** 2).mean(axis=0).tolist() if not below.all() else [0.0] * 3,
         "bent": [float((bent**2).mean())],
         "mean": errors.mean(axis=0).tolist(),
         "mean_sigmas": accuracy.mean_sigmas().tolist(),
@@ -128,8 +130,8 @@ def with_control(block: Block, scene: Scene, places: tuple[tuple[float, float], 
 
 def true_pixels(scene: Scene, photos: np.ndarray, point: int) -> Float64[np.ndarray, "k 2"]:
     """Where some photos show a point."""
-    away = scene.points[point] - scene.flight.centres[photos]
-    rays = np.einsum("kij,kj->ki", scene.flight.rotations[photos], away)
+    away = scene.points[point] - scene.centres[photos]
+    rays = np.einsum("kij,kj->ki", scene.rotations[photos], away)
     return np.asarray(scene.camera.img_from_cam(rays), np.float64)
 
 
@@ -157,13 +159,13 @@ def measure(name: str, fault: str, seed: int) -> Row:
     row |= {"focal": [float(fit.adjusted.block.lenses[0].values[0]), float(scene.camera.params[0])]}
     row["focal"].append(float(accuracy.lens_sigmas()[0][0, 0] ** 0.5))
     noise = fit.noise
-    row["noise"] = [noise.factors.tolist(), noise.shares.tolist(), noise.correlations.tolist()]
+    row["noise"] = [noise.classes, noise.factors.tolist(), noise.shares.tolist(), noise.correlations.tolist()]
     row["wrong"] = [int(scene.wrong.sum()), int((scene.wrong & ~fit.kept).sum()), int((~scene.wrong & ~fit.kept).sum())]
     if fault != "none":
         return row
     observed = told_noise(scene)
     row["told"] = compared(accuracy_of(adjust_block(fit.adjusted.block, observed), observed), scene)
-    for key, places in (("one", CONTROL_AT[:1]), ("three", THREE_AT)):
+    for key, places in (("one", ONE_AT), ("three", THREE_AT)):
         block = with_control(fit.adjusted.block, scene, places, seed)
         controlled = converge(block, scene.positions, fit.kept)
         row[key] = compared(accuracy_of(controlled.adjusted, controlled.observed), scene)
@@ -184,19 +186,18 @@ def summarised(rows: list[Row], sound: list[Row]) -> Row:
 
     gsd = rows[0]["gsd_m"]
     found = root("found")
+    inside = [np.abs(row["found"]["mean"]) <= NORMAL_95 * np.array(row["found"]["mean_sigmas"]) for row in rows]
+    values = {"found": found / gsd, "sigma": found / root("found", "expected"), "held": np.mean(inside, axis=0)}
     result: Row = {"scene": rows[0]["scene"], "fault": rows[0]["fault"], "seeds": len(rows)}
-    quotients = {"found": np.full(3, gsd), "sigma": root("found", "expected")}
+    result |= {"plane": float(root("found", "bent")[0]) / gsd, "rim": float(root("found", "rim")[2]) / gsd}
     if "told" in rows[0]:
-        quotients["told"] = root("told")
+        values |= {"told": found / root("told"), "today": root("today") / gsd}
         result |= {key: float(root(key)[2]) / gsd for key in ("one", "three")}
-        result |= {f"today_{axis}": value for axis, value in zip("enu", (root("today") / gsd).tolist(), strict=True)}
     if sound:
-        quotients["none"] = root("found", among=sound)
-    for key, scale in quotients.items():
-        result |= {f"{key}_{axis}": value for axis, value in zip("enu", (found / scale).tolist(), strict=True)}
-    inside = [np.abs(row["found"]["mean"]) <= 1.96 * np.array(row["found"]["mean_sigmas"]) for row in rows]
-    result |= {f"held_{axis}": value for axis, value in zip("enu", np.mean(inside, axis=0).tolist(), strict=True)}
-    result["plane"] = float(root("found", "bent")[0]) / gsd
+        values["none"] = found / root("found", among=sound)
+    result |= {
+        f"{key}_{axis}": float(value) for key, each in values.items() for axis, value in zip(AXES, each, strict=True)
+    }
     counts = np.sum([row["wrong"] for row in rows], axis=0).tolist()
     result |= dict(zip(("wrong", "recall", "false"), counts, strict=True))
     result["cpu"] = float(np.mean([row["cpu"] for row in rows]))

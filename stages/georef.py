@@ -23,12 +23,13 @@ from splatpipe.pipeline.survey.adjusted_positions import (
     adjust_model,
     adjusted_frame,
     adjustment_json,
+    with_adjustment,
 )
 from splatpipe.pipeline.survey.blunders import gsd_m
 from splatpipe.pipeline.survey.boundary import lay_boundary
 from splatpipe.pipeline.survey.control import ControlResult, GeorefInput, place_by_control
 from splatpipe.pipeline.survey.crs import parse_vertical
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError, PositionFit
+from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame, save_frame
 from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit, report_frame
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
@@ -74,20 +75,10 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     model = read_model(source, photos)
     positions = read_positions(inputs["ingest.positions"])
     report.progress(1, 3, "fitting the positions", "steps")
-    frame, fit = _by_positions(config, model, positions, photos)
     lenses = _lens_knowledge(inputs["ingest.cameras"], inputs["ingest.lenses"], model, photos)
-    held = inputs.settings.get("sparse.lens") == "held"
-    found = None
-    if isinstance(frame, Frame) and config.adjust == "auto":
-        found = adjust_model(model, frame, positions, photos, lenses, held, report)
-        if found is not None and found.adopted:
-            model, frame = model_of(found.done.reconstruction, photos), adjusted_frame(frame, found)
-    if isinstance(frame, Frame) and fit is not None:
-        if found is not None and found.adopted:
-            report.note(frame.note)
-            report_frame(frame, model, positions, report)
-        else:
-            report_fit(frame, fit, model, positions, report)
+    capture = GeorefInput(model, positions, photos, lenses, inputs.settings.get("sparse.lens") == "held")
+    frame, capture = _by_positions(config, capture, report)
+    model, found = capture.model, capture.adjusted
     report.progress(2, 3, "fitting the control", "steps")
     controlled = None
     targets = TargetSurvey(
@@ -100,7 +91,6 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     )
     survey, scale = _survey(targets, inputs, config, report)
     if survey is not None and any(point.sightings for point in survey.points):
-        capture = GeorefInput(model, positions, photos, lenses, held, found)
         try:
             controlled = place_by_control(survey, capture, None if isinstance(frame, str) else frame, config, report)
         except FrameUndeterminedError as error:
@@ -119,7 +109,6 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         report.warning(f"Arbitrary scale: {frame}.", "Lengths and heights in this result are not in metres.")
         frame = arbitrary_frame(model, positions, frame)
     frame = _declared(frame, config, controlled)
-    save_frame(frame, out / "frame.json")
     placed_points = (controlled.placed.model if controlled is not None else model).points
     bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
     control, accuracy = _accuracy(config, controlled, (model, positions, frame), photos, report)
@@ -128,6 +117,10 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     elif found is not None:
         accuracy["adjustment"] = adjustment_json(found, accuracy["gsd_m"])
         _report_adjustment(accuracy["adjustment"], report)
+        if controlled is None:
+            frame = with_adjustment(frame, accuracy["adjustment"])
+            accuracy["uncertainty"] = frame.residuals["uncertainty"]
+    save_frame(frame, out / "frame.json")
     accuracy |= scale_json(targets.wanted.bars, scale, frame)
     for name, value in (("control.json", control), ("accuracy.json", accuracy)):
         write_json(out / name, value)
@@ -158,14 +151,21 @@ def _survey(
     return survey, scale_of(targets, found, marked, report)
 
 
-def _by_positions(
-    config: GeorefConfig, model: SparseModel, positions: Positions, photos: Mapping[str, Photo]
-) -> tuple[Frame | str, PositionFit | None]:
-    """Return the frame fitted to the positions and that fit, or the reason why there is none."""
+def _by_positions(config: GeorefConfig, capture: GeorefInput, report: Reporter) -> tuple[Frame | str, GeorefInput]:
+    """Return the frame by positions, or the reason why there is none, and the capture, adjusted to accurate ones."""
+    model, positions, photos = capture.model, capture.positions, capture.photos
     try:
-        return georeference(model, positions, config.max_position_error_m, photos)
+        frame, fit = georeference(model, positions, config.max_position_error_m, photos)
     except FrameUndeterminedError as error:
-        return str(error), None
+        return str(error), capture
+    found = adjust_model(capture, frame, report) if config.adjust == "auto" else None
+    if found is None or not found.adopted:
+        report_fit(frame, fit, model, positions, report)
+        return frame, replace(capture, adjusted=found)
+    frame, model = adjusted_frame(frame, found), model_of(found.done.reconstruction, photos)
+    report.note(frame.note)
+    report_frame(frame, model, positions, report)
+    return frame, replace(capture, model=model, adjusted=found)
 
 
 def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | None) -> Frame:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,10 @@ from splatpipe.pipeline.survey.block_accuracy import (
 )
 from splatpipe.pipeline.survey.fitting import capture_order
 from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.georef_input import AdjustedPositions, GeorefInput
 from splatpipe.pipeline.survey.level import Positions
 from splatpipe.pipeline.survey.model import SparseModel, model_of
-from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, PositionAdjustment, adjust_to_positions
+from splatpipe.pipeline.survey.position_adjustment import PositionAdjustment, adjust_to_positions
 from splatpipe.pipeline.survey.position_noise import StatedPositions
 from splatpipe.pipeline.survey.receiver_noise import ReceiverNoise
 from splatpipe.pipeline.survey.uncertainty import Uncertainty, metres_in_words
@@ -36,46 +37,16 @@ MANY_GSDS = 3.0  # ground sample distances up to which positions are accurate, a
 HEIGHTS_SHOWN = 400
 
 
-@dataclass(frozen=True)
-class AdjustedPositions:
-    """The outcome of an adjustment to positions.
-
-    Attributes:
-        done: The adjustment.
-        moved_px: RMS shift of what the photos show.
-        adopted: Whether the adjusted model is used; otherwise it is too close to the model before.
-        names: Photos with a position, in the order of capture.
-        flights: Numbers of the flights, in the order of the adjustment's offsets.
-    """
-
-    done: PositionAdjustment
-    moved_px: float
-    adopted: bool
-    names: tuple[str, ...]
-    flights: tuple[int, ...]
-
-
-def adjust_model(
-    model: SparseModel,
-    frame: Frame,
-    positions: Positions,
-    photos: Mapping[str, Photo],
-    lenses: Mapping[int, LensKnowledge],
-    lenses_held: bool,
-    report: Reporter,
-) -> AdjustedPositions | None:
+def adjust_model(capture: GeorefInput, frame: Frame, report: Reporter) -> AdjustedPositions | None:
     """Adjust a model to its positions if these are accurate; None if they are not, or too few.
 
     Args:
-        model: The model.
+        capture: The model and its photos.
         frame: By a similarity to the positions.
-        positions: Of the photos.
-        photos: All photos of the capture by name.
-        lenses: What is known of the cameras, by COLMAP id.
-        lenses_held: Keep the interior orientation fixed.
-        report: Receives progress and warnings.
+        report: Receives progress.
     """
-    stated = stated_positions(model, frame, positions, photos)
+    model = capture.model
+    stated = stated_positions(model, frame, capture.positions, capture.photos)
     if stated is None or not can_adjust(model.reconstruction) or _ties(model) < MIN_TIES:
         return None
     names, observed = stated
@@ -87,15 +58,15 @@ def adjust_model(
         observed,
         names,
         suspects,
-        lenses,
-        lenses_held=lenses_held,
+        capture.lenses,
+        lenses_held=capture.lenses_held,
         poll=lambda step, steps: report.progress(step, steps, "adjusting to the positions", "steps"),
     )
     sizes = np.median(done.noise.sizes(done.positions), axis=0)
     if not done.adjusted.settled or float(sizes.max()) > ACCURATE_M:
         return None  # not what they are stated to be: the similarity says so
     moved = moved_px(model.reconstruction, done.reconstruction)
-    return AdjustedPositions(done, moved, moved >= MIN_DEFORMATION_PX, names, flights_of(names, positions))
+    return AdjustedPositions(done, moved, moved >= MIN_DEFORMATION_PX, names, flights_of(names, capture.positions))
 
 
 def _ties(model: SparseModel) -> float:
@@ -227,6 +198,21 @@ def adjustment_json(found: AdjustedPositions, gsd: float | None) -> dict[str, JS
         },
         **block_json(done.accuracy, gsd, stated_sigma(done.positions)),
     }
+
+
+def with_adjustment(frame: Frame, adjustment: Mapping[str, Any]) -> Frame:
+    """The frame whose uncertainty has the sentences of an adjustment too, for ``georef.json``."""
+    heights = adjustment["heights"] or {}
+    together = heights.get("together_sigma_m")
+    said = {
+        "positions_left_out_m": adjustment["predicted_m"],
+        "positions_left_out": adjustment["sentence"],
+        "heights_95_m": None if together is None else round(ninety_five(together[2]), 4),
+        "heights": heights.get("sentence"),
+        "unknown": "what the base station's place or the datum (ETRS89, ITRF, WGS 84) is off by leaves no residual",
+    }
+    uncertainty = {**frame.residuals.get("uncertainty", {}), **said}
+    return replace(frame, residuals={**frame.residuals, "uncertainty": uncertainty})
 
 
 def stated_sigma(positions: StatedPositions) -> float:

@@ -12,9 +12,8 @@ from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.joint_fit import SIMILARITY, JointFit, fit_jointly
-from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel
-from splatpipe.pipeline.survey.adjusted_positions import AdjustedPositions, block_json
+from splatpipe.pipeline.survey.adjusted_positions import block_json
 from splatpipe.pipeline.survey.adjustment import ControlAdjustment, ControlStart, Target, adjust, can_adjust, moved_px
 from splatpipe.pipeline.survey.block import Lens
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of
@@ -22,7 +21,7 @@ from splatpipe.pipeline.survey.block_adjustment import PositionObservations
 from splatpipe.pipeline.survey.blunders import name_blunders, require_near, warn_of_datum_offset, warn_of_weak_control
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.survey.georef_input import GeorefInput
 from splatpipe.pipeline.survey.local_survey import (
     MIN_CONTROL,
     LocalSurvey,
@@ -33,7 +32,7 @@ from splatpipe.pipeline.survey.local_survey import (
     stations_of,
     with_sigmas_times,
 )
-from splatpipe.pipeline.survey.model import SparseModel, model_of
+from splatpipe.pipeline.survey.model import model_of
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens, simple_lens
 from splatpipe.pipeline.survey.surveyed_points import Survey, locate
@@ -47,27 +46,6 @@ LONELY = 3.0  # a single point is the blunder if leaving it out reduces the nois
 CROWD = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
 SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
 ROUNDS = 4  # of adjustment, each without a blunder found in the one before, or with larger sigmas
-
-
-@dataclass(frozen=True)
-class GeorefInput:
-    """Input of georeferencing.
-
-    Attributes:
-        model: The sparse model.
-        positions: The photos' stated positions.
-        photos: All photos of the capture by name.
-        lenses: What is known of the cameras, by COLMAP camera id.
-        lenses_held: Whether the interior orientation is kept fixed.
-        adjusted: The adjustment of accurate positions, whose model this is; None without.
-    """
-
-    model: SparseModel
-    positions: Positions
-    photos: Mapping[str, Photo]
-    lenses: Mapping[int, LensKnowledge]
-    lenses_held: bool = False
-    adjusted: AdjustedPositions | None = None
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,18 @@ from splatpipe.pipeline.survey.block import Block, ReducedBlock
 from splatpipe.pipeline.survey.block_adjustment import PositionObservations, solve
 
 AXES = ((0, 1), (2,))  # east and north; up
-SHARES = (0.5, 0.8)  # of the variance, that drifts
-CORRELATIONS = (0.5, 0.7, 0.8, 0.9, 0.95)
-UNPROVEN = 2.0  # least gain in minus twice the log-likelihood for a drift (Akaike 1974), for each of its parameters
+USUAL = (
+    0.5,
+    0.9,
+)  # share of the variance that drifts, and its correlation from photo to photo: 50 photos prove neither
+DRIFTS = (USUAL, (0.0, 0.0), *((share, r) for share in (0.5, 0.8) for r in (0.5, 0.7, 0.8, 0.95)), (0.8, 0.9))
+UNPROVEN = 4.0  # least gain in minus twice the log-likelihood for another drift than usual (Akaike 1974)
 MAX_CHAIN = 200  # neighbours along a flight whose drift is modelled together
 MIN_CLASS = 10  # positions with a factor of their own
-PRIOR_DEGREES = 2.0  # weight of the stated standard deviation
-FACTOR_ROUNDS, SEARCHES = 12, 2
+PRIOR_DEGREES = 2.0  # weight of the stated standard deviation, for few positions
+LITTLE = 0.2  # its weight for many
+FEW_DEGREES = 10.0  # of freedom: fewer do not tell a factor, and the other direction's counts
+FACTOR_ROUNDS = 12
 SETTLED = 0.01  # relative, of a factor
 MIN_FACTOR = 0.05
 ROBUST_ROUNDS = 30
@@ -197,23 +202,19 @@ def settled_noise(
 def estimate_noise(system: CentreSystem, block: Block, positions: StatedPositions) -> PositionNoise:
     """Estimate the noise from what the photos say of the centres."""
     errors = block.centres[positions.photo] - positions.stated
-    noise = _settled(system, errors, positions, as_stated(positions))
+    noise = as_stated(positions)
+    noise = replace(noise, shares=np.full(2, USUAL[0]), correlations=np.full(2, USUAL[1]))
+    noise = _settled(system, errors, positions, noise)
     if len(positions) < MIN_CLASS:
         return noise
     best = _fit(system, errors, positions, noise).cost
-    for _ in range(SEARCHES):
-        before = best
-        for half in range(2):
-            for share in SHARES:
-                for correlation in CORRELATIONS:
-                    tried = _with_drift(noise, half, share, correlation)
-                    tried = _settled(system, errors, positions, tried, rounds=3)
-                    cost = _fit(system, errors, positions, tried).cost + 2.0 * UNPROVEN * (noise.shares[half] == 0.0)
-                    if cost < best:
-                        best, chosen = cost, tried
-                        noise = chosen
-        if before - best < SETTLED:
-            break
+    for half in (1, 0):  # heights tell more
+        usual = noise
+        for drift in DRIFTS[1:]:
+            tried = _settled(system, errors, positions, _with_drift(usual, half, *drift), rounds=3)
+            cost = _fit(system, errors, positions, tried).cost
+            if cost < best - (UNPROVEN if noise is usual else 0.0):
+                best, noise = cost, tried
     return _settled(system, errors, positions, noise)
 
 
@@ -377,7 +378,7 @@ def _settled(
     for _ in range(rounds):
         fit = _fit(system, errors, positions, noise)
         precision = noise.precision(positions)
-        factors, degrees = noise.factors.copy(), noise.degrees.copy()
+        found, degrees = np.zeros_like(noise.factors), noise.degrees.copy()
         for half, axes in enumerate(AXES):
             squares, free = np.zeros(len(positions)), np.zeros(len(positions))
             for axis in axes:
@@ -386,11 +387,23 @@ def _settled(
             for c in range(len(noise.classes)):
                 mine = noise.of == c
                 degrees[c, half] = max(float(free[mine].sum()), 0.0)
-                found = float(squares[mine].sum()) * noise.factors[c, half] ** 2
-                mean = (found + PRIOR_DEGREES) / (degrees[c, half] + PRIOR_DEGREES)
-                factors[c, half] = max(mean**0.5, MIN_FACTOR)
+                found[c, half] = float(squares[mine].sum()) * noise.factors[c, half] ** 2
+        factors = _weighed(found, degrees)
         change = float(np.abs(factors / noise.factors - 1.0).max())
         noise = replace(noise, factors=factors, degrees=degrees)
         if change < SETTLED:
             break
     return noise
+
+
+def _weighed(found: Float64[np.ndarray, "c 2"], degrees: Float64[np.ndarray, "c 2"]) -> Float64[np.ndarray, "c 2"]:
+    """Factors from sums of squares and their degrees of freedom, with the stated standard deviation as a prior.
+
+    Straight down, a tilt absorbs a horizontal error: where one direction has hardly any degrees of freedom, the prior
+    is the other one's factor if that is larger, as a receiver that is worse than stated is so in both.
+    """
+    weight = np.where(degrees >= FEW_DEGREES, LITTLE, PRIOR_DEGREES)
+    alone = (found + weight) / (degrees + weight)
+    other = np.where(degrees[:, ::-1] >= FEW_DEGREES, np.maximum(alone[:, ::-1], 1.0), 1.0)
+    mean = np.where(degrees >= FEW_DEGREES, 1.0, other)
+    return np.asarray(np.maximum(np.sqrt((found + weight * mean) / (degrees + weight)), MIN_FACTOR))

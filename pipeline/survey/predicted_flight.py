@@ -26,7 +26,7 @@ from splatpipe.pipeline.survey.position_adjustment import MIN_PHOTOS, SIMPLE, Le
 from splatpipe.pipeline.survey.position_noise import StatedPositions, as_stated
 from splatpipe.pipeline.survey.tie_points import MIN_SIGMA_PX, PER_PHOTO
 
-MAX_PHOTOS = 120  # more are predicted from a part: two seconds
+MAX_PHOTOS = 120  # more are predicted from a part: two or three seconds
 DRAWN = 100  # points per photo, of which those that two photos show are thinned to PER_PHOTO in each
 MIN_VIEWS = 2
 RELIEF = 0.02  # of the flying height: standard deviation of the ground's heights
@@ -181,7 +181,7 @@ def predict_accuracy(
     together = accuracy.mean_sigmas()
     if not len(accuracy.points) or not np.isfinite(together).all():
         return None
-    control, strip = with_control(accuracy), with_cross_strip(accuracy, observed)
+    control, strip = with_control(accuracy), with_cross_strip(accuracy)
     height = float(np.median(flight.heights))
     focal = float(np.median([camera.focal_px for camera in flight.cameras]))
     places = _around_site(np.array(control[3].places), flight, part)
