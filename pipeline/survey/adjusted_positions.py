@@ -33,7 +33,7 @@ ACCURATE_M = 0.5  # standard deviation up to which positions bend the model: RTK
 MIN_POSITIONS = 8
 MIN_TIES = 20  # points that a photo must have at the median, to be adjusted
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if positions deform the model by less, it is not adjusted
-MANY_GSDS = 3.0  # ground sample distances up to which positions are accurate, and heights should be
+MANY_GSDS = 3.0  # ground sample distances, or standard deviations of a position: ground heights should be as good
 HEIGHTS_SHOWN = 400
 
 
@@ -216,8 +216,8 @@ def with_adjustment(frame: Frame, adjustment: Mapping[str, Any]) -> Frame:
 
 
 def stated_sigma(positions: StatedPositions) -> float:
-    """Typical stated standard deviation of a position, metres."""
-    return float(np.median(positions.sigmas))
+    """Typical stated standard deviation of a position's height, metres."""
+    return float(np.median(positions.sigmas[:, 2]))
 
 
 def block_json(accuracy: BlockAccuracy, gsd: float | None, stated_m: float | None) -> dict[str, JSON]:
@@ -226,7 +226,7 @@ def block_json(accuracy: BlockAccuracy, gsd: float | None, stated_m: float | Non
     Args:
         accuracy: By propagation.
         gsd: Ground sample distance, metres.
-        stated_m: Typical stated standard deviation of the positions; None where control is in the adjustment, so that
+        stated_m: Typical stated standard deviation of the positions' heights; None where control is in the adjustment, so that
             no remedy has to be named.
     """
     lenses = []
@@ -275,14 +275,14 @@ def height_sentence(together_m: float, gsd: float | None, stated_m: float) -> st
     Args:
         together_m: Standard deviation of the ground's mean height.
         gsd: Ground sample distance.
-        stated_m: Typical stated standard deviation of the positions.
+        stated_m: Typical stated standard deviation of the positions' heights.
     """
-    if gsd is None or stated_m > MANY_GSDS * gsd or together_m <= MANY_GSDS * gsd:
+    if gsd is None or stated_m > ACCURATE_M or together_m <= MANY_GSDS * max(gsd, stated_m):
         return None
     return (
         f"heights of the ground are uncertain by ±{metres_in_words(ninety_five(together_m))} together (95 %): photos"
-        " straight down from one height do not tell focal length from height; one control point in the positions'"
-        " vertical datum, oblique photos or a second flying height would settle it"
+        " straight down from one height do not tell focal length from height; one control point, oblique photos beside"
+        " these or a second flying height would settle it"
     )
 
 

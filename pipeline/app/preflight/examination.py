@@ -24,6 +24,7 @@ from splatpipe.pipeline.app.preflight.findings import (
     PresetForecast,
     worst_first,
 )
+from splatpipe.pipeline.app.preflight.heights import height_findings, predict_heights
 from splatpipe.pipeline.app.preflight.intake import MIN_PHOTOS, Intake, read_capture
 from splatpipe.pipeline.app.preflight.overlap import (
     MatchGraph,
@@ -36,7 +37,6 @@ from splatpipe.pipeline.app.preflight.overlap import (
 from splatpipe.pipeline.app.preflight.photo_quality import find_blurred, find_copies, find_exposures, sharpness
 from splatpipe.pipeline.app.preflight.places import (
     control_findings,
-    focal_findings,
     footprint,
     origin_of,
     scale_bar_findings,
@@ -101,7 +101,9 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     intake, findings = read_capture(source, config, threads, report)
     examination = examine_photos(intake, threads, report)
     control, control_problems = _control(source, config, intake)
-    findings += [*examination.findings, *focal_findings(intake), *control_problems]
+    heights = predict_heights(source, config, intake, report)
+    controlled = any(place.kind == "control" for place in control)
+    findings += [*examination.findings, *height_findings(intake, heights, controlled), *control_problems]
     if (boundary := source.part_path("source.boundary")).is_file():
         controlled = source.part_path("source.control").is_file()
         findings += boundary_findings(boundary, config.georef, intake.positions.positions, controlled)
@@ -118,6 +120,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
         control=control,
         forecasts=forecasts,
         machine=machine,
+        heights=heights,
         when_s=when_s,
         seconds=round(time.monotonic() - began_s, 3),
     )

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from splatpipe.pipeline.engine.stage import JSON
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.survey.predicted_flight import PredictedAccuracy
 
 Severity = Literal["error", "warning", "note"]
 RANK: dict[Severity, int] = {"error": 0, "warning": 1, "note": 2}
@@ -160,6 +163,7 @@ class Preflight:
         machine: The machine they apply to.
         when_s: Time of the preflight, seconds since 1970.
         seconds: Its duration.
+        heights: Predicted accuracy of the ground; None without accurate positions, or if nothing can be said.
     """
 
     folder: Path
@@ -175,6 +179,7 @@ class Preflight:
     machine: MachineFacts
     when_s: float
     seconds: float
+    heights: PredictedAccuracy | None = None
 
     @property
     def orphans(self) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Checks positions, footprints, whether the views determine the focal length, and control points."""
+"""Checks positions, footprints and control points."""
 
 from __future__ import annotations
 
@@ -17,12 +17,9 @@ from splatpipe.pipeline.sfm.footprints import FURTHEST, MIN_HEIGHT_M, StatedPose
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
-from splatpipe.pipeline.survey.position_issues import WELL_KNOWN_M
 from splatpipe.pipeline.survey.scale_bars import read_scale_bars
 from splatpipe.pipeline.survey.surveyed_points import missing_photos
 
-DOWN_DEG = -75.0  # gimbal pitch: views less steep show walls, which determine the focal length
-ONE_HEIGHT = 0.1  # spread of the heights above take-off relative to their median
 OUTSIDE_SHARE = 0.3  # of the marks outside their photos: they were made in photos of another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
 REACH_SPACINGS, MIN_REACH_M = 3.0, 60.0  # around photos whose viewing direction is unknown
@@ -50,26 +47,6 @@ def footprint(views: StatedPoses | None, photo: int) -> tuple[Place, ...] | None
         corner = views.centres_m[photo, :2] + step
         corners.append((round(float(corner[0]), 2), round(float(corner[1]), 2)))
     return tuple(corners)
-
-
-def focal_findings(intake: Intake) -> list[Finding]:
-    """Warn of nadir-only flights at one height, which do not determine the focal length and thus the heights."""
-    stated = intake.positions.positions
-    pitches = [each.pitch_deg for each in stated if each.pitch_deg is not None]
-    if len(pitches) < max(3, len(intake.photos) // 2) or max(pitches) > DOWN_DEG:
-        return []
-    heights = [each.relative_altitude_m for each in stated if each.relative_altitude_m is not None]
-    if heights and np.median(heights) > 0.0 and np.ptp(heights) > ONE_HEIGHT * float(np.median(heights)):
-        return []
-    good = [each for each in stated if max(each.sigma_horizontal_m, each.sigma_vertical_m) <= WELL_KNOWN_M]
-    if len(good) > len(stated) / 2:
-        return []
-    text = (
-        "All photos look straight down from one height: the focal length, and with it heights, cannot be "
-        "determined reliably."
-    )
-    hint = "Add some photos at 45° or from another height, or control points with heights, or a calibrated lens."
-    return [Finding("nadir-only", "warning", text, hint)]
 
 
 def control_findings(

@@ -244,6 +244,26 @@ def test_points_that_no_photo_can_show_are_reported(
     assert len(places) == 3 and ("P2" in findings[0].message if severities == ["warning"] else True)
 
 
+def test_accurate_positions_straight_down_are_told_what_control_would_buy(tmp_path: Path) -> None:
+    """The demo's lower orbit, with a positions file that states RTK's accuracy and cameras that look straight down."""
+    photos = ring(tmp_path / "photos")
+    config = overrides(None, [], None).resolve(load_preset("preview"))
+    quiet = EventReporter("check", lambda _event: None)
+    intake, _ = read_capture(open_source(photos, tmp_path / "out", LINE, config), config, 1, quiet)
+    rows = [
+        f"{each.name} {each.longitude:.10f} {each.latitude:.10f} 500.0 {20 * k} 1 0 0.02 0.03"
+        for k, each in enumerate(intake.positions.positions)
+    ]
+    (photos / "geo.txt").write_text("\n".join(["EPSG:4979", *rows]))
+    preflight = examined(photos)
+    (finding,) = found(preflight, "heights-uncertain")
+    heights = json.loads(json.dumps(as_json(preflight)))["heights"]
+    assert "straight down from one height" in finding.message and heights["straight_down"]
+    assert heights["height_m"] > 3.0 * heights["gsd_m"] > heights["control_1_m"]
+    assert len(heights["spots"]) == 3 and heights["photos"] == len(RING)
+    assert not found(preflight, "nadir-only")
+
+
 def test_a_run_reports_a_broken_control_file_before_its_first_stage(tmp_path: Path) -> None:
     photos = little(tmp_path / "photos")
     (photos / "gcp_list.txt").write_text("EPSG:32633\n388710 5299705 512 112 514\n")
