@@ -171,7 +171,11 @@ def adjustment_json(found: AdjustedPositions, gsd: float | None) -> dict[str, JS
     squares = np.nanmean(done.predicted**2, axis=0)
     predicted = [float(np.sqrt(squares[:2].mean())), float(np.sqrt(squares[2]))]
     used = [
-        {"photo": name, "flight": int(done.positions.group[k]), "residual_m": np.round(error, 4).tolist()}
+        {
+            "photo": name,
+            "flight": found.flights[int(done.positions.group[k])],
+            "residual_m": np.round(error, 4).tolist(),
+        }
         for k, (name, error) in enumerate(zip(done.names, done.errors, strict=True))
     ]
     judged = done.judgement
@@ -234,6 +238,7 @@ def block_json(accuracy: BlockAccuracy, gsd: float | None, stated_m: float | Non
         sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         lenses.append(
             {
+                "camera": lens.camera.camera_id,
                 "names": list(lens.names),
                 "values": lens.values.tolist(),
                 "sigmas": sigmas.tolist(),

@@ -56,8 +56,8 @@ class GeorefConfig(StageConfig):
     mark_sigma_px: Annotated[float, Field(ge=0.01, le=100.0)] = 0.5
     """Standard deviation of a mark in a photo, pixels."""
     adjust: Literal["auto", "off"] = "auto"
-    """`auto`: control enters a bundle adjustment; if that moves image points by half a pixel or more, the adjusted
-    model is used. `off`: control only places the model."""
+    """`auto`: control and accurate positions (RTK, PPK; up to 0.5 m) enter a bundle adjustment with the lens; if that
+    moves image points by half a pixel or more, the adjusted model is used. `off`: they only place the model."""
 
     @field_validator("crs", "vertical")
     @classmethod

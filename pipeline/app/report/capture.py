@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from splatpipe.pipeline.app.report.adjustment_results import adopted_focals_px
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, length, number, share
 
@@ -82,7 +84,10 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Cha
         "cameras": [_calibrated(camera, lenses.get(camera.get("id"), {})) for camera in sparse.get("cameras", [])],
         "tried": [_attempt_row(row) for row in sparse.get("tried", [])],
         "rungs": [_step_row(row) for row in sparse.get("ladder", [])],
+        "adjusted_later": False,
     }
+    with suppress(OSError, ValueError):  # of another chapter, which reports it
+        chapter["adjusted_later"] = bool(adopted_focals_px(inputs, sparse.get("cameras", [])))
     if geometry is not None:
         chapter |= _registration_charts(inputs, geometry)
     return chapter

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float64
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
@@ -24,6 +23,7 @@ from splatpipe.pipeline.app.report.drawing import (
     RED,
     WIDTH,
     as_map,
+    map_box,
     map_size,
     new_figure,
     to_svg,
@@ -72,7 +72,7 @@ def stated_map(places: Sequence[tuple[float, float]]) -> Markup:
     degrees = np.array(places, np.float64)
     north = METRES_A_DEGREE * (degrees[:, 0] - degrees[:, 0].mean())
     east = METRES_A_DEGREE * math.cos(math.radians(degrees[0, 0])) * (degrees[:, 1] - degrees[:, 1].mean())
-    box = _about(np.stack([east, north], axis=1))
+    box = map_box(np.stack([east, north], axis=1))
     figure, axes = new_figure(*map_size(box))
     axes.plot(east, north, "o-", ms=4, mfc=BLUE, mec="white", mew=0.5, color=LINE, lw=0.8)
     as_map(axes, box, "m")
@@ -97,7 +97,7 @@ def overlap_map(overlap: OverlapGrid, unit: str) -> Markup:
 
 def match_map(geometry: Geometry, pairs: Sequence[tuple[str, str, int]], unit: str) -> Markup:
     """The verified pairs as lines between the photos, darker with more matches."""
-    box = _about(geometry.photos.centres[:, :2])
+    box = map_box(geometry.photos.centres[:, :2])
     figure, axes = new_figure(*map_size(box))
     places = dict(zip(geometry.photos.names, geometry.photos.centres[:, :2], strict=True))
     known = [pair for pair in pairs if pair[0] in places and pair[1] in places]
@@ -181,7 +181,7 @@ def residual_map(geometry: Geometry, groups: Mapping[str, Sequence[Residual]]) -
         groups: Residuals of points or photos, by kind.
     """
     every = [entry for entries in groups.values() for entry in entries]
-    box = _about(np.array([entry[1][:2] for entry in every], np.float64))
+    box = map_box(np.array([entry[1][:2] for entry in every], np.float64))
     figure, axes = new_figure(*map_size(box))
     _draw_points(axes, geometry)
     longest = max(math.hypot(*entry[2][:2]) for entry in every)
@@ -262,12 +262,6 @@ def _with_cameras(geometry: Geometry) -> tuple[float, float, float, float]:
         min(south, float(low[1]) - margin),
         max(north, float(high[1]) + margin),
     )
-
-
-def _about(places: Float64[np.ndarray, "n 2"]) -> tuple[float, float, float, float]:
-    low, high = places.min(axis=0), places.max(axis=0)
-    margin = 0.15 * float(max(high - low)) + 1e-6
-    return float(low[0]) - margin, float(high[0]) + margin, float(low[1]) - margin, float(high[1]) + margin
 
 
 def _rgb(colour: str) -> tuple[float, float, float]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from jaxtyping import Float64
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -59,6 +60,15 @@ def new_figure(width: float = WIDTH, height: float = HEIGHT, right: float = MARG
     return figure, figure.add_subplot()
 
 
+def new_rows(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """Empty charts one below the other, with a common horizontal axis; sizes of all of it in inches."""
+    figure = Figure(figsize=(width, height))
+    FigureCanvasSVG(figure)
+    left, right, bottom, top = MARGINS
+    figure.subplots_adjust(left / width, bottom / height, 1.0 - right / width, 1.0 - top / height, hspace=0.28)
+    return figure, list(figure.subplots(count, 1, sharex=True))
+
+
 def to_svg(figure: Figure, title: str) -> Markup:
     """A chart as an SVG element for the page; IDs are unique across charts.
 
@@ -95,8 +105,20 @@ def as_map(axes: Axes, box: tuple[float, float, float, float], unit: str) -> Non
     axes.set_ylabel("north (m)" if placed else f"y ({unit or 'model units'})")
 
 
-def map_size(box: tuple[float, float, float, float]) -> tuple[float, float]:
-    """Width and height, inches, of a map of that box: as wide as any chart, and not much higher."""
+def map_box(places: Float64[np.ndarray, "n 2"], margin: float = 0.15) -> tuple[float, float, float, float]:
+    """West, east, south, north about some places, with a margin as a share of the longer side."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    around = margin * float(max(high - low)) + 1e-6
+    return float(low[0]) - around, float(high[0]) + around, float(low[1]) - around, float(high[1]) + around
+
+
+def map_size(box: tuple[float, float, float, float], right: float = MARGINS[1]) -> tuple[float, float]:
+    """Width and height, inches, of a map of that box: as wide as any chart, and not much higher.
+
+    Args:
+        box: West, east, south, north.
+        right: The right margin, inches.
+    """
     ratio = (box[3] - box[2]) / max(box[1] - box[0], 1e-9)
-    left, right, bottom, top = MARGINS
+    left, _, bottom, top = MARGINS
     return WIDTH, float(np.clip((WIDTH - left - right) * ratio, 2.0, 4.8)) + bottom + top

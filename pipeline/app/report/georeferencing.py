@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from splatpipe.pipeline.app.report.adjustment import adjustment_section
+from splatpipe.pipeline.app.report.adjustment_results import read_adjustment
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs, read_json
 from splatpipe.pipeline.app.report.wording import count, interval, length, metres, number
 
@@ -18,6 +20,7 @@ GROUPS = {"gps": "photo positions", "control": "control points", "check": "check
 MAX_POINTS = 200  # rows of the table; metrics.json has all
 MAX_BARS = 20
 AXES = ("east", "north", "up", "horizontal", "3d")
+Residual = tuple[str, Sequence[float], Sequence[float]]  # name, position and residual: east, north, up, metres
 
 
 def georeferencing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter | None:
@@ -43,9 +46,17 @@ def georeferencing_chapter(inputs: ReportInputs, geometry: Geometry | None) -> C
         "has_splat": bool(splat["points"]),
         "marks": [],
         "marks_left_out": 0,
+        "adjustment": None,
     }
+    adjusted = read_adjustment(report)
+    if adjusted is not None:
+        cameras = inputs.summary("sparse").get("cameras") or []
+        places = None if geometry is None else _camera_places(geometry)
+        chapter["adjustment"] = adjustment_section(adjusted, cameras, frame.get("origin"), places)
     if geometry is not None:
-        chapter |= _charts_and_marks(inputs, geometry, frame, points)
+        drawn = bool(chapter["adjustment"] and chapter["adjustment"]["charts"])
+        photos = [] if drawn else _photo_residuals(geometry, frame)
+        chapter |= _charts_and_marks(inputs, geometry, points, photos, placed=frame.get("kind") == "enu")
     return chapter
 
 
@@ -186,19 +197,31 @@ def _rms_px(observations: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _charts_and_marks(
-    inputs: ReportInputs, geometry: Geometry, frame: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
+    inputs: ReportInputs,
+    geometry: Geometry,
+    points: Sequence[Mapping[str, Any]],
+    photos: Sequence[Residual],
+    *,
+    placed: bool,
 ) -> Chapter:
-    """The residual maps, and the crops for each point."""
+    """The residual maps, and the crops for each point.
+
+    Args:
+        inputs: The report's inputs.
+        geometry: The sparse model's geometry.
+        points: The surveyed points.
+        photos: Residuals of the photos' own positions.
+        placed: Whether the model is georeferenced; otherwise there are no maps.
+    """
     from splatpipe.pipeline.app.report.charts import residual_map
     from splatpipe.pipeline.app.report.pictures import cut_chips
 
     charts = []
-    if frame.get("kind") == "enu":
+    if placed:
         surveyed = _surveyed_residuals(points)
         if surveyed:
             text = "Residuals of the surveyed points (estimated minus surveyed)."
             charts.append({"svg": residual_map(geometry, surveyed), "text": text})
-        photos = _photo_residuals(geometry, frame)
         if photos:
             text = "Residuals of the photos' own positions relative to the model."
             charts.append({"svg": residual_map(geometry, {"photo": photos}), "text": text})
@@ -227,8 +250,8 @@ def _marks(index: int, point: Mapping[str, Any], chips: Mapping[tuple[int, int],
     }
 
 
-def _surveyed_residuals(points: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, list[float], list[float]]]]:
-    groups: dict[str, list[tuple[str, list[float], list[float]]]] = {}
+def _surveyed_residuals(points: Sequence[Mapping[str, Any]]) -> dict[str, list[Residual]]:
+    groups: dict[str, list[Residual]] = {}
     for point in points:
         place, residual = point.get("surveyed_m"), point.get("residual_m")
         if place and residual and None not in place[:2] and None not in residual[:2]:
@@ -237,7 +260,11 @@ def _surveyed_residuals(points: Sequence[Mapping[str, Any]]) -> dict[str, list[t
     return groups
 
 
-def _photo_residuals(geometry: Geometry, frame: Mapping[str, Any]) -> list[tuple[str, list[float], list[float]]]:
+def _photo_residuals(geometry: Geometry, frame: Mapping[str, Any]) -> list[Residual]:
     found = (frame.get("residuals") or {}).get("photos") or {}
-    places = dict(zip(geometry.photos.names, geometry.photos.centres.tolist(), strict=True))
+    places = _camera_places(geometry)
     return [(name, places[name], list(residual)) for name, residual in found.items() if name in places]
+
+
+def _camera_places(geometry: Geometry) -> dict[str, list[float]]:
+    return dict(zip(geometry.photos.names, geometry.photos.centres.tolist(), strict=True))

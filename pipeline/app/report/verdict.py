@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from splatpipe.pipeline.app.report.adjustment_results import adopted_focals_px, read_adjustment
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number, plural, share
 from splatpipe.pipeline.engine.stage import stage_name
@@ -52,13 +53,13 @@ class Verdict:
 def judge(inputs: ReportInputs) -> Verdict:
     """Judge a run by its results so far; unreadable parts are skipped, and reported in their own chapters."""
     findings: list[VerdictLine] = []
-    for criterion in (_cameras, _photos, _reprojection, _focal, _georeference, _splat, _views, _floaters):
+    for criterion in (_heights, _cameras, _photos, _reprojection, _focal, _georeference, _splat, _views, _floaters):
         try:
             findings += filter(None, [criterion(inputs)])
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
     ending, text = _ending(inputs)
-    listed = tuple(str(reason["text"]) for reason in _camera_reasons(inputs))  # their warnings are not counted again
+    listed = _listed(inputs)
     stages = inputs.history.stages.values()
     warnings = sum(not message.endswith(listed) for stage in stages for message, _ in stage.messages.warnings)
     if warnings:
@@ -75,6 +76,12 @@ def judge(inputs: ReportInputs) -> Verdict:
     if doubtful:
         return Verdict("doubt", f"Finished; {plural(len(doubtful), 'point')} to check", text, findings)
     return Verdict("good", "Finished; no problems found", text, findings)
+
+
+def _listed(inputs: ReportInputs) -> tuple[str, ...]:
+    """Texts of warnings that are findings of their own, and not counted again."""
+    heights = _height_sentence(inputs).partition("; ")[0]
+    return (*(str(reason["text"]) for reason in _mapping_reasons(inputs)), *([f"{heights}."] if heights else []))
 
 
 def _ending(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
@@ -129,6 +136,24 @@ def _progress_text(inputs: ReportInputs) -> str:
     return f"It had reached {count(stage.reached)} of {count(total)} {unit}."
 
 
+def _heights(inputs: ReportInputs) -> VerdictLine | None:
+    """Heights that accurate positions leave uncertain: what a surveyor has to know before all else."""
+    sentence = _height_sentence(inputs)
+    return VerdictLine("doubt", "Heights", f"{sentence}.") if sentence else None
+
+
+def _height_sentence(inputs: ReportInputs) -> str:
+    """Georeferencing's warning of uncertain heights, without a full stop; empty if there is none."""
+    if "georef" not in inputs.artifacts:
+        return ""
+    try:
+        found = read_adjustment(inputs.read("georef.accuracy"))
+    except (OSError, ValueError):
+        return ""
+    sentence = found.heights.sentence if found is not None and found.heights is not None else ""
+    return sentence[:1].upper() + sentence[1:]
+
+
 def _cameras(inputs: ReportInputs) -> VerdictLine | None:
     """The mapping stage's own verdict on the cameras."""
     reasons = _camera_reasons(inputs)
@@ -138,12 +163,33 @@ def _cameras(inputs: ReportInputs) -> VerdictLine | None:
 
 
 def _camera_reasons(inputs: ReportInputs) -> list[Mapping[str, Any]]:
+    """The mapping stage's worst reasons that still hold; empty if there are none or they cannot be read."""
+    reasons = _mapping_reasons(inputs)
+    if not any(_is_focal_doubt(reason) for reason in reasons):
+        return reasons
+    try:
+        settled = _has_adopted_focals(inputs) and max(_focal_deviations(inputs), default=1.0) <= FOCAL_GOOD
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        settled = False
+    return [reason for reason in reasons if not (settled and _is_focal_doubt(reason))]
+
+
+def _mapping_reasons(inputs: ReportInputs) -> list[Mapping[str, Any]]:
     """The mapping stage's worst reasons to doubt the cameras; empty if there are none or they cannot be read."""
     try:
         verdict = inputs.read("sparse.summary")["verdict"]
         return [reason for reason in verdict["reasons"] if reason["level"] == verdict["level"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
+
+
+def _is_focal_doubt(reason: Mapping[str, Any]) -> bool:
+    """Whether a reason is a doubtful focal length, which georeferencing may have settled since."""
+    return bool(reason.get("kind") == "focal" and reason["level"] == "doubt")
+
+
+def _has_adopted_focals(inputs: ReportInputs) -> bool:
+    return bool(adopted_focals_px(inputs, inputs.summary("sparse").get("cameras", [])))
 
 
 def _is_camera_reason(inputs: ReportInputs, kind: str) -> bool:
@@ -173,13 +219,19 @@ def _reprojection(inputs: ReportInputs) -> VerdictLine | None:
     return VerdictLine(level, "Reprojection error", f"{error:.2f} pixels on average: {meaning[level]}.")
 
 
-def _focal(inputs: ReportInputs) -> VerdictLine | None:
+def _focal_deviations(inputs: ReportInputs) -> list[float]:
+    """Relative deviations from the metadata of the focal lengths that the model has, georeferenced if it is."""
     cameras = inputs.summary("sparse").get("cameras", [])
-    off = [
-        abs(camera["focal_px"] / camera["prior_focal_px"] - 1.0)
-        for camera in cameras
+    adopted = adopted_focals_px(inputs, cameras)
+    return [
+        abs(adopted.get(k, camera["focal_px"]) / camera["prior_focal_px"] - 1.0)
+        for k, camera in enumerate(cameras)
         if camera["has_prior"] and camera["prior_focal_px"]
     ]
+
+
+def _focal(inputs: ReportInputs) -> VerdictLine | None:
+    off = _focal_deviations(inputs)
     if not off:
         return None
     if max(off) <= FOCAL_GOOD:

@@ -37,6 +37,15 @@ def length(value: object) -> str:
     return f"{value:.2f} m" if longest < 100.0 else f"{value:,.0f} m"
 
 
+def two_digits(value: object) -> str:
+    """A standard deviation or a bound, to two significant digits."""
+    if not _finite(value):
+        return NONE
+    if abs(value) < 0.0995:
+        return f"{100.0 * value:.2g} cm"
+    return f"{value:.2g} m" if abs(value) < 99.5 else f"{value:,.0f} m"
+
+
 def share(value: object, digits: int = 0) -> str:
     """A share as a percentage."""
     return f"{value:.{digits}%}".replace("%", " %") if _finite(value) else NONE
