@@ -27,10 +27,11 @@ from splatpipe.pipeline.survey.adjusted_positions import (
 )
 from splatpipe.pipeline.survey.blunders import gsd_m
 from splatpipe.pipeline.survey.boundary import lay_boundary
-from splatpipe.pipeline.survey.control import ControlResult, GeorefInput, place_by_control
+from splatpipe.pipeline.survey.control import ControlResult, place_by_control
 from splatpipe.pipeline.survey.crs import parse_vertical
 from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame, save_frame
+from splatpipe.pipeline.survey.georef_input import GeorefInput
 from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit, report_frame
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of

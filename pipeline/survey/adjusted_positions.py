@@ -230,8 +230,8 @@ def block_json(accuracy: BlockAccuracy, gsd: float | None, stated_m: float | Non
     Args:
         accuracy: By propagation.
         gsd: Ground sample distance, metres.
-        stated_m: Typical stated standard deviation of the positions' heights; None where control is in the adjustment, so that
-            no remedy has to be named.
+        stated_m: Typical stated standard deviation of the positions' heights; None where control is in the adjustment,
+            so that no remedy has to be named.
     """
     lenses = []
     for lens, covariance in zip(accuracy.adjusted.block.lenses, accuracy.lens_sigmas(), strict=True):

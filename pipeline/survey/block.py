@@ -171,7 +171,8 @@ class Block:
         return total if np.isfinite(total) else np.inf
 
     def _rays(self) -> Float64[np.ndarray, "m 3"]:
-        return np.einsum("mij,mj->mi", self.rotations[self.photo], self.points[self.point] - self.centres[self.photo])
+        away = self.points[self.point] - self.centres[self.photo]
+        return np.asarray(np.einsum("mij,mj->mi", self.rotations[self.photo], away))
 
 
 @dataclass(frozen=True)

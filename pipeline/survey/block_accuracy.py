@@ -53,7 +53,7 @@ class BlockAccuracy:
     @property
     def places(self) -> Float64[np.ndarray, "k 3"]:
         """The ground points, world metres."""
-        return self.adjusted.block.points[self.points]
+        return np.asarray(self.adjusted.block.points[self.points])
 
     def cameras(self) -> Float64[np.ndarray, "q q"]:
         """Covariance of the unknowns without the offsets."""

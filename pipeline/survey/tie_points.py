@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -162,9 +163,9 @@ def intersected(block: Block) -> Block:
     """
     rays = np.ones((len(block.photo), 3))
     for number, lens in enumerate(block.lenses):
-        rows = block.lens_of[block.photo] == number
+        rows = np.flatnonzero(block.lens_of[block.photo] == number)
         rays[rows, :2] = np.asarray(lens.camera.cam_from_img(block.pixels[rows]), np.float64).reshape(-1, 2)
-    sound = np.isfinite(rays).all(axis=1)
+    sound = np.asarray(np.isfinite(rays).all(axis=1))
     rays = np.where(sound[:, None], rays, 1.0)
     ways = np.einsum("mji,mj->mi", block.rotations[block.photo], rays)
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -202,7 +203,7 @@ def tie_sigma(block: Block) -> float:
     sums = np.stack([np.bincount(place, weights=errors[sound, axis]) for axis in range(2)])
     full = count >= 2
     shared = float((sums[:, full] ** 2 / count[full]).sum()) / max(2 * int(full.sum()), 1)
-    return max(MIN_SIGMA_PX, max(own, shared) ** 0.5)
+    return max(MIN_SIGMA_PX, math.sqrt(max(own, shared)))
 
 
 def observing(table: TieTable, block: Block, world_from_model: Similarity) -> Block:
