@@ -105,7 +105,8 @@ def told_noise(scene: Scene) -> PositionObservations:
     factors = (size / STATED_M)[[0, 2]][None]
     share = (DRIFT_M**2 / size**2)[[0, 2]]
     noise = as_stated(positions)
-    told = PositionNoise(noise.classes, noise.of, factors, factors, share, np.full(2, DRIFT))
+    drifts = np.tile(share, (len(noise.classes), 1)), np.full_like(factors, DRIFT)
+    told = PositionNoise(noise.classes, noise.of, factors, factors, *drifts)
     return replace(told.observations(positions), offset_sigmas=COMMON_M[None])
 
 

@@ -127,7 +127,7 @@ def adjusted_frame(frame: Frame, found: AdjustedPositions) -> Frame:
         "rmse_vertical_m": float(rms[2]),
         "rmse_m": float(np.sqrt((rms**2).sum())),
         "photos_used": len(errors),
-        "over_stated_sigmas": float(np.sqrt((done.noise.factors[0][[0, 0, 1]] ** 2).mean())),
+        "over_stated_sigmas": float(np.sqrt((done.noise.factors[done.noise.main][[0, 0, 1]] ** 2).mean())),
         "sigma_scale_percent": 100.0 * uncertainty.scale,
         "sigma_rotation_deg": math.degrees(uncertainty.weakest_rad),
         "uncertainty": uncertainty.as_json(),
@@ -151,7 +151,7 @@ def uncertainty_of_block(done: PositionAdjustment) -> Uncertainty:
     ground = np.median(done.accuracy.ground_sigmas(), axis=0) if len(done.accuracy.points) else np.zeros(3)
     noise = done.noise
     hidden = noise.offset_sigmas(done.positions, 0.0)[0]
-    equivalent = ReceiverNoise(noise.factors[0], noise.white_correlations(), noise.degrees[0])
+    equivalent = ReceiverNoise(noise.factors[noise.main], noise.white_correlations(), noise.degrees[noise.main])
     return Uncertainty(
         offset_m=np.array(cameras["offset_m"]),
         north_rad=cameras["north_rad"],

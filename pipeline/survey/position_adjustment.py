@@ -29,6 +29,7 @@ from splatpipe.pipeline.survey.position_noise import (
     predicted_errors,
     settled_noise,
     strip_pieces,
+    with_drift_of,
 )
 from splatpipe.pipeline.survey.tie_points import (
     MIN_SIGMA_PX,
@@ -360,7 +361,7 @@ def _noise_of(adjusted: AdjustedBlock, positions: StatedPositions) -> PositionNo
             factors[at] += count * found.factors[own] ** 2
             weights[at] += count
     mean = np.sqrt(np.where(weights[:, None] > 0.0, factors / np.maximum(weights, 1.0)[:, None], 1.0))
-    return replace(every, factors=mean, shares=noise.shares, correlations=noise.correlations)
+    return with_drift_of(replace(every, factors=mean), noise)
 
 
 def _judged(

@@ -87,16 +87,21 @@ class PositionNoise:
         of: Class of each position.
         factors: (c, 2) standard deviations over the stated ones, horizontally and in height.
         degrees: (c, 2) degrees of freedom behind them.
-        shares: (2,) of the variance that drifts.
-        correlations: (2,) of the drift from one photo to the next.
+        shares: (c, 2) of the variance that drifts.
+        correlations: (c, 2) of the drift from one photo of a class to its next.
     """
 
     classes: tuple[str, ...]
     of: Int64[np.ndarray, " k"]
     factors: Float64[np.ndarray, "c 2"]
     degrees: Float64[np.ndarray, "c 2"]
-    shares: Float64[np.ndarray, " 2"]
-    correlations: Float64[np.ndarray, " 2"]
+    shares: Float64[np.ndarray, "c 2"]
+    correlations: Float64[np.ndarray, "c 2"]
+
+    @property
+    def main(self) -> int:
+        """The class with the most positions."""
+        return int(np.argmax(np.bincount(self.of, minlength=len(self.classes))))
 
     def sizes(self, positions: StatedPositions) -> Float64[np.ndarray, "k 3"]:
         """Standard deviation of each coordinate, metres."""
@@ -105,7 +110,8 @@ class PositionNoise:
     def white_correlations(self) -> Float64[np.ndarray, " 2"]:
         """Correlations of first-order processes whose mean over many photos is as uncertain, horizontally and in
         height."""
-        times = 1.0 - self.shares + self.shares * (1.0 + self.correlations) / (1.0 - self.correlations)
+        share, correlation = self.shares[self.main], self.correlations[self.main]
+        times = 1.0 - share + share * (1.0 + correlation) / (1.0 - correlation)
         return np.asarray((times - 1.0) / (times + 1.0))
 
     def precision(self, positions: StatedPositions) -> Float64[np.ndarray, "3 k k"]:
@@ -113,7 +119,7 @@ class PositionNoise:
         sizes = self.sizes(positions)
         result = []
         for half, axes in enumerate(AXES):
-            inverse = _inverse_pattern(positions, float(self.shares[half]), float(self.correlations[half]))
+            inverse = _inverse_pattern(positions, self.of, self.shares[:, half], self.correlations[:, half])
             result += [inverse / np.outer(sizes[:, axis], sizes[:, axis]) for axis in axes]
         return np.stack(result)
 
@@ -149,7 +155,7 @@ def as_stated(positions: StatedPositions) -> PositionNoise:
     classes = (*large, *(["others"] if len(large) < len(counts) else []))
     of = np.array([classes.index(name) if name in large else len(classes) - 1 for name in names], dtype=np.int64)
     ones = np.ones((len(classes), 2))
-    return PositionNoise(classes, of, ones, ones, np.zeros(2), np.zeros(2))
+    return PositionNoise(classes, of, ones, ones, np.zeros_like(ones), np.zeros_like(ones))
 
 
 @dataclass(frozen=True)
@@ -195,7 +201,7 @@ def settled_noise(
 ) -> PositionNoise:
     """Estimate the factors of positions whose drift is known from others."""
     errors = block.centres[positions.photo] - positions.stated
-    start = replace(as_stated(positions), shares=drift.shares, correlations=drift.correlations)
+    start = with_drift_of(as_stated(positions), drift)
     return _settled(system, errors, positions, start)
 
 
@@ -203,7 +209,9 @@ def estimate_noise(system: CentreSystem, block: Block, positions: StatedPosition
     """Estimate the noise from what the photos say of the centres."""
     errors = block.centres[positions.photo] - positions.stated
     noise = as_stated(positions)
-    noise = replace(noise, shares=np.full(2, USUAL[0]), correlations=np.full(2, USUAL[1]))
+    noise = replace(
+        noise, shares=np.full_like(noise.shares, USUAL[0]), correlations=np.full_like(noise.shares, USUAL[1])
+    )
     noise = _settled(system, errors, positions, noise)
     if len(positions) < MIN_CLASS:
         return noise
@@ -225,7 +233,8 @@ def find_blunders(
     errors = block.centres[positions.photo] - positions.stated
     weights = np.ones(len(positions))
     typical = np.ones(len(noise.classes))
-    plain = replace(noise, shares=np.zeros(2), correlations=np.zeros(2), factors=np.ones_like(noise.factors))
+    none = np.zeros_like(noise.shares)
+    plain = replace(noise, shares=none, correlations=none, factors=np.ones_like(noise.factors))
     normed = np.ones(len(positions))
     for _ in range(ROBUST_ROUNDS):
         scaled = replace(positions, sigmas=positions.sigmas * typical[noise.of][:, None] / np.sqrt(weights)[:, None])
@@ -283,23 +292,40 @@ def strip_pieces(positions: StatedPositions, length: int = 4, sets: int = 3) -> 
     return [np.asarray(place % sets == k) for k in range(sets)]
 
 
-def _inverse_pattern(positions: StatedPositions, share: float, correlation: float) -> Float64[np.ndarray, "k k"]:
-    """Inverse of the errors' correlations: along a flight, none between flights."""
+def _inverse_pattern(
+    positions: StatedPositions,
+    of: Int64[np.ndarray, " k"],
+    shares: Float64[np.ndarray, " c"],
+    correlations: Float64[np.ndarray, " c"],
+) -> Float64[np.ndarray, "k k"]:
+    """Inverse of the errors' correlations: along a flight for positions of one class, none otherwise."""
     inverse = np.eye(len(positions))
-    if share == 0.0:
-        return inverse
     for group in np.unique(positions.group).tolist():
-        members = np.flatnonzero(positions.group == group)
-        for piece in np.array_split(members, -(-len(members) // MAX_CHAIN)):
-            order = np.arange(len(piece))
-            drift = correlation ** np.abs(order[:, None] - order[None, :])
-            inverse[np.ix_(piece, piece)] = np.linalg.inv((1.0 - share) * np.eye(len(piece)) + share * drift)
+        for kind in np.unique(of).tolist():
+            members = np.flatnonzero((positions.group == group) & (of == kind))
+            if shares[kind] == 0.0 or len(members) == 0:
+                continue
+            for piece in np.array_split(members, -(-len(members) // MAX_CHAIN)):
+                order = np.arange(len(piece))
+                drift = correlations[kind] ** np.abs(order[:, None] - order[None, :])
+                pattern = (1.0 - shares[kind]) * np.eye(len(piece)) + shares[kind] * drift
+                inverse[np.ix_(piece, piece)] = np.linalg.inv(pattern)
     return inverse
+
+
+def with_drift_of(noise: PositionNoise, other: PositionNoise) -> PositionNoise:
+    """A noise whose classes drift as those of the same name do in another one, or as usual."""
+    shares, correlations = np.full_like(noise.shares, USUAL[0]), np.full_like(noise.shares, USUAL[1])
+    for place, name in enumerate(noise.classes):
+        if name in other.classes:
+            there = other.classes.index(name)
+            shares[place], correlations[place] = other.shares[there], other.correlations[there]
+    return replace(noise, shares=shares, correlations=correlations)
 
 
 def _with_drift(noise: PositionNoise, half: int, share: float, correlation: float) -> PositionNoise:
     shares, correlations = noise.shares.copy(), noise.correlations.copy()
-    shares[half], correlations[half] = share, correlation
+    shares[noise.main, half], correlations[noise.main, half] = share, correlation
     return replace(noise, shares=shares, correlations=correlations)
 
 
