@@ -30,7 +30,7 @@ from splatpipe.pipeline.survey.boundary import lay_boundary
 from splatpipe.pipeline.survey.control import ControlResult, place_by_control
 from splatpipe.pipeline.survey.crs import parse_vertical
 from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.frames import Frame, save_frame
+from splatpipe.pipeline.survey.frames import Frame, Undetermined, save_frame
 from splatpipe.pipeline.survey.georef_input import GeorefInput
 from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit, report_frame
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
@@ -87,40 +87,43 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         load_finds(inputs["targets.found"]),
         model,
         photos,
-        None if isinstance(frame, str) else frame,
+        frame if isinstance(frame, Frame) else None,
         config.approximate_crs,
     )
     survey, scale = _survey(targets, inputs, config, report)
     if survey is not None and any(point.sightings for point in survey.points):
         try:
-            controlled = place_by_control(survey, capture, None if isinstance(frame, str) else frame, config, report)
+            known = frame if isinstance(frame, Frame) else None
+            controlled = place_by_control(survey, capture, known, config, report)
         except FrameUndeterminedError as error:
-            frame = str(error) if isinstance(frame, str) else frame
+            frame = frame if isinstance(frame, Frame) else Undetermined(str(error))
             report.warning(
                 f"Control cannot georeference the model: {error}.", "Mark more control points, each in several photos."
             )
     if controlled is not None:
         frame = controlled.frame
-    if isinstance(frame, str) and scale is not None:
-        frame = scaled(arbitrary_frame(model, positions, frame), scale)
+    if isinstance(frame, Undetermined) and scale is not None:
+        frame = scaled(arbitrary_frame(model, positions, frame.why), scale)
         report.note(frame.note)
     elif scale is not None and isinstance(frame, Frame):
         compare(frame, scale, report)
-    if isinstance(frame, str):
-        report.warning(f"Arbitrary scale: {frame}.", "Lengths and heights in this result are not in metres.")
-        frame = arbitrary_frame(model, positions, frame)
+    if isinstance(frame, Undetermined):
+        report.warning(f"Arbitrary scale: {frame.why}.", "Lengths and heights in this result are not in metres.")
+        frame = arbitrary_frame(model, positions, frame.why)
     frame = _declared(frame, config, controlled)
     placed_points = (controlled.placed.model if controlled is not None else model).points
     bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
     control, accuracy = _accuracy(config, controlled, (model, positions, frame), photos, report)
+    adjustment = {} if found is None else adjustment_json(found, accuracy["gsd_m"])
     if controlled is not None and controlled.block is not None:
-        accuracy["adjustment"] = controlled.block
-    elif found is not None:
-        accuracy["adjustment"] = adjustment_json(found, accuracy["gsd_m"])
-        _report_adjustment(accuracy["adjustment"], report)
-        if controlled is None:
-            frame = with_adjustment(frame, accuracy["adjustment"])
-            accuracy["uncertainty"] = frame.residuals["uncertainty"]
+        bent = controlled.adjusted is not None or adjustment.get("adopted", False)
+        adjustment |= {**controlled.block, "adopted": bent}
+    if adjustment:
+        accuracy["adjustment"] = adjustment
+        _report_adjustment(adjustment, report)
+    if found is not None and controlled is None:
+        frame = with_adjustment(frame, adjustment)
+        accuracy["uncertainty"] = frame.residuals["uncertainty"]
     save_frame(frame, out / "frame.json")
     accuracy |= scale_json(targets.wanted.bars, scale, frame)
     for name, value in (("control.json", control), ("accuracy.json", accuracy)):
@@ -152,13 +155,15 @@ def _survey(
     return survey, scale_of(targets, found, marked, report)
 
 
-def _by_positions(config: GeorefConfig, capture: GeorefInput, report: Reporter) -> tuple[Frame | str, GeorefInput]:
-    """Return the frame by positions, or the reason why there is none, and the capture, adjusted to accurate ones."""
+def _by_positions(
+    config: GeorefConfig, capture: GeorefInput, report: Reporter
+) -> tuple[Frame | Undetermined, GeorefInput]:
+    """Return the frame by positions, if they determine one, and the capture, adjusted to accurate ones."""
     model, positions, photos = capture.model, capture.positions, capture.photos
     try:
         frame, fit = georeference(model, positions, config.max_position_error_m, photos)
     except FrameUndeterminedError as error:
-        return str(error), capture
+        return Undetermined(str(error)), capture
     found = adjust_model(capture, frame, report) if config.adjust == "auto" else None
     if found is None or not found.adopted:
         report_fit(frame, fit, model, positions, report)
@@ -253,7 +258,8 @@ def _flight_offsets(frame: Frame, flights: tuple[int, ...]) -> np.ndarray:
 
 def _report_adjustment(adjustment: JSON, report: Reporter) -> None:
     """Report how well positions that the fit did not use are predicted, and what the ground's heights are worth."""
-    report.note(f"{adjustment['sentence'][0].upper()}{adjustment['sentence'][1:]}.")
+    if "sentence" in adjustment:
+        report.note(f"{adjustment['sentence'][0].upper()}{adjustment['sentence'][1:]}.")
     sentence = (adjustment["heights"] or {}).get("sentence")
     if sentence:
         heights, _, remedy = sentence.partition("; ")

@@ -51,17 +51,21 @@ def adjust_model(capture: GeorefInput, frame: Frame, report: Reporter) -> Adjust
         return None
     names, observed = stated
     suspects = np.array([name in frame.left_out for name in names])
-    done = adjust_to_positions(
-        model.reconstruction,
-        frame.world_from_model,
-        model.image_ids,
-        observed,
-        names,
-        suspects,
-        capture.lenses,
-        lenses_held=capture.lenses_held,
-        poll=lambda step, steps: report.progress(step, steps, "adjusting to the positions", "steps"),
-    )
+    try:
+        done = adjust_to_positions(
+            model.reconstruction,
+            frame.world_from_model,
+            model.image_ids,
+            observed,
+            names,
+            suspects,
+            capture.lenses,
+            lenses_held=capture.lenses_held,
+            poll=lambda step, steps: report.progress(step, steps, "adjusting to the positions", "steps"),
+        )
+    except np.linalg.LinAlgError as error:
+        report.warning(f"The positions place the model, but cannot adjust it: {error}.", "Is the sparse model sound?")
+        return None
     sizes = np.median(done.noise.sizes(done.positions), axis=0)
     if not done.adjusted.settled or float(sizes.max()) > ACCURATE_M:
         return None  # not what they are stated to be: the similarity says so

@@ -162,14 +162,25 @@ def solve(normal: Normal, right: Float64[np.ndarray, r * k]) -> Float64[np.ndarr
     sizes = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = normal / sizes[:, None] / sizes[None, :]
     scale = sizes if right.ndim == 1 else sizes[:, None]
+    factor = factorised(scaled)
+    return np.asarray(scipy.linalg.cho_solve((factor, True), right / scale, check_finite=False) / scale)
+
+
+def factorised(scaled: Float64[np.ndarray, "r r"]) -> Float64[np.ndarray, "r r"]:
+    """Lower Cholesky factor of a matrix with ones on its diagonal; the diagonal is raised where rounding demands it.
+
+    Raises:
+        np.linalg.LinAlgError: if it is not finite.
+    """
     ridge = 0.0
-    while True:
+    while ridge < 1.0:
         try:
-            factor = scipy.linalg.cho_factor(scaled + ridge * np.eye(len(scaled)), check_finite=False)
+            return np.asarray(scipy.linalg.cholesky(scaled + ridge * np.eye(len(scaled)), lower=True))
         except np.linalg.LinAlgError:
             ridge = max(100.0 * ridge, 1e-13)
-            continue
-        return np.asarray(scipy.linalg.cho_solve(factor, right / scale, check_finite=False) / scale)
+        except ValueError:
+            break
+    raise np.linalg.LinAlgError("the normal equations are not finite")
 
 
 def _solve_sparse(normal: scipy.sparse.csr_array, right: Float64[np.ndarray, r * _]) -> Float64[np.ndarray, r * _]:

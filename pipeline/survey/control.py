@@ -212,7 +212,11 @@ def _without_one(
 
 def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> ControlResult:
     """Return the result with the adjusted model, if the adjustment moves the images' content noticeably."""
-    settled = _settle(result, capture, config, report)
+    try:
+        settled = _settle(result, capture, config, report)
+    except np.linalg.LinAlgError as error:
+        report.warning(f"Control places the model, but cannot adjust it: {error}.", "Is the sparse model sound?")
+        return result
     survey, done, factor = settled.survey, settled.done, settled.factor
     if not done.usable:
         report.warning(

@@ -24,6 +24,7 @@ __all__ = [
     "Origin",
     "Similarity",
     "SimilarityFit",
+    "Undetermined",
     "ecef_from_geodetic",
     "geodetic_from_ecef",
     "load_frame",
@@ -69,6 +70,17 @@ class Frame:
     def in_metres(self) -> bool:
         """Whether lengths are metres."""
         return self.origin is not None or self.metres
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """A frame that neither positions nor control determine.
+
+    Attributes:
+        why: The reason, a sentence without its full stop.
+    """
+
+    why: str
 
 
 def save_frame(frame: Frame, path: Path) -> None:

@@ -17,7 +17,7 @@ import scipy.linalg
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.survey.block import Block, ReducedBlock
-from splatpipe.pipeline.survey.block_adjustment import PositionObservations, solve
+from splatpipe.pipeline.survey.block_adjustment import PositionObservations, factorised, solve
 
 AXES = ((0, 1), (2,))  # east and north; up
 USUAL = (
@@ -370,8 +370,7 @@ def _fit(
     normal, gradient, observed = _system_with(system, errors, positions, noise)
     size = len(system.gradient)
     sizes = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal / np.outer(sizes, sizes) + 1e-13 * np.eye(len(normal))
-    factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
+    factor = factorised(normal / np.outer(sizes, sizes) + 1e-13 * np.eye(len(normal)))
     covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(normal)), check_finite=False)
     covariance = covariance / np.outer(sizes, sizes)
     step = -covariance @ gradient
