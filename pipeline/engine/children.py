@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.python_module import python_module
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 POLL_S = 0.2
@@ -63,7 +64,7 @@ def run_children(commands: Sequence[Sequence[str]], poll: Callable[[], None], wh
     peak = 0
     try:
         for module, *arguments in commands:
-            command = [sys.executable, "-m", module, str(os.getpid()), *arguments]
+            command = python_module(module, str(os.getpid()), *arguments)
             child = subprocess.Popen(command, stdin=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD})
             running[child.pid] = child
         while running:

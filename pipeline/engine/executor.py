@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import IO
 
 from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, StageError, StopSignal
 from splatpipe.pipeline.engine.events import Event, Sink
+from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.worker import Task, peak_memory_of
 
@@ -118,7 +118,7 @@ class Executor:
     def _spawn(self, log: IO[str]) -> subprocess.Popen[str]:
         try:
             return subprocess.Popen(
-                [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())],
+                python_module("splatpipe.pipeline.engine.worker", str(os.getpid())),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,

@@ -20,6 +20,7 @@ from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.line import Line
 from splatpipe.pipeline.engine.lock import locked, locked_shard
 from splatpipe.pipeline.engine.needs import ForecastFunction, no_forecasts
+from splatpipe.pipeline.engine.python_module import SAFE_PATH
 from splatpipe.pipeline.engine.run_folder import CONFIG_FILE, EVENTS_FILE, LOG_FILE, shard_events
 from splatpipe.pipeline.engine.runner import Runner
 from splatpipe.pipeline.engine.source import open_source
@@ -144,6 +145,7 @@ def _worker_environment(threads: int) -> dict[str, str]:
         "MKL_NUM_THREADS": str(threads),
         "OMP_WAIT_POLICY": "PASSIVE",
         "PYTHONHASHSEED": "0",
+        **SAFE_PATH,
     }
 
 

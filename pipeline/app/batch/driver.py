@@ -32,6 +32,7 @@ from splatpipe.pipeline.app.report.wording import roughly
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, StopSignal, UsageError, exit_code
 from splatpipe.pipeline.engine.lock import locked
+from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.store import write_error
 from splatpipe.stages.line import LINE
@@ -257,7 +258,7 @@ def _guarded(call: Call, lock: int) -> Iterator[Callable[[JSON], None]]:
         A function that sends the guard a message.
     """
     guard = subprocess.Popen(
-        [sys.executable, "-m", "splatpipe.pipeline.app.batch.guard", str(call.folder)],
+        python_module("splatpipe.pipeline.app.batch.guard", str(call.folder)),
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

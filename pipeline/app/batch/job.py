@@ -27,11 +27,12 @@ from splatpipe.pipeline.app.command_summary import PART_VARIABLE
 from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.engine.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
+from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
 from splatpipe.pipeline.engine.stage import JSON, stage_name
 from splatpipe.stages.line import LINE
 
-SPLATPIPE = (sys.executable, "-m", "splatpipe.pipeline.app.cli")
+SPLATPIPE = tuple(python_module("splatpipe.pipeline.app.cli"))
 RESERVE_BYTES = 256 << 20  # of the disk, reserved for what other captures' stages write at the same time
 
 

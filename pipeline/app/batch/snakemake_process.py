@@ -14,7 +14,6 @@ import re
 import runpy
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,6 +25,7 @@ from splatpipe.pipeline.app.batch.plan import MEGABYTE, BatchPlan, Call
 from splatpipe.pipeline.app.batch.workflow import SNAKEFILE
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
+from splatpipe.pipeline.engine.python_module import SAFE_PATH, python_module
 
 END_PATIENCE_S = 8.0  # a run ends within five seconds and Docker kills after ten
 POLL_S = 0.05
@@ -86,7 +86,7 @@ def require_snakemake() -> None:
 
 def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str]:
     """The command that runs a call's workflow."""
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.batch.snakemake_process"]
+    command = python_module("splatpipe.pipeline.app.batch.snakemake_process")
     command += ["--snakefile", str(call.folder / SNAKEFILE)]
     command += ["--directory", str(call.folder), "--nolock", "--keep-going", "--nocolor"]
     command += ["--retries", str(plan.retries), "--scheduler", "greedy", "--rerun-triggers", "input"]
@@ -107,7 +107,7 @@ def snakemake_environment(call: Call) -> dict[str, str]:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SNAKEMAKE_")}
     # Snakemake does not start without HOME and a user name, which an arbitrary container user lacks.
     nobody = {"HOME": str(call.folder), "LOGNAME": f"user-{os.getuid()}"}
-    return {**nobody, **environment, "XDG_CACHE_HOME": str(call.folder / "cache")}
+    return {**nobody, **environment, **SAFE_PATH, "XDG_CACHE_HOME": str(call.folder / "cache")}
 
 
 def start_snakemake(call: Call, plan: BatchPlan, profile: Profile) -> subprocess.Popen[bytes]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.plan import SHARDS_FOLDER, BatchPlan, Call
 from splatpipe.pipeline.app.batch.shards import counts_shards
+from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.stage import JSON, Stage, stage_name
 
 SNAKEFILE = "Snakefile"
@@ -91,7 +91,7 @@ def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
     }
     done = f"done-{plan.began_s:.3f}"  # storage that outlives the call still has those of earlier calls
     wanted = {name for stages_of in jobs.values() for name in stages_of}
-    words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder)]
+    words = python_module("splatpipe.pipeline.app.batch.job", str(call.folder))
     job = shlex.join(words).encode("unicode_escape").decode("ascii")  # as in a Python string literal
     job = job.replace('"', '\\"').replace("{", "{{").replace("}", "}}")
     rules, divided = [], False

@@ -7,7 +7,6 @@ there can neither fail a good run nor delay its end, and the command need not lo
 from __future__ import annotations
 
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import IO
 from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.heap import importing
+from splatpipe.pipeline.engine.python_module import python_module
 
 REPORT_FILE = "report.html"
 PATIENCE_S = 600.0  # far more than hundreds of photos take
@@ -61,13 +61,8 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     Raises:
         MachineError: if it could not be written.
     """
-    command = [
-        sys.executable,
-        "-m",
-        "splatpipe.pipeline.app.report",
-        str(out),
-        *([] if until_s is None else ["--hurry"]),
-    ]
+    hurry = [] if until_s is None else ["--hurry"]
+    command = python_module("splatpipe.pipeline.app.report", str(out), *hurry)
     path = out / REPORT_FILE
     before = _stamp(path)
     began_s = time.monotonic()
