@@ -24,9 +24,10 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic, utm_of
 from splatpipe.pipeline.survey.geodesy import ecef_from_geodetic
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Stations, locate_survey, observed_in
+from splatpipe.pipeline.survey.located_points import SurveyPoint
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.surveyed_points import Survey, SurveyPoint
+from splatpipe.pipeline.survey.surveyed_points import Survey
 
 FAR_M = 2000.0  # from the photos; control that they show must be nearer
 DATUM_M = 20.0  # a larger horizontal offset from the positions (and DATUM_SIGMAS) means another datum

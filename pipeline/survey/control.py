@@ -32,10 +32,11 @@ from splatpipe.pipeline.survey.local_survey import (
     stations_of,
     with_sigmas_times,
 )
+from splatpipe.pipeline.survey.located_points import locate
 from splatpipe.pipeline.survey.model import model_of
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens, simple_lens
-from splatpipe.pipeline.survey.surveyed_points import Survey, locate
+from splatpipe.pipeline.survey.surveyed_points import Survey
 from splatpipe.pipeline.survey.tie_points import MIN_SIGMA_PX, block_of, sizes_of, spread_points, tie_sigma, tie_table
 
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if control deforms the model by less, it is not adjusted
