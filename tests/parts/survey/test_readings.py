@@ -1,15 +1,15 @@
 """Control files written by another convention: named where it can be tested, and never used in silence."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from surveyed import HEIGHT, POINTS, TRUTH, WIDTH, Row, gcp_list, positions, rows, true_model
-from test_control import RTK, Notes, georef
+from surveyed import HEIGHT, POINTS, TRUTH, WIDTH, Row, capture_parts, gcp_list, positions, rows, true_model
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.sfm.sparse_model import write_model
 from splatpipe.pipeline.survey.coordinate_readings import SHAPES, nearer_reading, shape_reading
@@ -18,17 +18,47 @@ from splatpipe.pipeline.survey.model import SparseModel, read_model
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.readings import Evidence, Reading, plausible
 from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
+from splatpipe.stages.georef import run
 
 PHOTOS = {photo["name"]: Photo(photo["name"], "0" * 64, WIDTH, HEIGHT, 0) for photo in TRUTH["photos"]}
 ALL = rows(tuple(POINTS))
 PLANE = np.array([POINTS[name]["utm_m"][:2] for name in POINTS])
 STATED = np.array([[r["latitude"], r["longitude"], r["altitude_m"]] for r in positions("gps", (3.0, 5.0))])
 UTM = parse_crs("EPSG:32633")
+ZONE_IN_FRONT = np.array([33e6, 0.0])
+
+
+@dataclass
+class Notes:
+    """A reporter that records."""
+
+    warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None: ...
+
+    def metric(self, name: str, value: int | float, step: int | None = None) -> None: ...
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+    def warning(self, message: str, hint: str = "") -> None:
+        self.warnings.append(f"{message} {hint}")
+
+
+def georef(folder: Path, lift: float = 0.0, **options: str | bool) -> Notes:
+    """The notes of georeferencing by five points and RTK positions that are lifted against them."""
+    control = gcp_list(rows(("P01", "P03", "P05", "P07", "P16")))
+    parts = capture_parts(folder, true_model(points=300), positions("rtk", (0.02, 0.03), lift), control)
+    (folder / "out").mkdir()
+    notes = Notes()
+    run(GeorefConfig(adjust="off", **options), Inputs(parts, folder / "photos"), folder / "out", notes)
+    return notes
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> SparseModel:
-    folder = tmp_path_factory.mktemp("model")
+    folder = tmp_path_factory.mktemp("capture") / "model"
     write_model(true_model(points=300), folder)
     return read_model(folder, PHOTOS)
 
@@ -59,7 +89,7 @@ def test_marks_by_another_convention_stop_control_which_names_it(
     tmp_path: Path, model: SparseModel, written: Callable[[float, float], tuple[float, float]], cause: str
 ) -> None:
     lines = [replace(row, pixel=written(*row.pixel)) for row in ALL]
-    with pytest.raises(SplatpipeError, match="contradict each other|outside their photos") as caught:
+    with pytest.raises(SplatpipeError, match=r"contradict each other|outside their photos") as caught:
         load(tmp_path, model, lines)
     assert cause in caught.value.hint
     assert "georef.control=none" in caught.value.hint
@@ -97,9 +127,9 @@ def test_names_that_lost_their_leading_zeros_are_said_to_have(tmp_path: Path, mo
 @pytest.mark.parametrize(
     ("xy", "crs", "cause"),
     [
-        (PLANE + [33e6, 0.0], "EPSG:32633", "zone number in front of the eastings (33)"),
+        (PLANE + ZONE_IN_FRONT, "EPSG:32633", "zone number in front of the eastings (33)"),
         (PLANE[:, ::-1], "EPSG:32633", "swapped"),
-        (PLANE[:, ::-1] + [0.0, 33e6], "EPSG:32633", "swapped and without the zone number"),
+        ((PLANE + ZONE_IN_FRONT)[:, ::-1], "EPSG:32633", "swapped and without the zone number"),
         (PLANE / 0.3048, "EPSG:32633", "in feet"),
         (PLANE * 3937.0 / 1200.0, "EPSG:32633", "in feet"),
         (PLANE * [1.0, -1.0], "EPSG:32633", "sign of the second"),
@@ -119,7 +149,7 @@ def test_coordinates_far_from_the_photos_are_read_as_what_brings_them_there(
 
 def test_coordinates_without_positions_are_read_by_their_area_and_sound_ones_are_not() -> None:
     nowhere = np.zeros((0, 3))
-    assert "zone number in front" in nearer_reading(PLANE + [33e6, 0.0], UTM, nowhere)
+    assert "zone number in front" in nearer_reading(PLANE + ZONE_IN_FRONT, UTM, nowhere)
     assert "swapped" in nearer_reading(PLANE[:, ::-1], UTM, nowhere)
     assert nearer_reading(PLANE, UTM, STATED) == nearer_reading(PLANE, UTM, nowhere) == ""
 
@@ -166,22 +196,18 @@ def test_swapped_file_in_a_datum_apart_is_told_of_its_place() -> None:
         to_geodetic(np.ascontiguousarray(place[:, [1, 0, 2]]), crs, True)
 
 
+@pytest.mark.parametrize(
+    ("lift", "pole", "geoid"), [(-2.0, True, False), (47.0, False, True), (-105.0, False, True), (0.0, False, False)]
+)
 def test_heights_a_pole_above_accurate_positions_are_reported_and_a_geoid_is_named_as_possible(
-    tmp_path: Path,
+    tmp_path: Path, lift: float, pole: bool, geoid: bool
 ) -> None:
-    whole, five = true_model(points=300), ("P01", "P03", "P05", "P07", "P16")
-    for name, lift, pole, geoid in (
-        ("pole", -2.0, True, False),
-        ("geoid", 47.0, False, True),
-        ("same", 0.0, False, False),
-    ):
-        done = georef(tmp_path / name, whole, gcp_list(rows(five)), RTK, lift=lift, adjust="off")
-        assert any("Was a pole of that length" in text for text in done.notes.warnings) == pole, name
-        assert any("possibly one is above the geoid" in text for text in done.notes.notes) == geoid, name
+    told = georef(tmp_path, lift)
+    assert any("Was a pole of that length" in text for text in told.warnings) == pole
+    assert any("possibly one is above the geoid" in text for text in told.notes) == geoid
 
 
 @pytest.mark.parametrize(("crs", "told"), [("EPSG:5513", True), ("EPSG:5514", False)])
 def test_crs_that_counts_west_is_told_to_be_unsuitable_for_rasters(tmp_path: Path, crs: str, told: bool) -> None:
-    five = ("P01", "P03", "P05", "P07", "P16")
-    done = georef(tmp_path, true_model(points=300), gcp_list(rows(five)), adjust="off", crs=crs, approximate_crs=True)
-    assert any(f"{crs} " in text and "EPSG:32633" in text for text in done.notes.warnings) == told
+    done = georef(tmp_path, crs=crs, approximate_crs=True)
+    assert any(f"{crs} " in text and "EPSG:32633" in text for text in done.warnings) == told
