@@ -74,7 +74,7 @@ def _rewritten(stated: Plane, crs: Crs, place: Float64[np.ndarray, " 3"] | None)
     """Readings of coordinates in a CRS; the order of two is part of most."""
     for swapped in (False, True):
         xy = stated[:, ::-1] if swapped else stated
-        order = "with its first two coordinates swapped" if swapped else ""
+        order = "with its first two coordinates swapped (east comes first)" if swapped else ""
 
         def as_(how: str, changed: Plane, order: str = order, swapped: bool = swapped) -> _Rewritten:
             return _Rewritten(" and ".join(filter(None, (order, how))), changed, swapped + bool(how))

@@ -129,7 +129,7 @@ def test_names_that_lost_their_leading_zeros_are_said_to_have(tmp_path: Path, mo
     [
         (PLANE + ZONE_IN_FRONT, "EPSG:32633", "zone number in front of the eastings (33)"),
         (PLANE[:, ::-1], "EPSG:32633", "swapped"),
-        ((PLANE + ZONE_IN_FRONT)[:, ::-1], "EPSG:32633", "swapped and without the zone number"),
+        ((PLANE + ZONE_IN_FRONT)[:, ::-1], "EPSG:32633", "swapped (east comes first) and without the zone number"),
         (PLANE / 0.3048, "EPSG:32633", "in feet"),
         (PLANE * 3937.0 / 1200.0, "EPSG:32633", "in feet"),
         (PLANE * [1.0, -1.0], "EPSG:32633", "sign of the second"),
