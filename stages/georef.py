@@ -51,7 +51,7 @@ from splatpipe.pipeline.survey.target_survey import (
     scale_summary,
     scaled,
 )
-from splatpipe.pipeline.survey.world import in_crs
+from splatpipe.pipeline.survey.world import in_crs, report_map_crs
 
 DATUM_STEP_M = 1.0  # least offset that suggests another vertical datum; less may be the receiver's error
 
@@ -110,7 +110,7 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     if isinstance(frame, Undetermined):
         report.warning(f"Arbitrary scale: {frame.why}.", "Lengths and heights in this result are not in metres.")
         frame = arbitrary_frame(model, positions, frame.why)
-    frame = _declared(frame, config, controlled)
+    frame = _declared(frame, config, controlled, report)
     placed_points = (controlled.placed.model if controlled is not None else model).points
     bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
     control, accuracy = _accuracy(config, controlled, (model, positions, frame), photos, report)
@@ -174,12 +174,14 @@ def _by_positions(
     return frame, replace(capture, model=model, adjusted=found)
 
 
-def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | None) -> Frame:
+def _declared(frame: Frame, config: GeorefConfig, controlled: ControlResult | None, report: Reporter) -> Frame:
     """Return the frame with the declared CRS and vertical datum."""
     stated = controlled.survey.crs.text if controlled is not None else ""
     if controlled is None and config.vertical != "auto":
         frame = replace(frame, vertical_datum=parse_vertical(config.vertical))
-    return in_crs(frame, config.crs, stated, config.approximate_crs)
+    frame = in_crs(frame, config.crs, stated, config.approximate_crs)
+    report_map_crs(frame, asked=config.crs != "auto", report=report)
+    return frame
 
 
 def _lens_knowledge(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from pathlib import PurePath, PurePosixPath
 
@@ -70,6 +71,11 @@ def _last(name: str) -> str:
 def _without_suffix(name: str) -> str:
     stem, dot, suffix = _folded(name).rpartition(".")
     return stem if dot and suffix in PHOTO_SUFFIXES else _folded(name)
+
+
+def without_zeros(name: str) -> str:
+    """A name whose numbers have lost their leading zeros, as in a spreadsheet's column of numbers."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", name)
 
 
 NAMES_SHOWN = 10  # in one message; left_out.json lists them all

@@ -25,6 +25,7 @@ from splatpipe.pipeline.survey.crs import (
     describe_vertical,
     open_operation,
     same_datum,
+    usable_for_maps,
     utm_of,
 )
 from splatpipe.pipeline.survey.frames import Frame
@@ -114,8 +115,7 @@ def unit_name(unit_m: float) -> str:
 
 def _plane(world: World) -> World:
     """The same world in a projected CRS whose first axis does not point west."""
-    directions = [axis.direction for axis in world.crs.horizontal.axis_info[:2]]
-    if not world.crs.is_geographic and "west" not in directions:
+    if usable_for_maps(world.crs):
         return world
     latitude, longitude = world.origin.latitude, world.origin.longitude
     crs = utm_of(latitude, longitude)

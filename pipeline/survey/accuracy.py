@@ -12,9 +12,10 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.local_survey import LocalSurvey
+from splatpipe.pipeline.survey.located_points import Sighting, residual_px
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.residuals import accuracy_table
-from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, residual_px
+from splatpipe.pipeline.survey.surveyed_points import Survey
 
 
 @dataclass(frozen=True)

@@ -21,17 +21,21 @@ from splatpipe.pipeline.geometry.joint_fit import (
     studentised,
 )
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic, utm_of
+from splatpipe.pipeline.survey.coordinate_readings import FAR_M, nearer_reading, shape_reading
 from splatpipe.pipeline.survey.geodesy import ecef_from_geodetic
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Stations, locate_survey, observed_in
+from splatpipe.pipeline.survey.located_points import SurveyPoint
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.surveyed_points import Survey, SurveyPoint
+from splatpipe.pipeline.survey.surveyed_points import Survey
 
-FAR_M = 2000.0  # from the photos; control that they show must be nearer
 DATUM_M = 20.0  # a larger horizontal offset from the positions (and DATUM_SIGMAS) means another datum
 DATUM_SIGMAS = 5.0
+EXACT_M = 0.5  # sigma of positions that also tell a pole's length and another base station
+EXACT_DATUM_M = 0.3  # least offset from them that is worth a word
+POLES_M = (1.0, 3.0)  # lengths of poles
 DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
+GEOIDS_M = (-110.0, 90.0)  # of geoids above the ellipsoid
 SWAPPED_SHARE = 0.3  # largest share of two points' errors that remains if swapping their names explains them
 WEAK = 4.0  # model uncertainty over the control's own accuracy that is worth a warning
 MIN_GSD = 3.0  # errors below this many ground pixels are not worth a message
@@ -158,11 +162,64 @@ def warn_of_datum_offset(fit: JointFit, survey: Survey, stations: Stations, repo
         )
     lift = fit.offsets[:, 2]
     heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
+    if heights:
+        _tell_heights_apart(lift, survey, stations, report)
     if heights and float(np.abs(lift).min()) > DATUMS_APART_M:
         report.warning(
             f"The heights of {survey.name} lie {abs(lift[0]):.0f} m {'below' if lift[0] > 0 else 'above'} the photos'"
             " positions, more than vertical datums can differ.",
             "Check whether they are in feet, or relative to a local benchmark. The georeference follows the control.",
+        )
+
+
+def _tell_heights_apart(lift: Float64[np.ndarray, " k"], survey: Survey, stations: Stations, report: Reporter) -> None:
+    """Tell of heights that differ from the positions' as a pole's length, or a geoid from an ellipsoid, does.
+
+    Neither can be tested: no other height is known. So they are named as possible.
+
+    Args:
+        lift: Of each flight's positions above the control's heights, metres.
+    """
+    above = -float(lift[np.abs(lift).argmin()])
+    sigma = float(np.median(stations.sigmas[:, 2]))
+    side = "above" if above > 0.0 else "below"
+    where = f"The heights of {survey.name} lie {abs(above):.2f} m {side} the photos' positions"
+    follows = "The georeference follows the control."
+    if sigma <= EXACT_M and POLES_M[0] <= above <= POLES_M[1] and above > DATUM_SIGMAS * sigma:
+        report.warning(
+            f"{where}, which are stated to {sigma:.2f} m.",
+            f"Was a pole of that length not subtracted, or is the vertical datum another? {follows}",
+        )
+    elif max(EXACT_DATUM_M if sigma <= EXACT_M else DATUM_M, DATUM_SIGMAS * sigma) < abs(above) <= DATUMS_APART_M:
+        possible = GEOIDS_M[0] <= -above <= GEOIDS_M[1]
+        report.note(
+            f"{where}: possibly one is above the geoid and the other above the ellipsoid,"
+            f" which lie {GEOIDS_M[0]:g} to {GEOIDS_M[1]:+g} m apart. {follows}"
+            if possible
+            else f"{where}: their vertical datums differ. {follows}"
+        )
+
+
+def require_shape(survey: Survey, site: LocalSurvey, start: Similarity) -> None:
+    """Refuse points that have the model's shape only when read by another convention.
+
+    Args:
+        survey: The points.
+        site: Their coordinates.
+        start: From the model to the world by the photos' positions.
+
+    Raises:
+        SplatpipeError: if a convention explains them that the stated one does not; the hint names it.
+    """
+    chosen = [k for k, point in enumerate(survey.points) if point.found is not None]
+    places = [point.found.xyz for point in survey.points if point.found is not None]
+    found = start.apply(np.array(places, dtype=np.float64).reshape(-1, 3))
+    cause = shape_reading(found, site.targets.enu[chosen], np.isfinite(site.targets.sigmas[chosen, 2]))
+    if cause is not None:
+        reading, evidence = cause
+        raise SplatpipeError(
+            f"The points of {survey.name} do not have the shape that the photos show.",
+            f"If {reading.cause}, {evidence.share:.0%} of them do: it looks like that. {reading.remedy} {CONTROL_HINT}",
         )
 
 
@@ -246,25 +303,6 @@ def _distance_m(geodetic: Float64[np.ndarray, "n 3"], stations: Stations) -> flo
 
 
 def _better_reading(survey: Survey, stations: Stations) -> str:
-    """Return a hint at the CRS or axis order that would put the points near the photos; empty if there is none."""
-    if len(stations) == 0:
-        return ""
-    place = np.median(stations.geodetic, axis=0)
-    zone = utm_of(float(place[0]), float(place[1]))
-    number = zone.text.rpartition(":")[2]
-    candidates = [survey.crs.text, zone.text, "EPSG:4326"]
-    if number.startswith("326"):
-        candidates.append(f"EPSG:258{number[3:]}")
-    stated = np.array([[point.surveyed.x, point.surveyed.y, 0.0] for point in survey.points], dtype=np.float64)
-    for text in candidates:
-        for swapped in (False, True):
-            try:
-                points = stated[:, [1, 0, 2]] if swapped else stated
-                geodetic = to_geodetic(np.ascontiguousarray(points), parse_crs(text), approximate=True).geodetic
-            except SplatpipeError:
-                continue
-            if _distance_m(geodetic, stations) <= FAR_M and (swapped or text != survey.crs.text):
-                how = "with its first two coordinates swapped" if swapped else f"as {text}"
-                how += f" and as {text}" if swapped and text != survey.crs.text else ""
-                return f"Read {how}, they match the photos' positions: correct the file."
-    return ""
+    """A hint at the reading that would put the points near the photos; empty if there is none."""
+    stated = np.array([[point.surveyed.x, point.surveyed.y] for point in survey.points], dtype=np.float64)
+    return nearer_reading(stated.reshape(-1, 2), survey.crs, stations.geodetic)

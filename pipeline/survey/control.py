@@ -18,8 +18,15 @@ from splatpipe.pipeline.survey.adjustment import ControlAdjustment, ControlStart
 from splatpipe.pipeline.survey.block import Lens
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import PositionObservations
-from splatpipe.pipeline.survey.blunders import name_blunders, require_near, warn_of_datum_offset, warn_of_weak_control
+from splatpipe.pipeline.survey.blunders import (
+    name_blunders,
+    require_near,
+    require_shape,
+    warn_of_datum_offset,
+    warn_of_weak_control,
+)
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
+from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.georef_input import GeorefInput
 from splatpipe.pipeline.survey.local_survey import (
@@ -32,14 +39,16 @@ from splatpipe.pipeline.survey.local_survey import (
     stations_of,
     with_sigmas_times,
 )
+from splatpipe.pipeline.survey.located_points import locate
 from splatpipe.pipeline.survey.model import model_of
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens, simple_lens
-from splatpipe.pipeline.survey.surveyed_points import Survey, locate
+from splatpipe.pipeline.survey.surveyed_points import Survey
 from splatpipe.pipeline.survey.tie_points import MIN_SIGMA_PX, block_of, sizes_of, spread_points, tie_sigma, tie_table
 
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if control deforms the model by less, it is not adjusted
 QUIET = 2.0  # times the stated sigmas; control with residuals up to this keeps its sigmas
+MISTAKEN = 100.0  # times the stated sigmas: no receiver, but mistakes; hand-held ones reach some 50 times 2 cm
 STRAY = 0.1  # relative deviation of a focal length from its prior that is worth a warning
 SUSPICIOUS = 1.0  # noise over sigmas; sound control with realistic sigmas stays well below
 LONELY = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
@@ -95,6 +104,8 @@ def place_by_control(
     stations = stations_of(model, capture.positions, frame)
     site = make_site(survey, require_near(survey, config, stations), stations, frame, config)
     start = start_similarity(site, survey, model, capture.positions, frame)
+    if frame is not None and len(stations) >= MIN_POSITIONS:  # only then is the start level, and in metres
+        require_shape(survey, site, start[0])
     survey = name_blunders(survey, site, model, start, config, report)
     observed = observed_in(site, survey, model, start[0].scale, config.mark_sigma_px)
     fit = fit_jointly(start[0], observed, start[1])
@@ -225,11 +236,14 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
         )
         return replace(result, survey=survey)
     if factor > 1.0:
+        far = factor > MISTAKEN
         worth = factor * float(np.median(result.site.targets.sigmas[_chosen(survey), 0]))
         report.warning(
             f"The control points agree with each other and the photos to {worth:.2f} m only, {factor:.1f} times what"
             " they are stated or taken to be worth: their standard deviations are raised by that.",
-            "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… sets their standard "
+            "So far apart, some are wrong: check their names, coordinates and marks against the field book."
+            if far
+            else "Were they measured with a hand-held receiver? --set georef.control_sigma_m=… sets their standard "
             "deviation.",
         )
     _warn_of_focal_lengths(done, capture, report)

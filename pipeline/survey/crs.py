@@ -53,6 +53,7 @@ __all__ = [
     "same_datum",
     "to_geodetic",
     "undulation",
+    "usable_for_maps",
     "utm_of",
 ]
 
@@ -122,6 +123,7 @@ def open_operation(crs: Crs, latitude: float, longitude: float, approximate: boo
         group = _quiet_group(crs.horizontal, latitude, longitude, allow_ballpark=True)
         note = "EPSG has no operation to WGS 84: its datum is treated as WGS 84, which may be metres off."
     if not group.transformers:
+        _require_near(crs, latitude, longitude, 0.0)  # the likelier cause, if PROJ knows operations in its area
         raise _no_way(f"{crs.text} ({crs.name})", _like_wgs84(crs))
     best = group.transformers[0]
     accuracy = float(best.accuracy) if best.accuracy is not None and best.accuracy >= 0.0 else None
@@ -268,7 +270,7 @@ def _rough_place(points: Float64[np.ndarray, "n 3"], crs: Crs) -> tuple[float, f
     return float(np.median(lat[good])), float(np.median(lon[good]))
 
 
-def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
+def _require_near(crs: Crs, latitude: float, longitude: float, most_km: float = MAX_OUTSIDE_KM) -> None:
     """Reject a place far outside the CRS's area or, where that is not stated, where it distorts lengths strongly."""
     place = (
         f"{abs(latitude):.4f}° {'N' if latitude >= 0 else 'S'}, {abs(longitude):.4f}° {'E' if longitude >= 0 else 'W'}"
@@ -276,7 +278,7 @@ def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
     hint = "Check the CRS, and the order of the coordinates: east (or longitude) comes first."
     if crs.area is not None:
         away = _outside_km(crs.area, latitude, longitude)
-        if away > MAX_OUTSIDE_KM:
+        if away > most_km:
             raise SplatpipeError(f"{place} is {away:,.0f} km outside the area of {crs.text} ({crs.name}).", hint)
     elif not crs.is_geographic:
         factors = pyproj.Proj(crs.horizontal).get_factors(longitude, latitude)
@@ -285,6 +287,11 @@ def _require_near(crs: Crs, latitude: float, longitude: float) -> None:
             raise SplatpipeError(
                 f"{place} is in another part of the earth, where {crs.text} is not true to scale.", hint
             )
+
+
+def usable_for_maps(crs: Crs) -> bool:
+    """Whether rasters can be in a CRS: cells are not square in degrees, and a westward axis turns them round."""
+    return not crs.is_geographic and "west" not in [axis.direction for axis in crs.horizontal.axis_info[:2]]
 
 
 def _require_no_degrees(points: Float64[np.ndarray, "n 3"], crs: Crs, latitude: float, longitude: float) -> None:

@@ -2,77 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.geometry.triangulation import Rays, TriangulatedPoint, triangulate
-from splatpipe.pipeline.photos.names import NameFinder, list_names
+from splatpipe.pipeline.photos.names import NameFinder, list_names, without_zeros
 from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.control_file import ControlFile, SurveyedPoint, read_control_file
+from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.crs import Crs, parse_crs
+from splatpipe.pipeline.survey.located_points import Sighting, SurveyPoint, locate, residual_px
+from splatpipe.pipeline.survey.mark_readings import Marks, named_reading, require_agreement, sentence_of
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.readings import EXPLAINED
 
 MIN_FOR_CHECKS = 6  # points: with at least as many, some are kept as check points
 EVERY_NTH = 3  # point becomes a check point
 OUTSIDE_SHARE = 0.3  # of the marks outside their photos: above, they were made in photos of another size
-MARK_TOLERANCE = 10.0  # times the marks' sigma
-MIN_TOLERANCE_PX = 5.0  # of marks: SfM's own errors at the edge of a photo
-FIT_TOLERANCE = 8.0  # times the model's mean reprojection error
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """A mark of a point in a photo.
-
-    Attributes:
-        photo: Its name.
-        pixel: In the stored grid; (0, 0) is the top-left corner of the first pixel.
-        index: Of the photo in the model; None where the photo has no pose.
-        agrees: Whether the mark was used to triangulate the point.
-        automatic: Whether it is a detected target rather than a mark made by hand.
-    """
-
-    photo: str
-    pixel: tuple[float, float]
-    index: int | None
-    agrees: bool = True
-    automatic: bool = False
-
-
-@dataclass(frozen=True)
-class SurveyPoint:
-    """A surveyed point.
-
-    Attributes:
-        surveyed: As in the file.
-        role: Control point, check point, or left out.
-        why: The reason if it is left out, as a clause.
-        sightings: Its marks, in the order of the photos' names.
-        found: Its triangulated position in the model; None where its marks do not determine it.
-    """
-
-    surveyed: SurveyedPoint
-    role: Literal["control", "check", "left_out"]
-    why: str
-    sightings: tuple[Sighting, ...]
-    found: TriangulatedPoint | None = None
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.surveyed.name
-
-    def left_out(self, why: str) -> SurveyPoint:
-        """The same point, left out."""
-        return replace(self, role="left_out", why=why)
 
 
 @dataclass(frozen=True)
@@ -130,11 +80,14 @@ def load_survey(
         crs = parse_crs(file.crs)
     except SplatpipeError as error:
         raise SplatpipeError(f"The CRS of {path.name}: {error}", error.hint) from error
-    sightings = _sightings(file, path.name, config, photos, model, report)
+    find = NameFinder(sorted(photos))
+    marks = _marks(file, find, config)
+    sightings = _sightings(file, path.name, marks, config, photos, model, report)
     points = [
         locate(SurveyPoint(point, "control", "", tuple(seen)), model, photos, config.mark_sigma_px)
         for point, seen in zip(file.points, sightings, strict=True)
     ]
+    require_agreement(path.name, marks, points, model, photos, config.mark_sigma_px)
     if find_targets is not None:
         points = _with_targets(points, find_targets(Survey(file, crs, path.name, tuple(points))), model, photos, config)
     if not any(point.sightings for point in points):
@@ -178,105 +131,97 @@ def _with_targets(
     return result
 
 
-def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], mark_sigma_px: float) -> SurveyPoint:
-    """Triangulate a point in the model from its marks; left out where they do not determine it."""
-    placed = [k for k, sighting in enumerate(point.sightings) if sighting.index is not None]
-    if len(placed) < 2:
-        return point.left_out(_why_unseen(point, len(placed)))
-    rays, error_px = _rays([point.sightings[k] for k in placed], model, photos)
-    good = np.isfinite(rays.rays).all(axis=1) & np.isfinite(rays.pixels).all(axis=(1, 2))
-    tolerance = max(MIN_TOLERANCE_PX, MARK_TOLERANCE * mark_sigma_px, FIT_TOLERANCE * error_px)
-    found = triangulate(rays.only(good), tolerance) if good.sum() >= 2 else None
-    if found is None:
-        many = "two marks" if len(placed) == 2 else f"{len(placed)} marks"
-        return point.left_out(
-            f"its {many} do not meet in one point: one is wrong, or the photos are too close together"
-        )
-    agrees = np.zeros(len(placed), dtype=bool)
-    agrees[good] = found.agree
-    sightings = list(point.sightings)
-    for k, agree in zip(placed, agrees.tolist(), strict=True):
-        sightings[k] = replace(sightings[k], agrees=agree)
-    return replace(point, sightings=tuple(sightings), found=found)
-
-
-def _rays(sightings: Sequence[Sighting], model: SparseModel, photos: Mapping[str, Photo]) -> tuple[Rays, float]:
-    """Rays of marks in photos of the model, and the model's mean reprojection error in the photos' pixels."""
-    views = [model.view(s.index, photos[s.photo].width) for s in sightings if s.index is not None]
-    rays = np.stack([view.ray(np.array(s.pixel)) for view, s in zip(views, sightings, strict=True)])
-    poses = np.stack([view.cam_from_model for view in views])
-    pixels = np.stack([view.pixels_by_ray(ray) for view, ray in zip(views, rays, strict=True)])
-    error_px = model.reconstruction.compute_mean_reprojection_error() / min(view.scale for view in views)
-    return Rays(poses, rays, pixels), error_px
-
-
-def residual_px(
-    sighting: Sighting, place: Float64[np.ndarray, " 3"], model: SparseModel, photos: Mapping[str, Photo]
-) -> Float64[np.ndarray, " 2"] | None:
-    """Reprojection error: a place of the model projected into a photo, less its mark (pixels); None if not visible."""
-    if sighting.index is None:
-        return None
-    residual = model.view(sighting.index, photos[sighting.photo].width).pixel(place) - np.array(sighting.pixel)
-    return residual if np.isfinite(residual).all() else None
+def _marks(file: ControlFile, find: NameFinder, config: GeorefConfig) -> Marks:
+    """The marks in photos of the capture; of several in one photo, the first."""
+    shift = 0.5 if config.pixel_origin == "centre" else 0.0
+    pixels = []
+    for point in file.points:
+        seen: dict[str, tuple[float, float]] = {}
+        for mark in point.marks:
+            photo = find(mark.photo)
+            if photo is not None:
+                seen.setdefault(photo, (mark.x + shift, mark.y + shift))
+        pixels.append(seen)
+    return Marks(file.points, tuple(pixels))
 
 
 def _sightings(
     file: ControlFile,
     name: str,
+    marks: Marks,
     config: GeorefConfig,
     photos: Mapping[str, Photo],
     model: SparseModel,
     report: Reporter,
 ) -> list[list[Sighting]]:
-    find = NameFinder(sorted(photos))
+    """Each point's marks inside their photos.
+
+    Raises:
+        SplatpipeError: if no photo is known, or too many marks lie outside.
+    """
+    _check_photos(name, file, photos, report)
     index = {photo: k for k, photo in enumerate(model.names)}
-    shift = 0.5 if config.pixel_origin == "centre" else 0.0
-    marks = [(mark, find(mark.photo)) for point in file.points for mark in point.marks]
-    missing = sorted({mark.photo for mark, photo in marks if photo is None})
     outside: list[str] = []
     result = []
-    for point in file.points:
-        seen: dict[str, Sighting] = {}
-        for mark in point.marks:
-            photo = find(mark.photo)
-            if photo is None:
-                continue
-            x, y = mark.x + shift, mark.y + shift
+    for point, pixels in zip(marks.points, marks.pixels, strict=True):
+        seen = []
+        for photo, (x, y) in sorted(pixels.items()):
             if 0.0 <= x <= photos[photo].width and 0.0 <= y <= photos[photo].height:
-                seen.setdefault(photo, Sighting(photo, (x, y), index.get(photo)))
+                seen.append(Sighting(photo, (x, y), index.get(photo)))
             else:
                 outside.append(f"{point.name} in {photo}")
-        result.append([seen[photo] for photo in sorted(seen)])
-    _check_marks(name, len(marks), missing, outside, report, all_missing=all(photo is None for _, photo in marks))
-    return result
-
-
-def _check_marks(
-    name: str, marks: int, missing: Sequence[str], outside: Sequence[str], report: Reporter, all_missing: bool
-) -> None:
-    if marks == 0:
-        return
-    if all_missing:
+        result.append(seen)
+    count = sum(len(point.marks) for point in file.points)
+    if len(outside) > OUTSIDE_SHARE * count:
+        cause = named_reading(marks, model, photos, config.mark_sigma_px)
+        hint = "Were they made in photos that were resized or rotated? Pixel coordinates must be in these photos."
         raise SplatpipeError(
-            f"None of the photos that {name} names is in this capture: {list_names(missing)}.",
-            "Check that the file belongs to these photos; photos must be listed by their file names."
-            " --set georef.control=none runs without control.",
-        )
-    if missing:
-        report.warning(
-            f"{name} names {missing_photos(missing)}.",
-            "Their marks are ignored. Correct the names, or add the photos.",
-        )
-    if len(outside) > OUTSIDE_SHARE * marks:
-        raise SplatpipeError(
-            f"{len(outside)} of {marks} marks of {name} lie outside their photos: {list_names(outside)}.",
-            "Were they made in photos that were resized or rotated? Pixel coordinates must be in these photos.",
+            f"{len(outside)} of {count} marks of {name} lie outside their photos: {list_names(outside)}.",
+            hint if cause is None else f"{sentence_of(*cause)} --set georef.control=none runs without control.",
         )
     if outside:
         report.warning(
             f"{len(outside)} marks of {name} lie outside their photos and are left out: {list_names(outside)}.",
             "Correct their pixel coordinates.",
         )
+    return result
+
+
+def _check_photos(name: str, file: ControlFile, photos: Mapping[str, Photo], report: Reporter) -> None:
+    """Warn of photos that the file names and the capture does not have.
+
+    Raises:
+        SplatpipeError: if it has none of them.
+    """
+    find = NameFinder(sorted(photos))
+    named = sorted({mark.photo for point in file.points for mark in point.marks})
+    missing = [photo for photo in named if find(photo) is None]
+    if not missing:
+        return
+    eaten = eaten_zeros(missing, photos)
+    if len(missing) == len(named):
+        raise SplatpipeError(
+            f"None of the photos that {name} names is in this capture: {list_names(missing)}.",
+            (eaten or "Check that the file belongs to these photos; photos must be listed by their file names.")
+            + " --set georef.control=none runs without control.",
+        )
+    report.warning(
+        f"{name} names {missing_photos(missing)}.",
+        f"Their marks are ignored. {eaten or 'Correct the names, or add the photos.'}",
+    )
+
+
+def eaten_zeros(missing: Sequence[str], known: Iterable[str], what: str = "photos") -> str:
+    """A hint where names lack only the leading zeros of known names; empty where most differ otherwise."""
+    find = NameFinder(sorted(known))
+    bare = NameFinder(sorted({without_zeros(name) for name in known}))
+    back = [name for name in missing if find(name) is None and bare(without_zeros(name)) is not None]
+    if len(back) < EXPLAINED * max(len(missing), 1):
+        return ""
+    return (
+        f"Without leading zeros, {list_names(back, 3)} would be {what} of this capture: a spreadsheet drops the zeros"
+        " of 001. Format the column as text."
+    )
 
 
 def missing_photos(names: Sequence[str]) -> str:
@@ -295,15 +240,6 @@ def _report_overruled_roles(points: Sequence[SurveyPoint], name: str, setting: s
             f"{list_names(sorted(stated)) if stated else 'no point'} as check points; "
             "--set georef.check_points=auto takes the file's."
         )
-
-
-def _why_unseen(point: SurveyPoint, placed: int) -> str:
-    count = len(point.sightings)
-    if count == 0:
-        return "it is marked in no photo of this capture"
-    if placed < count and placed < 2 <= count:
-        return f"only {placed} of the {count} photos that it is marked in could be placed"
-    return "it is marked in one photo only" if placed else "the photo that it is marked in could not be placed"
 
 
 def _warn_of_unusable(
@@ -353,7 +289,8 @@ def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]
         if unknown:
             raise SplatpipeError(
                 f"georef.check_points has points that are not in the control file: {list_names(unknown)}.",
-                f"It has {list_names([point.name for point in points])}.",
+                eaten_zeros(unknown, [point.name for point in points], "points")
+                or f"It has {list_names([point.name for point in points])}.",
             )
     return [
         replace(point, role="check") if point.role == "control" and point.name in checks else point for point in points

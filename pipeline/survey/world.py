@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.survey.crs import (
     ELLIPSOIDAL,
     UNKNOWN,
@@ -27,6 +28,7 @@ from splatpipe.pipeline.survey.crs import (
     parse_crs,
     same_datum,
     undulation,
+    usable_for_maps,
     utm_of,
 )
 from splatpipe.pipeline.survey.frames import Frame
@@ -216,6 +218,30 @@ def in_crs(frame: Frame, asked: str, stated: str = "", approximate: bool = False
     placed = replace(frame, crs=crs.text, approximate_crs=approximate)
     open_world(placed)
     return placed
+
+
+def report_map_crs(frame: Frame, asked: bool, report: Reporter) -> None:
+    """Tell where the frame's CRS suits points but no rasters, so that survey files are in another one.
+
+    Args:
+        frame: Georeferenced; nothing is told of an arbitrary one.
+        asked: Whether the CRS was asked for; degrees of a control file are not expected of rasters.
+        report: Receives the warning or note.
+    """
+    if frame.origin is None or not frame.crs:
+        return
+    crs = parse_crs(frame.crs)
+    if usable_for_maps(crs):
+        return
+    utm = utm_of(frame.origin.latitude, frame.origin.longitude)
+    instead = f"Orthophoto, elevation models, contours, point cloud and plans are in {utm.text} ({utm.name}) instead"
+    if not crs.is_geographic:
+        report.warning(
+            f"{crs.text} ({crs.name}) counts to the west or south, which would turn rasters round. {instead}.",
+            "Choose its east-north form, if there is one (EPSG:5514 for Krovak), with --set georef.crs=EPSG:n.",
+        )
+    elif asked:
+        report.note(f"{crs.text} ({crs.name}) is in degrees, which rasters cannot be. {instead}.")
 
 
 def _samples(box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, "n 3"]:

@@ -16,9 +16,10 @@ from splatpipe.pipeline.photos.names import NameFinder, list_names
 from splatpipe.pipeline.sfm.footprints import FURTHEST, MIN_HEIGHT_M, StatedPoses
 from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
-from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
+from splatpipe.pipeline.survey.coordinate_readings import nearer_reading
+from splatpipe.pipeline.survey.crs import Crs, parse_crs, to_geodetic
 from splatpipe.pipeline.survey.scale_bars import read_scale_bars
-from splatpipe.pipeline.survey.surveyed_points import missing_photos
+from splatpipe.pipeline.survey.surveyed_points import eaten_zeros, missing_photos
 
 OUTSIDE_SHARE = 0.3  # of the marks outside their photos: they were made in photos of another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
@@ -72,7 +73,8 @@ def control_findings(
     try:
         located = to_geodetic(rows, crs, approximate).geodetic
     except SplatpipeError as error:
-        return [*findings, Finding("control-broken", "error", error.message, error.hint)], []
+        hint = _reading_of(rows, crs, intake) or error.hint
+        return [*findings, Finding("control-broken", "error", error.message, hint)], []
     origin = origin_of(intake)
     assert origin is not None
     east = np.radians(located[:, 1] - origin[1]) * np.cos(np.radians(origin[0])) * EARTH_RADIUS_M
@@ -88,7 +90,14 @@ def control_findings(
         )
         for point, at in zip(file.points, points, strict=True)
     ]
-    return [*findings, *_outside(path.name, places, points, intake)], places
+    better = _reading_of(rows, crs, intake)
+    return [*findings, *_outside(path.name, places, points, intake, better)], places
+
+
+def _reading_of(rows: Float64[np.ndarray, "n 3"], crs: Crs, intake: Intake) -> str:
+    """A hint at how to read points that lie far from the photos; empty where none helps."""
+    photos = [[each.latitude, each.longitude, 0.0] for each in intake.positions.positions]
+    return nearer_reading(rows[:, :2], crs, np.array(photos, dtype=np.float64).reshape(-1, 3))
 
 
 def scale_bar_findings(path: Path) -> list[Finding]:
@@ -117,16 +126,18 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
     findings = []
     if marks and all(photo is None for _, _, photo in marks):
         text = f"None of the photos that {name} names is in this capture: {list_names(missing)}."
-        return [Finding("control-broken", "error", text, "Check that the file belongs to these photos.")]
+        hint = eaten_zeros(missing, sizes) or "Check that the file belongs to these photos."
+        return [Finding("control-broken", "error", text, hint)]
     if missing:
         text = f"{name} names {missing_photos(missing)}."
-        findings.append(
-            Finding("control-marks", "warning", text, "Their marks are ignored. Correct the names, or add the photos.")
-        )
+        hint = eaten_zeros(missing, sizes) or "Correct the names, or add the photos."
+        findings.append(Finding("control-marks", "warning", text, f"Their marks are ignored. {hint}"))
     if outside:
         severe = len(outside) > OUTSIDE_SHARE * len(marks)
         text = f"{len(outside)} of {len(marks)} marks of {name} lie outside of their photos: {list_names(outside)}."
         hint = "Were they made in photos that were resized or rotated?"
+        if all(mark.y <= 0.0 for _, mark, _ in marks):
+            hint = "All pixel rows are negative, as QGIS writes them: omit their minus signs."
         findings.append(Finding("control-marks", "error" if severe else "warning", text, hint))
     return findings
 
@@ -145,7 +156,7 @@ def _shown_by(at: Float64[np.ndarray, " 2"], intake: Intake) -> int | None:
 
 
 def _outside(
-    name: str, places: Sequence[ControlPlace], points: Float64[np.ndarray, "n 2"], intake: Intake
+    name: str, places: Sequence[ControlPlace], points: Float64[np.ndarray, "n 2"], intake: Intake, better: str
 ) -> list[Finding]:
     """Points that no photo can show."""
     positions = intake.layout.positions_m[intake.layout.located(), :2]
@@ -157,7 +168,9 @@ def _outside(
     nearest[placed] = tree.query(points[placed])[0]
     if float(np.median(nearest)) > ELSEWHERE_M:
         text = f"The points of {name} lie {np.median(nearest) / 1000.0:,.1f} km from the photos."
-        return [Finding("control-outside", "error", text, "Check the CRS, its zone, and that east comes first.")]
+        return [
+            Finding("control-outside", "error", text, better or "Check the CRS, its zone, and that east comes first.")
+        ]
     spacing = float(np.median(tree.query(positions, k=2)[0][:, 1])) if len(positions) > 1 else 0.0
     reach = max(MIN_REACH_M, REACH_SPACINGS * spacing)
     off = [

@@ -29,8 +29,9 @@ from splatpipe.pipeline.survey.local_survey import (
     start_similarity,
     stations_of,
 )
+from splatpipe.pipeline.survey.located_points import Sighting, SurveyPoint, locate, residual_px
 from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.surveyed_points import Sighting, Survey, SurveyPoint, locate, residual_px, with_roles
+from splatpipe.pipeline.survey.surveyed_points import Survey, with_roles
 
 Marks = Mapping[str, Mapping[str, tuple[float, float]]]
 UNKNOWN_HEIGHT_M = 5.0  # of a point without a height, or while the vertical datum is unknown
