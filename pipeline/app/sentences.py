@@ -44,7 +44,9 @@ def _ingest(facts: Figures) -> str:
             if facts["positions"] == facts["photos"]
             else f"{count(facts['positions'])} with positions"
         )
-        known += f" accurate to {_sigmas(facts)}" if facts.get("sigma_horizontal_m") else ""
+        if facts.get("sigma_horizontal_m"):
+            known += f" accurate to {_sigmas(facts)}"
+            known += "" if facts.get("sigma_vertical_m") else ", without altitudes"
         parts.append(known)
     else:
         parts.append("none with a position")

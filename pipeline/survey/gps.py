@@ -39,6 +39,7 @@ from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.level import Positions, known_directions
 from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.position_spread import spread_of
 
 ORIGIN_DIGITS = 5  # degrees: about a metre, so that the origin stays put when a few photos are added or removed
 SWAPPED_NOISE = 0.5  # of the residuals: if swapped coordinates fit twice as well, they are swapped
@@ -69,6 +70,8 @@ def georeference(
     times = {name: photos[name].time if name in photos else None for name in usable}
     names = capture_order(usable, positions.by_name, times)
     records = [positions.by_name[name] for name in names]
+    if reason := spread_of([(r["latitude"], r["longitude"], r["altitude_m"]) for r in records]).too_few:
+        raise FrameUndeterminedError(reason)
     index = {name: i for i, name in enumerate(model.names)}
     geodetic = np.array([[r["latitude"], r["longitude"], r["altitude_m"]] for r in records], dtype=np.float64)
     sigmas = np.array([[r["sigma_horizontal_m"]] * 2 + [r["sigma_vertical_m"]] for r in records], dtype=np.float64)
@@ -84,7 +87,10 @@ def georeference(
             points = _bound(points, limit)
         robust = _robust(points, limit, directions.prior)
         noise = robust.noise
-        fit = fit_positions(points, flights, robust, limit, directions, model.points)
+        try:
+            fit = fit_positions(points, flights, robust, limit, directions, model.points)
+        except np.linalg.LinAlgError as error:
+            raise FrameUndeterminedError("the photo positions determine neither scale nor rotation") from error
         require_determined(fit, points)
     except FrameUndeterminedError:
         _require_unswapped(points, geodetic, limit, noise)
