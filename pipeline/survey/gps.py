@@ -17,6 +17,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.assumed_heights import ASSUMED
 from splatpipe.pipeline.survey.fitting import (
     MAX_SIGMA_ROTATION_RAD,
     MAX_SIGMA_SCALE,
@@ -40,6 +41,7 @@ from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.level import Positions, known_directions
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.position_spread import spread_of
+from splatpipe.pipeline.survey.up_witnesses import UpVerdict, check_up
 
 ORIGIN_DIGITS = 5  # degrees: about a metre, so that the origin stays put when a few photos are added or removed
 SWAPPED_NOISE = 0.5  # of the residuals: if swapped coordinates fit twice as well, they are swapped
@@ -92,6 +94,7 @@ def georeference(
         except np.linalg.LinAlgError as error:
             raise FrameUndeterminedError("the photo positions determine neither scale nor rotation") from error
         require_determined(fit, points)
+        _require_upright(check_up(fit.noisy.similarity, model, positions))
     except FrameUndeterminedError:
         _require_unswapped(points, geodetic, limit, noise)
         raise
@@ -101,6 +104,10 @@ def georeference(
     left_out = [name for name, inlier in zip(names, fit.inliers, strict=True) if not inlier]
     note = f"From the positions of {len(names) - len(left_out)} photos: {fit.uncertainty.sentence()}"
     note += f"; the rotation that they leave open is from {fit.held_by}." if fit.held_by else "."
+    if any(record.get("altitude_source") == ASSUMED for record in records):
+        fit = replace(fit, uncertainty=fit.uncertainty.at_least_up(directions.prior.sigma_rad))
+        note = f"From the horizontal positions of {len(names) - len(left_out)} photos: {fit.uncertainty.sentence()}."
+        note += f" Up is from {directions.source}; heights are arbitrary: they count from the middle of the scene."
     residuals = {**_residuals(names, fit), "flights": flights_json(records, points, fit.noisy.offsets)}
     datum = declared_datum(records, points)
     return Frame("enu", fit.noisy.similarity, origin, datum, residuals, tuple(sorted(left_out + wrong)), note), fit
@@ -148,6 +155,15 @@ def _require_unswapped(
     determined = fit.sigma_scale <= MAX_SIGMA_SCALE and fit.sigma_rotation_rad <= MAX_SIGMA_ROTATION_RAD
     if determined and fit.noise < SWAPPED_NOISE * noise:
         raise FrameUndeterminedError("the photo positions fit only with latitude and longitude swapped: correct them")
+
+
+def _require_upright(verdict: UpVerdict) -> None:
+    """Reject a placement that is upside down or mirrored by all that is known besides the positions."""
+    if verdict.refuted:
+        raise FrameUndeterminedError(
+            f"the photo positions place the model upside down or mirrored: {verdict.sentence()}; a W or S that is "
+            "missing, or latitude and longitude swapped, does that"
+        )
 
 
 def _require_agreement(fit: SimilarityFit, positions: int) -> None:
@@ -213,6 +229,12 @@ def report_frame(frame: Frame, model: SparseModel, positions: Positions, report:
             f"The stated position of {len(frame.left_out)} photos is wrong and is left out of the fit: "
             f"{list_names(frame.left_out)}.",
             "The photos themselves are used.",
+        )
+    up = check_up(frame.world_from_model, model, positions)
+    if up.doubtful:
+        report.warning(
+            f"The model may be placed upside down or mirrored: {up.sentence()}.",
+            "Check the signs of latitude and longitude (W and S), and that up is up in the result.",
         )
     heights = _heights(frame, model, positions)
     if heights is not None and abs(heights[0] / heights[1] - 1.0) > HEIGHT_TOLERANCE:

@@ -43,8 +43,8 @@ class PositionSpread:
         if self.photos == self.places:
             return f"only {self.photos} photo{'s have' if self.photos > 1 else ' has'} a position"
         if self.places == 1:
-            return f"all {self.photos} photos with a position state one and the same"
-        return f"the {self.photos} photos with a position state only {NUMBERS[self.places]} different ones"
+            return f"all {self.photos} photo positions are one and the same"
+        return f"the {self.photos} photo positions are only {NUMBERS[self.places]} different places"
 
     def is_too_close(self, sigma_m: float) -> bool:
         """Whether no fit can determine the scale, even if the positions are much better than stated."""

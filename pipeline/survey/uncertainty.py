@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,10 @@ class Uncertainty:
     common_m: Float64[np.ndarray, " 2"]
     noise: ReceiverNoise
     covariance: Float64[np.ndarray, "7 7"]
+
+    def at_least_up(self, up_rad: float) -> Uncertainty:
+        """The same with an up direction that is known no better than this."""
+        return replace(self, up_rad=max(self.up_rad, up_rad), weakest_rad=max(self.weakest_rad, up_rad))
 
     def sentence(self) -> str:
         """The accuracy as a sentence for the user."""
