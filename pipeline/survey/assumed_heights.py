@@ -15,6 +15,7 @@ from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.level import UP_SIGMA_RAD, Positions, gimbal_rotation, upright_cameras
 from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.position_spread import spread_of
 
 ASSUMED = "assumed"  # an altitude's source
 LONG_PAIRS = 0.5  # of the pairs of cameras: the scale is from the longer ones, which errors change less
@@ -38,6 +39,8 @@ def with_assumed_heights(model: SparseModel, positions: Positions) -> Positions:
     if len(stated) >= MIN_POSITIONS or len(index) < MIN_POSITIONS:
         return positions
     records = [positions.by_name[name] for name in index]
+    if spread_of([(record["latitude"], record["longitude"], 0.0) for record in records]).too_few:
+        return positions
     gimbal = gimbal_rotation(model, positions)
     upright = gimbal if gimbal is not None else rotation_to_up(upright_cameras(model, positions).up)
     cameras = model.centres[list(index.values())] @ upright.T

@@ -176,6 +176,9 @@ def _why_few(model: SparseModel, positions: Positions, usable: int) -> str:
     stated = sum(name in positions.by_name for name in model.names)
     if stated == 0:
         return "no photo of the model has a position"
+    records = [positions.by_name[name] for name in model.names if name in positions.by_name]
+    if stated >= MIN_POSITIONS and (why := spread_of([(r["latitude"], r["longitude"], 0.0) for r in records]).too_few):
+        return why
     if usable < stated:
         return f"only {usable} photos of the model have a position with an altitude"
     return f"only {stated} photo{'s' if stated > 1 else ''} of the model {'have' if stated > 1 else 'has'} a position"

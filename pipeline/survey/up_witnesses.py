@@ -67,7 +67,7 @@ class UpVerdict:
         """What contradicts, a clause."""
         others = f" and {self.against[-1]}" if len(self.against) > 1 else ""
         listed = ", ".join(self.against[:-1] or self.against) + others
-        return f"{listed} contradict{'s' if len(self.against) == 1 else ''} it"
+        return f"this contradicts {listed}"
 
 
 def check_up(placed: Similarity, model: SparseModel, positions: Positions) -> UpVerdict:
