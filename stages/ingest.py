@@ -206,16 +206,15 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
     stated = positions.positions
     if not stated:
         return {"positions": 0}
-    summary: dict[str, JSON] = {
+    vertical = [each.sigma_vertical_m for each in stated if each.altitude_m is not None]
+    return {
         "positions": len(stated),
         "position_sources": sorted({each.source for each in stated}),
         "flights": len({each.flight for each in stated}),
         "sigma_horizontal_m": float(np.median([each.sigma_horizontal_m for each in stated])),
+        **({"sigma_vertical_m": float(np.median(vertical))} if vertical else {}),
         "sigma_sources": sorted({each.sigma_source for each in stated}),
     }
-    if vertical := [each.sigma_vertical_m for each in stated if each.altitude_m is not None]:
-        summary["sigma_vertical_m"] = float(np.median(vertical))
-    return summary
 
 
 def _warn_of_focal(groups: Sequence[CameraGroup], refused: Sequence[str], report: Reporter) -> None:

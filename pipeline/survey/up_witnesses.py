@@ -25,6 +25,7 @@ SHARE = 0.8  # of the photos that must agree for a statement
 LEVEL_SINE = np.sin(np.radians(15.0))  # views and edges that are closer to level than this say nothing
 FLYING_M = 5.0  # above take-off: the ground is below, whatever is being photographed
 ABOVE_SHARE = 0.95  # of the points above flying cameras: no ground is among them
+VERTICAL = 0.9  # of the mean view, whose length is less where views differ
 ALIGNED, SCATTERED = 0.9, 0.5  # length of the mean of headings' differences as unit vectors
 STOPPING = 2  # witnesses against a placement
 
@@ -100,7 +101,7 @@ def up_witnesses(placed: Similarity, model: SparseModel, positions: Positions) -
         _by_photos("the gimbal's pitch", (forward[:, 2] * sines < 0.0)[looking], of_gimbal=True),
         _by_photos("the pictures' upper edges", (up[:, 2] < 0.0)[edges]),
         _by_heading(right, yaw),
-        _by_ground(placed, model, height),
+        _by_ground(placed, model, height, forward),
     ]
     return [witness for witness in found if witness is not None]
 
@@ -136,13 +137,21 @@ def _by_heading(right: Float64[np.ndarray, "n 3"], yaw_deg: Float64[np.ndarray, 
     return Witness("the gimbal's headings", bool(mirrored > same), of_gimbal=True)
 
 
-def _by_ground(placed: Similarity, model: SparseModel, height_m: Float64[np.ndarray, " n"]) -> Witness | None:
-    """Cameras that fly have the ground below them."""
-    flying = height_m > FLYING_M
-    if flying.sum() < MIN_PHOTOS or len(model.points) == 0:
-        return None
+def _by_ground(
+    placed: Similarity, model: SparseModel, height_m: Float64[np.ndarray, " n"], forward: Float64[np.ndarray, "n 3"]
+) -> Witness | None:
+    """The ground is below cameras that fly, and before a survey's parallel vertical views (few survey a ceiling)."""
+    mean = forward.mean(axis=0)
+    cameras = placed.apply(model.centres)[:, 2]
     points = placed.apply(model.points)[:, 2]
-    above = float((points > np.median(placed.apply(model.centres[flying])[:, 2])).mean())
+    if len(points) == 0:
+        return None
+    flying = height_m > FLYING_M
+    vertical = abs(float(mean[2])) > VERTICAL and abs(float(np.median(cameras) - np.median(points))) > FLYING_M
+    flying |= vertical and not np.isfinite(height_m).any()
+    if flying.sum() < MIN_PHOTOS:
+        return None
+    above = float((points > np.median(cameras[flying])).mean())
     if above >= ABOVE_SHARE or above <= 1.0 - ABOVE_SHARE:
         return Witness("the ground's side of the cameras", above >= ABOVE_SHARE)
     return None

@@ -88,6 +88,17 @@ def test_edges_and_ground_alone_stop_mirrored_positions() -> None:
         georeference(model, positions, "auto", {})
 
 
+def test_a_survey_without_angles_and_heights_above_takeoff_still_knows_its_ground() -> None:
+    """Only the parallel views straight down speak: enough to warn, not to stop."""
+    unknown = {"relative_altitude_m": None, **dict.fromkeys(ANGLES)}
+    model, positions = scene(pitch=-90.0, **unknown)
+    assert check_up(TRUTH, model, positions).confirming == 1
+    model, positions = scene(pitch=-90.0, mirrored=True, **unknown)
+    frame, _ = georeference(model, positions, "auto", {})
+    verdict = check_up(frame.world_from_model, model, positions)
+    assert verdict.against == ("the ground's side of the cameras",) and verdict.doubtful and not verdict.refuted
+
+
 class Warnings(list[str]):
     """A reporter that records warnings."""
 
