@@ -212,7 +212,7 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
         "position_sources": sorted({each.source for each in stated}),
         "flights": len({each.flight for each in stated}),
         "sigma_horizontal_m": float(np.median([each.sigma_horizontal_m for each in stated])),
-        **({"sigma_vertical_m": float(np.median(vertical))} if vertical else {}),
+        "sigma_vertical_m": float(np.median(vertical)) if vertical else None,
         "sigma_sources": sorted({each.sigma_source for each in stated}),
     }
 

@@ -105,7 +105,7 @@ def georeference(
     note = f"From the positions of {len(names) - len(left_out)} photos: {fit.uncertainty.sentence()}"
     note += f"; the rotation that they leave open is from {fit.held_by}." if fit.held_by else "."
     if any(record.get("altitude_source") == ASSUMED for record in records):
-        fit = replace(fit, uncertainty=fit.uncertainty.at_least_up(directions.prior.sigma_rad))
+        fit = replace(fit, uncertainty=fit.uncertainty.without_heights(directions.prior.sigma_rad))
         note = f"From the horizontal positions of {len(names) - len(left_out)} photos: {fit.uncertainty.sentence()}."
         note += f" Up is from {directions.source}; heights are arbitrary: they count from the middle of the scene."
     residuals = {**_residuals(names, fit), "flights": flights_json(records, points, fit.noisy.offsets)}
@@ -200,7 +200,7 @@ def _residuals(names: Sequence[str], fit: PositionFit) -> dict[str, Any]:
     uncertainty = fit.uncertainty
     return {
         "rmse_horizontal_m": _rms(used[:, :2]),
-        "rmse_vertical_m": _rms(used[:, 2:]),
+        "rmse_vertical_m": _rms(used[:, 2:]) if uncertainty.heights_known else None,
         "rmse_m": _rms(used),
         "photos_used": len(used),
         "over_stated_sigmas": float(np.sqrt((uncertainty.noise.factors[[0, 0, 1]] ** 2).mean())),
@@ -258,9 +258,11 @@ def _warn_of_noise(fit: PositionFit, frame: Frame, positions: Positions, report:
         axes = ("horizontal", "vertical")
         stated = [float(np.median([record[f"sigma_{axis}_m"] for record in used])) for axis in axes]
         across, height = (frame.residuals[f"rmse_{axis}_m"] for axis in axes)  # as in the report's table
+        known = fit.uncertainty.heights_known
+        off, expected = (f" and {height:.1f} m in height", f" and {stated[1]:g}") if known else ("", "")
         report.warning(
-            f"The photos' positions are inaccurate: off by {across:.1f} m horizontally and {height:.1f} m in height "
-            f"(RMS), where {stated[0]:g} and {stated[1]:g} m were expected. Result: {fit.uncertainty.sentence()}.",
+            f"The photos' positions are inaccurate: off by {across:.1f} m horizontally{off} "
+            f"(RMS), where {stated[0]:g}{expected} m were expected. Result: {fit.uncertainty.sentence()}.",
             "Control points (gcp_list.txt), or better positions (positions.csv), would improve the georeference.",
         )
 
