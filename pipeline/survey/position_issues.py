@@ -6,11 +6,13 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.position_outliers import median_distance_m
+from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
 from splatpipe.pipeline.survey.photo_positions import DATUM_STEP_M, NOWHERE, Position, PositionList
 from splatpipe.pipeline.survey.position_sources import MOST_DATUMS_M, is_on_earth, xmp_place
 from splatpipe.pipeline.survey.position_spread import spread_of
@@ -201,9 +203,8 @@ def _altitudes(of: PositionList) -> list[CaptureIssue]:
     positions = of.positions
     stated = {each.name: each.altitude_m for each in positions if each.altitude_m is not None}
     takeoff = any(each.altitude_source == "takeoff" for each in positions)
+    lacking = frozenset(each.name for each in positions if takeoff or each.altitude_m is None)
     issues = []
-    without = tuple(each.name for each in positions if each.altitude_m is None)
-    lacking = frozenset(each.name for each in positions) if takeoff else frozenset(without)
     impossible = {name: metres for name, metres in of.doubts.impossible_m.items() if name in lacking}
     if impossible:
         least, most = min(impossible.values()), max(impossible.values())
@@ -214,25 +215,39 @@ def _altitudes(of: PositionList) -> list[CaptureIssue]:
         text = "No photo states a usable altitude: heights will count from the take-off point, not from the sea."
         hint = "Scale, horizontal place and up are not affected. Control points or geo.txt would give heights."
         issues.append(CaptureIssue("altitude-missing", text, hint))
-    elif positions and not stated:
-        text = "No photo states a usable altitude: only horizontal positions are used, and heights are arbitrary."
+    elif lacking:
+        issues.append(_without_altitude(sorted(lacking), len(stated)))
+    return [*issues, *_far_altitudes(stated)]
+
+
+def _without_altitude(names: Sequence[str], others: int) -> CaptureIssue:
+    """Photos without an altitude.
+
+    Args:
+        names: The photos.
+        others: How many have one.
+    """
+    if others < MIN_POSITIONS:
+        who = f"Only {others} of {len(names) + others} photos state" if others else "No photo states"
+        text = f"{who} a usable altitude: only horizontal positions are used, and heights are arbitrary."
         hint = "Up will be from how the cameras were held. Control points, or altitudes in geo.txt, would give heights."
-        issues.append(CaptureIssue("altitude-missing", text, hint))
-    elif without:
-        many = len(without) > len(positions) / 2
-        text = f"Without an altitude: {f'{len(without)} of {len(positions)} photos' if many else list_names(without)}."
-        hint = "Their positions are not used." if len(stated) < 3 else "Their heights are treated as unknown."
-        issues.append(CaptureIssue("altitude-missing", text, hint, without))
-    if len(stated) < 3:
-        return issues
-    values = np.array(list(stated.values()), dtype=np.float64)
+        return CaptureIssue("altitude-missing", text, hint)
+    who = list_names(names) if len(names) <= others else f"{len(names)} of {len(names) + others} photos"
+    return CaptureIssue("altitude-missing", f"Without an altitude: {who}.", "Others place the model.", tuple(names))
+
+
+def _far_altitudes(stated: Mapping[str, float]) -> list[CaptureIssue]:
+    """Altitudes far off the others'."""
+    if len(stated) < MIN_POSITIONS:
+        return []
+    values: Float64[np.ndarray, " n"] = np.array(list(stated.values()), dtype=np.float64)
     off = np.abs(values - np.median(values))
     limit = max(MIN_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
     odd = tuple(name for name, metres in zip(stated, off.tolist(), strict=True) if metres > limit)
-    if odd:
-        text = f"Altitudes far from the others' ({np.median(values):.0f} m): {list_names(odd)}."
-        issues.append(CaptureIssue("altitude-far", text, "Correct them, or leave the photos out.", odd))
-    return issues
+    if not odd:
+        return []
+    text = f"Altitudes far from the others' ({np.median(values):.0f} m): {list_names(odd)}."
+    return [CaptureIssue("altitude-far", text, "Correct them, or leave the photos out.", odd)]
 
 
 def _datums(positions: PositionList) -> list[CaptureIssue]:
