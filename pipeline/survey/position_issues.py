@@ -57,8 +57,10 @@ def _none_on_earth(positions: PositionList) -> list[CaptureIssue]:
         issues.append(
             CaptureIssue(
                 "position-impossible",
-                f"Impossible positions: {list_names(positions.impossible)}.",
-                "These photos are used without their positions.",
+                f"Impossible positions: {list_names(positions.impossible)}."
+                if positions.positions
+                else "All stated positions are impossible: the result will have neither scale nor georeference.",
+                "They are none on Earth, 0, 0, or of no known hemisphere. These photos are used without them.",
                 positions.impossible,
             )
         )

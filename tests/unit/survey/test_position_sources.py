@@ -101,6 +101,11 @@ def test_xmp_precedes_a_position_without_hemisphere() -> None:
     assert "read as north and east" in issues["position-hemisphere"]
 
 
+def test_positions_that_are_all_impossible_are_told_with_the_consequence() -> None:
+    _, issues = told([photo(k, Gps(0.0, 0.0, 520.0)) for k in range(8)])
+    assert "neither scale nor georeference" in issues["position-impossible"]
+
+
 @pytest.mark.parametrize("altitude", [None, -999.0, 9999.0, 0.0])
 def test_no_usable_altitude_in_any_photo_is_told(altitude: float | None) -> None:
     positions, issues = told([photo(k, at(k, altitude)) for k in range(10)])
