@@ -25,6 +25,7 @@ from splatpipe.pipeline.survey.adjusted_positions import (
     adjustment_json,
     with_adjustment,
 )
+from splatpipe.pipeline.survey.assumed_heights import with_assumed_heights
 from splatpipe.pipeline.survey.blunders import gsd_m
 from splatpipe.pipeline.survey.boundary import lay_boundary
 from splatpipe.pipeline.survey.control import ControlResult, place_by_control
@@ -74,7 +75,7 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     report.progress(0, 3, "reading the model", "steps")
     photos = load_photo_list(inputs["ingest.photos"]).by_name()
     model = read_model(source, photos)
-    positions = read_positions(inputs["ingest.positions"])
+    positions = with_assumed_heights(model, read_positions(inputs["ingest.positions"]))
     report.progress(1, 3, "fitting the positions", "steps")
     lenses = _lens_knowledge(inputs["ingest.cameras"], inputs["ingest.lenses"], model, photos)
     capture = GeorefInput(model, positions, photos, lenses, inputs.settings.get("sparse.lens") == "held")

@@ -46,13 +46,9 @@ from splatpipe.pipeline.photos.preparation import (
 from splatpipe.pipeline.photos.scan import ExcludedPhoto, Scan, scan_folder
 from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
-from splatpipe.pipeline.survey.photo_positions import (
-    PositionList,
-    is_on_earth,
-    positions_json,
-    read_positions,
-)
+from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
 from splatpipe.pipeline.survey.position_issues import find_position_issues
+from splatpipe.pipeline.survey.position_sources import is_on_earth
 from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
 
 MIN_PHOTOS = 2
@@ -210,12 +206,13 @@ def _accuracy(positions: PositionList) -> dict[str, JSON]:
     stated = positions.positions
     if not stated:
         return {"positions": 0}
+    vertical = [each.sigma_vertical_m for each in stated if each.altitude_m is not None]
     return {
         "positions": len(stated),
         "position_sources": sorted({each.source for each in stated}),
         "flights": len({each.flight for each in stated}),
         "sigma_horizontal_m": float(np.median([each.sigma_horizontal_m for each in stated])),
-        "sigma_vertical_m": float(np.median([each.sigma_vertical_m for each in stated])),
+        "sigma_vertical_m": float(np.median(vertical)) if vertical else None,
         "sigma_sources": sorted({each.sigma_source for each in stated}),
     }
 

@@ -44,7 +44,9 @@ def _ingest(facts: Figures) -> str:
             if facts["positions"] == facts["photos"]
             else f"{count(facts['positions'])} with positions"
         )
-        known += f" accurate to {_sigmas(facts)}" if facts.get("sigma_horizontal_m") else ""
+        if facts.get("sigma_horizontal_m"):
+            known += f" accurate to {_sigmas(facts)}"
+            known += ", without altitudes" if facts.get("sigma_vertical_m", 0.0) is None else ""
         parts.append(known)
     else:
         parts.append("none with a position")
@@ -103,8 +105,9 @@ def _georef(facts: Figures) -> str:
             break
     else:
         if facts.get("rmse_horizontal_m") is not None:
-            horizontal, up = length(facts["rmse_horizontal_m"]), length(facts["rmse_vertical_m"])
-            parts.append(f"photo positions off by {horizontal} horizontally and {up} in height (RMSE)")
+            vertical = facts.get("rmse_vertical_m")
+            up = "" if vertical is None else f" and {length(vertical)} in height"
+            parts.append(f"photo positions off by {length(facts['rmse_horizontal_m'])} horizontally{up} (RMSE)")
     parts += [f"{plural(facts['positions_left_out'], 'position')} left out"] if facts.get("positions_left_out") else []
     parts += [f"{plural(facts['points_left_out'], 'point')} left out"] if facts.get("points_left_out") else []
     parts += ["cameras adjusted to the control points"] if facts.get("model_bent") else []

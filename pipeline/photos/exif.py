@@ -17,6 +17,8 @@ MAX_SIDE_PX = 1_000_000
 MM_PER_FOCAL_PLANE_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF 2.32, FocalPlaneResolutionUnit; 4, 5 by TIFF/EP
 BELOW_SEA_LEVEL = (1, 3)  # GPSAltitudeRef: below sea level; EXIF 3.0 adds 3, below the ellipsoid
 NO_FIX = "V"  # GPSStatus of a receiver without a fix
+LATITUDE_SIGNS = {"N": 1.0, "S": -1.0}  # first letters of GPSLatitudeRef; some programs write whole words
+LONGITUDE_SIGNS = {"E": 1.0, "W": -1.0}
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Gps:
         altitude_m: Metres above the reference that GPSAltitudeRef names (sea level), or None.
         horizontal_error_m: GPSHPositioningError, or None.
         void: Whether the receiver reported that it had no fix.
+        hemispheres: Whether both hemispheres are stated, by their tags or by a sign; else they are read as north and
+            east.
     """
 
     latitude: float
@@ -36,6 +40,7 @@ class Gps:
     altitude_m: float | None = None
     horizontal_error_m: float | None = None
     void: bool = False
+    hemispheres: bool = True
 
 
 @dataclass(frozen=True)
@@ -172,20 +177,36 @@ def _gps(tags: Mapping[int, Any]) -> Gps | None:
         reference = reference[0] if reference else 0
     if altitude is not None and reference in BELOW_SEA_LEVEL:
         altitude = -abs(altitude)
+    latitude, latitude_stated = _degrees(tags[GPS.GPSLatitude], tags.get(GPS.GPSLatitudeRef), LATITUDE_SIGNS)
+    longitude, longitude_stated = _degrees(tags[GPS.GPSLongitude], tags.get(GPS.GPSLongitudeRef), LONGITUDE_SIGNS)
     return Gps(
-        latitude=_degrees(tags[GPS.GPSLatitude], tags.get(GPS.GPSLatitudeRef), "S"),
-        longitude=_degrees(tags[GPS.GPSLongitude], tags.get(GPS.GPSLongitudeRef), "W"),
+        latitude=latitude,
+        longitude=longitude,
         altitude_m=altitude,
         horizontal_error_m=_number(tags.get(GPS.GPSHPositioningError), 1e-4, 1e5),
         void=_text(tags.get(GPS.GPSStatus)).upper() == NO_FIX,
+        hemispheres=latitude_stated and longitude_stated,
     )
 
 
-def _degrees(value: Any, reference: Any, negative: str) -> float:
-    """Convert degrees, minutes, seconds (or fewer of them) to signed degrees; NaN if they are invalid."""
+def _degrees(value: Any, reference: Any, signs: Mapping[str, float]) -> tuple[float, bool]:
+    """Convert degrees, minutes, seconds (or fewer of them) to signed degrees.
+
+    Args:
+        value: The numbers.
+        reference: The hemisphere: a word whose first letter counts.
+        signs: Of the hemispheres by their first letters.
+
+    Returns:
+        The degrees, NaN if they or the hemisphere are invalid; and whether the hemisphere is stated.
+    """
     parts = value if isinstance(value, (tuple, list)) else (value,)
     numbers = [_number(part, -1e6, 1e6) for part in parts]
     if not 1 <= len(numbers) <= 3 or any(number is None for number in numbers):
-        return math.nan
+        return math.nan, True
     degrees = sum(number / 60.0**power for power, number in enumerate(numbers) if number is not None)
-    return -abs(degrees) if _text(reference).upper() == negative else degrees
+    word = _text(reference).upper()
+    if not word:
+        return degrees, degrees < 0.0
+    sign = signs.get(word[0], math.nan)
+    return (degrees if sign > 0.0 else sign * abs(degrees)), True

@@ -12,6 +12,7 @@ import numpy as np
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.adjustment import can_adjust, moved_px
+from splatpipe.pipeline.survey.assumed_heights import ASSUMED
 from splatpipe.pipeline.survey.block_accuracy import (
     BlockAccuracy,
     camera_accuracy,
@@ -96,6 +97,7 @@ def stated_positions(
         for name in model.names
         if (record := positions.by_name.get(name)) is not None
         and record["altitude_m"] is not None
+        and record.get("altitude_source") != ASSUMED
         and name not in positions.wrong
     ]
     if len(usable) < MIN_POSITIONS:

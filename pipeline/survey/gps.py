@@ -17,6 +17,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.assumed_heights import ASSUMED
 from splatpipe.pipeline.survey.fitting import (
     MAX_SIGMA_ROTATION_RAD,
     MAX_SIGMA_SCALE,
@@ -39,6 +40,8 @@ from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.level import Positions, known_directions
 from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.position_spread import spread_of
+from splatpipe.pipeline.survey.up_witnesses import UpVerdict, check_up
 
 ORIGIN_DIGITS = 5  # degrees: about a metre, so that the origin stays put when a few photos are added or removed
 SWAPPED_NOISE = 0.5  # of the residuals: if swapped coordinates fit twice as well, they are swapped
@@ -69,6 +72,8 @@ def georeference(
     times = {name: photos[name].time if name in photos else None for name in usable}
     names = capture_order(usable, positions.by_name, times)
     records = [positions.by_name[name] for name in names]
+    if reason := spread_of([(r["latitude"], r["longitude"], r["altitude_m"]) for r in records]).too_few:
+        raise FrameUndeterminedError(reason)
     index = {name: i for i, name in enumerate(model.names)}
     geodetic = np.array([[r["latitude"], r["longitude"], r["altitude_m"]] for r in records], dtype=np.float64)
     sigmas = np.array([[r["sigma_horizontal_m"]] * 2 + [r["sigma_vertical_m"]] for r in records], dtype=np.float64)
@@ -84,8 +89,12 @@ def georeference(
             points = _bound(points, limit)
         robust = _robust(points, limit, directions.prior)
         noise = robust.noise
-        fit = fit_positions(points, flights, robust, limit, directions, model.points)
+        try:
+            fit = fit_positions(points, flights, robust, limit, directions, model.points)
+        except np.linalg.LinAlgError as error:
+            raise FrameUndeterminedError("the photo positions determine neither scale nor rotation") from error
         require_determined(fit, points)
+        _require_upright(check_up(fit.noisy.similarity, model, positions))
     except FrameUndeterminedError:
         _require_unswapped(points, geodetic, limit, noise)
         raise
@@ -95,6 +104,10 @@ def georeference(
     left_out = [name for name, inlier in zip(names, fit.inliers, strict=True) if not inlier]
     note = f"From the positions of {len(names) - len(left_out)} photos: {fit.uncertainty.sentence()}"
     note += f"; the rotation that they leave open is from {fit.held_by}." if fit.held_by else "."
+    if any(record.get("altitude_source") == ASSUMED for record in records):
+        fit = replace(fit, uncertainty=fit.uncertainty.without_heights(directions.prior.sigma_rad))
+        note = f"From the horizontal positions of {len(names) - len(left_out)} photos: {fit.uncertainty.sentence()}."
+        note += f" Up is from {directions.source}; heights are arbitrary: they count from the middle of the scene."
     residuals = {**_residuals(names, fit), "flights": flights_json(records, points, fit.noisy.offsets)}
     datum = declared_datum(records, points)
     return Frame("enu", fit.noisy.similarity, origin, datum, residuals, tuple(sorted(left_out + wrong)), note), fit
@@ -144,6 +157,15 @@ def _require_unswapped(
         raise FrameUndeterminedError("the photo positions fit only with latitude and longitude swapped: correct them")
 
 
+def _require_upright(verdict: UpVerdict) -> None:
+    """Reject a placement that is upside down or mirrored by all that is known besides the positions."""
+    if verdict.refuted:
+        raise FrameUndeterminedError(
+            f"the photo positions place the model upside down or mirrored: {verdict.sentence()}; a W or S that is "
+            "missing, or latitude and longitude swapped, does that"
+        )
+
+
 def _require_agreement(fit: SimilarityFit, positions: int) -> None:
     inliers = int(fit.inliers.sum())
     if inliers < MIN_POSITIONS or 2 * inliers < positions:
@@ -154,6 +176,9 @@ def _why_few(model: SparseModel, positions: Positions, usable: int) -> str:
     stated = sum(name in positions.by_name for name in model.names)
     if stated == 0:
         return "no photo of the model has a position"
+    records = [positions.by_name[name] for name in model.names if name in positions.by_name]
+    if stated >= MIN_POSITIONS and (why := spread_of([(r["latitude"], r["longitude"], 0.0) for r in records]).too_few):
+        return why
     if usable < stated:
         return f"only {usable} photos of the model have a position with an altitude"
     return f"only {stated} photo{'s' if stated > 1 else ''} of the model {'have' if stated > 1 else 'has'} a position"
@@ -175,7 +200,7 @@ def _residuals(names: Sequence[str], fit: PositionFit) -> dict[str, Any]:
     uncertainty = fit.uncertainty
     return {
         "rmse_horizontal_m": _rms(used[:, :2]),
-        "rmse_vertical_m": _rms(used[:, 2:]),
+        "rmse_vertical_m": _rms(used[:, 2:]) if uncertainty.heights_known else None,
         "rmse_m": _rms(used),
         "photos_used": len(used),
         "over_stated_sigmas": float(np.sqrt((uncertainty.noise.factors[[0, 0, 1]] ** 2).mean())),
@@ -208,6 +233,12 @@ def report_frame(frame: Frame, model: SparseModel, positions: Positions, report:
             f"{list_names(frame.left_out)}.",
             "The photos themselves are used.",
         )
+    up = check_up(frame.world_from_model, model, positions)
+    if up.doubtful:
+        report.warning(
+            f"The model may be placed upside down or mirrored: {up.sentence()}.",
+            "Check the signs of latitude and longitude (W and S), and that up is up in the result.",
+        )
     heights = _heights(frame, model, positions)
     if heights is not None and abs(heights[0] / heights[1] - 1.0) > HEIGHT_TOLERANCE:
         report.warning(
@@ -227,9 +258,11 @@ def _warn_of_noise(fit: PositionFit, frame: Frame, positions: Positions, report:
         axes = ("horizontal", "vertical")
         stated = [float(np.median([record[f"sigma_{axis}_m"] for record in used])) for axis in axes]
         across, height = (frame.residuals[f"rmse_{axis}_m"] for axis in axes)  # as in the report's table
+        known = fit.uncertainty.heights_known
+        off, expected = (f" and {height:.1f} m in height", f" and {stated[1]:g}") if known else ("", "")
         report.warning(
-            f"The photos' positions are inaccurate: off by {across:.1f} m horizontally and {height:.1f} m in height "
-            f"(RMS), where {stated[0]:g} and {stated[1]:g} m were expected. Result: {fit.uncertainty.sentence()}.",
+            f"The photos' positions are inaccurate: off by {across:.1f} m horizontally{off} "
+            f"(RMS), where {stated[0]:g}{expected} m were expected. Result: {fit.uncertainty.sentence()}.",
             "Control points (gcp_list.txt), or better positions (positions.csv), would improve the georeference.",
         )
 

@@ -1,8 +1,8 @@
 """Each photo's position and camera angles, and their accuracies.
 
 Each value comes from the first of three sources that states it: the position file, EXIF (where corrected positions are
-written back), XMP. Angles are from the file, then the gimbal's in XMP, then the ``Camera:`` tags. Accuracies are from
-the file, then XMP, then EXIF, else the default for the receiver's type of fix.
+written back; ``position_sources`` has the exceptions), XMP. Angles are from the file, then the gimbal's in XMP, then
+the ``Camera:`` tags. Accuracies are from the file, then XMP, then EXIF, else the default for the type of fix.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -19,20 +19,31 @@ from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.camera_angles import Convention, detect_convention, gimbal_from_nadir
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import Gps
+from splatpipe.pipeline.photos.names import printable
 from splatpipe.pipeline.photos.position_outliers import find_misplaced
 from splatpipe.pipeline.photos.xmp import xmp_number
 from splatpipe.pipeline.survey.crs_names import ELLIPSOIDAL, UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.flights import Stamp, assign_flights
+from splatpipe.pipeline.survey.position_sources import (
+    MIN_REPEATED,
+    SourceDoubts,
+    exif_altitude,
+    is_on_earth,
+    relative_altitude,
+    same_place,
+    settle_sources,
+    xmp_altitude,
+    xmp_place,
+)
 from splatpipe.pipeline.survey.stated_positions import FilePlace
 
-ALTITUDE_BOUNDS_M = (-1000.0, 20_000.0)
-NULL_ISLAND_DEG = 1e-6  # receivers without a fix write 0, 0
 FIXED, SINGLE = 50, 16  # drone-dji:RtkFlag (DJI's user manuals); 32 to 49 are kinds of float
 FLOAT = range(32, 50)
 # Horizontal (per axis) and vertical standard deviations, metres, where a photo does not state its own.
 DEFAULT_SIGMAS_M = {"fixed": (0.02, 0.03), "float": (0.5, 1.0), "single": (3.0, 5.0), None: (3.0, 5.0)}
 MIN_SIGMA_M = 0.005  # smaller stated accuracies are the receiver's noise, not the accuracy of the camera's position
 VERTICAL_OVER_HORIZONTAL = 1.5  # of GNSS errors, where only the horizontal one is stated
+BAROMETER_SIGMA_M = 1.0  # of heights above take-off, whatever the receiver's accuracy
 DATUM_STEP_M = 1.0  # EXIF and XMP altitudes further apart than this are not roundings of one value
 NOWHERE = "states a position that is none on Earth"
 
@@ -46,7 +57,8 @@ class Position:
         latitude: Degrees north, WGS84.
         longitude: Degrees east, WGS84.
         altitude_m: As stated; None when there is none.
-        altitude_source: ``file``, ``exif`` or ``xmp``; None when there is none.
+        altitude_source: ``file``, ``exif``, ``xmp``, or ``takeoff``: no photo of the capture states an altitude, and
+            this is the height above the take-off point. None when there is none.
         relative_altitude_m: Above the take-off point, by the drone.
         sigma_horizontal_m: Standard deviation in east and in north each.
         sigma_vertical_m: Standard deviation of the altitude.
@@ -95,12 +107,14 @@ class PositionList:
         wrong: Why a stated position is unusable, by photo: the end of a sentence that starts with the photo's name.
         altitude_step_m: Median of EXIF's altitude less XMP's where both are given, else None.
         orientations: EXIF orientation of every photo where it is not 1, by name.
+        doubts: Where EXIF was not read as it stands.
     """
 
     positions: tuple[Position, ...]
     wrong: Mapping[str, str]
     altitude_step_m: float | None
     orientations: Mapping[str, int]
+    doubts: SourceDoubts = field(default_factory=SourceDoubts)
 
     @property
     def impossible(self) -> tuple[str, ...]:
@@ -120,6 +134,7 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
     wrong: dict[str, str] = {}
     steps: list[float] = []
     conventions = _conventions(photos)
+    photos, doubts = settle_sources(photos)
     for photo in photos:
         place = (places or {}).get(photo.name)
         stated = [gps for gps in (_file_gps(place), photo.exif.gps, xmp_place(photo.xmp)) if gps and not gps.void]
@@ -134,9 +149,11 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
         position = replace(position, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
         found.append(position)
         stamps.append(_stamp(photo, position))
-        exif_altitude, xmp_altitude = _exif_altitude(photo.exif.gps), _xmp_altitude(photo.xmp)
-        if exif_altitude is not None and xmp_altitude is not None:
-            steps.append(exif_altitude - xmp_altitude)
+        ours, theirs = exif_altitude(photo.exif.gps), xmp_altitude(photo.xmp)
+        if ours is not None and theirs is not None:
+            steps.append(ours - theirs)
+    found = _above_takeoff(found)
+    wrong |= _repeated(found, photos)
     wrong |= find_misplaced({each.name: (each.latitude, each.longitude) for each in found})
     flights = assign_flights(stamps)
     numbered = [replace(each, flight=flight) for each, flight in zip(found, flights, strict=True)]
@@ -145,7 +162,43 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
         dict(sorted(wrong.items())),
         float(np.median(steps)) if steps else None,
         {photo.name: photo.exif.orientation for photo in photos if photo.exif.orientation != 1},
+        doubts,
     )
+
+
+def _above_takeoff(found: Sequence[Position]) -> list[Position]:
+    """Positions with heights above take-off as altitudes, if none has an altitude: they at least agree mutually."""
+    if any(each.altitude_m is not None for each in found):
+        return list(found)
+    return [
+        each
+        if each.relative_altitude_m is None
+        else replace(
+            each,
+            altitude_m=each.relative_altitude_m,
+            altitude_source="takeoff",
+            sigma_vertical_m=max(each.sigma_vertical_m, BAROMETER_SIGMA_M),
+        )
+        for each in found
+    ]
+
+
+def _repeated(found: Sequence[Position], photos: Sequence[CheckedPhoto]) -> dict[str, str]:
+    """Photos that repeat one position which most photos state, where the others state several.
+
+    A receiver that lost its fix repeats the last one. The first such photo may be right; the others, as a majority,
+    would make any fit contract the model to a point.
+    """
+    times = {photo.name: photo.exif.time or "" for photo in photos}
+    by_place: dict[tuple[float, float], list[str]] = {}
+    for each in found:
+        if each.source != "file":
+            by_place.setdefault(same_place(each.latitude, each.longitude), []).append(each.name)
+    largest = max(by_place.values(), key=len, default=[])
+    if len(largest) < MIN_REPEATED or 2 * len(largest) <= len(found) or len(by_place) < MIN_REPEATED:
+        return {}
+    first, *others = sorted(largest, key=lambda name: (times[name], name))
+    return dict.fromkeys(others, f"repeats the position of {printable(first)}")
 
 
 def positions_json(positions: PositionList) -> JSON:
@@ -157,23 +210,14 @@ def positions_json(positions: PositionList) -> JSON:
     return value | ({"wrong": dict(positions.wrong)} if positions.wrong else {})
 
 
-def is_on_earth(latitude: float, longitude: float) -> bool:
-    """Whether a position is plausible: finite, within bounds, and not the 0, 0 of a receiver without a fix."""
-    if not (math.isfinite(latitude) and math.isfinite(longitude)):
-        return False
-    if abs(latitude) > 90.0 or abs(longitude) > 180.0:
-        return False
-    return abs(latitude) > NULL_ISLAND_DEG or abs(longitude) > NULL_ISLAND_DEG
-
-
 def _position(photo: CheckedPhoto, gps: Gps, source: str, place: FilePlace | None) -> Position:
     """The photo's position without its angles."""
     xmp = photo.xmp
     altitudes = {
         "file": place.altitude_m if place is not None else None,
         # Post-processed positions (PPK) are written to EXIF, so it takes precedence over XMP.
-        "exif": _exif_altitude(photo.exif.gps),
-        "xmp": _xmp_altitude(xmp),
+        "exif": exif_altitude(photo.exif.gps),
+        "xmp": xmp_altitude(xmp),
     }
     altitude_source = next((name for name, altitude in altitudes.items() if altitude is not None), None)
     rtk = _rtk(xmp)
@@ -184,7 +228,7 @@ def _position(photo: CheckedPhoto, gps: Gps, source: str, place: FilePlace | Non
         longitude=gps.longitude,
         altitude_m=altitudes[altitude_source] if altitude_source else None,
         altitude_source=altitude_source,
-        relative_altitude_m=xmp_number(xmp, "drone-dji:RelativeAltitude", *ALTITUDE_BOUNDS_M),
+        relative_altitude_m=relative_altitude(xmp),
         sigma_horizontal_m=horizontal,
         sigma_vertical_m=vertical,
         rtk=rtk,
@@ -295,25 +339,3 @@ def _seconds(time: str | None) -> float:
 
 def _file_gps(place: FilePlace | None) -> Gps | None:
     return None if place is None else Gps(place.latitude, place.longitude)
-
-
-def _exif_altitude(gps: Gps | None) -> float | None:
-    altitude = gps.altitude_m if gps is not None else None
-    if altitude is None or not ALTITUDE_BOUNDS_M[0] <= altitude <= ALTITUDE_BOUNDS_M[1]:
-        return None
-    return altitude
-
-
-def _xmp_altitude(xmp: Mapping[str, str]) -> float | None:
-    return xmp_number(xmp, "drone-dji:AbsoluteAltitude", *ALTITUDE_BOUNDS_M)
-
-
-def xmp_place(xmp: Mapping[str, str]) -> Gps | None:
-    """The position that XMP states; DJI spells the longitude both ways."""
-    latitude = xmp_number(xmp, "drone-dji:GpsLatitude", -1e6, 1e6)
-    longitude = xmp_number(xmp, "drone-dji:GpsLongitude", -1e6, 1e6)
-    if longitude is None:
-        longitude = xmp_number(xmp, "drone-dji:GpsLongtitude", -1e6, 1e6)
-    if latitude is None or longitude is None:
-        return None
-    return Gps(latitude, longitude, void=xmp.get("drone-dji:GpsStatus", "").casefold() == "invalid")

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.position_outliers import median_distance_m
-from splatpipe.pipeline.survey.photo_positions import (
-    DATUM_STEP_M,
-    NOWHERE,
-    Position,
-    PositionList,
-    is_on_earth,
-    xmp_place,
-)
+from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
+from splatpipe.pipeline.survey.photo_positions import DATUM_STEP_M, NOWHERE, Position, PositionList
+from splatpipe.pipeline.survey.position_sources import MOST_DATUMS_M, is_on_earth, xmp_place
+from splatpipe.pipeline.survey.position_spread import spread_of
 
 CONTRADICTION_M = 1.0  # between a photo's EXIF and XMP: too large for rounding
 CONTRADICTION_TIMES = 6.0  # times the difference in most photos, whose EXIF may have been post-processed (PPK)
@@ -27,6 +24,12 @@ WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
 RTK_SHARE = 0.5  # of the photos with a fix: above, the others have lost it
 ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
 MIN_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
+ORIGINS = {
+    "file": "from the file of positions",
+    "exif": "from EXIF",
+    "xmp": "from XMP",
+    "takeoff": "above take-off",
+}  # of altitudes
 
 
 def find_position_issues(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
@@ -39,8 +42,10 @@ def find_position_issues(photos: Sequence[CheckedPhoto], positions: PositionList
     return [
         *_none_on_earth(positions),
         *_missing(photos, positions),
-        *_contradicting(photos),
-        *_altitudes(positions.positions),
+        *_degenerate(positions.positions),
+        *_doubted(positions),
+        *_contradicting(photos, positions),
+        *_altitudes(positions),
         *_datums(positions),
         *_lost_fix(positions.positions),
     ]
@@ -52,8 +57,10 @@ def _none_on_earth(positions: PositionList) -> list[CaptureIssue]:
         issues.append(
             CaptureIssue(
                 "position-impossible",
-                f"Impossible positions: {list_names(positions.impossible)}.",
-                "These photos are used without their positions.",
+                f"Impossible positions: {list_names(positions.impossible)}."
+                if positions.positions
+                else "All stated positions are impossible: the result will have neither scale nor georeference.",
+                "They are none on Earth, 0, 0, or of no known hemisphere. These photos are used without them.",
                 positions.impossible,
             )
         )
@@ -92,12 +99,88 @@ def _missing(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[Ca
     return [CaptureIssue("position-missing", f"Without a position: {which}.", hint, single)]
 
 
-def _contradicting(photos: Sequence[CheckedPhoto]) -> list[CaptureIssue]:
+def _degenerate(positions: Sequence[Position]) -> list[CaptureIssue]:
+    """Positions that cannot determine scale and rotation, all together."""
+    if not positions:
+        return []
+    spread = spread_of([(each.latitude, each.longitude, each.altitude_m or 0.0) for each in positions])
+    consequence = "the result will have neither scale nor georeference"
+    if spread.too_few:
+        text = f"{spread.too_few[0].upper()}{spread.too_few[1:]}: {consequence}."
+        hint = "Was the receiver's fix lost, or its last one repeated? Control points give both, scale bars the scale."
+        return [CaptureIssue("positions-too-few", text, hint)]
+    sigma = float(np.median([each.sigma_horizontal_m for each in positions]))
+    if spread.is_too_close(sigma):
+        text = (
+            f"All positions lie within {spread.extent_m:.2g} m, but are accurate only to {sigma:.2g} m: {consequence}."
+        )
+        hint = "Control points give both, scale bars the scale; or give more accurate positions."
+        return [CaptureIssue("positions-too-close", text, hint)]
+    if spread.is_line(sigma):
+        text = "All positions lie along a line: they do not determine the rotation about it."
+        hint = "The gimbal's angles or the pictures' edges give it less accurately; a second line, or control, would."
+        return [CaptureIssue("positions-in-line", text, hint, severity="note")]
+    return []
+
+
+def _doubted(positions: PositionList) -> list[CaptureIssue]:
+    """Photos whose EXIF is not read as it stands."""
+    doubts = positions.doubts
+    texts: list[tuple[str, frozenset[str], str, str]] = [
+        (
+            "position-frozen",
+            doubts.frozen,
+            "state one and the same position in EXIF: the receiver was frozen, or the EXIF copied.",
+            "XMP's positions, which vary, are used.",
+        ),
+        (
+            "position-hemisphere",
+            doubts.by_xmp,
+            "state no hemisphere (N or S, E or W) in EXIF.",
+            "XMP's positions are used.",
+        ),
+        (
+            "position-hemisphere",
+            doubts.no_hemisphere,
+            "state no hemisphere (N or S, E or W): they are read as north and east.",
+            "In the west or south this would mirror the flight and place the model on another continent. Then add "
+            "GPSLatitudeRef and GPSLongitudeRef to the EXIF, or give positions in geo.txt.",
+        ),
+        (
+            "altitude-sign",
+            doubts.sign,
+            "state an altitude below the sea in EXIF, and the same above it in XMP.",
+            "It is read as above the sea (EXIF's AltitudeRef is wrong).",
+        ),
+        (
+            "altitude-takeoff",
+            doubts.above_takeoff,
+            "state the height above take-off as EXIF's altitude.",
+            "XMP's altitudes are used.",
+        ),
+        ("altitude-zero", doubts.zero, "state an altitude of exactly 0 m.", "It is read as no altitude."),
+    ]
+    return [
+        CaptureIssue(code, f"{_who(names, positions)} {text}", hint, tuple(sorted(names)))
+        for code, names, text, hint in texts
+        if names
+    ]
+
+
+def _who(names: Collection[str], positions: PositionList) -> str:
+    """All photos, or their number and names."""
+    if len(names) >= len(positions.positions):
+        return f"All {len(names)} photos"
+    return f"{len(names)} of {len(positions.positions)} photos ({list_names(sorted(names))})"
+
+
+def _contradicting(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
     """Photos whose EXIF and XMP state different positions, where most photos' agree."""
     apart: dict[str, float] = {}
+    settled = positions.doubts.frozen | positions.doubts.by_xmp
     for photo in photos:
         gps, other = photo.exif.gps, xmp_place(photo.xmp)
-        if gps is None or other is None or not is_on_earth(gps.latitude, gps.longitude):
+        if photo.name in settled or gps is None or other is None or not is_on_earth(gps.latitude, gps.longitude):
             continue
         if is_on_earth(other.latitude, other.longitude):
             places = [(gps.latitude, gps.longitude)], [(other.latitude, other.longitude)]
@@ -117,24 +200,56 @@ def _contradicting(photos: Sequence[CheckedPhoto]) -> list[CaptureIssue]:
     ]
 
 
-def _altitudes(positions: Sequence[Position]) -> list[CaptureIssue]:
-    """Altitudes far off the others'."""
+def _altitudes(of: PositionList) -> list[CaptureIssue]:
+    """Altitudes that are missing, impossible, or far off the others'."""
+    positions = of.positions
     stated = {each.name: each.altitude_m for each in positions if each.altitude_m is not None}
+    takeoff = any(each.altitude_source == "takeoff" for each in positions)
+    lacking = frozenset(each.name for each in positions if takeoff or each.altitude_m is None)
     issues = []
-    without = tuple(each.name for each in positions if each.altitude_m is None)
-    if stated and without and len(without) <= len(positions) / 2:
-        text = f"Without an altitude: {list_names(without)}."
-        issues.append(CaptureIssue("altitude-missing", text, "Their heights are treated as unknown.", without))
-    if len(stated) < 3:
-        return issues
-    values = np.array(list(stated.values()), dtype=np.float64)
+    impossible = {name: metres for name, metres in of.doubts.impossible_m.items() if name in lacking}
+    if impossible:
+        least, most = min(impossible.values()), max(impossible.values())
+        values = f"{least:,.0f} m" if round(least) == round(most) else f"{least:,.0f} to {most:,.0f} m"
+        text = f"{_who(impossible, of)} state an impossible altitude ({values})."
+        issues.append(CaptureIssue("altitude-impossible", text, "It is not used.", tuple(sorted(impossible))))
+    if takeoff:
+        text = "No photo states a usable altitude: heights will count from the take-off point, not from the sea."
+        hint = "Scale, horizontal place and up are not affected. Control points or geo.txt would give heights."
+        issues.append(CaptureIssue("altitude-missing", text, hint))
+    elif lacking:
+        issues.append(_without_altitude(sorted(lacking), len(stated)))
+    return [*issues, *_far_altitudes(stated)]
+
+
+def _without_altitude(names: Sequence[str], others: int) -> CaptureIssue:
+    """Photos without an altitude.
+
+    Args:
+        names: The photos.
+        others: How many have one.
+    """
+    if others < MIN_POSITIONS:
+        who = f"Only {others} of {len(names) + others} photos state" if others else "No photo states"
+        text = f"{who} a usable altitude: only horizontal positions are used, and heights are arbitrary."
+        hint = "Up will be from how the cameras were held. Control points, or altitudes in geo.txt, would give heights."
+        return CaptureIssue("altitude-missing", text, hint)
+    who = list_names(names) if len(names) <= others else f"{len(names)} of {len(names) + others} photos"
+    return CaptureIssue("altitude-missing", f"Without an altitude: {who}.", "Others place the model.", tuple(names))
+
+
+def _far_altitudes(stated: Mapping[str, float]) -> list[CaptureIssue]:
+    """Altitudes far off the others'."""
+    if len(stated) < MIN_POSITIONS:
+        return []
+    values: Float64[np.ndarray, " n"] = np.array(list(stated.values()), dtype=np.float64)
     off = np.abs(values - np.median(values))
     limit = max(MIN_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
     odd = tuple(name for name, metres in zip(stated, off.tolist(), strict=True) if metres > limit)
-    if odd:
-        text = f"Altitudes far from the others' ({np.median(values):.0f} m): {list_names(odd)}."
-        issues.append(CaptureIssue("altitude-far", text, "Correct them, or leave the photos out.", odd))
-    return issues
+    if not odd:
+        return []
+    text = f"Altitudes far from the others' ({np.median(values):.0f} m): {list_names(odd)}."
+    return [CaptureIssue("altitude-far", text, "Correct them, or leave the photos out.", odd)]
 
 
 def _datums(positions: PositionList) -> list[CaptureIssue]:
@@ -150,7 +265,11 @@ def _datums(positions: PositionList) -> list[CaptureIssue]:
             )
         )
     step = positions.altitude_step_m
-    if step is not None and abs(step) > DATUM_STEP_M:
+    if step is not None and abs(step) > MOST_DATUMS_M:
+        text = f"The altitudes in EXIF and in the drone's XMP differ by {step:.1f} m, more than any two datums do."
+        hint = "Usually one of them is the height above take-off. EXIF's are used: correct them if they are wrong."
+        issues.append(CaptureIssue("altitude-contradiction", text, hint))
+    elif step is not None and abs(step) > DATUM_STEP_M:
         issues.append(
             CaptureIssue(
                 "altitude-datums",
@@ -162,7 +281,12 @@ def _datums(positions: PositionList) -> list[CaptureIssue]:
 
 
 def _datum(vertical: str, source: str | None) -> str:
-    where = {"file": "from the file of positions", "exif": "from EXIF", "xmp": "from XMP"}.get(source or "", "")
+    where = {
+        "file": "from the file of positions",
+        "exif": "from EXIF",
+        "xmp": "from XMP",
+        "takeoff": "above take-off",
+    }.get(source or "", "")
     return f"{where} ({vertical if vertical != 'unknown' else 'datum not stated'})"
 
 

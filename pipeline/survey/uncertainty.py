@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ class Uncertainty:
         common_m: Horizontally and in height: the error common to all positions, included in ``coordinates_m``.
         noise: Of the positions.
         covariance: Of rotation vector, scale's logarithm and place, without the common part.
+        heights_known: Whether heights were measured; else those of the figures say nothing.
     """
 
     offset_m: Float64[np.ndarray, " 3"]
@@ -43,12 +44,20 @@ class Uncertainty:
     common_m: Float64[np.ndarray, " 2"]
     noise: ReceiverNoise
     covariance: Float64[np.ndarray, "7 7"]
+    heights_known: bool = True
+
+    def without_heights(self, up_rad: float) -> Uncertainty:
+        """The same with arbitrary heights, and an up direction that is known no better than this."""
+        up, weakest = max(self.up_rad, up_rad), max(self.weakest_rad, up_rad)
+        return replace(self, up_rad=up, weakest_rad=weakest, heights_known=False)
 
     def sentence(self) -> str:
         """The accuracy as a sentence for the user."""
         across, height = self.coordinates_m.tolist()
         metres = f"about {metres_in_words(across)}"
-        if not 0.67 < height / max(across, 1e-12) < 1.5:
+        if not self.heights_known:
+            metres += " horizontally"
+        elif not 0.67 < height / max(across, 1e-12) < 1.5:
             metres += f" ({metres_in_words(height)} in height)"
         angles = f"north to {_degrees(self.north_rad)}, up to {_degrees(self.up_rad)}"
         return f"coordinates good to {metres}, {angles}, scale to {_percent(self.scale)}"

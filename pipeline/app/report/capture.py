@@ -260,5 +260,6 @@ def _positions(summary: Mapping[str, Any], positions: Sequence[Mapping[str, Any]
     text += f", {count(flights)} flights" if isinstance(flights, int) and flights > 1 else ""
     horizontal, vertical = summary.get("sigma_horizontal_m"), summary.get("sigma_vertical_m")
     if horizontal is not None:
-        text += f"; assumed accurate to {length(horizontal)} horizontally, {length(vertical)} in height"
+        text += f"; assumed accurate to {length(horizontal)} horizontally, "
+        text += f"{length(vertical)} in height" if vertical is not None else "without heights"
     return text
