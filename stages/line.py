@@ -17,7 +17,7 @@ from splatpipe.pipeline.web.options import ExportConfig
 
 INGEST = Stage(
     "ingest",
-    version=5,
+    version=6,
     config=IngestConfig,
     reads=("source.photos", "source.geo", "source.lens"),
     parts={
