@@ -87,7 +87,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=10,
+    version=11,
     config=GeorefConfig,
     reads=(
         "sparse.model",
