@@ -38,7 +38,7 @@ def test_the_workflow_has_a_job_per_shard_and_a_checkpoint_that_counts_them(tmp_
     assert kinds == ["rule all:", "checkpoint divide:", "rule sum_shard:", "rule sum:", "rule show:"]
     (house,) = call.plan().captures
     words = command_of(call, call.plan(), house, job("sum.2"), 3)
-    assert words[3:] == [
+    assert words[4:] == [
         "stage", "sum", str(tmp_path / "house"), "--shard", "2", "--device", "auto", "--threads", "3", "--json",
     ]  # fmt: skip
 
