@@ -58,7 +58,7 @@ DATUM_STEP_M = 1.0  # least offset that suggests another vertical datum; less ma
 
 
 def run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """As ``_run``, on one thread: BLAS with several rounds sums in another order."""
+    """As ``_run``, on one thread: BLAS with several threads sums in another order."""
     with threadpool_limits(limits=1):
         return _run(config, inputs, out, report)
 

@@ -24,7 +24,7 @@ from splatpipe.pipeline.survey.fitting import capture_order
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.georef_input import AdjustedPositions, GeorefInput
 from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import SparseModel, model_of
+from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.position_adjustment import PositionAdjustment, adjust_to_positions
 from splatpipe.pipeline.survey.position_noise import StatedPositions
 from splatpipe.pipeline.survey.receiver_noise import ReceiverNoise
@@ -295,8 +295,3 @@ def height_sentence(together_m: float, gsd: float | None, stated_m: float) -> st
         " straight down from one height do not tell focal length from height; one control point, oblique photos beside"
         " these or a second flying height would settle it"
     )
-
-
-def model_after(found: AdjustedPositions, photos: Sequence[str] | Mapping[str, Photo]) -> SparseModel:
-    """The adjusted model."""
-    return model_of(found.done.reconstruction, photos)

@@ -386,8 +386,3 @@ def ground_carry(reduced: ReducedBlock, points: Sequence[int]) -> Float64[np.nda
     """Dense derivative of some tie points by the unknowns."""
     rows = (3 * np.asarray(points, dtype=np.int64)[:, None] + np.arange(3)).ravel()
     return np.asarray(reduced.carry[rows].todense()).reshape(len(points), 3, -1)
-
-
-def lens_values(block: Block) -> list[Mapping[str, float]]:
-    """The free parameters of each lens by name."""
-    return [dict(zip(lens.names, lens.values.tolist(), strict=True)) for lens in block.lenses]
