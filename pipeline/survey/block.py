@@ -372,8 +372,8 @@ def _project(camera: pycolmap.Camera, rays: Float64[np.ndarray, "m 3"]) -> Float
 
 
 def _summed(
-    values: Float64[np.ndarray, m * r], starts: Int64[np.ndarray, " p"], point: Int64[np.ndarray, " m"], p: int
-) -> Float64[np.ndarray, p * r]:
+    values: Float64[np.ndarray, " m *r"], starts: Int64[np.ndarray, " p"], point: Int64[np.ndarray, " m"], p: int
+) -> Float64[np.ndarray, " p *r"]:
     """Sums over each point's observations, which are contiguous; zeros for a point without any."""
     result = np.zeros((p, *values.shape[1:]))
     seen = np.bincount(point, minlength=p) > 0

@@ -154,7 +154,7 @@ def joint_system(
     return normal, gradient
 
 
-def solve(normal: Normal, right: Float64[np.ndarray, r * k]) -> Float64[np.ndarray, r * k]:
+def solve(normal: Normal, right: Float64[np.ndarray, " r *k"]) -> Float64[np.ndarray, " r *k"]:
     """Solve a positive definite system whose unknowns differ in size; undetermined directions stay put."""
     if scipy.sparse.issparse(normal):
         return _solve_sparse(normal, right)
@@ -183,7 +183,7 @@ def factorised(scaled: Float64[np.ndarray, "r r"]) -> Float64[np.ndarray, "r r"]
     raise np.linalg.LinAlgError("the normal equations are not finite")
 
 
-def _solve_sparse(normal: scipy.sparse.csr_array, right: Float64[np.ndarray, r * _]) -> Float64[np.ndarray, r * _]:
+def _solve_sparse(normal: scipy.sparse.csr_array, right: Float64[np.ndarray, " r *_"]) -> Float64[np.ndarray, " r *_"]:
     diagonal = normal.diagonal()
     sizes = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scale = scipy.sparse.diags_array(1.0 / sizes)
