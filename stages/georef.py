@@ -39,11 +39,12 @@ from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, station
 from splatpipe.pipeline.survey.model import SparseModel, copy_model, model_of, read_model
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE, LensKnowledge
-from splatpipe.pipeline.survey.scale_bars import ModelScale
+from splatpipe.pipeline.survey.scale_bars import ModelScale, scale_by
 from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
 from splatpipe.pipeline.survey.target_finds import load_finds, load_wanted
 from splatpipe.pipeline.survey.target_marks import TargetMarks
 from splatpipe.pipeline.survey.target_survey import (
+    FoundBars,
     TargetSurvey,
     compare,
     marker_of,
@@ -91,11 +92,11 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         frame if isinstance(frame, Frame) else None,
         config.approximate_crs,
     )
-    survey, scale = _survey(targets, inputs, config, report)
+    survey, scale, bars = _survey(targets, inputs, config, report)
     if survey is not None and any(point.sightings for point in survey.points):
         try:
             known = frame if isinstance(frame, Frame) else None
-            controlled = place_by_control(survey, capture, known, config, report)
+            controlled = place_by_control(survey, capture, known, config, report, bars)
         except FrameUndeterminedError as error:
             frame = frame if isinstance(frame, Frame) else Undetermined(str(error))
             report.warning(
@@ -103,11 +104,12 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
             )
     if controlled is not None:
         frame = controlled.frame
+        scale = scale_by(targets.wanted.bars, controlled.bar_ends) or scale
     if isinstance(frame, Undetermined) and scale is not None:
         frame = scaled(arbitrary_frame(model, positions, frame.why), scale)
         report.note(frame.note)
     elif scale is not None and isinstance(frame, Frame):
-        compare(frame, scale, report)
+        compare(frame, scale, report, controlled is not None and bool(controlled.bar_ends))
     if isinstance(frame, Undetermined):
         report.warning(f"Arbitrary scale: {frame.why}.", "Lengths and heights in this result are not in metres.")
         frame = arbitrary_frame(model, positions, frame.why)
@@ -141,8 +143,8 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
 
 def _survey(
     targets: TargetSurvey, inputs: Inputs, config: GeorefConfig, report: Reporter
-) -> tuple[Survey | None, ModelScale | None]:
-    """Return the survey, with marks from detected targets, and the scale from scale bars; each None if not given."""
+) -> tuple[Survey | None, ModelScale | None, FoundBars | None]:
+    """Return the survey, with marks from detected targets, the scale from scale bars, and these; None if not given."""
     control = inputs["source.control"]
     seen: list[TargetMarks] = []
     survey, marked = None, {}
@@ -153,7 +155,7 @@ def _survey(
     elif targets.finds:
         seen.append(targets.marks({}, report))
     found = seen[0] if seen else TargetMarks((), {})
-    return survey, scale_of(targets, found, marked, report)
+    return survey, *scale_of(targets, found, marked, report)
 
 
 def _by_positions(

@@ -87,7 +87,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=11,
+    version=12,
     config=GeorefConfig,
     reads=(
         "sparse.model",

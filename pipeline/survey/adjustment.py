@@ -1,4 +1,5 @@
-"""Bundle adjustment with control: marks and surveyed points enter the block beside tie points and camera positions.
+"""Bundle adjustment with control: marks, surveyed points and scale bars enter the block beside tie points and camera
+positions.
 
 Everything is in world metres, in a fixed order and on one thread, so that results are bit-identical. Each flight's
 common position error is an unknown.
@@ -13,12 +14,12 @@ from functools import cached_property
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 from splatpipe.pipeline.sfm.focal import UNOBSERVED
-from splatpipe.pipeline.survey.block import Block, Lens
+from splatpipe.pipeline.survey.block import Block, Distances, Lens
 from splatpipe.pipeline.survey.block_adjustment import (
     AdjustedBlock,
     PositionObservations,
@@ -53,6 +54,26 @@ class Target:
 
 
 @dataclass(frozen=True)
+class TargetDistances:
+    """Scale bars in the adjustment.
+
+    Attributes:
+        ends: Targets without coordinates that bars need beside the control points.
+        pairs: Indices of each bar's two targets: control points first, then ``ends``.
+        lengths: Metres.
+        sigmas: Their standard deviations.
+    """
+
+    ends: tuple[Target, ...]
+    pairs: Int64[np.ndarray, "b 2"]
+    lengths: Float64[np.ndarray, " b"]
+    sigmas: Float64[np.ndarray, " b"]
+
+
+NO_BARS = TargetDistances((), np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
 class ControlAdjustment:
     """The result of an adjustment.
 
@@ -63,6 +84,7 @@ class ControlAdjustment:
         source: The model before, in its own frame.
         world_from_model: Its approximate similarity.
         places: Adjusted positions of the targets, world frame.
+        bar_ends: Adjusted positions of the scale bars' further ends, world frame.
         normed: Root mean square of each target's distance to its surveyed position, over its sigmas.
         held: Cameras whose focal length cannot be determined, so that it is held near its prior.
         focal_sigmas: Relative standard deviation of each camera's focal length, by COLMAP camera id.
@@ -74,6 +96,7 @@ class ControlAdjustment:
     source: pycolmap.Reconstruction
     world_from_model: Similarity
     places: Float64[np.ndarray, "n 3"]
+    bar_ends: Float64[np.ndarray, "e 3"]
     normed: Float64[np.ndarray, " n"]
     held: tuple[int, ...]
     focal_sigmas: Mapping[int, float]
@@ -122,9 +145,11 @@ def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
     return reconstruction.num_points3D() > 0 and all(image.is_ref_in_frame() for image in images)
 
 
-def adjust(start: ControlStart, targets: Sequence[Target]) -> ControlAdjustment:
-    """Adjust a block to control and positions."""
-    block = _with_targets(start.block, targets, start.table.numbers)
+def adjust(start: ControlStart, targets: Sequence[Target], bars: TargetDistances = NO_BARS) -> ControlAdjustment:
+    """Adjust a block to control, scale bars and positions."""
+    first = len(start.block.points)
+    block = _with_targets(start.block, [*targets, *bars.ends], start.table.numbers)
+    block = replace(block, distances=Distances(first + bars.pairs, bars.lengths, bars.sigmas))
     done = adjust_block(block, start.observed)
     cameras = sorted(set(start.table.cameras))
     focal_sigmas = _focal_sigmas(done, start.observed, cameras)
@@ -135,7 +160,7 @@ def adjust(start: ControlStart, targets: Sequence[Target]) -> ControlAdjustment:
             place = cameras.index(number)
             lenses[place] = _near(lenses[place], start.focal_priors[number])
         done = adjust_block(replace(done.block, lenses=tuple(lenses)), start.observed, done.offsets)
-    places = done.block.points[len(done.block.points) - len(targets) :]
+    places, bar_ends = np.split(done.block.points[first:], [len(targets)])
     normed = [
         math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())
         for p, t in zip(places, targets, strict=True)
@@ -147,6 +172,7 @@ def adjust(start: ControlStart, targets: Sequence[Target]) -> ControlAdjustment:
         start.source,
         start.world_from_model,
         places,
+        bar_ends,
         np.array(normed),
         tuple(held),
         focal_sigmas,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -99,6 +99,43 @@ def free_lens(
 
 
 @dataclass(frozen=True)
+class Distances:
+    """Measured distances between points of a block.
+
+    Attributes:
+        ends: Indices of the two points of each.
+        lengths: Metres.
+        sigmas: Their standard deviations.
+    """
+
+    ends: Int64[np.ndarray, "b 2"]
+    lengths: Float64[np.ndarray, " b"]
+    sigmas: Float64[np.ndarray, " b"]
+
+    def residuals(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, " b"]:
+        """Distance less measured one, over the standard deviations."""
+        apart = points[self.ends[:, 0]] - points[self.ends[:, 1]]
+        return np.asarray((np.linalg.norm(apart, axis=1) - self.lengths) / self.sigmas)
+
+    def design(self, points: Float64[np.ndarray, "p 3"]) -> scipy.sparse.csr_array:
+        """(b, 3p) derivatives of the residuals by the points."""
+        apart = points[self.ends[:, 0]] - points[self.ends[:, 1]]
+        way = apart / np.linalg.norm(apart, axis=1, keepdims=True) / self.sigmas[:, None]
+        columns = (3 * self.ends[:, :, None] + np.arange(3)).reshape(len(way), 6)
+        rows = np.repeat(np.arange(len(way)), 6)
+        at = (rows, columns.ravel())
+        return scipy.sparse.csr_array((np.hstack([way, -way]).ravel(), at), shape=(len(way), 3 * len(points)))
+
+    def of_points(self, kept: Bool[np.ndarray, " p"]) -> Distances:
+        """Those of which both ends are kept, by their new indices."""
+        both = kept[self.ends].all(axis=1)
+        return Distances((np.cumsum(kept) - 1)[self.ends[both]], self.lengths[both], self.sigmas[both])
+
+
+NO_DISTANCES = Distances(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
 class Block:
     """Photos, lenses and tie points in world metres.
 
@@ -114,6 +151,7 @@ class Block:
         sigmas: Standard deviations of the observations, pixels.
         stated: Surveyed positions of points; anything finite where unknown.
         weights: Inverse variances of ``stated``; 0 where unknown.
+        distances: Measured between points: scale bars.
     """
 
     rotations: Float64[np.ndarray, "n 3 3"]
@@ -127,6 +165,7 @@ class Block:
     sigmas: Float64[np.ndarray, " m"]
     stated: Float64[np.ndarray, "p 3"]
     weights: Float64[np.ndarray, "p 3"]
+    distances: Distances = field(default=NO_DISTANCES)
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -166,6 +205,7 @@ class Block:
     def cost(self) -> float:
         """Sum of squares of all weighted residuals, positions apart; infinite where the block has come apart."""
         total = float((self.residuals() ** 2).sum()) + float((self.weights * (self.points - self.stated) ** 2).sum())
+        total += float((self.distances.residuals(self.points) ** 2).sum())
         for lens in self.lenses:
             total += float((((lens.values - lens.mean) / lens.sigmas) ** 2).sum())
         return total if np.isfinite(total) else np.inf
@@ -208,7 +248,7 @@ def reduce_block(block: Block) -> ReducedBlock:
     diagonal = np.arange(3)
     information[:, diagonal, diagonal] += block.weights
     gradient_points = _summed(np.einsum("mka,mk->ma", point, residual), starts, block.point, p)
-    gradient_points += block.weights * (block.points - block.stated)
+    gradient_points += block.weights * (block.points - block.stated) + _pull(block)
     information[:, diagonal, diagonal] += FLAT * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
     root = np.linalg.cholesky(information)  # information = root root'
     inverse_root = np.linalg.inv(root)
@@ -238,7 +278,63 @@ def reduce_block(block: Block) -> ReducedBlock:
         gradient[where] += known * (lens.values - lens.mean)
     normal = 0.5 * (normal + normal.T) + scipy.sparse.diags_array(prior)
     dense = normal if q > MAX_DENSE else np.asarray(normal.todense())
-    return ReducedBlock(dense, gradient, own, shift, carry)
+    return _with_distances(ReducedBlock(dense, gradient, own, shift, carry), block)
+
+
+def _pull(block: Block) -> Float64[np.ndarray, "p 3"]:
+    """Gradient of the distances by the points."""
+    bars = block.distances
+    if not len(bars.lengths):
+        return np.zeros_like(block.points)
+    return np.asarray(bars.design(block.points).T @ bars.residuals(block.points)).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """What distances add to tie points that were eliminated one by one (Woodbury's identity).
+
+    Attributes:
+        design: (b, 3p) derivatives of the distances.
+        spread: (3p, b) the points' own covariance times its transpose.
+        inverse: (b, b) inverse covariance of the distances as the points have them, and as measured.
+    """
+
+    design: scipy.sparse.csr_array
+    spread: scipy.sparse.csr_array
+    inverse: Float64[np.ndarray, "b b"]
+
+    @classmethod
+    def of(cls, block: Block, own: Float64[np.ndarray, "p 3 3"]) -> _Joined:
+        design = block.distances.design(block.points)
+        p = len(block.points)
+        blocks = scipy.sparse.bsr_array((own, np.arange(p), np.arange(p + 1)), shape=(3 * p, 3 * p))
+        spread = scipy.sparse.csr_array(blocks @ design.T)
+        return cls(design, spread, np.linalg.inv(np.eye(len(block.distances.lengths)) + (design @ spread).todense()))
+
+    def corrected(self, step: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+        """The points' step with the distances."""
+        return np.asarray(step - (self.spread @ (self.inverse @ (self.design @ step.ravel()))).reshape(-1, 3))
+
+
+def _with_distances(reduced: ReducedBlock, block: Block) -> ReducedBlock:
+    """Add distances to equations whose gradient has them already."""
+    if not len(block.distances.lengths):
+        return reduced
+    joined = _Joined.of(block, reduced.own)
+    crossed = scipy.sparse.csr_array(joined.design @ reduced.carry)
+    weighed = scipy.sparse.csr_array(joined.inverse @ crossed.todense())
+    own = reduced.own.copy()
+    for point in np.unique(block.distances.ends).tolist():
+        mine = joined.spread[3 * point : 3 * point + 3].todense()
+        own[point] -= mine @ joined.inverse @ mine.T
+    added = crossed.T @ weighed
+    return ReducedBlock(
+        reduced.normal + (added if scipy.sparse.issparse(reduced.normal) else added.todense()),
+        reduced.gradient + weighed.T @ (joined.design @ reduced.shift.ravel()),
+        own,
+        joined.corrected(reduced.shift),
+        scipy.sparse.csr_array(reduced.carry - joined.spread @ weighed),
+    )
 
 
 def settle_points(block: Block, rounds: int = 2) -> Block:
@@ -251,8 +347,11 @@ def settle_points(block: Block, rounds: int = 2) -> Block:
         information[:, diagonal, diagonal] += block.weights
         information[:, diagonal, diagonal] += FLAT * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
         gradient = _summed(np.einsum("mka,mk->ma", point, residual), starts, block.point, p)
-        gradient += block.weights * (block.points - block.stated)
-        block = replace(block, points=block.points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0])
+        gradient += block.weights * (block.points - block.stated) + _pull(block)
+        step = -np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+        if len(block.distances.lengths):
+            step = _Joined.of(block, np.linalg.inv(information)).corrected(step)
+        block = replace(block, points=block.points + step)
     return block
 
 
@@ -296,6 +395,7 @@ def part_of(block: Block, photos: Bool[np.ndarray, " n"]) -> Block:
         sigmas=block.sigmas[rows],
         stated=block.stated[seen],
         weights=block.weights[seen],
+        distances=block.distances.of_points(seen),
     )
 
 

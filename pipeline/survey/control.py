@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pycolmap
@@ -14,7 +14,16 @@ from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.joint_fit import SIMILARITY, JointFit, fit_jointly
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel
 from splatpipe.pipeline.survey.adjusted_positions import block_json
-from splatpipe.pipeline.survey.adjustment import ControlAdjustment, ControlStart, Target, adjust, can_adjust, moved_px
+from splatpipe.pipeline.survey.adjustment import (
+    NO_BARS,
+    ControlAdjustment,
+    ControlStart,
+    Target,
+    TargetDistances,
+    adjust,
+    can_adjust,
+    moved_px,
+)
 from splatpipe.pipeline.survey.block import Lens
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import PositionObservations
@@ -39,11 +48,18 @@ from splatpipe.pipeline.survey.local_survey import (
     stations_of,
     with_sigmas_times,
 )
-from splatpipe.pipeline.survey.located_points import locate
+from splatpipe.pipeline.survey.located_points import SurveyPoint, locate
 from splatpipe.pipeline.survey.model import model_of
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens, simple_lens
+from splatpipe.pipeline.survey.position_adjustment import (
+    UNKNOWN_LENS,
+    LensKnowledge,
+    doubted,
+    lens_with_positions,
+    simple_lens,
+)
 from splatpipe.pipeline.survey.surveyed_points import Survey
+from splatpipe.pipeline.survey.target_survey import FoundBars
 from splatpipe.pipeline.survey.tie_points import MIN_SIGMA_PX, block_of, sizes_of, spread_points, tie_sigma, tie_table
 
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if control deforms the model by less, it is not adjusted
@@ -71,6 +87,7 @@ class ControlResult:
         sigma_factor: Factor applied to the control's stated or assumed sigmas.
         focal_held: COLMAP ids of cameras whose focal length neither photos nor control determine.
         block: Lens and heights after the adjustment, for ``accuracy.json``; None without one.
+        bar_ends: Ends of scale bars in the adjusted model, model frame, by name; empty if it is unchanged.
     """
 
     frame: Frame
@@ -82,10 +99,16 @@ class ControlResult:
     sigma_factor: float
     focal_held: tuple[int, ...] = ()
     block: JSON = None
+    bar_ends: Mapping[str, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
 
 
 def place_by_control(
-    survey: Survey, capture: GeorefInput, frame: Frame | None, config: GeorefConfig, report: Reporter
+    survey: Survey,
+    capture: GeorefInput,
+    frame: Frame | None,
+    config: GeorefConfig,
+    report: Reporter,
+    bars: FoundBars | None = None,
 ) -> ControlResult:
     """Georeference a model by surveyed points.
 
@@ -95,6 +118,7 @@ def place_by_control(
         frame: The frame from the positions alone; None if there is none.
         config: Options.
         report: Receives warnings.
+        bars: Scale bars; they take part in the adjustment.
 
     Raises:
         FrameUndeterminedError: if there are neither positions nor enough control.
@@ -118,7 +142,7 @@ def place_by_control(
     needed = MIN_CONTROL if capture.adjusted is None else 1
     if config.adjust == "auto" and int(observed.is_control.sum()) >= needed:
         if can_adjust(model.reconstruction):
-            result = _adjusted(result, capture, config, report)
+            result = _adjusted(result, capture, config, report, bars)
         else:
             report.warning("A model with camera rigs is georeferenced by control, but not adjusted to it.")
     if result.adjusted is None:  # refit with the adjustment's roles and sigmas of control
@@ -148,25 +172,36 @@ def _frame(frame: Frame | None, survey: Survey, site: LocalSurvey, fit: JointFit
 
 
 @dataclass(frozen=True)
+class _Case:
+    """What all adjustments of a capture start from."""
+
+    result: ControlResult
+    capture: GeorefInput
+    config: GeorefConfig
+    start: ControlStart
+    bars: FoundBars | None
+
+
+@dataclass(frozen=True)
 class _TrustedAdjustment:
-    """An adjustment with the control points and sigmas it used."""
+    """An adjustment with the control points, bars and sigmas it used."""
 
     survey: Survey
     done: ControlAdjustment
+    ends: Mapping[str, int]
     factor: float
     noise: float
 
 
-def _settle(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> _TrustedAdjustment:
+def _settle(case: _Case, report: Reporter) -> _TrustedAdjustment:
     """Adjust until the control agrees, leaving out single blunders or else enlarging the sigmas."""
-    start = _start(result, capture)
-    best = _try(result.survey, 1.0, result, capture, config, start)
+    best = _try(case.result.survey, 1.0, case)
     for _ in range(ROUNDS):
-        better = _without_one(best, result, capture, config, start) if best.noise > SUSPICIOUS else None
+        better = _without_one(best, case) if best.noise > SUSPICIOUS else None
         if better is None:
             if best.noise <= QUIET:
                 break
-            best = _try(best.survey, best.factor * best.noise, result, capture, config, start)
+            best = _try(best.survey, best.factor * best.noise, case)
             continue
         index, off, best = better
         point = best.survey.points[index]
@@ -179,29 +214,19 @@ def _settle(result: ControlResult, capture: GeorefInput, config: GeorefConfig, r
     return best
 
 
-def _try(
-    survey: Survey,
-    factor: float,
-    result: ControlResult,
-    capture: GeorefInput,
-    config: GeorefConfig,
-    start: ControlStart,
-) -> _TrustedAdjustment:
+def _try(survey: Survey, factor: float, case: _Case) -> _TrustedAdjustment:
     chosen = _chosen(survey)
-    done = adjust(start, _targets(survey, chosen, factor, result, capture, config))
+    targets = [_target(survey.points[k], k, factor, case) for k in chosen]
+    bars, ends = _bars(survey, chosen, case)
+    done = adjust(case.start, targets, bars)
     coordinates = np.array([3 if survey.points[k].surveyed.z is not None else 2 for k in chosen], dtype=np.int64)
-    return _TrustedAdjustment(survey, done, factor, _noise(done.normed, coordinates))
+    return _TrustedAdjustment(survey, done, ends, factor, _noise(done.normed, coordinates))
 
 
-def _without_one(
-    settled: _TrustedAdjustment,
-    result: ControlResult,
-    capture: GeorefInput,
-    config: GeorefConfig,
-    start: ControlStart,
-) -> tuple[int, float, _TrustedAdjustment] | None:
+def _without_one(settled: _TrustedAdjustment, case: _Case) -> tuple[int, float, _TrustedAdjustment] | None:
     """Return the point without which the others agree, its offset in metres, and that adjustment; None if there is
     none."""
+    result, capture = case.result, case.capture
     chosen = _chosen(settled.survey)
     if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > CROWD:
         return None
@@ -209,10 +234,10 @@ def _without_one(
         index = chosen[worst]
         points = list(settled.survey.points)
         points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
-        rest = _try(settled.survey.with_points(points), settled.factor, result, capture, config, start)
+        rest = _try(settled.survey.with_points(points), settled.factor, case)
         if rest.noise <= settled.noise / LONELY:
             model = model_of(rest.done.reconstruction, capture.photos)
-            found = locate(settled.survey.points[index], model, capture.photos, config.mark_sigma_px).found
+            found = locate(settled.survey.points[index], model, capture.photos, case.config.mark_sigma_px).found
             if found is not None:
                 known = np.isfinite(result.site.targets.sigmas[index])
                 place = result.placed.world_from_model.apply(found.xyz[None])[0]
@@ -221,10 +246,12 @@ def _without_one(
     return None
 
 
-def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter) -> ControlResult:
+def _adjusted(
+    result: ControlResult, capture: GeorefInput, config: GeorefConfig, report: Reporter, bars: FoundBars | None
+) -> ControlResult:
     """Return the result with the adjusted model, if the adjustment moves the images' content noticeably."""
     try:
-        settled = _settle(result, capture, config, report)
+        settled = _settle(_Case(result, capture, config, _start(result, capture), bars), report)
     except np.linalg.LinAlgError as error:
         report.warning(f"Control places the model, but cannot adjust it: {error}.", "Is the sparse model sound?")
         return result
@@ -248,7 +275,8 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
         )
     _warn_of_focal_lengths(done, capture, report)
     moved = moved_px(capture.model.reconstruction, done.reconstruction)
-    accuracy = accuracy_of(done.adjusted, done.observed)
+    adjusted_block = doubted(done.adjusted, capture.lenses) if capture.lenses_held else done.adjusted
+    accuracy = accuracy_of(adjusted_block, done.observed)
     block = block_json(accuracy, capture.model.gsd(result.placed.world_from_model.scale), None)
     result = replace(result, survey=survey, moved_px=moved, sigma_factor=factor, focal_held=done.held, block=block)
     if moved < MIN_DEFORMATION_PX:
@@ -264,7 +292,9 @@ def _adjusted(result: ControlResult, capture: GeorefInput, config: GeorefConfig,
         for point in survey.points
     ]
     placed = GeoreferencedModel(model, world_from_model, done.offsets)
-    return replace(result, survey=survey.with_points(points), placed=placed, adjusted=adjusted)
+    every = world_from_model.inverse().apply(np.concatenate([done.places, done.bar_ends]))
+    ends = {name: every[index] for name, index in settled.ends.items()}
+    return replace(result, survey=survey.with_points(points), placed=placed, adjusted=adjusted, bar_ends=ends)
 
 
 def _warn_of_focal_lengths(done: ControlAdjustment, capture: GeorefInput, report: Reporter) -> None:
@@ -304,9 +334,9 @@ def _start(result: ControlResult, capture: GeorefInput) -> ControlStart:
     priors = {} if capture.adjusted is not None or capture.lenses_held else _focal_priors(capture.lenses)
 
     def lens_of(camera: pycolmap.Camera) -> Lens:
-        known = capture.lenses.get(camera.camera_id, LensKnowledge(None, 0.3))
         if whole:
-            return prior_lens(camera, known, None)
+            return lens_with_positions(camera, capture.lenses, table.cameras.count(camera.camera_id))
+        known = capture.lenses.get(camera.camera_id, UNKNOWN_LENS)
         return simple_lens(camera, model.reconstruction.cameras[camera.camera_id], known, capture.lenses_held)
 
     start = result.placed.world_from_model
@@ -343,26 +373,48 @@ def _positions(site: LocalSurvey, capture: GeorefInput) -> PositionObservations:
     )
 
 
-def _targets(
-    survey: Survey,
-    chosen: Sequence[int],
-    factor: float,
-    result: ControlResult,
-    capture: GeorefInput,
-    config: GeorefConfig,
-) -> list[Target]:
-    """The control points as the adjustment takes them, with sigmas times a factor."""
-    model, site = capture.model, result.site
-    targets = []
-    for k in chosen:
-        point = survey.points[k]
-        assert point.found is not None
-        marks, sigmas = [], []
-        for sighting in point.sightings:
-            if sighting.index is not None and sighting.agrees:
-                scale = model.view(sighting.index, capture.photos[sighting.photo].width).scale
-                marks.append((model.image_ids[sighting.index], np.array(sighting.pixel) * scale))
-                sigmas.append(config.mark_sigma_px * scale)
-        place = result.placed.world_from_model.apply(point.found.xyz[None])[0]
-        targets.append(Target(site.targets.enu[k], factor * site.targets.sigmas[k], place, marks, np.array(sigmas)))
-    return targets
+def _target(point: SurveyPoint, index: int, factor: float, case: _Case) -> Target:
+    """A point as the adjustment takes it, with its sigmas times a factor; without coordinates for infinite ones."""
+    assert point.found is not None
+    site, start = case.result.site, case.start.world_from_model
+    marks = [(seen.index, seen.photo, seen.pixel) for seen in point.sightings if seen.index is not None and seen.agrees]
+    place = start.apply(point.found.xyz[None])[0]
+    return Target(site.targets.enu[index], factor * site.targets.sigmas[index], place, *_marks(marks, case))
+
+
+def _marks(
+    seen: Sequence[tuple[int, str, tuple[float, float]]], case: _Case
+) -> tuple[list[tuple[int, Float64[np.ndarray, " 2"]]], Float64[np.ndarray, " m"]]:
+    """Marks, given by the model's photo, its name and the photo's pixel, in the model's pixels; with their sigmas."""
+    model = case.capture.model
+    scales = [model.view(index, case.capture.photos[photo].width).scale for index, photo, _ in seen]
+    marks = [
+        (model.image_ids[index], np.array(pixel) * scale) for (index, _, pixel), scale in zip(seen, scales, strict=True)
+    ]
+    return marks, case.config.mark_sigma_px * np.array(scales)
+
+
+def _bars(survey: Survey, chosen: Sequence[int], case: _Case) -> tuple[TargetDistances, dict[str, int]]:
+    """The scale bars, and the index of each end by name: control points first, then points without coordinates."""
+    if case.bars is None:
+        return NO_BARS, {}
+    points = {point.name: point for point in survey.points if point.found is not None}
+    index = {name: k for k, name in enumerate(case.capture.model.names)}
+    places = {survey.points[k].name: place for place, k in enumerate(chosen)}
+    ends: list[Target] = []
+    unknown = np.full(3, np.inf)
+    for name in sorted({name for bar in case.bars.bars for name in (bar.a, bar.b)} - set(places)):
+        if name in points:
+            target = _target(points[name], survey.points.index(points[name]), 1.0, case)
+        else:
+            pixels = case.bars.pixels[name]
+            seen = [(index[photo], photo, pixel) for photo, pixel in sorted(pixels.items()) if photo in index]
+            start = case.start.world_from_model.apply(case.bars.places[name][None])[0]
+            target = Target(start, unknown, start, *_marks(seen, case))
+        places[name] = len(chosen) + len(ends)
+        ends.append(replace(target, place=target.start, sigmas=unknown))
+    used = [case.bars.bars[k] for k in case.bars.used]
+    pairs = np.array([[places[bar.a], places[bar.b]] for bar in used], dtype=np.int64).reshape(-1, 2)
+    lengths, sigmas = (np.array([getattr(bar, key) for bar in used]) for key in ("metres", "sigma_m"))
+    own = {name: places[name] for bar in case.bars.bars for name in (bar.a, bar.b)}
+    return TargetDistances(tuple(ends), pairs, lengths, sigmas), own

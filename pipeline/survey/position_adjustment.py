@@ -84,6 +84,9 @@ class LensKnowledge:
     centre: tuple[float, float] | None = None
 
 
+UNKNOWN_LENS = LensKnowledge(None, FOCAL_SHARES["guess"])
+
+
 @dataclass(frozen=True)
 class LensJudgement:
     """How two lenses predict what their adjustment did not use.
@@ -169,9 +172,8 @@ def adjust_to_positions(
 
     def block_with(which: Bool[np.ndarray, " p"], whole: bool) -> Block:
         def lens_of(camera: pycolmap.Camera) -> Lens:
-            known = lenses.get(camera.camera_id, LensKnowledge(None, 0.3))
-            few = counts[camera.camera_id] < MIN_PHOTOS
-            return prior_lens(camera, known, () if lenses_held else SIMPLE if few or not whole else None)
+            photos = counts[camera.camera_id]
+            return lens_with_positions(camera, lenses, photos, held=lenses_held, whole=whole)
 
         return block_of(table.only(which), reconstruction, world_from_model, lens_of, MIN_SIGMA_PX)
 
@@ -200,11 +202,41 @@ def adjust_to_positions(
         left_out,
         fit.noise,
         fit.predicted(),
-        accuracy_of(fit.adjusted, fit.observed),
+        accuracy_of(doubted(fit.adjusted, lenses) if lenses_held else fit.adjusted, fit.observed),
         judgement,
         whole,
         sigma,
     )
+
+
+def lens_with_positions(
+    camera: pycolmap.Camera, lenses: Mapping[int, LensKnowledge], photos: int, *, held: bool = False, whole: bool = True
+) -> Lens:
+    """A camera's lens as accurate positions let it be adjusted: whole, or simple where its photos are few.
+
+    Args:
+        camera: Of a wide model.
+        lenses: What is known beforehand, by COLMAP camera id.
+        photos: Of this camera.
+        held: Keep it fixed.
+        whole: Free more than a simple lens if the photos are not few.
+    """
+    names = () if held else SIMPLE if photos < MIN_PHOTOS or not whole else None
+    return prior_lens(camera, lenses.get(camera.camera_id, UNKNOWN_LENS), names)
+
+
+def doubted(adjusted: AdjustedBlock, lenses: Mapping[int, LensKnowledge]) -> AdjustedBlock:
+    """The same state for propagation, with held focal lengths as uncertain as what they come from."""
+    own = [
+        prior_lens(
+            lens.camera,
+            replace(lenses.get(lens.camera.camera_id, UNKNOWN_LENS), focal_px=float(lens.camera.params[0])),
+            ("f",),
+        )
+        for lens in adjusted.block.lenses
+    ]
+    block = replace(adjusted.block, lenses=tuple(own))
+    return replace(adjusted, block=block, reduced=reduce_block(block))
 
 
 def prior_lens(camera: pycolmap.Camera, known: LensKnowledge, names: tuple[str, ...] | None) -> Lens:

@@ -27,6 +27,23 @@ SCALE_OFF = 3.0  # joint sigmas between the bars' scale and the frame's: worth a
 
 
 @dataclass(frozen=True)
+class FoundBars:
+    """Scale bars whose ends were found in photos.
+
+    Attributes:
+        bars: Of which both ends were found.
+        used: Indices of those that agree with the others.
+        places: Of the ends, model frame, by name.
+        pixels: Where photos show the detected ones, by name and photo.
+    """
+
+    bars: tuple[ScaleBar, ...]
+    used: tuple[int, ...]
+    places: Mapping[str, Float64[np.ndarray, " 3"]]
+    pixels: Mapping[str, Mapping[str, tuple[float, float]]]
+
+
+@dataclass(frozen=True)
 class TargetSurvey:
     """Identifies detected targets.
 
@@ -100,11 +117,11 @@ def marker_of(
 
 def scale_of(
     survey: TargetSurvey, found: TargetMarks, marked: Mapping[str, Float64[np.ndarray, " 3"]], report: Reporter
-) -> ModelScale | None:
-    """The model's scale by the scale bars; warns about bars that contradict the others or were not found."""
+) -> tuple[ModelScale | None, FoundBars | None]:
+    """The model's scale by the scale bars, and these; warns about bars that contradict the others or were not found."""
     bars = survey.wanted.bars
     if not bars:
-        return None
+        return None, None
     places = dict(marked) | {each.name: each.track.place for each in found.named}
     scale = scale_by(bars, places)
     missing = [f"{bar.a} to {bar.b}" for bar in bars if bar.a not in places or bar.b not in places]
@@ -117,7 +134,7 @@ def scale_of(
     if scale is None:
         if len(missing) < len(bars):
             report.warning("The scale bars contradict each other, so none of them is used.", "Measure them again.")
-        return None
+        return None, None
     wrong = [
         f"{bar.a} to {bar.b} ({scale.errors_m[k]:+.3f} m)"
         for k, bar in enumerate(bars)
@@ -127,7 +144,9 @@ def scale_of(
         report.warning(
             f"Scale bars contradict the others and are left out: {list_names(wrong)}.", "Measure them again."
         )
-    return scale
+    there = [k for k, bar in enumerate(bars) if bar.a in places and bar.b in places]
+    used = tuple(place for place, k in enumerate(there) if k in scale.used)
+    return scale, FoundBars(tuple(bars[k] for k in there), used, places, found.pixels())
 
 
 def scaled(frame: Frame, scale: ModelScale) -> Frame:
@@ -140,11 +159,20 @@ def scaled(frame: Frame, scale: ModelScale) -> Frame:
     return replace(frame, world_from_model=similarity, metres=True, note=note + upright)
 
 
-def compare(frame: Frame, scale: ModelScale, report: Reporter) -> None:
-    """Report how well the frame's scale agrees with the bars'."""
+def compare(frame: Frame, scale: ModelScale, report: Reporter, adjusted: bool = False) -> None:
+    """Report how well the frame's scale agrees with the bars'.
+
+    Args:
+        frame: The resulting one.
+        scale: By the bars.
+        report: Receives the sentence.
+        adjusted: Whether the bars took part in the adjustment.
+    """
     ratio = frame.world_from_model.scale / scale.metres_per_unit - 1.0
     bars = f"{_counted(scale)} (good to {scale.sigma:.3%})"
     what = f"According to {bars}, lengths in this result are {ratio:+.3%} off."
+    if adjusted:
+        what = f"After the adjustment, which {bars} took part in, lengths are {ratio:+.3%} off theirs."
     if abs(ratio) > SCALE_OFF * scale.sigma + 0.01:
         report.warning(what, "Check the bars, and the coordinates or positions that set the scale.")
     else:

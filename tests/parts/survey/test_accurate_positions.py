@@ -28,14 +28,20 @@ def placed(folder: Path, model: pycolmap.Reconstruction, stated: Any = RTK, **op
     return georef(folder, model, control, stated, check_points=checks(*GROUND_AND_ROOF), **options)
 
 
-def alone(folder: Path, model: pycolmap.Reconstruction, stated: tuple[str, tuple[float, float]] = RTK) -> Result:
+def alone(
+    folder: Path,
+    model: pycolmap.Reconstruction,
+    stated: tuple[str, tuple[float, float]] = RTK,
+    settings: dict[str, str] | None = None,
+) -> Result:
     """Return georef's output without control."""
     names = {image.name for image in model.images.values()}
     records = [record for record in positions(*stated) if record["name"] in names]
     parts = capture_parts(folder, model, records, "") | {"source.control": ABSENT}
     (folder / "out").mkdir()
     notes = Notes()
-    summary = run(GeorefConfig(), Inputs(parts, folder / "photos"), folder / "out", notes)
+    inputs = Inputs(parts, folder / "photos", settings=settings or {})
+    summary = run(GeorefConfig(), inputs, folder / "out", notes)
     return Result(folder / "out", parts, summary, notes)
 
 
@@ -59,6 +65,14 @@ def test_uncertain_heights_are_said_with_what_settles_them(tmp_path: Path, bowl:
     assert remedies["control_3"]["height_sigma_m"] <= remedies["control_1"]["height_sigma_m"]
     assert remedies["control_1"]["height_sigma_m"] < 0.3 * heights["together_sigma_m"][2]
     assert result.read("frame.json")["residuals"]["uncertainty"]["heights"] == heights["sentence"]
+
+
+def test_a_held_lens_is_no_surer_than_what_it_comes_from(tmp_path: Path) -> None:
+    held = alone(tmp_path, adjusted(true_model(NADIR)), settings={"sparse.lens": "held"})
+    (lens,) = held.read("accuracy.json")["adjustment"]["lenses"]
+    assert lens["names"] == ["f"]
+    assert 0.001 < lens["sigmas"][0] / lens["values"][0] < 0.03
+    assert "one control point" in held.read("accuracy.json")["adjustment"]["heights"]["sentence"]
 
 
 def test_one_control_point_settles_the_heights(tmp_path: Path, bowl: pycolmap.Reconstruction) -> None:

@@ -31,6 +31,8 @@ from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.survey.confidence import chi_squared_quantile, rmse_interval
 from splatpipe.pipeline.survey.frames import load_frame
 from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.scale_bars import ScaleBar
+from splatpipe.pipeline.survey.target_finds import WantedTargets, save_wanted
 from splatpipe.stages.georef import run
 
 GROUND_AND_ROOF = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08", "P15", "P16", "P17", "P18")
@@ -96,11 +98,14 @@ def georef(
     control: str,
     stated: tuple[str, tuple[float, float]] | None = CONSUMER,
     lift: float = 0.0,
+    bars: tuple[ScaleBar, ...] = (),
     **options: Any,
 ) -> Result:
     names = {image.name for image in model.images.values()}
     records = [] if stated is None else [r for r in positions(*stated, lift) if r["name"] in names]
     parts = capture_parts(folder, model, records, control)
+    if bars:
+        save_wanted(WantedTargets("", (), bars), parts["control.points"])
     (folder / "out").mkdir()
     notes = Notes()
     summary = run(GeorefConfig(**options), Inputs(parts, folder / "photos"), folder / "out", notes)
@@ -220,6 +225,32 @@ def test_doming_of_a_wrong_lens_is_straightened_by_control(tmp_path: Path) -> No
     focal = pycolmap.Reconstruction(result.out / "sparse" / "0").cameras[1].params[0]
     assert focal == pytest.approx(LENS[0], rel=0.01)
     assert result.summary["focal_held"] == []
+
+
+def test_scale_bars_take_part_in_the_adjustment(tmp_path: Path) -> None:
+    """Poor control, its distances 1 % too long: the bars, good to 2 mm, decide about lengths."""
+    domed = adjusted(true_model(NADIR), LENS[0] * 1.03, 0.0)
+    lines = rows(GROUND_AND_ROOF, NADIR)
+    middle = np.mean([row.place for row in lines], axis=0)
+
+    def stretched(row: Row) -> Row:
+        east, north, up = (middle + [1.01, 1.01, 1.0] * (np.array(row.place) - middle)).tolist()
+        return replace(row, place=(east, north, up))
+
+    control = gcp_list([stretched(row) for row in lines])
+    places = {name: np.array(POINTS[name]["xyz_m"]) for name in POINTS}
+    pairs = (("P01", "P03"), ("P03", "P05"), ("P05", "P07"), ("P01", "P07"))
+    bars = tuple(ScaleBar(a, b, float(np.linalg.norm(places[a] - places[b])), 0.002) for a, b in pairs)
+    errors = {}
+    for adjust in ("off", "auto"):
+        result = georef(tmp_path / adjust, domed, control, None, bars=bars, adjust=adjust, control_sigma_m=0.2)
+        scale = result.read("accuracy.json")["scale"]
+        assert [bar["used"] for bar in scale["bars"]] == [True] * 4
+        errors[adjust] = max(abs(bar["error_m"]) for bar in scale["bars"])
+    assert errors["off"] > 0.1
+    assert errors["auto"] < 0.02
+    assert any("After the adjustment, which 4 scale bars" in note for note in result.notes.notes)
+    assert not result.is_model_untouched()
 
 
 def made_up(model: pycolmap.Reconstruction) -> list[Row]:

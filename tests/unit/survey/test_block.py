@@ -8,7 +8,7 @@ import pytest
 
 from splatpipe.pipeline.survey import block as block_module
 from splatpipe.pipeline.survey.adjusted_positions import height_sentence
-from splatpipe.pipeline.survey.block import Block, free_lens, part_of, reduce_block, settle_points
+from splatpipe.pipeline.survey.block import Block, Distances, free_lens, part_of, reduce_block, settle_points
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of, with_control, with_cross_strip
 from splatpipe.pipeline.survey.block_adjustment import adjust_block, joint_system, solve
 from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, converge, parts_of, prior_lens
@@ -41,6 +41,43 @@ def test_gradient_is_the_derivative_of_the_cost_with_points_settled(flight: Flow
         step = 1e-2 * rng.normal(size=block.unknowns) * sizes
         ahead, back = (settle_points(block.moved(side * step, block.points), 8).cost() for side in (1.0, -1.0))
         assert (ahead - back) / 2.0 == pytest.approx(2.0 * float(reduced.gradient @ step), rel=1e-3)
+
+
+def with_bars(block: Block, truth: Block, sigma_m: float) -> Block:
+    """A block with scale bars that share an end, and one apart."""
+    ends = np.array([[0, 40], [40, 80], [100, 160]])
+    lengths = np.linalg.norm(truth.points[ends[:, 0]] - truth.points[ends[:, 1]], axis=1)
+    return replace(block, distances=Distances(ends, lengths, np.full(3, sigma_m)))
+
+
+def test_distances_join_their_points_in_the_equations(flight: FlownBlock) -> None:
+    block = settle_points(with_bars(flight.start, flight.truth, 0.002), 8)
+    reduced = reduce_block(block)
+    rng = np.random.default_rng(3)
+    sizes = 1.0 / np.sqrt(np.diag(reduced.normal))
+    for _ in range(3):
+        step = 1e-2 * rng.normal(size=block.unknowns) * sizes
+        ahead, back = (settle_points(block.moved(side * step, block.points), 8).cost() for side in (1.0, -1.0))
+        assert (ahead - back) / 2.0 == pytest.approx(2.0 * float(reduced.gradient @ step), rel=2e-3)
+    alone = reduce_block(replace(block, distances=part_of(block, np.zeros(len(block), dtype=bool)).distances))
+    assert np.linalg.eigvalsh(reduced.normal - alone.normal).min() > -1e-6 * np.diag(alone.normal).max()
+    tighter = np.trace(reduced.own[[0, 40, 100]] - alone.own[[0, 40, 100]], axis1=1, axis2=2)
+    assert (tighter < 0.0).all()
+
+
+def test_scale_bars_scale_a_block_whose_positions_are_poor() -> None:
+    poor = flown(sigmas_m=(0.5, 0.5, 0.5))
+    observed = as_stated(poor.positions).observations(poor.positions)
+
+    def error(block: Block) -> float:
+        done = adjust_block(block, observed)
+        assert done.settled
+        found, true = (each.points[::7] - each.points.mean(axis=0) for each in (done.block, poor.truth))
+        return float(abs(np.linalg.norm(found) / np.linalg.norm(true) - 1.0))
+
+    without, bars = error(poor.start), error(with_bars(poor.start, poor.truth, 0.002))
+    assert bars < 1e-3
+    assert bars < 0.3 * without
 
 
 def test_exact_observations_give_the_true_block() -> None:
