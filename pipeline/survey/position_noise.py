@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
@@ -306,11 +307,18 @@ def _inverse_pattern(
             if shares[kind] == 0.0 or len(members) == 0:
                 continue
             for piece in np.array_split(members, -(-len(members) // MAX_CHAIN)):
-                order = np.arange(len(piece))
-                drift = correlations[kind] ** np.abs(order[:, None] - order[None, :])
-                pattern = (1.0 - shares[kind]) * np.eye(len(piece)) + shares[kind] * drift
-                inverse[np.ix_(piece, piece)] = np.linalg.inv(pattern)
+                inverse[np.ix_(piece, piece)] = _inverse_chain(
+                    len(piece), float(shares[kind]), float(correlations[kind])
+                )
     return inverse
+
+
+@lru_cache(maxsize=256)
+def _inverse_chain(length: int, share: float, correlation: float) -> Float64[np.ndarray, "k k"]:
+    """Inverse correlations of neighbours whose errors drift by a share."""
+    order = np.arange(length)
+    drift = correlation ** np.abs(order[:, None] - order[None, :])
+    return np.asarray(np.linalg.inv((1.0 - share) * np.eye(length) + share * drift))
 
 
 def with_drift_of(noise: PositionNoise, other: PositionNoise) -> PositionNoise:
@@ -371,20 +379,17 @@ def _fit(
     size = len(system.gradient)
     sizes = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     factor = factorised(normal / np.outer(sizes, sizes) + 1e-13 * np.eye(len(normal)))
-    covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(normal)), check_finite=False)
-    covariance = covariance / np.outer(sizes, sizes)
+    lower, _ = scipy.linalg.lapack.dpotri(factor, lower=1)
+    covariance = (np.tril(lower) + np.tril(lower, -1).T) / np.outer(sizes, sizes)
     step = -covariance @ gradient
-    groups = len(observed.offset_sigmas)
     after, spread = np.zeros_like(errors), np.zeros((3, len(errors), len(errors)))
     quadratic = float(step @ gradient)
     likelihood = 2.0 * float(np.log(np.diag(factor)).sum() + np.log(sizes).sum())
     for axis in range(3):
-        design = np.zeros((len(errors), size + 3 * groups))
-        rows = np.arange(len(errors))
-        design[rows, 3 * positions.photo + axis] = 1.0
-        design[rows, size + 3 * positions.group + axis] = 1.0
-        after[:, axis] = errors[:, axis] + design @ step
-        spread[axis] = design @ covariance @ design.T
+        centres, shared = 3 * positions.photo + axis, size + 3 * positions.group + axis
+        after[:, axis] = errors[:, axis] + step[centres] + step[shared]
+        crossed = covariance[np.ix_(centres, shared)]
+        spread[axis] = covariance[np.ix_(centres, centres)] + covariance[np.ix_(shared, shared)] + crossed + crossed.T
         precision = observed.precision[axis]
         quadratic += float(errors[:, axis] @ precision @ errors[:, axis])
         likelihood -= float(np.linalg.slogdet(precision)[1])

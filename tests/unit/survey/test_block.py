@@ -11,7 +11,7 @@ from splatpipe.pipeline.survey.adjusted_positions import height_sentence
 from splatpipe.pipeline.survey.block import Block, Distances, free_lens, part_of, reduce_block, settle_points
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of, with_control, with_cross_strip
 from splatpipe.pipeline.survey.block_adjustment import adjust_block, joint_system, solve
-from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, converge, parts_of, prior_lens
+from splatpipe.pipeline.survey.position_adjustment import BlockFit, LensKnowledge, converge, parts_of, prior_lens
 from splatpipe.pipeline.survey.position_noise import as_stated, strip_pieces
 from splatpipe.pipeline.survey.tie_points import image_errors, tie_sigma
 from tests.scenes.flown_block import FlownBlock, flown
@@ -22,6 +22,11 @@ EVERY = 24
 @pytest.fixture(scope="module")
 def flight() -> FlownBlock:
     return flown()
+
+
+@pytest.fixture(scope="module")
+def fitted(flight: FlownBlock) -> BlockFit:
+    return converge(flight.start, flight.positions, kept(flight))
 
 
 def kept(flight: FlownBlock) -> np.ndarray:
@@ -91,8 +96,8 @@ def test_exact_observations_give_the_true_block() -> None:
     assert np.abs(image_errors(done.block)).max() < 0.01
 
 
-def test_a_bent_start_is_straightened_and_the_lens_is_found(flight: FlownBlock) -> None:
-    fit = converge(flight.start, flight.positions, kept(flight))
+def test_a_bent_start_is_straightened_and_the_lens_is_found(flight: FlownBlock, fitted: BlockFit) -> None:
+    fit = fitted
     lens = dict(zip(fit.adjusted.block.lenses[0].names, fit.adjusted.block.lenses[0].values, strict=True))
     assert lens["k1"] == pytest.approx(-0.08, abs=0.02)
     assert (lens["cx"], lens["cy"]) == pytest.approx((408.0, 294.0), abs=2.0)
@@ -139,8 +144,8 @@ def test_drifting_errors_are_recognised() -> None:
     assert fit.noise.white_correlations().min() > 0.3
 
 
-def test_positions_left_out_are_predicted_as_a_fit_without_them_does(flight: FlownBlock) -> None:
-    fit = converge(flight.start, flight.positions, kept(flight))
+def test_positions_left_out_are_predicted_as_a_fit_without_them_does(flight: FlownBlock, fitted: BlockFit) -> None:
+    fit = fitted
     piece = strip_pieces(flight.positions)[0]
     without = flight.positions.only(~piece)
     noise = replace(fit.noise, of=fit.noise.of[~piece])
@@ -149,8 +154,8 @@ def test_positions_left_out_are_predicted_as_a_fit_without_them_does(flight: Flo
     assert np.abs(fit.predicted()[piece] - errors).max() < 0.003
 
 
-def test_heights_straight_down_are_as_uncertain_as_the_focal_length(flight: FlownBlock) -> None:
-    fit = converge(flight.start, flight.positions, kept(flight))
+def test_heights_straight_down_are_as_uncertain_as_the_focal_length(flight: FlownBlock, fitted: BlockFit) -> None:
+    fit = fitted
     accuracy = accuracy_of(fit.adjusted, fit.observed)
     focal = float(np.sqrt(accuracy.lens_sigmas()[0][0, 0])) / 900.0
     assert accuracy.mean_sigmas()[2] == pytest.approx(38.5 * focal, rel=0.15)
@@ -159,8 +164,8 @@ def test_heights_straight_down_are_as_uncertain_as_the_focal_length(flight: Flow
     assert strip is not None and strip.height_sigma_m < 0.4 * accuracy.mean_sigmas()[2]
 
 
-def test_control_does_what_is_predicted_of_it(flight: FlownBlock) -> None:
-    fit = converge(flight.start, flight.positions, kept(flight))
+def test_control_does_what_is_predicted_of_it(flight: FlownBlock, fitted: BlockFit) -> None:
+    fit = fitted
     accuracy = accuracy_of(fit.adjusted, fit.observed)
     promised = with_control(accuracy)[1]
     index = int(np.argmin(np.abs(fit.adjusted.block.points - promised.places[0]).sum(axis=1)))
@@ -188,14 +193,16 @@ def test_heights_are_not_warned_of_where_positions_are_poor_or_nothing_has_a_sca
     assert height_sentence(5.0, None if off is None else 0.02, 0.014 if off is None else off) is None
 
 
-def test_a_long_flight_is_judged_in_parts(monkeypatch: pytest.MonkeyPatch, flight: FlownBlock) -> None:
-    whole = converge(flight.start, flight.positions, kept(flight))
+def test_a_long_flight_is_judged_in_parts(
+    monkeypatch: pytest.MonkeyPatch, flight: FlownBlock, fitted: BlockFit
+) -> None:
+
     monkeypatch.setattr("splatpipe.pipeline.survey.position_adjustment.PART", 12)
-    parts = list(parts_of(whole.adjusted, flight.positions))
+    parts = list(parts_of(fitted.adjusted, flight.positions))
     assert [int(part.chosen.sum()) for part in parts] == [12, 12]
     assert all(len(part.block) == 12 and len(part.system.gradient) == 36 for part in parts)
     fit = converge(flight.start, flight.positions, kept(flight))
-    assert np.abs(fit.adjusted.block.centres - whole.adjusted.block.centres).max() < 0.02
+    assert np.abs(fit.adjusted.block.centres - fitted.adjusted.block.centres).max() < 0.02
 
 
 def test_part_has_the_photos_and_what_two_of_them_see(flight: FlownBlock) -> None:
@@ -210,8 +217,8 @@ def prior_cost(block: Block) -> float:
     return sum(float((((lens.values - lens.mean) / lens.sigmas) ** 2).sum()) for lens in block.lenses)
 
 
-def test_errors_that_neighbours_share_make_tie_points_worth_less(flight: FlownBlock) -> None:
-    fit = converge(flight.start, flight.positions, kept(flight)).adjusted.block
+def test_errors_that_neighbours_share_make_tie_points_worth_less(fitted: BlockFit) -> None:
+    fit = fitted.adjusted.block
     assert tie_sigma(fit) == pytest.approx(1.0, abs=0.1)
     rng = np.random.default_rng(2)
     shift = 3.0 * rng.normal(size=(EVERY, 5, 5, 2))
