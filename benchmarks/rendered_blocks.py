@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import subprocess
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -21,6 +22,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from jaxtyping import Float64
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 from position_scenes import STATED_M, Scene, draw_scene
 from tables import Row, print_table
 
@@ -28,7 +31,7 @@ from splatpipe.demo.cameras import BrownLens, Pose
 from splatpipe.demo.generate import RTK_XMP, compress, develop
 from splatpipe.demo.geodesy import Origin
 from splatpipe.demo.mesh import WORLD, Builder, paint_faces
-from splatpipe.demo.metadata import GpsPosition, build_exif, build_xmp, position_attributes, with_metadata
+from splatpipe.demo.metadata import EXIF_IFD, GpsPosition, build_exif, build_xmp, position_attributes, with_metadata
 from splatpipe.demo.render import Renderer
 from splatpipe.demo.scene import DemoScene
 from splatpipe.demo.surroundings import GRAVEL, LAWN, SOIL, TERRACE
@@ -41,6 +44,7 @@ HALF_M, TEXEL_M = 62.0, 0.0165  # of the painted ground
 PATHS = 6  # a pixel
 BYTES = 900_000  # of a photo
 PAUSE_S = 3
+SENSOR_MM, FULL_FRAME_MM = 17.3, 43.27  # width of the camera model's sensor, and diagonal of 35 mm film
 AGREED_GSDS = 3.0
 COLUMNS = {
     "block": "block:",
@@ -122,8 +126,12 @@ def write_photos(scene: Scene, work: Path, seed: int) -> Path:
         angles = {"GimbalRollDegree": "+0.00", "GimbalYawDegree": f"{pose.yaw_deg:+.2f}", "GimbalPitchDegree": "-90.00"}
         attributes = {**angles, **calibrated, **position_attributes(position), **RTK_XMP}
         attributes |= {key: f"{value:.5f}" for key, value in stated.items()}
-        exif = build_exif((lens.width, lens.height), taken, 1 / 640, position)
-        (photos / pose.name).write_bytes(with_metadata(jpeg, exif, build_xmp(taken, attributes)))
+        exif = Image.Exif()
+        exif.load(build_exif((lens.width, lens.height), taken, 1 / 640, position))
+        focal_mm = scene.stated.params[0] * SENSOR_MM / lens.width
+        focal_35mm = scene.stated.params[0] * FULL_FRAME_MM / math.hypot(lens.width, lens.height)
+        exif.get_ifd(EXIF_IFD).update({0x920A: IFDRational(round(100 * focal_mm), 100), 0xA405: round(focal_35mm)})
+        (photos / pose.name).write_bytes(with_metadata(jpeg, exif.tobytes(), build_xmp(taken, attributes)))
     (work / "whole").touch()
     return photos
 
