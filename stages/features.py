@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
@@ -27,7 +27,7 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
         SplatpipeError: if no photo has enough keypoints.
     """
     photo_list = load_photo_list(inputs["ingest.photos"])
-    cameras = json.loads(inputs["ingest.cameras"].read_text(encoding="utf-8"))["cameras"]
+    cameras = read_json(inputs["ingest.cameras"])["cameras"]
     counts: list[int] = []
     colours: list[Bytes] = []
     with (

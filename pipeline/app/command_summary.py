@@ -22,6 +22,7 @@ from splatpipe.pipeline.engine.errors import (
     card_fault,
     exit_code,
 )
+from splatpipe.pipeline.engine.json_file import read_json
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.verdict import Verdict
@@ -157,11 +158,11 @@ def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     points: list[dict[str, Any]] = []
     with suppress(OSError, ValueError, KeyError, TypeError):  # ``status`` reports damaged files
         if "evaluate.metrics" in parts:
-            report = dict(json.loads(parts["evaluate.metrics"].read_text(encoding="utf-8"))["accuracy"])
+            report = dict(read_json(parts["evaluate.metrics"])["accuracy"])
         elif "georef.accuracy" in parts:
-            report = dict(json.loads(parts["georef.accuracy"].read_text(encoding="utf-8")))
+            report = dict(read_json(parts["georef.accuracy"]))
         if "georef.control" in parts:
-            points = list(json.loads(parts["georef.control"].read_text(encoding="utf-8"))["points"])
+            points = list(read_json(parts["georef.control"])["points"])
     return report, points
 
 
