@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.engine.output_file import token, write_file
+from splatpipe.pipeline.engine.output_file import open_own, token, write_file
 from splatpipe.pipeline.photos.images import Pixels
 
 CODECS = {".webm": "VP80", ".mp4": "vp09"}
@@ -114,7 +114,7 @@ class VideoWriter:
 
     def _number_track(self) -> None:
         """Replace the random track number by 1, so that the same frames give the same bytes."""
-        with self._partial.open("r+b") as file:
+        with os.fdopen(open_own(self._partial, os.O_RDWR), "r+b") as file:
             head = file.read(HEADER_BYTES)
             for element in TRACK_NUMBERS:
                 at = head.find(element)

@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
@@ -85,9 +86,10 @@ def save_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> di
     listed: list[dict[str, str | int]] = []
     pixels = found = 0
     for number, (camera, each) in enumerate(maps):
-        file = f"{number:05d}.npz"
-        np.savez(folder / file, depth=each.depth, confidence=each.confidence)
-        listed.append({"photo": camera.name, "file": file, "width": camera.width, "height": camera.height})
+        name = f"{number:05d}.npz"
+        with new_file(folder / name) as file:
+            np.savez(file, depth=each.depth, confidence=each.confidence)
+        listed.append({"photo": camera.name, "file": name, "width": camera.width, "height": camera.height})
         pixels += each.depth.size
         found += int(np.count_nonzero(each.confidence))
     write_json(folder / LIST, {"maps": listed})
