@@ -22,7 +22,6 @@ from splatpipe.pipeline.engine.errors import (
     card_fault,
     exit_code,
 )
-from splatpipe.pipeline.engine.json_file import read_json
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.verdict import Verdict
@@ -152,6 +151,8 @@ def _interrupted_again(error: BaseException | None) -> bool:
 
 def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The accuracy report, with the splat's own if measured, and the surveyed points; empty if not computed."""
+    from splatpipe.pipeline.engine.json_file import read_json
+
     artifacts = outcome.artifacts.values()
     parts = {name: part.path for artifact in artifacts for name, part in artifact.parts.items()}
     report: dict[str, Any] = {}

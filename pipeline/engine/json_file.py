@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.small_file import read_small
-from splatpipe.pipeline.engine.stage import JSON
+
+if TYPE_CHECKING:  # it imports pydantic
+    from splatpipe.pipeline.engine.stage import JSON
 
 MAX_JSON_BYTES = 256 << 20  # the pairs of 100,000 photos are smaller
 TOO_MANY_DIGITS = re.compile(rb"[0-9]{300}")  # neither a number that a float can hold nor a name

@@ -8,7 +8,6 @@ its path do so in a working folder that was made here, or in which ``require_own
 from __future__ import annotations
 
 import os
-import secrets
 import stat
 from collections.abc import Iterable
 from pathlib import Path, PurePath
@@ -120,7 +119,7 @@ def require_own_files(paths: Iterable[Path]) -> None:
 
 def token() -> str:
     """An unpredictable part of a temporary file's name: nobody can make such a file or link before we do."""
-    return secrets.token_hex(8)
+    return os.urandom(8).hex()
 
 
 def _create(path: str, flags: int) -> int:

@@ -63,7 +63,7 @@ def read_small(path: Path, max_bytes: int) -> bytes:
             found += block
     if len(found) <= max_bytes:
         return bytes(found)
-    raise OSError(errno.EOVERFLOW, f"it is larger than {_size(max_bytes)}", str(path))
+    raise OSError(errno.EOVERFLOW, f"it is too large: more than {_size(max_bytes)}", str(path))
 
 
 def read_end(path: Path, max_bytes: int) -> bytes:

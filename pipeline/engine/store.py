@@ -263,36 +263,40 @@ def _read_artifact(folder: Path) -> Artifact | None:
         manifest = read_json(folder / MANIFEST)
         if manifest["format"] != FORMAT:
             return None
-        whole = all(_is_whole(os.fspath(folder), **part) for part in manifest["parts"].values())
+        folders = {""}
+        for part in manifest["parts"].values():
+            folders |= _folders_of(os.fspath(folder), part["path"], part["files"])
+        if any(os.path.islink(f"{folder}/{name}".rstrip("/")) for name in folders):  # noqa: PTH114 (there are many)
+            return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return Artifact(folder, manifest) if whole and not folder.is_symlink() else None
+    return Artifact(folder, manifest)
 
 
-def _is_whole(folder: str, path: str, files: Iterable[Mapping[str, JSON]], **_facts: JSON) -> bool:
-    """Whether a part lies in its artifact's folder, with all its files as regular ones of the recorded sizes.
+def _folders_of(folder: str, part: str, files: Iterable[Mapping[str, JSON]]) -> set[str]:
+    """Check the files of a part, and return the folders that they lie in, relative to the artifact's folder.
 
     Raises:
         OSError: if a file is missing.
+        ValueError: if the part or a file lies elsewhere, is not a regular file, or has another size than recorded.
         TypeError, AttributeError: if an entry is not one of a manifest.
     """
-    if path.startswith("/") or ".." in path.split("/"):
-        return False
-    above = {path}
+    found = {part}
     for each in files:
         entry = FileEntry(**each)
-        inside = entry.path == path or entry.path.startswith(f"{path}/")
+        if entry.path != part:
+            if not entry.path.startswith(f"{part}/"):
+                raise ValueError(entry.path)
+            found.add(entry.path.rpartition("/")[0])
         status = os.lstat(f"{folder}/{entry.path}")
-        if not inside or ".." in entry.path.split("/") or status.st_size != entry.size or not S_ISREG(status.st_mode):
-            return False
-        above.add(entry.path.rpartition("/")[0])
-    return not any(os.path.islink(f"{folder}/{name}") for name in _with_parents(above))  # noqa: PTH114 (thousands)
-
-
-def _with_parents(names: Iterable[str]) -> set[str]:
-    return {
-        "/".join(parts[:count]) for parts in (name.split("/") for name in names) for count in range(1, len(parts) + 1)
-    }
+        if status.st_size != entry.size or not S_ISREG(status.st_mode):
+            raise ValueError(entry.path)
+    for name in sorted(found):
+        if name.startswith("/") or ".." in name.split("/"):
+            raise ValueError(name)
+        while (name := name.rpartition("/")[0]) not in found:
+            found.add(name)
+    return found
 
 
 def _drop_strays(folder: Path, keep: set[str]) -> None:

@@ -19,14 +19,14 @@ def test_a_file_of_exactly_the_limit_is_read_and_one_byte_more_is_not(tmp_path: 
     path = tmp_path / "config.toml"
     path.write_bytes(b"#" * 2000)
     assert read_small(path, 2000) == b"#" * 2000 and read_end(path, 3) == b"###"
-    with pytest.raises(OSError, match="it is larger than 1 KiB"):
+    with pytest.raises(OSError, match="it is too large: more than 1 KiB"):
         read_small(path, 1999)
 
 
 def test_a_file_that_states_no_size_is_read_up_to_the_limit() -> None:
     path = Path("/proc/self/maps")
     assert path.stat().st_size == 0 and read_small(path, 1 << 24).count(b"\n") > 10
-    with pytest.raises(OSError, match="larger"):
+    with pytest.raises(OSError, match="too large"):
         read_small(path, 10)
 
 
@@ -46,7 +46,7 @@ def test_too_large_a_configuration_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
     with path.open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(UsageError, match=r"config.toml: it is larger than 1 MiB\."):
+    with pytest.raises(UsageError, match=r"config.toml: it is too large: more than 1 MiB\."):
         load_file(path)
 
 
