@@ -10,7 +10,9 @@ from pathlib import Path
 import torch
 
 from splatpipe.pipeline.engine.durable import sync_tree, write_durably
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.machine import available_memory_bytes
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.photos.options import UndistortConfig
@@ -55,7 +57,7 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         folder.mkdir(exist_ok=True)
     if division.is_whole:
         limit = _default_limit(division, train, device, report)
-        (out / "blocks.json").write_text(whole_json(limit), encoding="utf-8")
+        write_file(out / "blocks.json", whole_json(limit))
         return {"blocks": 1} | ({"limit_bytes": limit} if limit else {})
     _report_division(division, train, division.limit_bytes and division.limit_bytes - _host_bytes(device), report)
     finished = out / "coarse.json"
@@ -66,12 +68,12 @@ def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         write_durably(finished, json.dumps(dict(summary)))
     (coarse / "checkpoint.npz").unlink(missing_ok=True)
     site, block_summary = lay_out(train, inputs, division, out, report)
-    (out / "blocks.json").write_text(site.to_json(), encoding="utf-8")
+    write_file(out / "blocks.json", site.to_json())
     return {
         "blocks": division.blocks,
         "division": asdict(division),
         **block_summary,
-        "coarse": json.loads(finished.read_text(encoding="utf-8")),
+        "coarse": read_json(finished),
     }
 
 
@@ -83,7 +85,7 @@ def stored_division(path: Path, make: Callable[[], Division]) -> Division:
         make: Makes the division.
     """
     try:
-        return Division.of_facts(json.loads(path.read_text(encoding="utf-8")))
+        return Division.of_facts(read_json(path))
     except (OSError, ValueError, KeyError, TypeError):
         division = make()
         write_durably(path, json.dumps(asdict(division)))

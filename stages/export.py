@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 from dataclasses import replace
@@ -15,7 +14,8 @@ import pycolmap
 import torch
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import read_world_area
 from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
@@ -79,7 +79,7 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     plain_ply.write(out / "splat.ply", Scene(gaussians, facts), bounded)
     report.progress(1, 4, "writing the cameras and the points", "files")
     write_json(out / "cameras.json", cameras_json(cameras, frame))
-    (out / "sparse.glb").write_bytes(sparse_glb(points, cameras, frame))
+    write_file(out / "sparse.glb", sparse_glb(points, cameras, frame))
     centres = np.array([pose_in_world(camera, frame)[1] for camera in cameras]).reshape(-1, 3)
     box = scene_box(frame.world_from_model.apply(points.xyz), centres)
     placed = georef_facts(frame, box, inputs.parts.get("georef.boundary"))
@@ -198,6 +198,6 @@ def _version(distribution: str) -> str | None:
 
 def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_json(path)
     except (OSError, ValueError) as error:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun.") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,8 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
@@ -27,7 +28,7 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
         SplatpipeError: if no photo has enough keypoints.
     """
     photo_list = load_photo_list(inputs["ingest.photos"])
-    cameras = json.loads(inputs["ingest.cameras"].read_text(encoding="utf-8"))["cameras"]
+    cameras = read_json(inputs["ingest.cameras"])["cameras"]
     counts: list[int] = []
     colours: list[Bytes] = []
     with (
@@ -51,7 +52,8 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
             counts.append(len(features.keypoints))
             colours.append(features.colours)
             report.progress(number, len(photo_list), "finding keypoints", "photos")
-    np.save(out / "colours.npy", np.concatenate(colours))
+    with new_file(out / "colours.npy") as file:
+        np.save(file, np.concatenate(colours))
     _check(photo_list, counts, report)
     return {
         "photos": len(photo_list),

@@ -4,7 +4,6 @@ cameras are held. The model is copied byte for byte unless the adjustment with c
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
 from splatpipe.pipeline.sfm.lens_model import named_params, stated_lenses
@@ -192,8 +191,8 @@ def _lens_knowledge(
 ) -> dict[int, LensKnowledge]:
     """What files and metadata say of the cameras, in the model's pixels, by COLMAP camera id."""
     try:
-        groups = json.loads(cameras.read_text(encoding="utf-8"))["cameras"]
-        stated = stated_lenses(json.loads(lenses.read_text(encoding="utf-8"))["lenses"])
+        groups = read_json(cameras)["cameras"]
+        stated = stated_lenses(read_json(lenses)["lenses"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(f"The cameras {cameras} cannot be read: {error}", "Run with --rerun ingest.") from error
     known = {}

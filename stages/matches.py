@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.layout import half_sizes, make_layout, make_views
@@ -26,7 +28,7 @@ def run(config: MatchesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         SplatpipeError: if no two photos match.
     """
     photos = load_photo_list(inputs["ingest.photos"]).photos
-    positions = json.loads(inputs["ingest.positions"].read_text(encoding="utf-8"))["positions"]
+    positions = read_json(inputs["ingest.positions"])["positions"]
     features = inputs["features.database"]
     layout = make_layout(photos, positions)
     layout = replace(
@@ -50,7 +52,7 @@ def run(config: MatchesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     names = layout.names
     listed = [[names[i], names[j], inliers.get((i, j), 0)] for i, j in pairs]
     text = json.dumps({"pairing": pairing, "pairs": listed}, ensure_ascii=False, indent=0)
-    (out / "pairs.json").write_text(text + "\n", encoding="utf-8")
+    write_file(out / "pairs.json", text + "\n")
     verified = [count for count in inliers.values() if count > 0]
     pieces = components([pair for pair, count in inliers.items() if count > 0], len(photos))
     return {

@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import load_photo_list
@@ -41,7 +43,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         capture = _capture(inputs, Path(scratch))
         found = run_ladder(capture, reconstruct(capture, config, report), config, report)
         hold_few(found.model, found.verified, capture.cameras)
-        stated = stated_lenses(json.loads(inputs["ingest.lenses"].read_text(encoding="utf-8"))["lenses"])
+        stated = stated_lenses(read_json(inputs["ingest.lenses"])["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
     model = canonical(found.model, found.colours, _keypoint_counts(found.verified))
@@ -50,7 +52,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     verdict = judge(model, found.verified, capture.cameras).joined(outside)
     summary = {**_summary(model, found, capture.cameras), "lenses": list(lenses), "verdict": verdict.as_json()}
     text = json.dumps(_without_times(summary), ensure_ascii=False, indent=1) + "\n"
-    (out / "models.json").write_text(text, encoding="utf-8")
+    write_file(out / "models.json", text)
     _warn(summary, report)
     report_cameras(summary["cameras"], report)
     report_lenses(summary, report)
@@ -60,7 +62,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
 def _capture(inputs: Inputs, scratch: Path) -> MappingInput:
     photos = load_photo_list(inputs["ingest.photos"])
     numbers = {photo.name: number for number, photo in enumerate(photos.photos, start=1)}
-    pairs = json.loads(inputs["matches.pairs"].read_text(encoding="utf-8"))["pairs"]
+    pairs = read_json(inputs["matches.pairs"])["pairs"]
     return MappingInput(
         database=inputs["matches.database"],
         features=inputs["features.database"],
@@ -68,8 +70,8 @@ def _capture(inputs: Inputs, scratch: Path) -> MappingInput:
         photos=photos,
         photos_part=inputs["ingest.photos"],
         photos_dir=inputs.photos_dir,
-        positions=json.loads(inputs["ingest.positions"].read_text(encoding="utf-8"))["positions"],
-        cameras=json.loads(inputs["ingest.cameras"].read_text(encoding="utf-8"))["cameras"],
+        positions=read_json(inputs["ingest.positions"])["positions"],
+        cameras=read_json(inputs["ingest.cameras"])["cameras"],
         scratch=scratch,
         threads=inputs.machine.threads,
         tried=frozenset((numbers[first], numbers[second]) for first, second, _ in pairs),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.dataset import load_views, split_views
 from splatpipe.pipeline.photos.options import SplitConfig
@@ -17,6 +18,6 @@ def run(config: SplitConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     """
     names = [view.camera.name for view in load_views(inputs["undistort.dataset"])]
     found = split_views(names, config.every, config.views)
-    (out / "split.json").write_text(found.to_json(), encoding="utf-8")
+    write_file(out / "split.json", found.to_json())
     report.progress(len(names), len(names), "holding out", "photos")
     return {"trained_on": len(found.train), "held_out": len(found.held_out)}

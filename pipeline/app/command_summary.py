@@ -151,17 +151,19 @@ def _interrupted_again(error: BaseException | None) -> bool:
 
 def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The accuracy report, with the splat's own if measured, and the surveyed points; empty if not computed."""
+    from splatpipe.pipeline.engine.json_file import read_json
+
     artifacts = outcome.artifacts.values()
     parts = {name: part.path for artifact in artifacts for name, part in artifact.parts.items()}
     report: dict[str, Any] = {}
     points: list[dict[str, Any]] = []
     with suppress(OSError, ValueError, KeyError, TypeError):  # ``status`` reports damaged files
         if "evaluate.metrics" in parts:
-            report = dict(json.loads(parts["evaluate.metrics"].read_text(encoding="utf-8"))["accuracy"])
+            report = dict(read_json(parts["evaluate.metrics"])["accuracy"])
         elif "georef.accuracy" in parts:
-            report = dict(json.loads(parts["georef.accuracy"].read_text(encoding="utf-8")))
+            report = dict(read_json(parts["georef.accuracy"]))
         if "georef.control" in parts:
-            points = list(json.loads(parts["georef.control"].read_text(encoding="utf-8"))["points"])
+            points = list(read_json(parts["georef.control"])["points"])
     return report, points
 
 

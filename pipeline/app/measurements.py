@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from splatpipe.pipeline.app.page_file import printable
 from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.json_file import read_json
 
 MEASURED = Path("stages/measured.json")
 SECTIONS = "sections"  # the folder in OUT
@@ -110,9 +111,7 @@ def is_number(value: Any) -> bool:
 def _stored(out: Path) -> dict[str, Any]:
     path = out / MEASURED
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            return {}
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        value = read_json(path, LARGEST_FILE)
+    except (OSError, ValueError):
         return {}
     return value if isinstance(value, dict) and value.get("format") == FORMAT else {}

@@ -15,6 +15,7 @@ import numpy as np
 from splatpipe.pipeline.app.console import RunConsole
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
+from splatpipe.pipeline.engine.output_file import own_folder, write_file
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import FilmCamera, Route, cameras_along
@@ -110,6 +111,8 @@ class RenderRequest:
             raise UsageError(f"{target} is not a film file.", hint=f"A film ends in {' or '.join(CODECS)}.")
         folder = target if self.stills else target.absolute().parent
         try:
+            if self.to is None:
+                own_folder(out, FOLDER)
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise MachineError(
@@ -253,7 +256,7 @@ def write_still(stem: Path, pictures: FrameRenderer, camera: Camera) -> None:
 def _write(path: Path, array: np.ndarray) -> None:
     done, data = cv2.imencode(path.suffix, np.ascontiguousarray(array))
     assert done, path
-    path.write_bytes(data.tobytes())
+    write_file(path, data.tobytes())
 
 
 def _keyframe_file(path: str) -> Path:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, Items, write_measurements
 from splatpipe.pipeline.engine.durable import sync_folder
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.engine.output_file import own_folder
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.engine.store import Part
 from splatpipe.stages.line import DEPTHS, DSM, GEOREF, LINE, UNDISTORT
@@ -189,7 +190,7 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
         volumes = _volumes(surface, wanted)
         if sections:
             write_measurements(out, "sections", surface.digests, ())  # in case this is killed before the end
-            _publish(aside, out / SECTIONS)
+            _publish(aside, own_folder(out, SECTIONS))
             write_measurements(out, "sections", surface.digests, sections)
             measured["sections"] = [_without_trace(item) for item in sections]
     finally:
@@ -239,7 +240,6 @@ def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threa
 
 def _publish(aside: Path, folder: Path) -> None:
     """Move sections to their final folder, and remove those of an earlier call."""
-    folder.mkdir(exist_ok=True)
     made = {path.name for path in aside.iterdir()}
     for path in sorted(aside.iterdir()):
         path.replace(folder / path.name)

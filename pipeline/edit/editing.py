@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +16,7 @@ from splatpipe.pipeline.edit.size import OutputFile
 from splatpipe.pipeline.edit.sources import SPLAT, STAGES, SplatSource, is_run, open_source
 from splatpipe.pipeline.edit.workpiece import Workpiece, between
 from splatpipe.pipeline.engine.digests import file_digest
-from splatpipe.pipeline.engine.durable import sync_folder, sync_tree
+from splatpipe.pipeline.engine.durable import beside
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
@@ -178,25 +176,11 @@ def _require_finite(scene: Scene) -> None:
 def _write(task: EditTask, scene: Scene) -> None:
     """Write the output atomically."""
     path = task.output.path
-    aside = path.with_name(f".{os.getpid()}.new.{path.name}")
     try:
-        write_scene(aside, scene, task.output.kind)
-        if aside.is_dir():
-            sync_tree(aside)
-            if path.is_dir():
-                path.rmdir()  # must be empty, or this fails
-        else:
-            with aside.open("rb") as file:
-                os.fsync(file.fileno())
-        aside.replace(path)
-        sync_folder(path.parent)
+        with beside(path) as aside:
+            write_scene(aside, scene, task.output.kind)
     except OSError as error:
         raise MachineError(f"Cannot write {path}: {error.strerror}.", hint="Check the free space.") from error
-    finally:
-        if aside.is_dir():
-            shutil.rmtree(aside, ignore_errors=True)
-        else:
-            aside.unlink(missing_ok=True)
 
 
 def _views(task: EditTask, before: _SplatExtent, after: _SplatExtent) -> PictureCameras:

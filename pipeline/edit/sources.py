@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.digests import part_digest, tree_entries
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.scene import Scene
@@ -95,21 +95,17 @@ def read_cameras(path: Path) -> list[Camera]:
         The valid ones; empty if the file is missing or damaged, in which case images are made without them.
     """
     try:
-        if path.stat().st_size > LARGEST_CAMERAS:
-            return []
-        listed = json.loads(path.read_text(encoding="utf-8"))
+        listed = read_json(path, LARGEST_CAMERAS)
         return [camera for entry in listed if (camera := _camera(entry)) is not None]
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+    except (OSError, ValueError, TypeError, KeyError):
         return []
 
 
 def _held_out(path: Path) -> set[str]:
     """Names of a run's held-out photos; empty if its metrics are missing or damaged."""
     try:
-        if path.stat().st_size > LARGEST_CAMERAS:
-            return set()
-        return {str(view["name"]) for view in json.loads(path.read_text(encoding="utf-8"))["per_view"]}
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return {str(view["name"]) for view in read_json(path, LARGEST_CAMERAS)["per_view"]}
+    except (OSError, ValueError, TypeError, KeyError):
         return set()
 
 

@@ -15,6 +15,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON, Stage
 
 Table = dict[str, JSON]
@@ -46,9 +47,7 @@ def load_file(path: Path) -> Table:
         UsageError: if it cannot be read or is not TOML; the message includes the line.
     """
     try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise UsageError(f"{path} is too large to be a configuration file.", hint="Give a TOML file with --config.")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_small(path, MAX_CONFIG_BYTES).decode("utf-8"))
     except OSError as error:
         raise UsageError(
             f"Cannot read {path}: {error.strerror}.", hint="Check the path given with --config."

@@ -5,12 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import stat
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.machine import pseudo_devices
+from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.engine.stage import JSON
 
 BLOCK_BYTES = 1 << 20
@@ -32,20 +36,38 @@ def digest(value: JSON) -> str:
 def file_digest(path: Path) -> str:
     """sha256 (hex) of a file's bytes."""
     sha = hashlib.sha256()
-    with path.open("rb", buffering=0) as file:
+    with open_regular(path) as file:
         while block := file.read(BLOCK_BYTES):
             sha.update(block)
     return sha.hexdigest()
 
 
 def walk_files(root: Path) -> Iterator[Path]:
-    """Yield every regular file below ``root`` in sorted order; hidden names and symlinked folders are skipped."""
+    """Yield every regular file below ``root`` in sorted order.
+
+    Hidden names, symlinked folders and the kernel's pseudo files are skipped.
+    """
+    pseudo = pseudo_devices()
     for folder, folders, files in os.walk(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(files):
             path = Path(folder) / name
-            if not name.startswith(".") and path.is_file():
+            if not name.startswith(".") and is_real_file(path, pseudo):
                 yield path
+
+
+def is_real_file(path: Path, pseudo: Container[int]) -> bool:
+    """Whether a path, which may be a link, leads to a regular file on a disk.
+
+    Args:
+        path: The path.
+        pseudo: ``pseudo_devices()``.
+    """
+    try:
+        status = path.stat()
+    except OSError:
+        return False
+    return stat.S_ISREG(status.st_mode) and status.st_dev not in pseudo
 
 
 @dataclass(frozen=True)
@@ -97,7 +119,7 @@ class HashTable:
         self._remember = remember
         self._known: dict[str, list[JSON]] = {}
         try:
-            table = json.loads(path.read_text(encoding="utf-8"))
+            table = read_json(path)
             self._known = {str(key): list(value) for key, value in table.items() if len(value) == KNOWN + 1}
         except (OSError, ValueError, AttributeError, TypeError):
             pass  # a missing or corrupt table only costs reading the photos again

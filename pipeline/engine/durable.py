@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import shutil
+import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+from splatpipe.pipeline.engine.output_file import new_file, token
+from splatpipe.pipeline.engine.small_file import kind_of
+
+UNFINISHED = ".new"
+
 
 def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None:
-    """Write a file atomically, replacing any existing one.
+    """Write a file atomically, replacing any existing one; a link is replaced, too, and its target untouched.
 
     Args:
         path: The file; the permissions of an existing one are kept.
@@ -21,37 +28,50 @@ def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None
     Raises:
         OSError: if the disk is full or not writable; what was at ``path`` is still there.
     """
-    with _beside(path) as aside:
-        with aside.open("wb") as file:
+    with beside(path) as aside:
+        with new_file(aside) as file:
             if isinstance(content, str):
                 file.write(content.encode())
             else:
                 content(file)
-        if path.exists():
-            shutil.copymode(path, aside)
+        with suppress(FileNotFoundError):
+            if stat.S_ISREG(mode := path.lstat().st_mode):
+                aside.chmod(stat.S_IMODE(mode))
 
 
 def copy_durably(source: Path, path: Path) -> None:
-    """Copy a file with its times and permissions to ``path`` atomically, replacing any existing file.
+    """Copy a regular file with its times and permissions to ``path`` atomically, replacing any existing file or link.
 
     Raises:
-        OSError: if ``source`` cannot be read, or the disk is full or not writable; what was at ``path`` is still there.
+        OSError: if ``source`` cannot be read or is a link, or the disk is full or not writable; what was at ``path``
+            is still there.
     """
-    with _beside(path) as aside:
-        shutil.copy2(source, aside)
+    if not stat.S_ISREG(mode := source.lstat().st_mode):
+        raise OSError(errno.EINVAL, f"it is {kind_of(mode)}, not a file", str(source))
+    with beside(path) as aside:
+        new_file(aside).close()
+        shutil.copy2(source, aside, follow_symlinks=False)
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside ``path`` to write to; on success it is flushed and renamed to ``path``."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
+def beside(path: Path) -> Iterator[Path]:
+    """Yield an unpredictable temporary path beside ``path`` for a new file or folder.
+
+    On success, what was written there is flushed and renamed to ``path``; otherwise it is removed.
+    """
+    aside = path.with_name(f".{path.name}.{os.getpid()}.{token()}{UNFINISHED}")
     try:
         yield aside
-        with aside.open("rb") as file:
-            os.fsync(file.fileno())
+        if aside.is_dir():
+            sync_tree(aside)
+            if path.is_dir() and not path.is_symlink():
+                path.rmdir()  # it must be empty, or this fails
+        else:
+            with aside.open("rb") as file:
+                os.fsync(file.fileno())
         aside.replace(path)
     except BaseException:
-        aside.unlink(missing_ok=True)
+        _remove(aside)
         raise
     sync_folder(path.parent)
 
@@ -64,8 +84,17 @@ def remove_unfinished(folder: Path, name: str = "*", process: int | None = None)
         name: Name of the target file; any by default.
         process: ID of the killed process; None if no other process is writing these files now.
     """
-    for aside in folder.glob(f".{glob.escape(name) if name != '*' else name}.{process or '*'}.new"):
-        aside.unlink(missing_ok=True)
+    pattern = f".{glob.escape(name) if name != '*' else name}.{process or '*'}"
+    for ending in (f".*{UNFINISHED}", UNFINISHED):  # the latter of versions up to 0.2
+        for aside in folder.glob(f"{pattern}{ending}"):
+            _remove(aside)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:

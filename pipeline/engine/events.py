@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
+from splatpipe.pipeline.engine.output_file import open_own
 from splatpipe.pipeline.engine.stage import JSON
 
 Kind = Literal[
@@ -105,7 +106,7 @@ class EventLog:
 
     def __init__(self, path: Path) -> None:
         self._name = path.name
-        self._descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self._descriptor = open_own(path, os.O_RDWR | os.O_APPEND)
         self._last_progress_s: dict[tuple[str, str], float] = {}  # by stage and activity
         size = os.fstat(self._descriptor).st_size
         if size and os.pread(self._descriptor, 1, size - 1) != b"\n":  # the machine stopped in the middle of a line

@@ -14,6 +14,7 @@ from typing import IO
 
 from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, StageError, StopSignal
 from splatpipe.pipeline.engine.events import Event, Sink
+from splatpipe.pipeline.engine.output_file import appended_file
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.worker import Task, peak_memory_of
@@ -111,11 +112,11 @@ class Executor:
 
     def _running_worker(self) -> subprocess.Popen[str]:
         if self._process is None:
-            with self._log.open("a", encoding="utf-8") as log:
+            with appended_file(self._log) as log:
                 self._process = self._spawn(log)
         return self._process
 
-    def _spawn(self, log: IO[str]) -> subprocess.Popen[str]:
+    def _spawn(self, log: IO[bytes]) -> subprocess.Popen[str]:
         try:
             return subprocess.Popen(
                 python_module("splatpipe.pipeline.engine.worker", str(os.getpid())),

@@ -1,11 +1,20 @@
-"""Writes JSON for people and programs: indented, UTF-8, no NaN; the same bytes for the same value."""
+"""Reads and writes JSON for people and programs: indented, UTF-8, no NaN; the same bytes for the same value."""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.small_file import read_small
+
+if TYPE_CHECKING:  # it imports pydantic
+    from splatpipe.pipeline.engine.stage import JSON
+
+MAX_JSON_BYTES = 256 << 20  # the pairs of 100,000 photos are smaller
+TOO_MANY_DIGITS = re.compile(rb"[0-9]{300}")  # neither a number that a float can hold nor a name
 
 
 def json_text(value: JSON) -> str:
@@ -19,4 +28,32 @@ def json_text(value: JSON) -> str:
 
 def write_json(path: Path, value: JSON) -> None:
     """Write a value as JSON to a file in a stage's own folder (not atomically)."""
-    path.write_text(json_text(value), encoding="utf-8")
+    write_file(path, json_text(value))
+
+
+def parse_json(data: bytes) -> Any:
+    """The value of JSON text in UTF-8.
+
+    Raises:
+        ValueError: if it is not JSON, is nested too deeply, or has a number that no float can hold.
+    """
+    if TOO_MANY_DIGITS.search(data):
+        raise ValueError("it has a number of 300 digits or more")
+    try:
+        return json.loads(data.decode("utf-8"))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Read a JSON file, which need not be one of ours.
+
+    Args:
+        path: The file.
+        max_bytes: The most it may have.
+
+    Raises:
+        OSError: if it cannot be read, is not a regular file, or is larger.
+        ValueError: if it is not JSON, is nested too deeply, or has a number that no float can hold.
+    """
+    return parse_json(read_small(path, max_bytes))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.config import settings_of
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.stage import Shard, Stage, StageConfig, stage_name
 from splatpipe.pipeline.engine.store import Artifact, Part, StageInputs, Store
@@ -100,7 +100,7 @@ class Line:
 
 def _shard_count(path: Path, stage: str) -> int:
     try:
-        count = json.loads(path.read_text(encoding="utf-8"))["shards"]
+        count = read_json(path)["shards"]
     except (OSError, ValueError, KeyError, TypeError):
         count = None
     if type(count) is not int or count < 0:

@@ -28,6 +28,8 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.machine import LOCAL_KINDS, mount_of
+from splatpipe.pipeline.engine.output_file import open_own
+from splatpipe.pipeline.engine.small_file import open_regular, read_small
 
 LOCK_FILE = ".lock"  # below stages/; it is never removed, and only its holder works
 PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
@@ -35,7 +37,6 @@ BEAT_S = 4.0  # between touches; rare enough not to burden a server
 SILENCE_S = 20.0  # without a touch: five missed ones cannot be explained by a busy disk
 SETTLE_S = 1.0  # time for two machines that sign at once to see which was last
 POLL_S = 0.25
-FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 LONGEST = 4096  # bytes read of a signature
 WIDTH = 1024  # bytes to which signatures are padded: of two written over each other, the last is intact
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
@@ -179,7 +180,7 @@ def locked_shard(out: Path, shard: str, *, wait: bool = False, notify: Notify = 
     path = out / "stages" / LOCK_FILE
     waiting = _Queue(path, notify, wait)
     with _lock_errors(out):
-        shared = os.open(path, FLAGS, 0o666)
+        shared = open_own(path, os.O_RDWR)
     try:
         while True:
             with _lock_errors(out):
@@ -204,7 +205,7 @@ def locked_shard(out: Path, shard: str, *, wait: bool = False, notify: Notify = 
 def _acquire(path: Path, notify: Notify, *, wait: bool) -> Hold:
     """Lock a file exclusively and sign it; raises what ``locked`` raises."""
     with _lock_errors(path.parents[1]):
-        descriptor = os.open(path, FLAGS, 0o666)
+        descriptor = open_own(path, os.O_RDWR)
         try:
             return Hold(path, descriptor, _lock_and_sign(path, descriptor, notify, wait=wait))
         except BaseException:
@@ -232,19 +233,19 @@ def is_locked(out: Path, shard: str = "") -> bool:
     """
     path = _shard_file(out, shard) if shard else out / "stages" / LOCK_FILE
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        file = open_regular(path)
     except OSError:
         return False
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # brief: a run that starts now waits longer
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # brief: a run that starts now waits longer
         holder = _read_signature(path)
-        touched_s = time.time() - os.fstat(descriptor).st_mtime
+        touched_s = time.time() - os.fstat(file.fileno()).st_mtime
     except BlockingIOError:
         return True
     except OSError:
         return False
     finally:
-        os.close(descriptor)
+        file.close()
     return holder is not None and holder.is_elsewhere and touched_s < SILENCE_S
 
 
@@ -380,15 +381,14 @@ def _try_flock(descriptor: int, out: Path, kind: int) -> bool:
 def _read_signature(path: Path) -> Holder | None:
     """The signer of the file, or None. The file is reopened so that NFS queries the server."""
     with suppress(OSError, ValueError, TypeError, KeyError, RecursionError):
-        with path.open("rb") as file:
-            read = json.loads(file.read(LONGEST))
+        read = json.loads(read_small(path, LONGEST))
         return Holder(int(read["process"]), str(read["host"])[:255], str(read["boot"]), str(read["turn"]))
     return None
 
 
 def _mtime_ns(path: Path) -> int:
     """The file's mtime, ns, by its file system's clock; 0 if unreadable. Reopened so that NFS queries the server."""
-    with suppress(OSError), path.open("rb") as file:
+    with suppress(OSError), open_regular(path) as file:
         return os.fstat(file.fileno()).st_mtime_ns
     return 0
 

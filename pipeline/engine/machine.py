@@ -20,6 +20,10 @@ UNLIMITED_BYTES = 1 << 60  # more than any machine has: cgroup version 1 express
 # File systems that belong to one machine, so that its own locks suffice.
 LOCAL_DISKS = ("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "ntfs3", "vfat", "exfat")
 LOCAL_KINDS = frozenset((*LOCAL_DISKS, "overlay", "tmpfs", "ramfs"))
+PSEUDO_KINDS = frozenset(
+    {"autofs", "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "devpts", "devtmpfs", "efivarfs"}
+    | {"fusectl", "mqueue", "nsfs", "proc", "pstore", "rpc_pipefs", "securityfs", "selinuxfs", "sysfs", "tracefs"}
+)
 _OCTAL = re.compile(r"\\([0-7]{3})")  # how the kernel escapes spaces in mount points
 
 
@@ -32,12 +36,14 @@ class Mount:
         point: The mount point.
         kind: The file system type, e.g. ``ext4``.
         options: Options of the mount, then of the file system.
+        device: ``st_dev`` of its files; 0 if unknown.
     """
 
     root: str
     point: str
     kind: str
     options: tuple[str, ...]
+    device: int = 0
 
 
 def mounts(root: Path = Path("/")) -> list[Mount]:
@@ -53,8 +59,22 @@ def parse_mounts(text: str) -> list[Mount]:
         left, right = before.split(" "), after.split(" ")
         if len(left) >= 6 and len(right) >= 2:
             options = (*left[5].split(","), *(right[2].split(",") if len(right) > 2 else ()))
-            found.append(Mount(_plain(left[3]), _plain(left[4]), right[0], options))
+            found.append(Mount(_plain(left[3]), _plain(left[4]), right[0], options, _device(left[2])))
     return found
+
+
+def _device(text: str) -> int:
+    """The number of a device such as ``0:22``; 0 if it is none."""
+    major, _, minor = text.partition(":")
+    return os.makedev(int(major), int(minor)) if major.isdecimal() and minor.isdecimal() else 0
+
+
+def pseudo_devices() -> frozenset[int]:
+    """``st_dev`` of files that the kernel makes up while they are read: some never end, and some wait for ever.
+
+    They claim to be regular files, e.g. ``/proc/kmsg``.
+    """
+    return frozenset(mount.device for mount in mounts() if mount.kind in PSEUDO_KINDS)
 
 
 def mount_of(path: Path, among: Sequence[Mount] | None = None) -> Mount | None:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from stat import S_ISREG
 
 from splatpipe.pipeline.engine.digests import FileEntry, canonical, digest, part_digest, tree_entries
 from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, sync_folder, sync_tree, write_durably
 from splatpipe.pipeline.engine.errors import MachineError, StageError, UsageError
+from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.output_file import is_inside, own_folder, require_own_files
 from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
 FORMAT = 1  # of the layout of OUT; raised when older versions could no longer read it
 KEY_CHARACTERS = 16  # in a folder's name: 64 bits are enough for the few artifacts of one OUT
 MIN_FREE_BYTES = 16 << 20
+MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
@@ -53,12 +58,15 @@ class Artifact:
         }
 
     def deliverables(self, stage: Stage) -> dict[Path, Path]:
-        """The files of the stage's deliverables by path relative to OUT; for a folder part, all files in it."""
+        """The files of the stage's deliverables by path relative to OUT, as its manifest lists them."""
         files: dict[Path, Path] = {}
         for name in stage.deliverables:
-            root = self.folder / stage.parts[name]
-            found = [root] if root.is_file() else sorted(path for path in root.rglob("*") if path.is_file())
-            files |= {file.relative_to(root.parent if file == root else root): file for file in found}
+            if name not in self.manifest["parts"]:  # of an older version
+                continue
+            part = self.manifest["parts"][name]
+            root = PurePosixPath(part["path"])
+            for path in sorted(PurePosixPath(entry["path"]) for entry in part["files"]):
+                files[Path(path.relative_to(root.parent if path == root else root))] = self.folder / path
         return files
 
 
@@ -155,8 +163,8 @@ class Store:
             **run,
         }
         sync_tree(partial)
-        write_durably(partial / "manifest.json", json.dumps(manifest, indent=1))
-        _drop_strays(partial, {"manifest.json", *(entry["path"] for part in parts.values() for entry in part["files"])})
+        write_durably(partial / MANIFEST, json.dumps(manifest, indent=1))
+        _drop_strays(partial, {MANIFEST, *(entry["path"] for part in parts.values() for entry in part["files"])})
         return self._publish(partial)
 
     def _publish(self, partial: Path) -> Artifact:
@@ -189,7 +197,7 @@ class Store:
                 continue
             if partial.name.startswith("replaced-"):
                 shutil.rmtree(partial, ignore_errors=True)
-            elif (partial / "manifest.json").is_file():
+            elif (partial / MANIFEST).is_file():
                 if _read_artifact(partial) is not None:
                     self._publish(partial)
                 else:
@@ -216,33 +224,33 @@ class Store:
         """Copy an artifact's deliverables into OUT, each replaced atomically; unchanged ones are left alone.
 
         Unmodified copies of an earlier artifact's deliverables that this one does not have are removed.
+
+        Raises:
+            UsageError: if a folder of theirs in OUT is a link.
         """
         wanted = artifact.deliverables(stage)
         for name, file in wanted.items():
-            _copy_if_changed(file, self.out / name)
+            if not is_copy(file, self.out / name) or not is_inside(self.out, name):
+                folder = own_folder(self.out, name.parent)
+                remove_unfinished(folder, name.name)  # of a killed run: only the lock's holder delivers
+                copy_durably(file, self.out / name)
         for earlier in self.artifacts(stage.name):
             for name, file in earlier.deliverables(stage).items():
-                if name not in wanted and is_copy(file, self.out / name):
+                if name not in wanted and is_copy(file, self.out / name) and is_inside(self.out, name):
                     (self.out / name).unlink()
 
 
 def is_copy(source: Path, target: Path) -> bool:
-    """Whether ``target`` is a copy made by ``_copy_if_changed`` that nobody has changed since.
+    """Whether ``target`` is a copy made by ``deliver`` that nobody has changed since.
 
     It may be larger than its source: code that adds something to a delivered file keeps the file's mtime.
     """
-    if not target.is_file():
+    try:
+        before, now = source.stat(), target.lstat()
+    except FileNotFoundError:
         return False
-    before, now = source.stat(), target.stat()
-    return now.st_mtime_ns == before.st_mtime_ns and now.st_size >= before.st_size
-
-
-def _copy_if_changed(source: Path, target: Path) -> None:
-    if is_copy(source, target):
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    remove_unfinished(target.parent, target.name)  # of a killed run: only the lock's holder delivers
-    copy_durably(source, target)
+    same = now.st_mtime_ns == before.st_mtime_ns and now.st_size >= before.st_size
+    return same and S_ISREG(now.st_mode)
 
 
 def _folder_name(stage: str, key: str) -> str:
@@ -250,15 +258,45 @@ def _folder_name(stage: str, key: str) -> str:
 
 
 def _read_artifact(folder: Path) -> Artifact | None:
+    """The artifact in a folder; None unless it has all that its manifest lists, as files of its own."""
     try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        manifest = read_json(folder / MANIFEST)
         if manifest["format"] != FORMAT:
             return None
-        entries = [FileEntry(**entry) for part in manifest["parts"].values() for entry in part["files"]]
-        whole = all((folder / entry.path).stat().st_size == entry.size for entry in entries)
+        folders = {""}
+        for part in manifest["parts"].values():
+            folders |= _folders_of(os.fspath(folder), part["path"], part["files"])
+        if any(os.path.islink(f"{folder}/{name}".rstrip("/")) for name in folders):  # noqa: PTH114 (there are many)
+            return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return Artifact(folder, manifest) if whole else None
+    return Artifact(folder, manifest)
+
+
+def _folders_of(folder: str, part: str, files: Iterable[Mapping[str, JSON]]) -> set[str]:
+    """Check the files of a part, and return the folders that they lie in, relative to the artifact's folder.
+
+    Raises:
+        OSError: if a file is missing.
+        ValueError: if the part or a file lies elsewhere, is not a regular file, or has another size than recorded.
+        TypeError, AttributeError: if an entry is not one of a manifest.
+    """
+    found = {part}
+    for each in files:
+        entry = FileEntry(**each)
+        if entry.path != part:
+            if not entry.path.startswith(f"{part}/"):
+                raise ValueError(entry.path)
+            found.add(entry.path.rpartition("/")[0])
+        status = os.lstat(f"{folder}/{entry.path}")
+        if status.st_size != entry.size or not S_ISREG(status.st_mode):
+            raise ValueError(entry.path)
+    for name in sorted(found):
+        if name.startswith("/") or ".." in name.split("/"):
+            raise ValueError(name)
+        while (name := name.rpartition("/")[0]) not in found:
+            found.add(name)
+    return found
 
 
 def _drop_strays(folder: Path, keep: set[str]) -> None:
@@ -278,7 +316,8 @@ def open_store(out: Path, *, create: bool) -> Store:
         create: Create it if it is missing; otherwise a missing one is an error.
 
     Raises:
-        UsageError: if it is a file, is not a run's folder, or was made by a version with a different layout.
+        UsageError: if it is a file, is not a run's folder, was made by a version with a different layout, or has links
+            or the like among the command's own files.
         MachineError: if it cannot be written.
     """
     if out.exists() and not out.is_dir():
@@ -304,16 +343,30 @@ def open_store(out: Path, *, create: bool) -> Store:
     if not create:
         return store
     try:
-        store.partials.mkdir(parents=True, exist_ok=True)
+        _require_own(store)
+        for folder in (store.partials, store.shards):
+            own_folder(out, folder.relative_to(out))
         with tempfile.TemporaryFile(dir=store.partials) as probe:
             probe.write(canonical(FORMAT))
-        store.shards.mkdir(exist_ok=True)
         format_file = store.stages / "format.json"
         if not format_file.exists():
             write_durably(format_file, json.dumps({"format": FORMAT}))
     except OSError as error:
         raise write_error(out, error) from error
     return store
+
+
+def _require_own(store: Store) -> None:
+    """Check that no link or the like lies where a run writes; files of artifacts are checked where they are read.
+
+    Raises:
+        UsageError: naming what is not a file or a folder.
+    """
+    require_own_files([store.stages])
+    if store.stages.exists():
+        require_own_files(store.stages.iterdir())
+        for folder in (store.partials, store.shards):
+            require_own_files(folder.rglob("*"))
 
 
 def write_error(out: Path, error: OSError) -> MachineError:
@@ -326,7 +379,7 @@ def write_error(out: Path, error: OSError) -> MachineError:
 
 def _check_format(out: Path) -> None:
     try:
-        found = json.loads((out / "stages" / "format.json").read_text(encoding="utf-8"))["format"]
+        found = read_json(out / "stages" / "format.json")["format"]
     except FileNotFoundError:
         return
     except (OSError, ValueError, KeyError, TypeError) as error:

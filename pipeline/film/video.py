@@ -6,6 +6,7 @@ takes four times as long as VP8 for a file a fifth smaller at the same quality.
 
 from __future__ import annotations
 
+import glob
 import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,6 +18,7 @@ import cv2
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.output_file import open_own, token, write_file
 from splatpipe.pipeline.photos.images import Pixels
 
 CODECS = {".webm": "VP80", ".mp4": "vp09"}
@@ -47,10 +49,12 @@ class VideoWriter:
         if path.suffix not in CODECS:
             raise ValueError(f"{path.name} is not a film file")
         self._path, self._size, self._fps = path.absolute(), size, fps
-        self._partial = self._path.with_name(f".{self._path.stem}.part{path.suffix}")
+        for left in self._path.parent.glob(f".{glob.escape(self._path.stem)}.{'?' * 16}.part{path.suffix}"):
+            left.unlink()  # of a killed process
+        self._partial = self._path.with_name(f".{self._path.stem}.{token()}.part{path.suffix}")
         self._frames = 0
         try:
-            self._partial.write_bytes(b"")  # OpenCV would not report why it cannot
+            write_file(self._partial, b"")  # OpenCV would not report why it cannot
         except OSError as error:
             raise MachineError(
                 f"Cannot write {path}: {error.strerror}.", hint="Check the folder, its permissions and the free space."
@@ -110,7 +114,7 @@ class VideoWriter:
 
     def _number_track(self) -> None:
         """Replace the random track number by 1, so that the same frames give the same bytes."""
-        with self._partial.open("r+b") as file:
+        with os.fdopen(open_own(self._partial, os.O_RDWR), "r+b") as file:
             head = file.read(HEADER_BYTES)
             for element in TRACK_NUMBERS:
                 at = head.find(element)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.similarity import Similarity
 
 Ring = Float64[np.ndarray, "_ 2"]
@@ -102,7 +102,7 @@ def _read(path: Path | None, frame: str) -> PlanArea | None:
     if path is None:
         return None
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))[frame]
+        facts = read_json(path)[frame]
         return None if facts is None else PlanArea.of_facts(facts)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError(f"The boundary {path.name} cannot be read: {error}", "Run with --rerun georef.") from error

@@ -6,7 +6,6 @@ one, and without them a third of a garden is missing. Depth edges are moved to w
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +16,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
@@ -86,9 +86,10 @@ def save_depth_maps(folder: Path, maps: Iterable[tuple[Camera, DepthMap]]) -> di
     listed: list[dict[str, str | int]] = []
     pixels = found = 0
     for number, (camera, each) in enumerate(maps):
-        file = f"{number:05d}.npz"
-        np.savez(folder / file, depth=each.depth, confidence=each.confidence)
-        listed.append({"photo": camera.name, "file": file, "width": camera.width, "height": camera.height})
+        name = f"{number:05d}.npz"
+        with new_file(folder / name) as file:
+            np.savez(file, depth=each.depth, confidence=each.confidence)
+        listed.append({"photo": camera.name, "file": name, "width": camera.width, "height": camera.height})
         pixels += each.depth.size
         found += int(np.count_nonzero(each.confidence))
     write_json(folder / LIST, {"maps": listed})
@@ -107,7 +108,7 @@ def list_depth_maps(folder: Path, views: Sequence[View]) -> list[DepthMapFile]:
     """
     cameras = {view.camera.name: view.camera for view in views}
     try:
-        listed = json.loads((folder / LIST).read_text(encoding="utf-8"))["maps"]
+        listed = read_json(folder / LIST)["maps"]
         return [
             DepthMapFile(cameras[each["photo"]].scaled(int(each["width"]), int(each["height"])), folder / each["file"])
             for each in listed

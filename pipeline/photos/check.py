@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Shaped
 from PIL import Image
 
+from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.exif import Exif, read_exif
 from splatpipe.pipeline.photos.photo_list import load_stored, open_picture
 from splatpipe.pipeline.photos.scan import Candidate, ExcludedPhoto
@@ -133,7 +134,7 @@ def stored_orientation(exif: Exif, picture: Image.Image) -> int:
 
 def _read_once(path: Path) -> tuple[bytes, str]:
     sha = hashlib.sha256()
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         data = file.read(MAX_FILE_BYTES + 1)
     if len(data) > MAX_FILE_BYTES:
         raise ValueError(f"is larger than {MAX_FILE_BYTES >> 30} GiB")

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from PIL import Image
 
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.photos.check import CheckedPhoto, deep_pixels, stored_orientation
 from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, read_checked
 
@@ -81,7 +82,8 @@ def convert_photo(
 def save_png(pixels: UInt8[np.ndarray, "h w *channels"], target: Path) -> None:
     """Write a PNG without any metadata, creating its folder."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.ascontiguousarray(pixels)).save(target, format="PNG", compress_level=PNG_LEVEL)
+    with new_file(target) as file:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(file, format="PNG", compress_level=PNG_LEVEL)
 
 
 def _scale(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.json_file import json_text, read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.colmap_model import Cloud, ModelPhoto, read_cloud, read_photos
 from splatpipe.pipeline.photos.names import NameFinder, list_names
@@ -205,7 +204,7 @@ def load_split(path: Path) -> Split:
         StageError: if it is missing or broken.
     """
     try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
+        fields = read_json(path)
         return Split(tuple(map(str, fields["train"])), tuple(map(str, fields["held_out"])))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from split.") from error

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.output_file import new_file
 
 QUALITY = 97  # with full chroma: far above what training reaches, and a third of a PNG's size and decoding time
 OPTIONS = (
@@ -42,7 +43,7 @@ def write_jpeg(path: Path, strips: Iterable[Strip], height: int) -> None:
     Raises:
         StageError: if a strip cannot be encoded.
     """
-    with path.open("wb") as file:
+    with new_file(path) as file:
         for number, strip in enumerate(_equal_strips(strips)):
             head, scan = _parts(_encode(path.name, strip))
             if number == 0:

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from splatpipe.pipeline.engine.digests import is_real_file
+from splatpipe.pipeline.engine.machine import pseudo_devices
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import read_exif
 from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, undo_orientation
@@ -176,11 +178,12 @@ def _grey(picture: Image.Image) -> Image.Image:
 
 
 def _mask_files(folder: Path, above: PurePosixPath, shown: str) -> Iterator[MaskFile]:
+    pseudo = pseudo_devices()
     for inner, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(files):
             path = Path(inner) / name
-            if name.startswith(".") or path.suffix.casefold() not in PHOTO_SUFFIXES or not path.is_file():
+            if name.startswith(".") or path.suffix.casefold() not in PHOTO_SUFFIXES or not is_real_file(path, pseudo):
                 continue
             relative = PurePosixPath(path.relative_to(folder).as_posix())
             label = os.fsencode(f"{shown}{folder.name}/{relative}").decode("utf-8", errors="backslashreplace")

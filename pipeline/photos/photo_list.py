@@ -8,7 +8,6 @@ PNG that ingest converted it to.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from io import BytesIO
@@ -20,7 +19,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.engine.source import find_model
 
 # Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
@@ -100,7 +99,7 @@ def load_photo_list(part: Path) -> PhotoList:
         SplatpipeError: if the list is missing or broken.
     """
     try:
-        records: list[dict[str, Any]] = json.loads((part / LIST_NAME).read_text(encoding="utf-8"))["photos"]
+        records: list[dict[str, Any]] = read_json(part / LIST_NAME)["photos"]
         photos = tuple(Photo(**record) for record in records)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(

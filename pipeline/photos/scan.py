@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
+
+from splatpipe.pipeline.engine.machine import pseudo_devices
+from splatpipe.pipeline.engine.small_file import open_regular
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"}
 OTHER_PICTURES = {
@@ -70,6 +74,7 @@ def scan_folder(root: Path) -> Scan:
     candidates: list[Candidate] = []
     left_out: list[ExcludedPhoto] = []
     others = 0
+    pseudo = pseudo_devices()
 
     def unreadable(error: OSError) -> None:
         left_out.append(
@@ -85,7 +90,7 @@ def scan_folder(root: Path) -> Scan:
             if name.startswith("."):
                 continue
             path = Path(folder) / name
-            reason = _exclusion_reason(path)
+            reason = _exclusion_reason(path, pseudo)
             if reason == "":
                 others += 1
                 continue
@@ -106,15 +111,15 @@ def _name(path: Path, root: Path) -> str:
     return os.fsencode(path.relative_to(root).as_posix()).decode("utf-8", errors="backslashreplace")
 
 
-def _exclusion_reason(path: Path) -> str | None:
+def _exclusion_reason(path: Path, pseudo: Container[int]) -> str | None:
     """None for a candidate; the reason for a file that claims to be a photo; an empty text for any other file."""
     suffix = path.suffix.casefold()
     claims = suffix in PHOTO_SUFFIXES or suffix in RAW_SUFFIXES or suffix in OTHER_PICTURES
     try:
         status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            return "is not a regular file" if claims else ""
-        with path.open("rb") as file:
+        if not stat.S_ISREG(status.st_mode) or status.st_dev in pseudo:
+            return "is not a regular file" if claims or path.is_symlink() else ""
+        with open_regular(path) as file:
             head = file.read(HEAD_BYTES)
     except OSError as error:
         return f"cannot be read ({error.strerror})" if claims else ""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter
 from splatpipe.pipeline.geometry.camera import reduced_size
 from splatpipe.pipeline.photos.dataset import MASKS, SKY_MASKS, image_path, mask_path
@@ -162,7 +163,7 @@ def _write(path: Path, strips: Iterable[npt.NDArray[np.uint8]], height: int) -> 
     done, encoded = cv2.imencode(suffix, np.concatenate(list(strips)))
     if not done:
         raise StageError(f"{path.name} could not be encoded.")
-    path.write_bytes(encoded.data)
+    write_file(path, encoded.data)
 
 
 def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[RegisteredPhoto]) -> pycolmap.Reconstruction:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.images import Pixels
 from splatpipe.pipeline.raster import rasterizer
@@ -65,7 +66,7 @@ def load_rendering(path: Path) -> Rendering:
         StageError: if it is not such a file.
     """
     try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
+        fields = read_json(path)
         red, green, blue = map(float, fields["background"])
         megapixels = None if fields["megapixels"] is None else float(fields["megapixels"])
         return Rendering(bool(fields["antialias"]), (red, green, blue), float(fields["near"]), megapixels)

@@ -7,7 +7,6 @@ the others' pixels were fitted.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import read_world_area
 from splatpipe.pipeline.photos.names import NameFinder
@@ -220,7 +220,7 @@ def _rounded(vector: Float64[np.ndarray, " 3"]) -> list[float | None]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = read_json(path)
         if not isinstance(value, dict):
             raise ValueError("no object")
     except (OSError, ValueError) as error:

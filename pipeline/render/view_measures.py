@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.heap import return_free_heap
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.images import Mask, Pixels
@@ -148,4 +149,4 @@ def _write_png(stem: Path, kind: str, pixels: Pixels) -> None:
     done, data = cv2.imencode(".png", np.ascontiguousarray(ordered))
     if not done:
         raise StageError(f"The {kind} of {stem.name} could not be coded as PNG.")
-    stem.with_name(f"{stem.name}.{kind}.png").write_bytes(data.tobytes())
+    write_file(stem.with_name(f"{stem.name}.{kind}.png"), data.tobytes())

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.photos.photo_list import Photo, decode, decode_mask
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 
@@ -138,7 +139,7 @@ def colmap_sift(grey: Bytes, limit: int, scratch: Path) -> tuple[Floats, Bytes]:
     options.sift.max_num_features = limit
     with tempfile.TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True) as folder:
         path = Path(folder) / "database.db"
-        (Path(folder) / "photo.pgm").write_bytes(b"P5 %d %d 255\n" % grey.shape[::-1] + grey.tobytes())
+        write_file(Path(folder) / "photo.pgm", b"P5 %d %d 255\n" % grey.shape[::-1] + grey.tobytes())
         pycolmap.Database.open(path).close()
         pycolmap.extract_features(
             path, folder, image_names=["photo.pgm"], extraction_options=options, device=pycolmap.Device.cpu

@@ -20,6 +20,7 @@ from xml.parsers import expat
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.sfm.lens_model import GRID, PARAMETERS, StatedLens, is_known
 
 MAX_BYTES = 32 << 20  # Pix4D's parameters take half a kilobyte per photo
@@ -60,9 +61,7 @@ def read_lens_file(path: Path) -> tuple[FileLens, ...]:
         SplatpipeError: If the format is not supported, the file is broken, or it contains no usable lens.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise _RefusedError(f"it is larger than {MAX_BYTES >> 20} MiB")
-        data = path.read_bytes()
+        data = read_small(path, MAX_BYTES)
         if b"\0" in data[:4096]:
             raise _RefusedError("it is no text")
         start = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]

@@ -11,6 +11,7 @@ import pycolmap
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.children import CHILDREN_MEMORY, run_children
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.sfm.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.reduction import copy_photos
@@ -95,7 +96,7 @@ def _write_share(features: Path, place: Path, share: Sequence[Pair]) -> None:
         for image in database.read_all_images():
             image.name = str(image.image_id)
             database.update_image(image)
-    _list_of(place).write_text("".join(f"{i + 1} {j + 1}\n" for i, j in share), encoding="ascii")
+    write_file(_list_of(place), "".join(f"{i + 1} {j + 1}\n" for i, j in share))
 
 
 def _join(features: Path, places: Sequence[Path], work: Path) -> None:

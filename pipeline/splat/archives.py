@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatpipe.pipeline.engine.small_file import open_regular
+
 
 def read_archive(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Read all arrays of an `.npz` file, by name.
@@ -16,7 +18,7 @@ def read_archive(path: Path) -> dict[str, npt.NDArray[Any]]:
         OSError: if the file cannot be read.
         ValueError: if it is damaged or not an archive.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         try:
             with np.load(file, allow_pickle=False) as archive:  # a bare `.npy` is not a context manager: TypeError
                 return {name: archive[name] for name in archive.files}

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.bounded import read_exactly
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -112,7 +113,7 @@ class _SpzSplat:
         data = read_exactly(container.path, container.file, self.length)
         with tempfile.TemporaryDirectory(prefix="splatpipe-") as folder:
             path = Path(folder) / "inside.spz"
-            path.write_bytes(data)
+            write_file(path, data)
             try:
                 return reader.read(path).turned("y up").gaussians
             except SplatpipeError as error:

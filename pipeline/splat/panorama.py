@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.archives import read_archive
 from splatpipe.pipeline.splat.sky_mask import directions, horizontal_axes
@@ -246,7 +247,7 @@ def write_panorama(path: Path, panorama: Panorama | None) -> None:
     """Write a panorama; without one, a file that says so."""
     up = np.zeros(3) if panorama is None else panorama.up
     colours = np.zeros((0, 3), np.float32) if panorama is None else panorama.colours.detach().cpu().numpy()
-    with path.open("wb") as file:
+    with new_file(path) as file:
         np.savez(file, allow_pickle=False, up=up, colours=colours)
 
 

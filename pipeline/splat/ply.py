@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.splat.formats.bounded import check_values, open_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply_header import PLY_HINT, PlyElement, ply_header_bytes, read_ply_header
@@ -71,7 +72,7 @@ def write_splat(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) 
     """
     gaussians = gaussians.detach().to("cpu", torch.float32)
     _check_finite(gaussians)
-    with path.open("wb") as file:
+    with new_file(path) as file:
         file.write(_header(len(gaussians), gaussians.sh_degree, comments))
         _write_rows(file, gaussians)
 
@@ -93,7 +94,7 @@ def write_splat_parts(
         OSError: if the file cannot be written.
     """
     left = count
-    with path.open("wb") as file:
+    with new_file(path) as file:
         file.write(_header(count, sh_degree, comments))
         for part in parts:
             if part.sh_degree != sh_degree:

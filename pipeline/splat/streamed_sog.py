@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.formats.sog import AXES, encode_sog
 from splatpipe.pipeline.splat.formats.sog_images import META, RECORD
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -81,7 +82,7 @@ class _Files:
         folder.mkdir(parents=True, exist_ok=True)
         turned = Scene(Gaussians.concat(parts), self.facts).turned(AXES).gaussians
         for name, data in encode_sog(turned, self.facts.antialias, in_order=True).files().items():
-            (folder / name).write_bytes(data)
+            write_file(folder / name, data)
 
     def close_all(self) -> None:
         """Write the remaining files."""
@@ -118,7 +119,7 @@ def write_streamed_sog(folder: Path, scene: Scene, root: LevelNode) -> None:
         "tree": tree,
     }
     text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
-    (folder / LOD_META).write_text(text, encoding="ascii")
+    write_file(folder / LOD_META, text)
     _drop_earlier(folder, {name.partition("/")[0] for name in files.names})
 
 

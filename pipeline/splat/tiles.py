@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import new_file, write_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import FLOAT, UNSIGNED_BYTE, padded, write_head
 from splatpipe.pipeline.splat.glb_splats import EXTENSION, KERNEL, RECORD, SPZ_EXTENSION, harmonics_names
@@ -92,7 +93,7 @@ def write_tiles(
         tile["extensions"][ESRI_CRS]["transform"] = _column_major(esri_crs.crs_from_local)
     tileset = _tileset(tile, root, scene.facts, esri_crs)
     text = json.dumps(tileset, separators=(",", ":"), allow_nan=False)
-    (folder / TILESET).write_text(text, encoding="ascii")
+    write_file(folder / TILESET, text)
     _drop_earlier(folder, set(names.values()))
 
 
@@ -180,7 +181,7 @@ def _write_tile(path: Path, gaussians: Gaussians, facts: SceneFacts) -> None:
     bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
     matrix = np.eye(4)
     matrix[:3, 3] = turn.numpy() @ origin
-    with path.open("wb") as file:
+    with new_file(path) as file:
         write_head(file, _document(about, matrix, bounds, len(spz)), padded(len(spz)))
         file.write(spz + b"\0" * (padded(len(spz)) - len(spz)))
 

@@ -9,12 +9,14 @@ has the AutoCAD 2000 format: the oldest with drawing units and polylines with an
 from __future__ import annotations
 
 import json
+from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.surface.contours import Contours
 from splatpipe.pipeline.surface.dxf import new_document, reproducible
 from splatpipe.pipeline.surface.grid import Grid
@@ -47,7 +49,7 @@ def write_geojson(path: Path, contours: Contours, grid: Grid) -> None:
             "Use the DXF, or georeference the run: give photos with positions, or a gcp_list.txt.",
         )
     header = {"type": "FeatureCollection", "heights": grid.crs.described_heights()}
-    with whole_file(path) as aside, aside.open("w", encoding="utf-8") as file:
+    with whole_file(path) as aside, TextIOWrapper(new_file(aside), "utf-8") as file:
         file.write(json.dumps(header)[:-1] + ',\n"features": [')
         for number, contour in enumerate(contours.lines):
             line = np.concatenate([contour.line, contour.line[:1]]) if contour.closed else contour.line

@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from splatpipe.pipeline.engine.output_file import write_file
+
 FOLDERS = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")  # variables of where it reads and writes
 NO_FONTS = '{"version": 2, "font-faces": []}'  # of another version, it would search for fonts
 
@@ -23,7 +25,7 @@ def _empty_home() -> Iterator[None]:
     with tempfile.TemporaryDirectory() as folder:
         fonts = Path(folder) / "ezdxf" / "font_manager_cache.json"
         fonts.parent.mkdir()
-        fonts.write_text(NO_FONTS, encoding="ascii")
+        write_file(fonts, NO_FONTS)
         os.environ.update(dict.fromkeys(FOLDERS, folder))
         try:
             yield

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.json_file import json_text, read_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.drawing_files import write_dxf_drawing, write_svg_drawing
@@ -95,7 +94,7 @@ def make_facades(task: FacadesTask, out: Path, report: Reporter) -> list[dict[st
         own = out / f"{wall.name}.json"
         if not own.is_file():
             _write(out, draw_elevation(wall, pixel_m, photos, progress), crs)
-        facts.append(json.loads(own.read_text(encoding="utf-8")))
+        facts.append(read_json(own))
     write_facades(out / LIST, facts, crs)
     return facts
 

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.splat.formats.plain_ply import frame_comments
 from splatpipe.pipeline.surface.photo_samples import linear_light
 from splatpipe.pipeline.surface.triangles import ColouredMesh
@@ -43,9 +44,9 @@ def write_mesh(folder: Path, made: ColouredMesh, frame: Frame, boundary: Path | 
     Raises:
         OSError: if the disk is full or not writable.
     """
-    with whole_file(folder / "mesh.glb") as aside, aside.open("wb") as file:
+    with whole_file(folder / "mesh.glb") as aside, new_file(aside) as file:
         _write_glb(file, made)
-    with whole_file(folder / "mesh.ply") as aside, aside.open("wb") as file:
+    with whole_file(folder / "mesh.ply") as aside, new_file(aside) as file:
         _write_ply(file, made, frame_comments(facts_of(frame, antialias=False)))
     vertices = made.mesh.vertices
     box = np.stack([vertices.min(axis=0), vertices.max(axis=0)])

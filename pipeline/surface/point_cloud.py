@@ -20,6 +20,7 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.surface.grid import Grid
 from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.whole_file import whole_file
@@ -103,7 +104,7 @@ def write_cloud(path: Path, chunks: Iterable[CloudChunk], frame: CloudFrame, tak
     count = 0
     with (
         whole_file(path) as aside,
-        aside.open("wb") as file,
+        new_file(aside) as file,
         laspy.LasWriter(file, header, laz_backend=laspy.LazBackend.Lazrs, closefd=False) as writer,
     ):
         for chunk in _pieces(chunks):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import math
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.surface.drawing import (
     GRID,
     POINTS,
@@ -138,7 +140,7 @@ def _write_points(path: Path, section: Section) -> None:
 
 def _write_table(path: Path, header: list[str], table: Float64[np.ndarray, "n k"]) -> None:
     """Write numbers as CSV with a header row; unknown values are empty."""
-    with whole_file(path) as aside, aside.open("w", encoding="utf-8", newline="") as file:
+    with whole_file(path) as aside, TextIOWrapper(new_file(aside), "utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows([f"{v:.{DIGITS}f}" if math.isfinite(v) else "" for v in row] for row in table.tolist())

@@ -5,7 +5,6 @@ It uses a sample of every photo's depths, so it takes seconds; the products' gri
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.sources import MIN_CONFIRMED, DepthSource, PosedDepthMap
@@ -96,7 +95,7 @@ def load_site(path: Path) -> tuple[SiteExtent, float] | None:
         StageError: if the file is broken.
     """
     try:
-        stored: dict[str, Any] | None = json.loads(path.read_text(encoding="utf-8"))
+        stored: dict[str, Any] | None = read_json(path)
         if stored is None:
             return None
         shape = int(stored["rows"]), int(stored["columns"])

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import sync_folder
+from splatpipe.pipeline.engine.output_file import token, write_file
 
 UNFINISHED = ".making"
 
@@ -29,7 +30,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     for left in path.parent.glob(f".{glob.escape(path.name)}.*{UNFINISHED}"):
         shutil.rmtree(left, ignore_errors=True)
-    folder = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+    folder = path.with_name(f".{path.name}.{token()}{UNFINISHED}")
     folder.mkdir()
     try:
         aside = folder / path.name
@@ -49,4 +50,4 @@ def write_whole_text(path: Path, text: str) -> None:
         OSError: as ``whole_file``.
     """
     with whole_file(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+        write_file(aside, text)

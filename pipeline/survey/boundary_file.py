@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.geometry.plan_area import Polygon, Ring, signed_area
 
 LARGEST_FILE = 8 << 20  # bytes: a hundred times the size of a detailed outline
@@ -88,9 +89,7 @@ class _BrokenError(ValueError):
 
 def _value(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise SplatpipeError(f"The boundary {path.name} has more than {LARGEST_FILE >> 20} MB.", EXPECTED)
-        value = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_no_number)
+        value = json.loads(read_small(path, LARGEST_FILE).decode("utf-8-sig"), parse_constant=_no_number)
     except OSError as error:
         raise SplatpipeError(f"The boundary {path.name} cannot be read: {error.strerror}.", EXPECTED) from error
     except (ValueError, RecursionError) as error:  # not text, not JSON, a number of a million digits, deep nesting

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
@@ -115,7 +114,7 @@ def load_frame(path: Path) -> Frame:
         SplatpipeError: if the file is missing or broken.
     """
     try:
-        value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        value: dict[str, Any] = read_json(path)
         similarity = Similarity(
             float(value["scale"]),
             np.array(value["rotation"], dtype=np.float64).reshape(3, 3),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.photos.names import list_names
@@ -312,7 +312,7 @@ def read_positions(path: Path) -> Positions:
         SplatpipeError: if it is missing or broken.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = read_json(path)
         by_name = {record["name"]: record for record in value["positions"]}
         return Positions(by_name, value.get("orientations", {}), value.get("wrong", {}))
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -117,7 +117,7 @@ def _boundary_facts(area: PlanArea, part: Path) -> dict[str, Any]:
         area: In the world frame.
         part: `georef.boundary`.
     """
-    degrees = json.loads(part.read_text(encoding="utf-8"))["degrees"]
+    degrees = read_json(part)["degrees"]
     closed = [[[*ring, ring[0]] for ring in polygon] for polygon in degrees]
     return {
         "area_m2": round(area.size(), 3),

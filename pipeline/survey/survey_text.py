@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.small_file import read_small
 
 MAX_LINE_CHARS = 2000
 LARGEST = 1e9  # of a coordinate, metres or pixels: larger ones are neither on the earth nor in a photo
@@ -54,9 +55,7 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
     """
     name = f"The {kind.what} {path.name}"
     try:
-        if path.stat().st_size > kind.max_bytes:
-            raise SplatpipeError(f"{name} is too large.", kind.expected)
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_small(path, kind.max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise SplatpipeError(f"{name} is not UTF-8 text.", "Save it as plain text in UTF-8.") from error
     except OSError as error:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.survey.scale_bars import ScaleBar
 
 QUADRANT = "quadrant"
@@ -69,7 +68,7 @@ def load_wanted(path: Path) -> WantedTargets:
         SplatpipeError: if it is missing or broken.
     """
     try:
-        value: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        value: Mapping[str, Any] = read_json(path)
         points = tuple((str(n), float(x), float(y), None if z is None else float(z)) for n, x, y, z in value["points"])
         return WantedTargets(str(value["crs"]), points, tuple(ScaleBar(**bar) for bar in value["bars"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -88,6 +87,6 @@ def load_finds(path: Path) -> tuple[TargetFind, ...]:
         SplatpipeError: if it is missing or broken.
     """
     try:
-        return tuple(TargetFind(**find) for find in json.loads(path.read_text(encoding="utf-8"))["targets"])
+        return tuple(TargetFind(**find) for find in read_json(path)["targets"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(f"The targets {path} cannot be read: {error}", "Run with --rerun targets.") from error

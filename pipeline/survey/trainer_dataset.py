@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.photos.dataset import IMAGES, MASKS, MODEL, Points, View, load_points, load_views
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.handover import pose_in_world
@@ -114,7 +115,7 @@ def write_points_ply(path: Path, points: Points, frame: Frame) -> None:
         rows[name] = points.rgb[usable, band]
     names = [*(f"property float {name}" for name in floats), *(f"property uchar {name}" for name in bytes_)]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *names, "end_header", ""]
-    path.write_bytes("\n".join(head).encode("ascii") + rows.tobytes())
+    write_file(path, "\n".join(head).encode("ascii") + rows.tobytes())
 
 
 def _add_pictures(dataset: Path, folder: Path) -> None:

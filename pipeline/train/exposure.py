@@ -8,7 +8,6 @@ the neutral appearance.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.json_file import json_text, read_json
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.train.auxiliary_model import AuxiliaryModel
 from splatpipe.pipeline.train.hooks import Shot, Technique
@@ -125,7 +124,7 @@ def read_exposures(path: Path, stage: str) -> dict[str, list[list[float]]]:
         StageError: if it is not such a file.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))["views"]
+        found = read_json(path)["views"]
         return {str(name): [[float(value) for value in row] for row in rows] for name, rows in found.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StageError(f"{path.name} cannot be read.", hint=f"Run again with --rerun-from {stage}.") from error

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.plan_area import read_model_area
@@ -149,7 +150,7 @@ def train_whole(
         state = go_through(course, out, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
-    (out / "history.json").write_text(state.whole_history().to_json(), encoding="utf-8")
+    write_file(out / "history.json", state.whole_history().to_json())
     write_auxiliary_models(out, state.techniques)
     return state, {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
 
@@ -188,7 +189,7 @@ def write_auxiliary_models(out: Path, techniques: Techniques) -> None:
     """Write the auxiliary models (sky, exposures); a model that was not trained is written as absent."""
     sky = techniques.find(SkyModel)
     write_panorama(out / "sky.npz", None if sky is None else sky.panorama)
-    (out / "exposures.json").write_text(exposures_json(techniques.find(Exposure)), encoding="utf-8")
+    write_file(out / "exposures.json", exposures_json(techniques.find(Exposure)))
 
 
 def summary_of(state: TrainState, plan: TrainingPlan) -> dict[str, JSON]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.camera import Camera, reduced_size
 from splatpipe.pipeline.photos.dataset import Split, View
@@ -24,6 +25,7 @@ from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
 from splatpipe.pipeline.train.windows import TrainingSize
 
 PLAN_FORMAT = 4
+MAX_PLAN_BYTES = 64 << 20
 EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
 NEAR_PER_EXTENT = 0.01  # 3DGS uses 0.2 world units at extents of about 5; drones see nothing that near
 
@@ -267,7 +269,7 @@ def load_or_write_plan(path: Path, make: Callable[[], TrainingPlan]) -> Training
         make: Makes a plan; called only if there is none, because it may take measurements for a while.
     """
     try:
-        return TrainingPlan.from_json(path.read_text(encoding="utf-8"))
+        return TrainingPlan.from_json(read_small(path, MAX_PLAN_BYTES).decode("utf-8"))
     except (OSError, ValueError):
         fresh = make()
         write_durably(path, fresh.to_json())

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.splat.archives import read_archive
 from splatpipe.pipeline.splat.sky_mask import SkyMask
 
@@ -16,7 +17,7 @@ def write_skies(path: Path, masks: Mapping[str, SkyMask]) -> None:
     """Write sky masks by photo name; an empty set also gives a file."""
     names = sorted(masks)
     bits = [masks[name].bits for name in names]
-    with path.open("wb") as file:
+    with new_file(path) as file:
         np.savez(
             file,
             allow_pickle=False,

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.levels import LevelNode
 from splatpipe.pipeline.splat.scene import Axes, Scene, turn_of
@@ -65,7 +66,7 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
         entry["children"] = [number[id(child)] for child in node.children]
     for shown, address in zip(scene.cameras, thumbs, strict=True):
         if shown.thumb is not None and address is not None:
-            (folder / address).write_bytes(shown.thumb)
+            write_file(folder / address, shown.thumb)
     points, colours = page_points(scene)
     facts["points"] = {
         "address": _write(folder, "points.bin", points.astype("<f4").tobytes() + colours.tobytes()),
@@ -74,7 +75,7 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
     levels = _write(folder, LEVELS, _json({"format": FORMAT, "nodes": tree}))
     facts["levels"] = {"tree": levels, "root": tree[0]["file"], "bytes": tree[0]["bytes"]}
     page = render_page(scene, facts, _page_parts(folder, levels, tree[0]["file"]))
-    (folder / INDEX).write_text(page, encoding="utf-8")
+    write_file(folder / INDEX, page)
 
 
 def _page_parts(folder: Path, levels: str, first: str) -> PageParts:
@@ -95,7 +96,7 @@ def _write_node(folder: Path, node: LevelNode, antialias: bool) -> dict[str, Any
     origin = _middle(node.gaussians)
     data = spz_bytes(_relative_to(node.gaussians, origin), antialias, turn=turn_of(SPZ_AXES, "z up"))
     name = f"nodes/{_digest(data)}.spz"
-    (folder / name).write_bytes(data)
+    write_file(folder / name, data)
     return {
         "file": name,
         "bytes": len(data),
@@ -135,7 +136,7 @@ def _thumb_address(shown: ViewerCamera) -> str | None:
 
 def _write(folder: Path, name: str, data: bytes) -> str:
     """Write a file with a fixed name; returns the URL to request it by."""
-    (folder / name).write_bytes(data)
+    write_file(folder / name, data)
     return f"{name}?v={_digest(data)}"
 
 

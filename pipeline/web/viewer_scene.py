@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_points, load_views
 from splatpipe.pipeline.photos.images import Pixels
@@ -118,9 +119,9 @@ def write_viewer(folder: Path, scene: ViewerScene, gaussians: Gaussians, largest
     fits = 4 * len(splat) <= 3 * largest_bytes  # base64; a page of gigabytes is not even assembled
     page = viewer_page(scene, splat) if fits else ""
     if not fits or len(page.encode()) > largest_bytes:
-        (folder / SPLAT).write_bytes(splat)
+        write_file(folder / SPLAT, splat)
         page = viewer_page(scene, SPLAT)
-    (folder / PAGE).write_text(page, encoding="utf-8")
+    write_file(folder / PAGE, page)
 
 
 def viewer_splat(gaussians: Gaussians, antialias: bool) -> bytes:

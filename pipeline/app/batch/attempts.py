@@ -11,9 +11,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_USAGE
+from splatpipe.pipeline.engine.output_file import appended_file
+from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
 
 PERMANENT_FAILURES = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options would fail again: not retried
+MAX_LOG_BYTES = 16 << 20
 NO_MESSAGE = "It ended without an error message: its process was killed, usually by the system for lack of memory."
 
 
@@ -118,7 +121,7 @@ class AttemptLog:
     def read(self) -> list[Attempt]:
         """All attempts in order; malformed lines, e.g. after a power cut, are skipped."""
         try:
-            lines = self._path.read_bytes().splitlines()
+            lines = read_small(self._path, MAX_LOG_BYTES).splitlines()
         except FileNotFoundError:
             return []
         attempts: list[Attempt] = []
@@ -135,9 +138,6 @@ class AttemptLog:
 
     def _append(self, record: Mapping[str, JSON]) -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-        try:
-            os.write(descriptor, json.dumps(record).encode() + b"\n")
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        with appended_file(self._path) as file:
+            file.write(json.dumps(record).encode() + b"\n")
+            os.fsync(file.fileno())

@@ -12,6 +12,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.config import Table, load_file, merge, parse_set
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
+from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.names import is_photo
 from splatpipe.pipeline.survey.survey_text import TableKind, delimiter_of, read_lines, written_lines
@@ -108,9 +109,7 @@ def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
     """The captures' tables, each overlaid on the defaults for all."""
     name = f"The list of captures {path.name}"
     try:
-        if path.stat().st_size > MAX_LIST_BYTES:
-            raise UsageError(f"{name} is too large.", hint=TOML_HINT)
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        table = tomllib.loads(read_small(path, MAX_LIST_BYTES).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a number with thousands of digits
         raise UsageError(f"{name} is not valid TOML: {error}.", hint=TOML_HINT) from error
     except OSError as error:

@@ -31,7 +31,9 @@ from splatpipe.pipeline.app.report import REPORT_FILE
 from splatpipe.pipeline.app.report.wording import roughly
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, StopSignal, UsageError, exit_code
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.lock import locked
+from splatpipe.pipeline.engine.output_file import own_folder, require_own_files
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.engine.store import write_error
@@ -69,10 +71,7 @@ def lock_folder(out: Path) -> Iterator[int]:
         MachineError: if it cannot be written.
     """
     check_folder(out)
-    try:
-        (out / BATCH_FOLDER).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(out, error) from error
+    _own_folder(out)
     with ExitStack() as stack:
         deadline = time.monotonic() + LOCK_PATIENCE_S
         while True:
@@ -86,11 +85,31 @@ def lock_folder(out: Path) -> Iterator[int]:
 
 
 def fresh_call(out: Path, name: str = "call") -> Call:
-    """Create an empty folder for a call; that of an earlier call is deleted."""
-    folder = (out / BATCH_FOLDER / name).resolve()
+    """Create an empty folder for a call; that of an earlier call is deleted.
+
+    Raises:
+        UsageError: if it or the folder above it is a link; nothing is deleted then.
+        MachineError: if it cannot be made.
+    """
+    folder = _own_folder(out.resolve()) / name
     shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    folder.mkdir()
     return Call(folder)
+
+
+def _own_folder(out: Path) -> Path:
+    """The folder of the command's own files, made if it is missing.
+
+    Raises:
+        UsageError: if it is a link, or has a link or the like.
+        MachineError: if it cannot be made.
+    """
+    try:
+        folder = own_folder(out, BATCH_FOLDER)
+        require_own_files(folder.iterdir())
+    except OSError as error:
+        raise write_error(out, error) from error
+    return folder
 
 
 def with_unlisted(plan: BatchPlan) -> BatchPlan:
@@ -98,7 +117,7 @@ def with_unlisted(plan: BatchPlan) -> BatchPlan:
     path = Path(plan.out) / BATCH_FOLDER / NAMES_FILE
     known: list[JSON] = []
     with suppress(OSError, ValueError):
-        known = json.loads(path.read_text(encoding="utf-8"))
+        known = read_json(path)
     names = [capture.name for capture in plan.captures]
     unlisted = [str(name) for name in known if name not in names and (Path(plan.out) / str(name) / "stages").is_dir()]
     write_durably(path, json.dumps([*names, *unlisted]))

@@ -27,6 +27,7 @@ from splatpipe.pipeline.app.command_summary import PART_VARIABLE
 from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.engine.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
+from splatpipe.pipeline.engine.output_file import appended_file, write_file
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
 from splatpipe.pipeline.engine.stage import JSON, stage_name
@@ -58,7 +59,7 @@ def main() -> None:
     if counts_shards(stage, LINE):
         store_shard_jobs(call, key, threads)
     marker.parent.mkdir(parents=True, exist_ok=True)
-    marker.touch()
+    write_file(marker, "")
 
 
 def _disk_shortage(out: Path, job: StageJob) -> AttemptResult | None:
@@ -80,7 +81,7 @@ def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, th
     log.parent.mkdir(parents=True, exist_ok=True)
     spent = spent_s(read_attempts(call.attempts_files(capture.key)))
     last = job.stage == capture.jobs[-1].stage
-    with log.open("a", encoding="utf-8") as log_file:
+    with appended_file(log) as log_file:
         process = subprocess.Popen(
             command_of(call, plan, capture, job, threads),
             stdin=subprocess.DEVNULL,

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 BATCH_FOLDER = ".batch"  # below the batch's folder: the command's own files
@@ -203,7 +204,7 @@ class Call:
 
     def _shards(self, key: str) -> Mapping[str, JSON]:
         try:
-            stored: Mapping[str, JSON] = json.loads(self.shards_file(key).read_text(encoding="utf-8"))
+            stored: Mapping[str, JSON] = read_json(self.shards_file(key))
         except FileNotFoundError:
             return {}
         return stored
@@ -212,7 +213,7 @@ class Call:
         write_durably(self.folder / PLAN_FILE, json.dumps(asdict(plan), indent=1))
 
     def plan(self) -> BatchPlan:
-        stored = json.loads((self.folder / PLAN_FILE).read_text(encoding="utf-8"))
+        stored = read_json(self.folder / PLAN_FILE)
         return BatchPlan(
             **{**stored, "captures": tuple(_capture(each) for each in stored["captures"]), **_tuples(stored)}
         )
@@ -224,7 +225,7 @@ class Call:
     def end(self) -> Mapping[str, JSON]:
         """``ended_s``, ``exit_code`` and ``message``; empty while it is running."""
         try:
-            stored: Mapping[str, JSON] = json.loads(self.end_file.read_text(encoding="utf-8"))
+            stored: Mapping[str, JSON] = read_json(self.end_file)
         except FileNotFoundError:
             return {}
         return stored

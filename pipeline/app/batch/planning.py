@@ -24,6 +24,7 @@ from splatpipe.pipeline.engine.line import Line, StageStatus, line_status
 from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
 from splatpipe.pipeline.engine.needs import Need
+from splatpipe.pipeline.engine.output_file import require_own_files
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
 from splatpipe.pipeline.engine.session import Request, status_of
 from splatpipe.pipeline.engine.source import open_source
@@ -133,6 +134,7 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
     tables = (*settings.tables, *capture.tables)
     config = Overrides(tables).resolve(load_preset(planned.preset))
     request = request_of(capture.photos.absolute(), call.out / capture.name, config)
+    require_own_files([request.out])
     source = open_source(request.photos, request.out, request.stages, config)
     size = size_of(source)
     line = Line(request.stages, config, {name: Part(source.folder, "") for name in source.part_files}, source.folder)

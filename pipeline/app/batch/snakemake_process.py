@@ -25,10 +25,13 @@ from splatpipe.pipeline.app.batch.plan import MEGABYTE, BatchPlan, Call
 from splatpipe.pipeline.app.batch.workflow import SNAKEFILE
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
+from splatpipe.pipeline.engine.output_file import appended_file, write_file
 from splatpipe.pipeline.engine.python_module import SAFE_PATH, python_module
+from splatpipe.pipeline.engine.small_file import read_end, read_small
 
 END_PATIENCE_S = 8.0  # a run ends within five seconds and Docker kills after ten
 POLL_S = 0.05
+MAX_PROFILE_BYTES = 1 << 20
 LOG_TAIL = 4000  # characters of Snakemake's log that are searched for its last message
 PROFILE_FILES = ("config.v9+.yaml", "config.v8+.yaml", "config.yaml")
 ERROR_LINE = re.compile(r"^(?:[A-Za-z]*(?:Error|Exception)\b.*|.*\berror: .*)", re.MULTILINE)
@@ -68,7 +71,7 @@ def open_profile(folder: Path | None) -> Profile:
     folder = folder.expanduser().resolve()
     for name in PROFILE_FILES:
         with suppress(FileNotFoundError, NotADirectoryError):
-            return Profile(folder, (folder / name).read_text(encoding="utf-8"))
+            return Profile(folder, read_small(folder / name, MAX_PROFILE_BYTES).decode("utf-8"))
     raise UsageError(f"{folder} is not a Snakemake profile.", hint="Name a folder that has a config.yaml.")
 
 
@@ -112,7 +115,7 @@ def snakemake_environment(call: Call) -> dict[str, str]:
 
 def start_snakemake(call: Call, plan: BatchPlan, profile: Profile) -> subprocess.Popen[bytes]:
     """Start a call's workflow; the terminal's Ctrl-C does not reach it."""
-    with call.snakemake_log.open("ab") as log:
+    with appended_file(call.snakemake_log) as log:
         return subprocess.Popen(
             snakemake_command(call, plan, profile),
             stdin=subprocess.DEVNULL,
@@ -134,7 +137,7 @@ def end_group(call: Call, group: int, *, local: bool, has_ended: Callable[[], bo
         has_ended: Returns whether Snakemake has ended.
     """
     with suppress(OSError):  # on a full disk the signals must suffice
-        call.stop_file.touch()
+        write_file(call.stop_file, "")
     deadline = time.monotonic() + END_PATIENCE_S
     with suppress(ProcessLookupError):
         os.killpg(group, signal.SIGTERM if local else signal.SIGINT)
@@ -155,7 +158,7 @@ def group_has_ended(group: int) -> bool:
 def last_error_line(call: Call) -> str:
     """The last line of Snakemake's log; empty if there is none."""
     with suppress(OSError):
-        text = call.snakemake_log.read_text(encoding="utf-8", errors="replace")[-LOG_TAIL:]
+        text = read_end(call.snakemake_log, LOG_TAIL).decode("utf-8", errors="replace")
         found = ERROR_LINE.findall(text) or [line for line in text.splitlines() if line.strip()]
         return str(found[-1]).strip() if found else ""
     return ""

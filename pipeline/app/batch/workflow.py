@@ -14,6 +14,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.app.batch.plan import SHARDS_FOLDER, BatchPlan, Call
 from splatpipe.pipeline.app.batch.shards import counts_shards
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.stage import JSON, Stage, stage_name
 
@@ -129,5 +130,5 @@ def _gpu(stage: str, plan: BatchPlan) -> str:
 def write_workflow(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> Path:
     """Write the Snakefile into the call's folder."""
     path = call.folder / SNAKEFILE
-    path.write_text(workflow_text(call, plan, stages), encoding="utf-8")
+    write_file(path, workflow_text(call, plan, stages))
     return path

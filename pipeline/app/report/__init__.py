@@ -15,6 +15,7 @@ from typing import IO
 from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.heap import importing
+from splatpipe.pipeline.engine.output_file import appended_file
 from splatpipe.pipeline.engine.python_module import python_module
 
 REPORT_FILE = "report.html"
@@ -73,7 +74,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
         return now_s > end_s and (_stamp(path) != before or now_s > began_s + MIN_S)
 
     try:
-        with log.open("a", encoding="utf-8") as stream:
+        with appended_file(log) as stream:
             code = _run(command, stream, over, out)
     except OSError as error:
         raise MachineError(f"The report could not be written: {error.strerror}.") from error
@@ -82,7 +83,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     return path
 
 
-def _run(command: Sequence[str], log: IO[str], over: Callable[[], bool], out: Path) -> int:
+def _run(command: Sequence[str], log: IO[bytes], over: Callable[[], bool], out: Path) -> int:
     """Run a process to its end or until its time is up; returns its exit code. An interrupted wait also kills it.
 
     Its unfinished files in OUT are removed; another process may be writing a report there at the same time.

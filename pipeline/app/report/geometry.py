@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity
 
@@ -140,7 +140,7 @@ def read_geometry(model_path: Path, frame_path: Path | None) -> Geometry:
 
 
 def _similarity(path: Path) -> Similarity:
-    value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    value: dict[str, Any] = read_json(path)
     return Similarity.from_matrix(np.array(value["world_from_model"], np.float64).reshape(4, 4))
 
 

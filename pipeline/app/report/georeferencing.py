@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.report.adjustment import adjustment_section
 from splatpipe.pipeline.app.report.adjustment_results import read_adjustment
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs, read_json
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, interval, length, metres, number
+from splatpipe.pipeline.engine.json_file import read_json
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.geometry import Geometry

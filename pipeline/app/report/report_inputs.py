@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +9,11 @@ from typing import Any
 
 from splatpipe.pipeline.app.report.run_history import RunHistory, read_history
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, Contents, RunFolder, open_run_folder
 from splatpipe.pipeline.engine.store import Artifact
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
-
-MAX_JSON_BYTES = 256 << 20  # an accuracy report of thousands of points is far smaller
 
 BAD = ("failed", "stopped", "interrupted", "running")
 
@@ -89,21 +87,6 @@ class ReportInputs:
         """A stage's summary; empty if it did not finish."""
         artifact = self.artifacts.get(stage)
         return {} if artifact is None else artifact.summary
-
-
-def read_json(path: Path) -> Any:
-    """Read one of our JSON files.
-
-    Raises:
-        OSError: if it cannot be read.
-        ValueError: if it is not JSON, or far too large.
-    """
-    if path.stat().st_size > MAX_JSON_BYTES:
-        raise ValueError(f"{path.name} is too large to be one of a run's")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except RecursionError as error:
-        raise ValueError(f"{path.name} is nested too deeply") from error
 
 
 def read_report_inputs(out: Path) -> ReportInputs:

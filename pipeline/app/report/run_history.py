@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from splatpipe.pipeline.engine.events import Event, parse_event
+from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.engine.stage import shards_first
 
 Facts = Mapping[str, Any]
@@ -130,8 +132,8 @@ def read_history(path: Path, *, running: bool) -> RunHistory:
 
 def _events(path: Path) -> Iterator[Event]:
     try:
-        with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - MAX_BYTES))
+        with open_regular(path) as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - MAX_BYTES))
             while line := file.readline(MAX_LINE):
                 event = parse_event(line)
                 if event is not None:

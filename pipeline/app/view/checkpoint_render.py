@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, card_fault
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.run_folder import Contents
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
@@ -145,7 +146,7 @@ def iteration_of(source: ModelSource) -> int | None:
     try:
         if source.kind == "checkpoint":
             return int(_facts(source.path)["iteration"])
-        manifest = json.loads((source.path.parent / "manifest.json").read_text(encoding="utf-8"))
+        manifest = read_json(source.path.parent / "manifest.json")
         return int(manifest["summary"]["iterations"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

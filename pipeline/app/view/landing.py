@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
@@ -10,6 +9,7 @@ from typing import Any
 
 from splatpipe.pipeline.app.view.files import FileNotServedError, is_inside, open_inside
 from splatpipe.pipeline.app.view.log import RunLog
+from splatpipe.pipeline.engine.json_file import parse_json
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE
@@ -112,7 +112,7 @@ def _read_json(run: RunFolder, name: str) -> Mapping[str, JSON]:
     try:
         file = open_inside(run.out, name)
         with os.fdopen(file.descriptor, "rb") as stream:
-            found = json.loads(stream.read(LARGEST_METRICS))
+            found = parse_json(stream.read(LARGEST_METRICS))
     except (FileNotServedError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}

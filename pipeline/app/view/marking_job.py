@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 from collections.abc import Mapping, Sequence
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.app.view.log import RunLog, contents_of
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.source import AUTO, NONE, open_source
 from splatpipe.pipeline.photos.names import NameFinder
@@ -114,7 +114,7 @@ def _found(control: Path | None, points: Sequence[SurveyedPoint], photos: Mappin
         return {}
     names, found = {point.name for point in points}, {}
     try:
-        for point in json.loads(control.read_text(encoding="utf-8"))["points"]:
+        for point in read_json(control)["points"]:
             pixels = {
                 str(seen["photo"]): (float(seen["pixel"][0]), float(seen["pixel"][1]))
                 for seen in point["observations"]

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.splat.gaussians import Gaussians
 
 MAX_EXPANSION = 10.0
@@ -25,10 +26,10 @@ def open_file(path: Path) -> BufferedReader:
     """Open a user's file to read its bytes.
 
     Raises:
-        SplatpipeError: if it cannot be opened, or is a folder.
+        SplatpipeError: if it cannot be opened, or is not a regular file.
     """
     try:
-        return path.open("rb")
+        return open_regular(path)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise SplatpipeError(f"Cannot read {path}: {_reason(error)}.", hint="Check the path.") from error
 

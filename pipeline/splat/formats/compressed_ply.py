@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8, UInt32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.splat.formats.bounded import all_finite, check_values, open_file, read_exactly
 from splatpipe.pipeline.splat.formats.plain_ply import facts_of_comments, header_comments
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -69,7 +70,7 @@ def write(path: Path, scene: Scene) -> None:
     order = in_neighbourhoods((gaussians.means.double() @ turn.T).float(), CHUNK, _COARSE_AXIS)
     sizes = [element.count * np.dtype(list(element.fields)).itemsize for element in elements]
     offsets = list(accumulate(sizes[:-1], initial=len(header)))
-    with path.open("wb") as file:
+    with new_file(path) as file:
         file.write(header)
         for piece in reordered(gaussians, order, _ROWS, None if scene.facts.axes == "y down" else turn):
             for i, data in enumerate(_coded(piece)):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import sync_folder, sync_tree
+from splatpipe.pipeline.engine.durable import beside
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
+from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
 from splatpipe.pipeline.splat.scene import Scene
 
@@ -57,7 +56,7 @@ def format_of_content(path: Path) -> SplatFormat:
 
 def _name_of_file(path: Path) -> str:
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(_MAX_HEADER_BYTES)
     except OSError as error:
         raise SplatpipeError(f"Cannot read {path}: {error.strerror}.", hint="Check the path.") from error
@@ -105,25 +104,14 @@ def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> No
         MachineError: if it cannot be written.
     """
     kind = format_of_name(path) if kind is None else kind
-    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir() and (kind.ending or any(path.iterdir())):
             raise UsageError(f"{path} is an existing folder.", hint="Name a new file or folder.")
-        try:
+        with beside(path) as aside:
             kind.write(aside, scene if kind.exact else in_unit_quats(scene))
-            sync_tree(aside) if aside.is_dir() else _sync_file(aside)
-            aside.replace(path)
-        finally:
-            shutil.rmtree(aside) if aside.is_dir() else aside.unlink(missing_ok=True)
-        sync_folder(path.parent)
     except OSError as error:
         raise MachineError(f"Cannot write {path}: {error.strerror or error}.", hint="Check the free space.") from error
-
-
-def _sync_file(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 def in_unit_quats(scene: Scene) -> Scene:

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.splat.formats.bounded import check_values, open_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import FLOAT, UNSIGNED_BYTE, open_container, write_head
@@ -49,7 +50,7 @@ def write(path: Path, scene: Scene) -> None:
     turn = turn_of("y up", scene.facts.axes)
     columns = _columns(gaussians.sh_degree)
     starts = np.cumsum([0, *(count * column.row_bytes for column in columns)]).tolist()
-    with path.open("wb") as file:
+    with new_file(path) as file:
         write_head(file, _document(columns, starts, count, _bounds(gaussians, turn), facts.record()), starts[-1])
         first, done = file.tell(), 0
         for piece in gaussians.pieces(ROWS_AT_ONCE):

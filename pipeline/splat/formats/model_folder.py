@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.scene import Scene
 
@@ -37,7 +38,7 @@ def write(path: Path, scene: Scene) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     plain_ply.write(folder / PLY, scene)
     settings = _SETTINGS.format(degree=scene.gaussians.sh_degree, white=False)
-    (path / "cfg_args").write_text(settings, encoding="utf-8")
+    write_file(path / "cfg_args", settings)
 
 
 def read(path: Path) -> Scene:

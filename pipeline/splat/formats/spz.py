@@ -18,6 +18,7 @@ import zstandard
 from jaxtyping import Float32, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.formats.bounded import (
     InflatedFile,
     check_expansion,
@@ -90,7 +91,7 @@ def write_version_2(path: Path, scene: Scene) -> None:
 def _write(path: Path, scene: Scene, version: int) -> None:
     facts = replace(scene.facts, axes=AXES)
     turn = None if scene.facts.axes == AXES else turn_of(AXES, scene.facts.axes)
-    path.write_bytes(spz_bytes(scene.gaussians, facts.antialias, turn=turn, version=version, record=facts.record()))
+    write_file(path, spz_bytes(scene.gaussians, facts.antialias, turn=turn, version=version, record=facts.record()))
 
 
 def read(path: Path) -> Scene:

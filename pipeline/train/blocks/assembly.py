@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.json_file import json_text, read_json
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -43,9 +44,9 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
         shutil.copyfile(coarse / name, out / name)
     histories = [_read(folder / "history.json") for folder in inputs.shards]
     history = joint_history(_read(coarse / "history.json"), histories)
-    (out / "history.json").write_text(json.dumps(history, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_file(out / "history.json", json.dumps(history, indent=1, allow_nan=False) + "\n")
     plans = {"coarse": _read(coarse / "plan.json"), "blocks": [_read(each / "plan.json") for each in inputs.shards]}
-    (out / "plan.json").write_text(json_text(plans), encoding="utf-8")
+    write_file(out / "plan.json", json_text(plans))
     most = sum(block.share for block in site.blocks)
     return {"gaussians": count, "blocks": len(inputs.shards), **_summary(inputs, history, most)}
 
@@ -156,6 +157,6 @@ def _ended_flat(part: Summary) -> dict[str, JSON]:
 
 def _read(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_json(path)
     except (OSError, ValueError) as error:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from train.") from error

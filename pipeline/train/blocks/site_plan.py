@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.json_file import json_text, read_json
 from splatpipe.pipeline.train.blocks.division import Division
 from splatpipe.pipeline.train.blocks.needs import FROZEN_SHARE, MARGIN_GROWTH, frozen_bytes, shared_cap, with_margin
 from splatpipe.pipeline.train.blocks.partition import Partition
@@ -77,7 +76,7 @@ def is_in_blocks(path: Path) -> bool:
         StageError: if it cannot be read.
     """
     try:
-        return int(json.loads(path.read_text(encoding="utf-8"))["shards"]) > 0
+        return int(read_json(path)["shards"]) > 0
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
 
@@ -89,7 +88,7 @@ def limit_of_whole(path: Path) -> int:
         StageError: if it cannot be read, or belongs to a scene in blocks.
     """
     try:
-        fields: Any = json.loads(path.read_text(encoding="utf-8"))
+        fields: Any = read_json(path)
         if int(fields["shards"]):
             raise StageError(
                 f"None of the {fields['shards']} blocks is available for merging.",
@@ -107,7 +106,7 @@ def load_site_plan(path: Path) -> SitePlan:
         StageError: if it is not such a file.
     """
     try:
-        fields: Any = json.loads(path.read_text(encoding="utf-8"))
+        fields: Any = read_json(path)
         partition = Partition.of_facts(fields["partition"])
         blocks = tuple(BlockLimits(**block) for block in fields["blocks"])
         if len(blocks) != len(partition.cells):

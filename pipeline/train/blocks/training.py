@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Machine, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.dataset import View, load_split, load_views
@@ -247,5 +248,5 @@ def _leave(block: Block, plan: TrainingPlan, out: Path, trained: tuple[Gaussians
     gaussians, history = trained
     gaussians = gaussians.select(block.fence(plan).kept(gaussians))
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
-    (out / "history.json").write_text(history.to_json(), encoding="utf-8")
+    write_file(out / "history.json", history.to_json())
     return {"gaussians": len(gaussians), "photos": len(plan.train_views)}

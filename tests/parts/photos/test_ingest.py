@@ -402,6 +402,20 @@ def test_links_to_folders_are_named_and_not_followed(folder: Path) -> None:
     assert "not followed" in result.left_out["loop"]
 
 
+def test_links_to_devices_pipes_and_pseudo_files_are_named_and_never_opened(folder: Path) -> None:
+    targets = {"c.jpg": "/proc/kmsg", "d.jpg": "/dev/zero", "f.bin": "/proc/kmsg", "g.tif": "/dev/tty"}
+    os.mkfifo(folder.parent / "pipe")
+    targets["e.png"] = str(folder.parent / "pipe")
+    for name, target in targets.items():
+        (folder / name).symlink_to(target)
+    os.mkfifo(folder / "h.jpg")
+    (folder / "masks").mkdir()
+    (folder / "masks/a.png").symlink_to("/proc/kmsg")
+    result = ingest(folder)
+    assert set(result.photos) == {"a.jpg", "b.jpg"}
+    assert result.left_out == dict.fromkeys([*targets, "h.jpg"], "is not a regular file")
+
+
 @pytest.mark.parametrize(
     ("prepare", "words"),
     [

@@ -11,14 +11,14 @@ from batch_captures import call_of, demo, link, planned
 
 from splatpipe.pipeline.app.batch.attempts import AttemptLog, AttemptResult
 from splatpipe.pipeline.app.batch.capture_list import read_captures
-from splatpipe.pipeline.app.batch.driver import fresh_call
+from splatpipe.pipeline.app.batch.driver import fresh_call, lock_folder
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
-from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE
+from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, UsageError
 from splatpipe.stages.line import LINE
 
 BAD = AttemptResult(EXIT_STAGE, "The stage train died.", "See the log.")
@@ -102,3 +102,31 @@ def test_a_time_budget_includes_the_captures_earlier_stages(monkeypatch: pytest.
     for value, expected in (("90.5", 90.5), ("-3", 0.0), ("soon", 0.0)):
         monkeypatch.setenv(SPENT_VARIABLE, value)
         assert spent_s() == expected
+
+
+@pytest.mark.parametrize("name", [".batch", ".batch/call", ".batch/dry-run", ".batch/pictures"])
+def test_a_link_below_the_folder_is_refused_and_its_target_kept(tmp_path: Path, name: str) -> None:
+    precious = tmp_path / "precious" / "call"
+    precious.mkdir(parents=True)
+    (tmp_path / "out").mkdir()
+    link = tmp_path / "out" / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(precious.parent)
+    for called in ("call", "dry-run"):
+        with pytest.raises(UsageError, match=f"out/{name} is a link"):
+            fresh_call(tmp_path / "out", called)
+    with pytest.raises(UsageError, match=f"out/{name} is a link"), lock_folder(tmp_path / "out"):
+        pass
+    assert precious.is_dir()
+
+
+def test_the_folder_of_a_batch_may_be_a_link_and_that_of_a_capture_not(tmp_path: Path) -> None:
+    link_photos = link(tmp_path / "captures" / "house", demo()[:2])
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    (tmp_path / "out").symlink_to(disk)
+    call = fresh_call(tmp_path / "out")
+    assert call.folder == disk / ".batch/call"
+    (disk / "house").symlink_to(link_photos.parent)
+    (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, Settings("preview")).captures
+    assert "house is a link" in planned.message and planned.jobs == ()
