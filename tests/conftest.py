@@ -173,12 +173,13 @@ class WatchedPage:
     errors: list[str] = field(default_factory=list)  # console errors, uncaught errors, failed requests
 
     def open(self, address: str) -> None:
-        """Open an address, and wait for its load event."""
+        """Open an address, and wait for its load event; one with a key leads on to a page."""
         self.page.on("request", lambda request: self._asked(address, request.url))
         self.page.on("requestfailed", lambda request: self.errors.append(f"failed: {request.url[:200]}"))
         self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.goto(address, wait_until="load")
+        self.page.wait_for_url(lambda url: "?key=" not in url)
 
     def _asked(self, address: str, url: str) -> None:
         if url.split("#")[0] != address.split("#")[0] and not url.startswith(("data:", "blob:")):

@@ -105,8 +105,8 @@ PAGES = {
         "docs/viewing.md",
     ),
     "view": HelpPage(
-        "Reads OUT, even during a run. Serves pages to this machine only, until Ctrl-C; writes nothing, except "
-        "with --mark the positions of control points in the photos.",
+        "Reads OUT, even during a run. Serves pages until Ctrl-C, to whoever has the address that it prints; "
+        "writes nothing, except with --mark the positions of control points in the photos.",
         ("view OUT", "view OUT --mark --points control.csv"),
         "docs/viewing.md",
     ),

@@ -9,13 +9,16 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from timeouts import TIMEOUT_S
 
-ADDRESS = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)")
+OPEN = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)\?key=(\w+)")
+LEADS_ON = re.compile(rb"url=/(\w+)/")
+OF_THE_RUN = re.compile(rb'data-folder="/(\w+)"')
 
 
 @dataclass(frozen=True)
@@ -40,19 +43,58 @@ class Served:
     Attributes:
         port: Its port.
         start: The page that it opens.
+        key: The key in the address that it prints.
         process: The server's process.
     """
 
     port: int
     start: str
+    key: str
     process: subprocess.Popen[str]
 
     @property
     def address(self) -> str:
         return f"http://127.0.0.1:{self.port}"
 
+    def page(self, name: str = "run") -> str:
+        """The address of one of our pages for a browser that has no cookie yet."""
+        return f"{self.address}/{name}?key={self.key}"
+
+    def file(self, name: str) -> str:
+        """The address of a file of the run."""
+        return f"{self.address}{self.files}/{name}"
+
+    @cached_property
+    def pages(self) -> str:
+        """The folder of our pages."""
+        found = LEADS_ON.search(self._entrance.body)
+        assert found is not None, self._entrance
+        return f"/{found.group(1).decode()}"
+
+    @cached_property
+    def files(self) -> str:
+        """The folder of the run's files."""
+        found = OF_THE_RUN.search(self.ask(f"{self.pages}/live").body)
+        assert found is not None
+        return f"/{found.group(1).decode()}"
+
+    @cached_property
+    def cookie(self) -> str:
+        """What a browser sends back."""
+        return self._entrance.headers["set-cookie"].partition(";")[0]
+
+    @cached_property
+    def _entrance(self) -> Answer:
+        return self.ask(f"/?key={self.key}", cookie=False)
+
     def ask(
-        self, target: str | bytes, *lines: str, method: str = "GET", host: str | None = "", body: bytes = b""
+        self,
+        target: str | bytes,
+        *lines: str,
+        method: str = "GET",
+        host: str | None = "",
+        body: bytes = b"",
+        cookie: bool = True,
     ) -> Answer:
         """Send one request and read the whole response.
 
@@ -62,16 +104,18 @@ class Served:
             method: The method.
             host: Value of the Host header; empty for the right one, None for none.
             body: Body of the request.
+            cookie: Whether to send the server's cookie.
         """
         raw = target if isinstance(target, bytes) else target.encode("latin-1")
         headers = [f"Host: {host or f'127.0.0.1:{self.port}'}"] if host is not None else []
+        headers += [f"Cookie: {self.cookie}"] if cookie else []
         head = b"%s %s HTTP/1.1\r\n" % (method.encode(), raw)
         head += "".join(f"{line}\r\n" for line in [*headers, *lines, "Connection: close"]).encode("latin-1") + b"\r\n"
         return self.send(head + body)
 
     def send(self, raw: bytes) -> Answer:
         """Send bytes and read the whole response."""
-        with socket.create_connection(("127.0.0.1", self.port), timeout=30) as connection:
+        with socket.create_connection(("127.0.0.1", self.port), timeout=TIMEOUT_S) as connection:
             with contextlib.suppress(OSError):  # rejected before all of it was sent
                 connection.sendall(raw)
             received = b""
@@ -94,17 +138,18 @@ def reserved_port() -> int:
 
 
 @contextlib.contextmanager
-def serving(out: Path, *options: object) -> Iterator[Served]:
-    """Run ``splatpipe view OUT`` while the context lasts."""
+def serving(out: Path, *options: object, environment: Mapping[str, str] | None = None) -> Iterator[Served]:
+    """Run ``splatpipe view OUT`` while the context lasts, with some more environment variables."""
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", str(out), "--no-browser", *map(str, options)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    env = {**os.environ, **(environment or {})}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
     try:
         assert process.stderr is not None
         output = ""
         for line in process.stderr:
             output += line
-            if found := ADDRESS.search(line):
-                yield Served(int(found.group(1)), found.group(2), process)
+            if found := OPEN.search(line):
+                yield Served(int(found.group(1)), found.group(2), found.group(3), process)
                 break
         else:
             raise AssertionError(output)

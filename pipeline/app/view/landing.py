@@ -77,20 +77,25 @@ def _state(log: RunLog, at_work: bool) -> dict[str, str]:
 def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> list[dict[str, Any]]:
     ways = []
     if marking:
-        ways.append(("/mark", "Mark control points", "Mark the surveyed points in the photos"))
+        ways.append(("mark", False, "Mark control points", "Mark the surveyed points in the photos"))
     if at_work:
-        ways.append(("/live", "Watch the training", "The latest checkpoint beside the photos, and the training curves"))
+        ways.append(
+            ("live", False, "Watch the training", "The latest checkpoint beside the photos, and the training curves")
+        )
     if VIEWER in names:
-        ways.append((f"/{VIEWER}", "3D viewer", "Fly around, measure, read coordinates"))
+        ways.append((VIEWER, True, "3D viewer", "Fly around, measure, read coordinates"))
     if SITE_PAGE in names:
-        ways.append((f"/{SITE_PAGE}", "Viewer for the web", "For any web host: coarse at first, finer where you look"))
+        ways.append((SITE_PAGE, True, "Viewer for the web", "For any web host: coarse at first, finer where you look"))
     if REPORT in names:
-        ways.append((f"/{REPORT}", "Report", "The capture, the processing and the quality of the result"))
+        ways.append((REPORT, True, "Report", "The capture, the processing and the quality of the result"))
     if "flythrough.webm" in names:
-        ways.append(("/flythrough.webm", "Film", "A flight through the scene"))
+        ways.append(("flythrough.webm", True, "Film", "A flight through the scene"))
     if not at_work and has_log:
-        ways.append(("/live", "Training", "Training curves, and renders beside the photos"))
-    return [{"href": href, "title": title, "text": text, "first": k == 0} for k, (href, title, text) in enumerate(ways)]
+        ways.append(("live", False, "Training", "Training curves, and renders beside the photos"))
+    return [
+        {"href": href, "of_run": of_run, "title": title, "text": text, "first": k == 0}
+        for k, (href, of_run, title, text) in enumerate(ways)
+    ]
 
 
 def _figures(metrics: Mapping[str, JSON]) -> list[dict[str, str]]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import ipaddress
 import math
-import secrets
 import signal
 import socket
 import threading
 import time
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,11 +20,13 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Mount, Route
 from starlette.types import ASGIApp
 
+from splatpipe.pipeline.app.view.access import KEY, Access
+from splatpipe.pipeline.app.view.connection import Connection
 from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, FileNotServedError, open_inside
-from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, Guard
+from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, FIRST_PAGE, OF_RUN, Guard
 from splatpipe.pipeline.app.view.landing import downloadable_files, landing
 from splatpipe.pipeline.app.view.live import Live
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, SplatpipeError, StopSignal, UsageError
@@ -34,7 +35,7 @@ from splatpipe.pipeline.web import asset
 from splatpipe.pipeline.web.measured_page import SITE
 from splatpipe.stages.line import LINE
 
-ADDRESS = "127.0.0.1"
+ADDRESS, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 # If free: unsent marks in the browser's storage belong to an address, which the next server must have too.
 MARKING_PORT = 8474
 ASSETS = {
@@ -44,10 +45,10 @@ ASSETS = {
     "mark.css": "text/css",
     "mark.js": "text/javascript",
 }
-OF_RUN = {"content-security-policy": CSP_OF_RUN, "cache-control": "no-cache"}
-OF_SITE = {"content-security-policy": CSP_OF_SITE, "cache-control": "no-cache"}
+PAGE_OF_RUN = {**OF_RUN, "content-security-policy": CSP_OF_RUN}
+PAGE_OF_SITE = {**OF_RUN, "content-security-policy": CSP_OF_SITE}
 FILES_CACHED_S = 1.0  # the list of files is cached, since a page may request thousands of files
-ALONE = {"cross-origin-opener-policy": "same-origin"}  # isolates it from the run's pages, which have our origin
+ALONE = {"cross-origin-opener-policy": "same-origin"}  # a page that opened it, or that it opens, has no handle of it
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class ViewOptions:
     Attributes:
         port: The port; 0 for any free one.
         bind: The IPv4 address to listen on. Other addresses than 127.0.0.1 are for containers, where requests through a
-            published port come from outside; they must name 127.0.0.1 or localhost all the same.
+            published port come from outside, under any name.
         open_browser: Whether to open the page.
         mark: Whether control points can be marked.
         points: File of points to mark.
@@ -85,22 +86,24 @@ def serve(out: Path, options: ViewOptions, print_line: Callable[[str], None]) ->
     bind = _check_address(options.bind)
     run = open_run_folder(out, LINE)
     listening = _listen_for_marks(bind) if options.mark and options.port == 0 else _listen(bind, options.port)
-    live, token = Live(run), secrets.token_urlsafe(32)
-    pages = Pages(run, live, token)
+    live, access = Live(run), Access()
+    pages = Pages(run, live, access)
     try:
-        routes = [*(_marking(pages, options, print_line) if options.mark else ()), *pages.routes()]
-        start = f"http://{ADDRESS}:{listening.getsockname()[1]}/"
+        ours = [*(_marking(pages, options, print_line) if options.mark else ()), *pages.routes()]
+        start = f"http://{ADDRESS if bind == EVERYWHERE else bind}:{listening.getsockname()[1]}/"
         start += "mark" if options.mark else "live" if run.is_running else ""
         _restore_signal_handlers()
 
         def ready() -> None:
             if bind != ADDRESS:
-                print_line(f"Listening on {bind}: publish the port to this machine only (-p {ADDRESS}:PORT:PORT).")
-            print_line(f"Open {start} (Ctrl-C to stop)")
+                print_line(f"Listening on {bind}: everyone who has this address can use it, and it is not encrypted.")
+            print_line(f"Open {start}{KEY}{access.key} (Ctrl-C to stop)")
             if options.open_browser:
-                threading.Thread(target=webbrowser.open, args=(start,), daemon=True).start()
+                own = f"{start}{KEY}{access.own_key}"
+                threading.Thread(target=webbrowser.open, args=(own,), daemon=True).start()
 
-        _Server(_settings(make_app(routes, token)), ready).run(sockets=[listening])
+        routes = [Mount(f"/{access.pages}", routes=ours), Mount(f"/{access.files}", routes=pages.files())]
+        _Server(_settings(make_app(routes, access, any_host=bind != ADDRESS)), ready).run(sockets=[listening])
     except StopSignal as stopped:
         if stopped.exit_code != EXIT_INTERRUPTED:  # Ctrl-C is the normal way to end the server
             raise
@@ -143,12 +146,13 @@ def _marking(pages: Pages, options: ViewOptions, print_line: Callable[[str], Non
 def _settings(app: ASGIApp) -> uvicorn.Config:
     return uvicorn.Config(
         app,
-        http="h11",
+        http=Connection,
         ws="none",
         lifespan="off",
         log_level="error",
         access_log=False,
         server_header=False,
+        proxy_headers=False,  # of no proxy that we know: anyone could send them
         timeout_graceful_shutdown=1,
         limit_concurrency=64,
     )
@@ -185,12 +189,12 @@ def _listen(bind: str, port: int) -> socket.socket:
     return listening
 
 
-def make_app(routes: list[Route], token: str) -> ASGIApp:
+def make_app(routes: Sequence[BaseRoute], access: Access, any_host: bool) -> ASGIApp:
     """The application behind the guard."""
     handlers: dict[Any, Any] = {SplatpipeError: _failed, HTTPException: _refused}
     app = Starlette(routes=routes, exception_handlers=handlers)
     app.router.redirect_slashes = False
-    return Guard(app, token)
+    return Guard(app, access, any_host)
 
 
 def _failed(_request: Request, error: Exception) -> Response:
@@ -209,36 +213,41 @@ class Pages:
     Args:
         run: The run.
         live: Its training.
-        token: The secret for writing requests.
+        access: The server's secrets: its addresses are below them.
     """
 
     marking = False
 
-    def __init__(self, run: RunFolder, live: Live, token: str) -> None:
-        self.run, self.live, self.token = run, live, token
+    def __init__(self, run: RunFolder, live: Live, access: Access) -> None:
+        self.run, self.live, self._access = run, live, access
         self._known: tuple[float, frozenset[str]] = (-math.inf, frozenset())
         folder = Path(__file__).parent / "pages"
         self._templates = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True)
 
     def routes(self) -> list[Route]:
-        """The routes; anything else is a file of the run, or not found."""
+        """The routes of our pages."""
         return [
-            Route("/", self._landing),
+            Route(f"/{FIRST_PAGE}", self._landing),
             Route("/live", self._live),
             Route("/api/live", self._state),
             Route(
                 "/live/{stamp}/{number:int}/{what}.jpg", self._picture
             ),  # the page sets the stamp: a new one means new images
+            Route("/assets/{name}", self._asset),
+        ]
+
+    def files(self) -> list[Route]:
+        """The routes of what the run itself made."""
+        return [
             Route("/live/{stamp}/viewer.html", self._viewer),
             Route("/live/{stamp}/splat.spz", self._splat),
-            Route("/assets/{name}", self._asset),
             Route("/{path:path}", self._file),
         ]
 
     def page(self, template: str, values: dict[str, Any]) -> Response:
         """Render one of our pages."""
         style = PurePosixPath(template).stem
-        text = self._templates.get_template(template).render(style=style, **values)
+        text = self._templates.get_template(template).render(style=style, folder=f"/{self._access.files}", **values)
         return HTMLResponse(text, headers=ALONE)
 
     def _landing(self, _request: Request) -> Response:
@@ -263,13 +272,13 @@ class Pages:
         page = self.live.viewer("page")
         if page is None:
             raise HTTPException(404)
-        return Response(page, media_type="text/html", headers=OF_RUN)
+        return Response(page, media_type="text/html", headers=PAGE_OF_RUN)
 
     def _splat(self, _request: Request) -> Response:
         splat = self.live.viewer("splat")
         if splat is None:
             raise HTTPException(404)
-        return Response(splat, media_type="application/octet-stream", headers=OF_RUN)
+        return Response(splat, media_type="application/octet-stream", headers=PAGE_OF_RUN)
 
     def _asset(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -287,7 +296,7 @@ class Pages:
         except FileNotServedError as error:
             raise HTTPException(404) from error
         kind = TYPES.get(PurePosixPath(path).suffix, "application/octet-stream")
-        return FileAnswer(file, kind, OF_SITE if path.startswith(SITE) else OF_RUN)
+        return FileAnswer(file, kind, PAGE_OF_SITE if path.startswith(SITE) else PAGE_OF_RUN)
 
     def _downloadable_files(self) -> frozenset[str]:
         now = time.monotonic()

@@ -23,7 +23,7 @@ const plots = {};
 
 async function ask() {
   try {
-    const answer = await fetch("/api/live");
+    const answer = await fetch("api/live");
     if (!answer.ok) throw new Error();
     const text = await answer.text();
     const next = JSON.parse(text);
@@ -109,7 +109,7 @@ function showViews() {
   $("nothing").hidden = Boolean(model);
   $("iteration").textContent = model ? modelLabel(model) : "";
   $("viewer").hidden = !model?.in_3d;
-  $("viewer").href = `/live/${model?.stamp}/viewer.html`;
+  $("viewer").href = `${$("viewer").dataset.folder}/live/${model?.stamp}/viewer.html`;
   if (model && number >= 0) picture(model.stamp, number);
 }
 
@@ -120,7 +120,7 @@ function modelLabel(model) {
 
 // The previous image stays until the new one has loaded; one at a time.
 async function picture(stamp, number) {
-  const address = `/live/${stamp}/${number}`;
+  const address = `live/${stamp}/${number}`;
   if (pictured.address === address) return;
   const mine = { address };
   pictured = mine;

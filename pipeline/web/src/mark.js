@@ -38,7 +38,7 @@ const pointName = () => state.overview.points[state.point].name;
 const place = () => row()?.mark ?? state.moved ?? row()?.predicted;
 
 async function begin() {
-  state.overview = await fetchJson("/api/mark");
+  state.overview = await fetchJson("api/mark");
   state.wanted = Number(localStorage.getItem("splatpipe.wanted")) || state.wanted;
   outbox = new Outbox(state.overview.file, numbers, onResult);
   await outbox.send();
@@ -77,7 +77,7 @@ function setDetail(detail) {
 // Until the point's photos are known and its photo is loaded, clicks apply to what is shown.
 async function choosePoint(number, photo) {
   state.requested = number;
-  const detail = await fetchJson(`/api/mark/${number}`);
+  const detail = await fetchJson(`api/mark/${number}`);
   if (state.requested !== number) return;
   state.point = number;
   state.order.delete(detail.name);
@@ -195,7 +195,7 @@ async function hide() {
 async function turnBack(what) {
   await outbox.send();
   try {
-    const answer = await post(`/api/mark/${what}`, {});
+    const answer = await post(`api/mark/${what}`, {});
     if (answer.point == null) return hint(`Nothing to ${what}.`);
     state.overview = answer.overview;
     if (answer.point !== state.point) await choosePoint(answer.point, answer.photo);

@@ -8,15 +8,18 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from finished_run import linked_copy
 from served import Served, serving
-from timeouts import TIMEOUT_S
+from timeouts import TIMEOUT_S, wait_until
 from view_home import SECRET, WEB, refused
 
+from splatpipe.pipeline.app.view.access import user_of
+from splatpipe.pipeline.app.view.connection import REQUEST_S
 from splatpipe.pipeline.app.view.files import FileNotServedError, open_inside, parse_range
 from splatpipe.pipeline.app.view.log import MAX_POINTS, Curve, RunLog
 
@@ -57,16 +60,16 @@ def served(home: Path) -> Iterator[Served]:
 def test_the_folder_for_web_hosts_is_served_under_its_own_policy_and_listed_once(served: Served) -> None:
     kinds = {"index.html": "text/html; charset=utf-8", "viewer.js": "text/javascript; charset=utf-8"}
     for name, content in WEB.items():
-        answer = served.ask(f"/web/{name}")
+        answer = served.ask(f"{served.files}/web/{name}")
         assert (answer.status, answer.body) == (200, content)
         assert answer.headers["content-type"] == kinds.get(name, answer.headers["content-type"])
         assert "script-src 'self' 'wasm-unsafe-eval' blob:;" in answer.headers["content-security-policy"]
-    assert "content-encoding" not in served.ask("/web/viewer.js.gz").headers
-    assert served.ask("/web/nodes/a1.spz", "Range: bytes=1-2").body == b"GS"
+    assert "content-encoding" not in served.ask(f"{served.files}/web/viewer.js.gz").headers
+    assert served.ask(f"{served.files}/web/nodes/a1.spz", "Range: bytes=1-2").body == b"GS"
     for path in ("/web/secret.txt", "/web/", "/web", "/web/nodes/../secret.txt"):
-        assert refused(served.ask(path))
-    page = served.ask("/").body.decode()
-    assert page.count("/web/index.html") >= 1
+        assert refused(served.ask(served.files + path))
+    page = served.ask(f"{served.pages}/run").body.decode()
+    assert page.count(f"{served.files}/web/index.html") >= 1
     assert "nodes/a1.spz" not in page
 
 
@@ -154,16 +157,18 @@ PATHS = [
 
 @pytest.mark.parametrize("path", PATHS, ids=[path[:40] for path in PATHS])
 def test_a_path_outside_a_runs_deliverables_is_refused(served: Served, path: str) -> None:
-    assert refused(served.ask(path))
-    assert refused(served.ask(path, method="HEAD"))
-    assert refused(served.ask(path, "Range: bytes=0-99"))
+    for folder in ("", served.pages, served.files):
+        assert refused(served.ask(folder + path))
+        assert refused(served.ask(folder + path, method="HEAD"))
+        assert refused(served.ask(folder + path, "Range: bytes=0-99"))
 
 
 @pytest.mark.parametrize(
     "raw", [b"/splat.ply\0", b"/\0", b"/splat.ply\xff", b"/..\xc0\xafsecret.txt", b"/a b", b"/a\tb"]
 )
 def test_invalid_paths_are_refused(served: Served, raw: bytes) -> None:
-    assert refused(served.ask(raw))
+    for folder in ("", served.pages, served.files):
+        assert refused(served.ask(folder.encode() + raw))
 
 
 @pytest.mark.parametrize(
@@ -192,43 +197,127 @@ def test_invalid_paths_are_refused(served: Served, raw: bytes) -> None:
 )
 def test_a_host_that_is_not_this_machine_is_refused(served: Served, host: str | None) -> None:
     """A foreign name that resolves to 127.0.0.1 is DNS rebinding."""
-    for path in ("/", "/splat.ply", "/api/live"):
+    for path in (f"/?key={served.key}", f"{served.pages}/run", f"{served.files}/splat.ply", f"{served.pages}/api/live"):
         assert refused(served.ask(path, host=host))
 
 
 def test_hosts_of_this_machine_are_answered_on_a_tunnels_port_too(served: Served) -> None:
     for host in (f"127.0.0.1:{served.port}", f"localhost:{served.port}", "localhost:9000", "localhost"):
-        assert served.ask("/", host=host).status == 200
-    assert refused(served.send(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: elsewhere.example\r\n\r\n"))
-    assert refused(served.send(b"GET / HTTP/1.0\r\n\r\n"))
+        assert served.ask(f"{served.pages}/run", host=host).status == 200
+    at = f"GET /?key={served.key} HTTP/1".encode()
+    assert refused(served.send(at + b".1\r\nHost: localhost\r\nHost: elsewhere.example\r\n\r\n"))
+    assert refused(served.send(at + b".0\r\n\r\n"))
 
 
 @pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "get"])
 def test_methods_other_than_reading_are_refused(served: Served, home: Path, method: str) -> None:
     before = (home / "out" / "splat.ply").read_bytes()
-    assert refused(served.ask("/splat.ply", "Content-Length: 3", method=method, body=b"bad"))
+    assert refused(served.ask(f"{served.files}/splat.ply", "Content-Length: 3", method=method, body=b"bad"))
     assert (home / "out" / "splat.ply").read_bytes() == before
 
 
-def test_writing_requires_the_pages_secret(served: Served) -> None:
+def test_nothing_is_shown_without_key_or_cookie(served: Served) -> None:
+    """Whatever the Host: each user of this machine, and each of its pages, can connect."""
     posted = ("Content-Type: application/json", "Content-Length: 2")
-    assert served.ask("/api/mark/change", *posted, method="POST", body=b"{}").status == 403
-    assert served.ask("/", *posted, "X-Splatpipe-Token: ", method="POST", body=b"{}").status == 403
+    for path in ("/", "/run", "/live", "/api/live", "/assets/live.js", "/splat.ply", "/report.html", "/nothing"):
+        for at in (
+            path,
+            f"{path}?key=",
+            f"{path}?key={'0' * 32}",
+            f"{path}?Key={served.key}",
+            served.pages + path.rstrip("/"),
+        ):
+            answer = served.ask(at, cookie=False)
+            assert (answer.status, answer.headers["connection"]) == (403, "close")
+            assert b"splatpipe view printed" in answer.body
+            assert "set-cookie" not in answer.headers
+        assert served.ask(path, *posted, method="POST", body=b"{}").status == 403
+    assert served.ask(f"/?key={served.key}", *posted, method="POST", body=b"{}", cookie=False).status == 403
+    for cookie in ("splatpipe=", f"splatpipe={served.key}", f"x={served.cookie.partition('=')[2]}"):
+        assert served.ask(f"{served.pages}/run", f"Cookie: {cookie}", cookie=False).status == 403
+    for header in ("X-Forwarded-For: 127.0.0.1", "X-Forwarded-Host: localhost", f"Referer: {served.page()}"):
+        assert served.ask(f"{served.pages}/run", header, cookie=False).status == 403
+
+
+def test_a_key_is_exchanged_for_a_cookie_of_our_pages_only(served: Served) -> None:
+    """Browsers send a cookie of 127.0.0.1 to other servers on its other ports, but for the path."""
+    answer = served.ask(f"/live?key={served.key}", cookie=False)
+    assert answer.status == 200 and f"url={served.pages}/live" in answer.body.decode()
+    name, *attributes = answer.headers["set-cookie"].split("; ")
+    assert set(attributes) == {f"Path={served.pages}", "HttpOnly", "SameSite=Strict"}
+    assert served.key not in answer.body.decode() and served.key not in name
+    assert answer.headers["referrer-policy"] == "no-referrer" and answer.headers["cache-control"] == "no-store"
+    for cookie in (name, f"a=b; {name}", f"{name}; splatpipe=planted", f"splatpipe=planted;{name}"):
+        assert served.ask(f"{served.pages}/run", f"Cookie: {cookie}", cookie=False).status == 200
+    # The run's pages know their own folder, which does not lead to ours.
+    page = served.ask(f"{served.files}/report.html", cookie=False)
+    assert page.status == 200 and "set-cookie" not in page.headers
+    assert served.pages[1:] not in page.body.decode()
+    assert len({served.pages, served.files, served.key, name}) == 4
+
+
+STRANGER = """
+import os, socket, sys
+os.setuid(65534)
+connection = socket.socket()
+connection.connect(("127.0.0.1", int(sys.argv[1])))
+connection.sendall(sys.argv[2].encode())
+print(connection.recv(99))
+"""
+
+
+def test_the_key_of_the_opened_browser_counts_for_this_user_only(home: Path, tmp_path: Path) -> None:
+    """The browser's command line, where it is, can be read by all users."""
+    told = tmp_path / "address"
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$1" > {told}.new && mv {told}.new {told}\n')
+    browser.chmod(0o755)
+    with serving(home / "out", "--browser", environment={"BROWSER": str(browser)}) as server:
+        address = wait_until(lambda: told.is_file() and told.read_text().strip(), "the browser")
+        target = address.removeprefix(server.address)
+        assert server.key not in address and "?key=" in target
+        assert "set-cookie" in server.ask(target, cookie=False).headers
+        request = f"GET {target} HTTP/1.1\r\nHost: localhost\r\nX-Forwarded-For: 127.0.0.1\r\n\r\n"
+        done = subprocess.run(
+            [sys.executable, "-c", STRANGER, str(server.port), request], capture_output=True, text=True, check=False
+        )
+        if os.geteuid() == 0:
+            assert "403 Forbidden" in done.stdout
+        else:
+            assert "PermissionError" in done.stderr  # only root can be somebody else
+        command = Path(f"/proc/{server.process.pid}/cmdline").read_text()
+        assert server.key not in command and target not in command
+    for file in (home / "out").rglob("*"):
+        assert not file.is_file() or server.key.encode() not in file.read_bytes()
+
+
+def test_who_is_at_the_other_end_of_a_connection_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        here = listening.getsockname()
+        for family, host in ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::ffff:127.0.0.1")):
+            with socket.socket(family) as client:
+                client.connect((host, here[1]))
+                there = client.getsockname()
+                with listening.accept()[0] as ours:
+                    assert user_of(ours.getpeername(), ours.getsockname()) == os.geteuid()
+                assert user_of(("127.0.0.1", 1), here) is user_of(("127.0.0.3", there[1]), here) is None
+    assert user_of(("127.0.0.1", there[1]), here) is None  # closed
+    assert user_of(None, here) is user_of(("nowhere", 5), here) is None
 
 
 def test_reading_has_no_body(served: Served) -> None:
-    assert refused(served.ask("/", "Content-Length: 9999999999"))
-    assert refused(served.ask("/", "Transfer-Encoding: chunked", body=b"0\r\n\r\n"))
+    assert refused(served.ask(f"{served.pages}/run", "Content-Length: 9999999999"))
+    assert refused(served.ask(f"{served.pages}/run", "Transfer-Encoding: chunked", body=b"0\r\n\r\n"))
 
 
 def test_headers_without_end_are_refused(served: Served) -> None:
-    assert refused(served.ask("/", "X: " + "a" * 200_000))
-    assert refused(served.ask("/", *[f"X-{k}: {k}" for k in range(20_000)]))
+    assert refused(served.ask(f"{served.pages}/run", "X: " + "a" * 200_000))
+    assert refused(served.ask(f"{served.pages}/run", *[f"X-{k}: {k}" for k in range(20_000)]))
 
 
 def test_files_are_served_unchanged_completely_or_in_ranges(served: Served, home: Path) -> None:
     data = (home / "out" / "splat.ply").read_bytes()
-    whole = served.ask("/splat.ply")
+    whole = served.ask(f"{served.files}/splat.ply")
     assert (whole.status, whole.body, whole.headers["accept-ranges"]) == (200, data, "bytes")
     size = len(data)
     for asked, first, last in (
@@ -239,34 +328,45 @@ def test_files_are_served_unchanged_completely_or_in_ranges(served: Served, home
         (f"bytes=-{size * 10}", 0, size - 1),
         (f"bytes=10-{10**17}", 10, size - 1),
     ):
-        part = served.ask("/splat.ply", f"Range: {asked}")
+        part = served.ask(f"{served.files}/splat.ply", f"Range: {asked}")
         assert (part.status, part.body) == (206, data[first : last + 1])
         assert part.headers["content-range"] == f"bytes {first}-{last}/{size}"
-        head = served.ask("/splat.ply", f"Range: {asked}", method="HEAD")
+        head = served.ask(f"{served.files}/splat.ply", f"Range: {asked}", method="HEAD")
         assert (head.status, head.body, head.headers["content-length"]) == (206, b"", part.headers["content-length"])
     for asked in (f"bytes={size}-", "bytes=-0", f"bytes={10**17}-{10**17 + 5}"):
-        nothing = served.ask("/splat.ply", f"Range: {asked}")
+        nothing = served.ask(f"{served.files}/splat.ply", f"Range: {asked}")
         assert (nothing.status, nothing.body, nothing.headers["content-range"]) == (416, b"", f"bytes */{size}")
     # Anything but a single byte range must not cause more than one copy of the file to be sent (RFC 9110, 14.2).
     for asked in ("bytes=9-5", "bytes=a-b", "bytes=", "bytes=-", "lines=0-5", "bytes=0-1,3-4", "bytes=" + "0-," * 2000):
-        assert (answer := served.ask("/splat.ply", f"Range: {asked}")).status == 200 and len(answer.body) == size
+        assert (answer := served.ask(f"{served.files}/splat.ply", f"Range: {asked}")).status == 200 and len(
+            answer.body
+        ) == size
 
 
 def test_a_cached_file_is_not_sent_again(served: Served, home: Path) -> None:
-    tag = served.ask("/metrics.json").headers["etag"]
-    assert (again := served.ask("/metrics.json", f"If-None-Match: {tag}")).status == 304 and again.body == b""
-    assert served.ask("/metrics.json", "Range: bytes=0-3", f"If-Range: {tag}").status == 206
-    assert served.ask("/metrics.json", "Range: bytes=0-3", 'If-Range: "another"').status == 200
+    tag = served.ask(f"{served.files}/metrics.json").headers["etag"]
+    assert (
+        again := served.ask(f"{served.files}/metrics.json", f"If-None-Match: {tag}")
+    ).status == 304 and again.body == b""
+    assert served.ask(f"{served.files}/metrics.json", "Range: bytes=0-3", f"If-Range: {tag}").status == 206
+    assert served.ask(f"{served.files}/metrics.json", "Range: bytes=0-3", 'If-Range: "another"').status == 200
 
 
 def test_every_response_has_restrictive_headers(served: Served) -> None:
-    for path in ("/", "/live", "/metrics.json", "/splat.ply", "/assets/live.js", "/api/live", "/none", "/../none"):
+    ours = [served.pages + path for path in ("/run", "/live", "/assets/live.js", "/api/live", "/none")]
+    of_run = [served.files + path for path in ("/report.html", "/metrics.json", "/splat.ply", "/web/index.html")]
+    for path in ("/", f"/?key={served.key}", "/../none", f"{served.files}/none", *ours, *of_run):
         headers = served.ask(path).headers
         assert headers["x-content-type-options"] == "nosniff" and headers["referrer-policy"] == "no-referrer"
-        assert headers["cross-origin-resource-policy"] == "same-origin"
         policy = headers["content-security-policy"]
         assert "default-src 'none'" in policy and "http" not in policy and "*" not in policy
-        assert "server" not in headers and "access-control-allow-origin" not in headers
+        assert "server" not in headers and served.key not in str(headers)
+        if path in of_run:  # of an origin of its own, which may load what lies beside it
+            assert policy.endswith("; sandbox allow-scripts allow-downloads")
+            assert headers["access-control-allow-origin"] == "null"
+        else:
+            assert headers["cross-origin-resource-policy"] == "same-origin"
+            assert "access-control-allow-origin" not in headers
 
 
 def test_it_listens_on_the_loopback_address_only(served: Served) -> None:
@@ -296,20 +396,77 @@ def test_invalid_calls_are_reported(demo_run: Path, tmp_path: Path) -> None:
     assert done.returncode == 2 and "--mark" in done.stderr
 
 
-def test_a_containers_published_port_is_answered_and_the_host_still_checked(demo_run: Path) -> None:
+def test_a_containers_published_port_needs_the_key_under_any_name(demo_run: Path) -> None:
     """127.0.0.2 is this machine, too, and not the address that is listened on without --bind."""
 
-    def status(port: int, host: str) -> int:
+    def status(port: int, host: str, path: str) -> int:
         connection = http.client.HTTPConnection("127.0.0.2", port, timeout=30)
         with contextlib.closing(connection):
-            connection.request("GET", "/", headers={"Host": host})
+            connection.request("GET", path, headers={"Host": host})
             return connection.getresponse().status
 
     with serving(demo_run, "--bind", "0.0.0.0") as server:
-        assert status(server.port, f"localhost:{server.port}") == status(server.port, "127.0.0.1:8080") == 200
-        assert status(server.port, f"127.0.0.2:{server.port}") == status(server.port, "splat.example") == 421
+        for host in (f"localhost:{server.port}", "127.0.0.1:8080", f"127.0.0.2:{server.port}", "splat.example"):
+            assert status(server.port, host, "/") == status(server.port, host, "/live") == 403
+            assert status(server.port, host, f"/live?key={server.key}") == 200
     with serving(demo_run) as server, pytest.raises(ConnectionRefusedError):
-        status(server.port, f"localhost:{server.port}")
+        status(server.port, f"localhost:{server.port}", "/")
+
+
+def half_open(port: int, count: int, sent: bytes = b"GET / HTTP/1.1\r\nX: ") -> list[socket.socket]:
+    """Connections that send a part of a request."""
+    held = [socket.create_connection(("127.0.0.1", port), timeout=TIMEOUT_S) for _ in range(count)]
+    for connection in held:
+        with contextlib.suppress(OSError):  # closed already
+            connection.sendall(sent)
+    return held
+
+
+def test_half_open_connections_keep_nobody_out(served: Served) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(5):
+            for connection in half_open(served.port, 63):
+                stack.enter_context(connection)
+            assert served.ask(f"{served.pages}/run").status == 200
+            assert served.ask("/", cookie=False).status == 403
+
+
+@pytest.mark.parametrize("sent", [b"", b"G", b"GET / HTTP/1.1\r\nX: ", b"POST"])
+def test_half_a_request_is_not_waited_for(served: Served, sent: bytes) -> None:
+    """However slowly it goes on: the seconds are for all of it."""
+    (connection,) = half_open(served.port, 1, sent)
+    with connection:
+        began_s, closed = time.monotonic(), False
+        connection.settimeout(REQUEST_S / 10.0)
+        while not closed and time.monotonic() - began_s < TIMEOUT_S:
+            try:
+                closed = connection.recv(1) == b""
+            except TimeoutError:
+                if sent:
+                    with contextlib.suppress(OSError):
+                        connection.sendall(b"a")
+            except ConnectionResetError:
+                closed = True
+        assert closed and time.monotonic() - began_s > REQUEST_S / 2.0
+
+
+def test_half_a_body_is_not_waited_for(served: Served) -> None:
+    head = f"POST {served.pages}/api/mark/undo HTTP/1.1\r\nHost: localhost\r\nCookie: {served.cookie}\r\n"
+    head += "Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
+    (connection,) = half_open(served.port, 1, head.encode())
+    with connection:
+        assert connection.recv(1) == b""
+    assert served.ask(f"{served.pages}/run").status == 200
+
+
+def test_a_connection_serves_several_requests(served: Served) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=TIMEOUT_S)
+    with contextlib.closing(connection):
+        for _ in range(3):
+            connection.request("GET", f"{served.pages}/run", headers={"Cookie": served.cookie})
+            answer = connection.getresponse()
+            assert answer.status == 200 and answer.read()
+        assert connection.sock is not None
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])

@@ -79,7 +79,7 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
     hold(process)
     with serving(out) as server:
         assert server.start == "live"
-        watched = open_page(f"{server.address}/{server.start}")
+        watched = open_page(server.page(server.start))
         page = watched.page
         state = wait(page, lambda state: state["model"] and len(state["curves"].get("loss", [])) > 0)
         assert state["at_work"] and state["model"]["kind"] == "initial"
@@ -142,7 +142,7 @@ def test_the_page_says_that_there_is_nothing_yet(tmp_path: Path, open_page: Call
     (tmp_path / "out" / "stages").mkdir(parents=True)
     with serving(tmp_path / "out") as server:
         served: Served = server
-        watched = open_page(f"{served.address}/live", 390, 844, True)
+        watched = open_page(served.page("live"), 390, 844, True)
         watched.page.get_by_text("the training has not begun").wait_for()
         assert watched.page.evaluate("document.documentElement.scrollWidth") <= 390
         assert watched.errors == []

@@ -54,7 +54,7 @@ def state(page: Page) -> Any:
 
 
 def opened(open_page: Callable, server: Served, *size: object) -> Any:
-    watched = open_page(f"{server.address}/mark", *size)
+    watched = open_page(server.page("mark"), *size)
     watched.page.evaluate("splatpipe.mark.ready")
     return watched
 
@@ -211,12 +211,18 @@ def test_a_mark_survives_a_killed_server(gps_run: Path, open_page: Callable) -> 
         page.get_by_text("1 change not saved").wait_for()
     assert not file.exists()
     with serving(gps_run, *options) as server:
-        page.get_by_text("Load it again").wait_for()  # the new server has a secret of its own
-        page.on("dialog", lambda dialog: dialog.accept())
-        page.reload()
+        page.get_by_text("Open the address that splatpipe view printed").wait_for()  # the new server has its own key
+        asked: list[str] = []
+        page.on("dialog", lambda dialog: (asked.append(dialog.message), dialog.accept()))
+        page.goto(server.page("mark"))
+        page.wait_for_url(lambda url: "?key=" not in url)
         page.evaluate("splatpipe.mark.ready")
         assert ("P17", "DJI_0034.JPG") in marks_in(file)
         assert state(page)["waiting"] == 0
+        assert len([text for text in asked if "P17 in DJI_0034.JPG" in text]) == 1
+        page.reload()
+        page.evaluate("splatpipe.mark.ready")
+        assert len([text for text in asked if "P17" in text]) == 1  # saved: not asked again
 
 
 def test_other_lines_of_the_file_are_kept_and_external_changes_are_read(gps_run: Path, open_page: Callable) -> None:
@@ -241,20 +247,19 @@ def test_other_lines_of_the_file_are_kept_and_external_changes_are_read(gps_run:
     file.unlink()
 
 
-def posted(server: Served, body: bytes, *lines: str, path: str = "/api/mark/change", token: str = "") -> int:
-    page = server.ask("/mark").body.decode()
-    found = re.search(r'name="splatpipe-token" content="([\w-]+)"', page)
-    assert found is not None
-    headers = ["Content-Type: application/json", f"X-Splatpipe-Token: {token or found.group(1)}", *lines]
+def posted(server: Served, body: bytes, *lines: str, path: str = "/api/mark/change", cookie: bool = True) -> int:
+    headers = ["Content-Type: application/json", *lines]
     if not any(line.lower().startswith(("content-length", "transfer-encoding")) for line in lines):
         headers.append(f"Content-Length: {len(body)}")
-    return server.ask(path, *headers, method="POST", body=body).status
+    return server.ask(server.pages + path, *headers, method="POST", body=body, cookie=cookie).status
 
 
 def test_only_requests_of_the_page_itself_are_written(marking: tuple[Served, Path], open_page: Callable) -> None:
     server, file = marking
     good = b'{"point": 0, "photo": 4, "action": "mark", "x": 10.5, "y": 20}'
-    assert posted(server, good, token="x" * 43) == 403
+    assert posted(server, good, cookie=False) == 403
+    assert posted(server, good, f"Cookie: splatpipe={'0' * 32}", cookie=False) == 403
+    assert server.ask("/api/mark/change", "Content-Type: application/json", method="POST", body=good).status == 403
     assert posted(server, good, "Origin: http://elsewhere.example") == 403
     assert posted(server, good, "Origin: null") == 403
     assert posted(server, good, f"Origin: http://localhost:{server.port}") == 403
@@ -262,8 +267,8 @@ def test_only_requests_of_the_page_itself_are_written(marking: tuple[Served, Pat
     assert posted(server, good, "Content-Length: 99999999999") == 413
     assert posted(server, b"0\r\n\r\n", "Transfer-Encoding: chunked") in (400, 411)
     assert posted(server, good, "Content-Length: 5", "Content-Length: 6") == 400
-    assert server.ask("/mark", "Sec-Fetch-Dest: iframe").status == 403
-    assert server.ask("/mark", "Sec-Fetch-Dest: empty").status == 403
+    plain = ("Content-Type: text/plain", f"Content-Length: {len(good)}")
+    assert server.ask(f"{server.pages}/api/mark/change", *plain, method="POST", body=good).status == 415
     bad: list[object] = [
         *([], 3, None, "x", {}, {"point": 0}),
         *({"point": number, "photo": 4, "action": "unmark"} for number in (-1, 18, 10**30, 0.0, True, "0", None, [0])),
@@ -281,9 +286,73 @@ def test_only_requests_of_the_page_itself_are_written(marking: tuple[Served, Pat
         assert posted(server, raw) == 400
     page = open_page((CAPTURE / "truth.json").as_uri()).page  # of another origin, with the cookies it may have
     sent = "(url) => fetch(url, { method: 'POST', mode: 'no-cors', body: '{}' }).then(() => 'sent', () => 'refused')"
-    page.evaluate(sent, f"{server.address}/api/mark/change")
+    page.evaluate(sent, f"{server.address}{server.pages}/api/mark/change")
     assert not file.exists()
     assert posted(server, good) == 200 and marks_in(file) == {("P01", "DJI_0005.JPG"): (10.5, 20.0)}
+
+
+TAMPERED = """<!doctype html><script>
+window.tried = (async (ours, file) => {
+  const forged = JSON.stringify([{ point: "P01", photo: "DJI_0005.JPG", action: "mark", x: 7, y: 8 }]);
+  const attempt = async (what) => { try { return String(await what()); } catch (error) { return error.name; } };
+  const post = { method: "POST", mode: "no-cors", credentials: "include", body: forged };
+  return {
+    storage: await attempt(() => localStorage.setItem(`splatpipe.marks:${file}`, forged)),
+    cookie: await attempt(() => document.cookie),
+    read: await attempt(() => fetch(`${ours}/api/mark`, { credentials: "include" })),
+    photo: await attempt(() => fetch(`${ours}/photo/3`, { credentials: "include", mode: "no-cors" })),
+    write: await attempt(() => fetch(`${ours}/api/mark/change`, post)),
+    open: await attempt(() => window.open(`${ours}/mark`)),
+    beside: await attempt(() => fetch("metrics.json").then((answer) => answer.status)),
+  };
+})("OURS", "FILE");
+</script>"""
+
+
+def test_a_page_of_the_run_can_neither_mark_nor_see_photos(
+    marking: tuple[Served, Path], gps_run: Path, open_page: Callable
+) -> None:
+    """A received report.html that even knows our addresses, in the browser that has the cookie."""
+    server, file = marking
+    report = gps_run / "report.html"
+    kept = report.read_bytes()
+    report.unlink()
+    report.write_text(TAMPERED.replace("OURS", f"{server.address}{server.pages}").replace("FILE", str(file)))
+    try:
+        page = opened(open_page, server).page
+        page.goto(f"{server.address}{server.pages}/run")
+        page.get_by_text("Report", exact=True).click()
+        page.wait_for_url("**/report.html")
+        tried = page.evaluate("tried")
+        assert tried.pop("open") == "null" and tried.pop("beside") == "200"
+        assert set(tried.values()) <= {"SecurityError", "TypeError"}, tried
+        with page.expect_navigation():  # by itself, not by the user: no cookie goes with it
+            page.evaluate(f"() => {{ location = '{server.address}{server.pages}/mark'; }}")
+        assert "splatpipe view printed" in page.content()
+        opened_again = page.context.new_page()
+        opened_again.goto(f"{server.address}{server.pages}/mark")  # by the user
+        assert state(opened_again)["waiting"] == 0
+        assert not file.exists()
+    finally:
+        report.write_bytes(kept)
+
+
+def test_marks_that_a_page_before_left_are_saved_only_if_the_user_agrees(
+    marking: tuple[Served, Path], open_page: Callable
+) -> None:
+    """The storage is that of an address and port: another user's server may have had them."""
+    server, file = marking
+    page = opened(open_page, server).page
+    forged = [{"point": "P01", "photo": "DJI_0005.JPG", "action": "mark", "x": 7, "y": 8}] * 20
+    asked: list[str] = []
+    page.on("dialog", lambda dialog: (asked.append(dialog.message), dialog.dismiss()))
+    for left in (forged, {"length": 3}, [None], "{}", 7):
+        page.evaluate("([key, left]) => localStorage.setItem(key, left)", [f"splatpipe.marks:{file}", json.dumps(left)])
+        page.reload()
+        page.evaluate("splatpipe.mark.ready")
+        assert state(page)["waiting"] == 0 and not file.exists()
+        assert page.evaluate("localStorage.length") == 0
+    assert len(asked) == 1 and asked[0].count("P01 in DJI_0005.JPG") == 12 and "8 more" in asked[0]
 
 
 def test_a_phone_shows_and_marks_by_touch(marking: tuple[Served, Path], open_page: Callable) -> None:

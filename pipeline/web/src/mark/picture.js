@@ -31,7 +31,7 @@ export class Photos {
 }
 
 async function load(number) {
-  const answer = await fetch(`/photo/${number}`);
+  const answer = await fetch(`photo/${number}`);
   if (!answer.ok) throw new Error((await answer.text()).trim());
   const whole = await createImageBitmap(await answer.blob());
   const resizeWidth = Math.min(SMALL_WIDTH, whole.width);

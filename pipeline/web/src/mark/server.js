@@ -1,8 +1,9 @@
 // The page's requests to the server. A change that was not saved on disk stays in the browser's storage and is sent
-// again, also by the next page opened: no mark is lost if the server or the machine goes down.
+// again, also by the next page opened, if the user agrees: no mark is lost if the server or the machine goes down. The
+// storage belongs to an address and a port, which other programs, and other users', may have had in the meantime.
 
 const RETRY_MS = 2000;
-const token = document.querySelector("meta[name=splatpipe-token]").content;
+const NAMED = 12; // changes that the question about them names
 
 export async function fetchJson(path) {
   const answer = await fetch(path);
@@ -21,12 +22,18 @@ async function whyNot(answer) {
 }
 
 export async function post(path, body) {
-  const headers = { "content-type": "application/json", "x-splatpipe-token": token };
+  const headers = { "content-type": "application/json" };
   const answer = await fetch(path, { method: "POST", headers, body: JSON.stringify(body) });
   if (answer.ok) return answer.json();
   const error = new Error(await whyNot(answer));
   error.status = answer.status;
   throw error;
+}
+
+function question(waiting) {
+  const named = waiting.slice(0, NAMED).map((change) => `${change.point} in ${change.photo}`);
+  const more = waiting.length > NAMED ? ` and ${waiting.length - NAMED} more` : "";
+  return `Not saved yet, from a page that was closed: ${named.join(", ")}${more}.\n\nSave now? Cancel discards.`;
 }
 
 export class Outbox {
@@ -39,10 +46,12 @@ export class Outbox {
     this.sending = null;
     this.trouble = "";
     try {
-      this.waiting = JSON.parse(localStorage.getItem(this.key)) ?? [];
+      const kept = JSON.parse(localStorage.getItem(this.key)) ?? [];
+      if (kept.length && confirm(question(kept))) this.waiting = kept;
     } catch {
-      localStorage.removeItem(this.key);
+      // Nothing that a page of ours has kept, or a browser without storage.
     }
+    this.keep();
     if (this.waiting.length) this.send();
   }
 
@@ -84,7 +93,7 @@ export class Outbox {
       const [point, photo] = this.numbers(change);
       try {
         if (point < 0 || photo < 0) throw Object.assign(new Error("This point or photo is no longer in this run."), { status: 400 });
-        const answer = await post("/api/mark/change", { ...change, point, photo });
+        const answer = await post("api/mark/change", { ...change, point, photo });
         this.trouble = "";
         this.waiting.shift();
         this.keep();
