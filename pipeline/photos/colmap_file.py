@@ -22,6 +22,7 @@ CAMERA = struct.Struct("<IiQQ")
 IMAGE = struct.Struct("<I4d3dI")
 POINT = struct.Struct("<Q3d3BdQ")  # ends with the length of the track
 XYZ_AT, XYZ_BYTES = 8, 24  # in a point
+_TRACK_LENGTH = struct.Struct("<43xQ")  # of a point, without the rest
 OBSERVATION = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
 ELEMENT_BYTES = 8  # of a track: two 32-bit numbers
 POINTS_AT_ONCE = 1 << 16
@@ -77,20 +78,21 @@ class ModelFile:
 
     def positions(self) -> Iterator[Float64[np.ndarray, "n 3"]]:
         """Step over the points of `points3D.bin`; yields the positions of many at a time."""
-        left, at, end = self.count(POINT.size), self._at, len(self._data)
+        left = self.count(POINT.size)
         if left == 0:
             return
-        windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(self._data, np.uint8), XYZ_BYTES)
+        at, data, length_of = self._at, self._data, _TRACK_LENGTH.unpack_from
+        windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), XYZ_BYTES)
         while left > 0:
             starts = []
-            for _ in range(min(left, POINTS_AT_ONCE)):  # a large file's time is spent here
-                starts.append(at + XYZ_AT)
-                at += POINT.size
-                if at > end:
-                    raise ValueError(f"{self._name} ends too early")
-                at += ELEMENT_BYTES * COUNT.unpack_from(self._data, at - COUNT.size)[0]
+            try:
+                for _ in range(min(left, POINTS_AT_ONCE)):  # a large file's time is spent here
+                    starts.append(at)
+                    at += POINT.size + ELEMENT_BYTES * length_of(data, at)[0]
+            except (struct.error, OverflowError) as error:  # beyond the end
+                raise ValueError(f"{self._name} ends too early") from error
             left -= len(starts)
-            yield windows[starts].view("<f8")
+            yield windows[np.array(starts) + XYZ_AT].view("<f8")
         self.skip(at - self._at)
 
     def end(self) -> None:
