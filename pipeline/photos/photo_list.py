@@ -22,6 +22,7 @@ from PIL import Image
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.source import find_model
+from splatpipe.pipeline.photos.names import is_plain, list_names
 
 # Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
@@ -102,6 +103,8 @@ def load_photo_list(part: Path) -> PhotoList:
     try:
         records: list[dict[str, Any]] = json.loads((part / LIST_NAME).read_text(encoding="utf-8"))["photos"]
         photos = tuple(Photo(**record) for record in records)
+        if odd := [photo.name for photo in photos if not is_plain(photo.name)]:
+            raise ValueError(f"the name {list_names(odd[:1])} has a control character")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(
             f"The photo list in {part} cannot be read: {error}", hint="Run again with --rerun ingest."

@@ -7,6 +7,8 @@ import stat
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatpipe.pipeline.photos.names import is_plain
+
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"}
 OTHER_PICTURES = {
     ".heic": "HEIC",
@@ -135,6 +137,8 @@ def _name_problem(relative: Path) -> str | None:
         str(relative).encode()
     except UnicodeEncodeError:
         return "has a name that is not UTF-8: rename it"
+    if not is_plain(str(relative)):
+        return "has a line break or another control character in its name: rename it"
     # Masks and converted photos are called NAME.png, and file systems allow 255 bytes.
     return "has a name that is too long: rename it" if len(relative.name.encode()) > MAX_NAME_BYTES else None
 

