@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 
 from splatpipe.pipeline.engine.errors import StageError
@@ -18,6 +17,7 @@ from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import read_world_area
+from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
 from splatpipe.pipeline.render.rendering import as_trained, load_rendering
 from splatpipe.pipeline.splat.dome import sky_dome
@@ -183,7 +183,7 @@ def mean_error(model: Path) -> float | None:
     Args:
         model: The COLMAP model that the training dataset was made from.
     """
-    reconstruction = pycolmap.Reconstruction(model)
+    reconstruction = read_reconstruction(model)
     reconstruction.update_point_3d_errors()  # models from other programs may lack them
     error = float(reconstruction.compute_mean_reprojection_error())
     return round(error, 4) if math.isfinite(error) and error > 0.0 else None

@@ -8,6 +8,7 @@ import cv2
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.dataset import MODEL
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.photo_list import load_photo_list
@@ -15,7 +16,6 @@ from splatpipe.pipeline.photos.undistortion import (
     RegisteredPhoto,
     pinhole_model,
     plan_views,
-    read_registered,
     write_view,
 )
 from splatpipe.pipeline.sfm.sparse_model import write_model
@@ -29,7 +29,7 @@ def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) ->
     Raises:
         SplatpipeError: if the model cannot be read, or its photos are missing.
     """
-    model = read_registered(inputs["georef.model"])
+    model = read_reconstruction(inputs["georef.model"])
     photos = load_photo_list(inputs["ingest.photos"]).photos
     placed = plan_views(model, photos, config.max_megapixels, report)
     dataset = out / "dataset"

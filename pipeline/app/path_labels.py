@@ -13,9 +13,19 @@ from pathlib import Path
 from typing import Any
 
 SYSTEM = ("dev", "proc", "sys")  # the same on every machine, and needed to understand messages about them
-_END = r"\s\"'<>|,;:()\[\]"
-_ELSEWHERE = re.compile(rf"(?<![\w./~-])(?:file://)?~?/(?!(?:{'|'.join(SYSTEM)})\b)(?:[^/{_END}]+/)+([^/{_END}]*)")
-_BESIDE = re.compile(rf"(?<![\w./-])(?:\.\./)+(?:[^/{_END}]+/)*([^/{_END}]+)")
+# A folder's name in a text. It may have single blanks, unless a path begins after one, and pairs of brackets; what
+# remains unclear is taken as part of the path: a word too few is better than a customer's name.
+_FOLDER = (
+    r"""(?:[^\s/\\"'<>|,;:()\[\]]|\([^()/\\\n]*\)|\[[^\[\]/\\\n]*\]|(?<=\w)'(?=\w)|(?<=\S)[ ](?=\w|[(\[&+#@-]))+"""
+)
+_FOLDERS = (
+    rf"(?<![\w./~-])~?/(?!(?:{'|'.join(SYSTEM)})\b)(?:{_FOLDER}/+)+",  # in the file system, also from ~
+    rf"(?<![\w./-])(?:\.\./)+(?:{_FOLDER}/+)*",
+    rf"(?<![\w+.-])(?!https?:)[A-Za-z][\w+.-]+://[^\s/]*/*(?:{_FOLDER}/+)*",  # smb://, file://, …
+    rf"(?<!\w)[A-Za-z]:[\\/]+(?:{_FOLDER}[\\/]+)*",  # of Windows
+    rf"(?<![\w\\/])\\\\+{_FOLDER}\\+(?:{_FOLDER}[\\/]+)*",  # a Windows server's
+)
+_ELSEWHERE = re.compile("|".join(_FOLDERS))
 
 
 @dataclass(frozen=True)
@@ -45,12 +55,12 @@ class PathLabels:
 
     def plain(self, text: str) -> str:
         """Remove this machine's folders from a text."""
-        if "/" not in text:
+        if "/" not in text and "\\" not in text:
             return text
         for path, name in self.names:
             shown = rf"{_escape_backslashes(name)}\1" if name else ""
             text = re.sub(rf"(?<![\w.-]){re.escape(path)}(?![\w-])(/?)", shown, text)
-        return _BESIDE.sub(r"\1", _ELSEWHERE.sub(r"\1", text))
+        return _ELSEWHERE.sub("", text)
 
     def plain_value(self, value: Any) -> Any:
         """Remove folders from a template's value if it is text; our own markup and other types are unchanged.

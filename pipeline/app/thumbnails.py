@@ -13,7 +13,8 @@ from pathlib import Path
 from markupsafe import Markup
 from PIL import Image, ImageOps
 
-FORMATS = ("JPEG", "PNG", "TIFF")  # as ingest accepts; an MPO opens as JPEG
+from splatpipe.pipeline.photos.picture_file import open_picture, turn_to_decode, why_hollow
+
 MAX_BYTES = 512 << 20  # of a file
 MAX_PIXELS = 300_000_000  # of a photo that cannot be reduced while decoding: about a gigabyte of memory
 END_OF_JPEG = b"\xff\xd9"
@@ -110,13 +111,16 @@ def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about large images or broken metadata: check has reported these
-                with Image.open(io.BytesIO(data + more), formats=FORMATS) as image:
+                with open_picture(io.BytesIO(data + more)) as image:
+                    if why_hollow(image, len(data)):
+                        return None
                     if side is not None:
                         image.draft("RGB", (2 * side, 2 * side))
                     if image.width * image.height > MAX_PIXELS:
                         return None
-                    image.load()
-                    return ImageOps.exif_transpose(image).convert("RGB"), not more
+                    with turn_to_decode(image.width * image.height):
+                        image.load()
+                        return ImageOps.exif_transpose(image).convert("RGB"), not more
         except Exception:  # Pillow raises nearly anything on broken files, SyntaxError and struct.error among them
             continue
     return None

@@ -124,7 +124,6 @@ def execute(task: Task, send: IO[str]) -> None:
             config_type: type[StageConfig] = getattr(__import__(module, fromlist=[name]), name)
             body = load_body(task.entry)
         config = config_type.model_validate(task.config)
-        _install_handlers()  # again: importing pycolmap replaces our handlers
         summary = body(config, task.inputs(), Path(task.out), EventReporter(task.stage, sink))
     except KeyboardInterrupt:
         send_message({"failed": {"type": "KeyboardInterrupt"}})

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -18,12 +16,11 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.exif import Exif, read_exif
-from splatpipe.pipeline.photos.photo_list import load_stored, open_picture
+from splatpipe.pipeline.photos.picture_file import STRIP_ROWS, load_stored, open_picture, turn_to_decode, why_hollow
 from splatpipe.pipeline.photos.scan import Candidate, ExcludedPhoto
 from splatpipe.pipeline.photos.xmp import find_packet, parse_xmp
 
 MAX_FILE_BYTES = 2 << 30
-LARGE_PIXELS = 40_000_000  # larger images are decoded one at a time: some hundred megabytes each
 DRAFT = 8  # libjpeg reads every coefficient of a JPEG, whatever the scale of the pixels that it computes
 FINGERPRINT_STEP = 8
 TAG_ORIENTATION = 274
@@ -33,7 +30,6 @@ DEEP_GREY_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 COLOUR_MODES = ("RGB", "RGBA")
 READ_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *DEEP_GREY_MODES)
 RANGE_QUANTILES = (0.001, 0.999)  # of a deep image's values: excludes hot and dead pixels
-_one_large_at_a_time = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -96,7 +92,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
     except Exception as error:  # Pillow's readers raise almost anything on broken images
         return ExcludedPhoto(candidate.name, _decode_problem(error))
     with picture:
-        reason = _refusal_reason(picture, limits)
+        reason = _refusal_reason(picture, limits) or why_hollow(picture, len(data))
         return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
 
 
@@ -121,7 +117,9 @@ def deep_pixels(data: bytes, picture: Image.Image, orientation: int) -> Shaped[n
     if pixels is None or pixels.dtype == np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         return None
     order = [2, 1, 0, 3][: pixels.shape[2]]
-    return np.ascontiguousarray(pixels[:, :, order])
+    for top in range(0, len(pixels), STRIP_ROWS):  # in place: a second array would be of gigabytes
+        pixels[top : top + STRIP_ROWS] = pixels[top : top + STRIP_ROWS][:, :, order]
+    return np.asarray(pixels)
 
 
 def stored_orientation(exif: Exif, picture: Image.Image) -> int:
@@ -166,8 +164,7 @@ def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image
     turned = picture.format == "TIFF" and orientation != 1
     if turned and orientation >= 5:
         width, height = height, width
-    large = _one_large_at_a_time if width * height > LARGE_PIXELS else contextlib.nullcontext()
-    with large:
+    with turn_to_decode(width * height):
         try:
             loaded = _load(data, picture, orientation)
         except MemoryError:
@@ -224,10 +221,16 @@ def _deep_facts(values: np.ndarray) -> _Facts | None:
 def _plain_facts(loaded: Image.Image, size: tuple[int, int]) -> _Facts:
     transparent = False
     if loaded.has_transparency_data:
-        transparent = bool((np.asarray(loaded.convert("RGBA"))[:, :, 3] < 128).any())
+        transparent = any(bool((np.asarray(strip.convert("RGBA"))[:, :, 3] < 128).any()) for strip in _strips(loaded))
     step = FINGERPRINT_STEP if loaded.size == size else 1  # a JPEG is decoded at a reduced scale
-    sample = np.asarray(loaded)[::step, ::step]
+    sample = np.concatenate([np.asarray(strip)[::step, ::step] for strip in _strips(loaded)])
     return _Facts(_fingerprint(loaded.mode, size, sample), transparent, None)
+
+
+def _strips(picture: Image.Image) -> Iterator[Image.Image]:
+    """The picture in strips, so that conversions take little memory; each begins at a sampled row."""
+    for top in range(0, picture.height, STRIP_ROWS):
+        yield picture.crop((0, top, picture.width, min(picture.height, top + STRIP_ROWS)))
 
 
 def _fingerprint(kind: str, size: tuple[int, ...], pixels: np.ndarray) -> str:

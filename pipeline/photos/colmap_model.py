@@ -1,31 +1,29 @@
-"""Read COLMAP's binary model of pinhole photos without pycolmap, which training and rendering may lack.
-
-The format is that of COLMAP's documentation ("Output format", binary): little-endian, lengths first. Lengths
-are checked against the file's size before memory is allocated.
-"""
+"""Read COLMAP's binary model of pinhole photos without pycolmap, which training and rendering may lack."""
 
 from __future__ import annotations
 
-import mmap
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-CAMERAS, IMAGES, POINTS = "cameras.bin", "images.bin", "points3D.bin"
-SIMPLE_PINHOLE, PINHOLE = 0, 1  # COLMAP's ids of the camera models, with 3 and 4 parameters
-LONGEST_NAME_BYTES = 4096
-UNMATCHED = -1  # a keypoint without a point: all 64 bits set
+from splatpipe.pipeline.photos.colmap_file import (
+    CAMERA,
+    CAMERAS,
+    COUNT,
+    ELEMENT_BYTES,
+    IMAGE,
+    IMAGES,
+    OBSERVATION,
+    POINT,
+    POINTS,
+    ModelFile,
+)
 
-_COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")
-_IMAGE = struct.Struct("<I4d3dI")
-_POINT = struct.Struct("<Q3d3BdQ")
-_OBSERVATION = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
-_ELEMENT_BYTES = 8  # of a track: two 32-bit numbers
+SIMPLE_PINHOLE, PINHOLE = 0, 1  # COLMAP's ids of the camera models, with 3 and 4 parameters
+UNMATCHED = -1  # a keypoint without a point: all 64 bits set
 
 
 @dataclass(frozen=True)
@@ -86,15 +84,15 @@ def read_photos(folder: Path) -> list[ModelPhoto]:
         OSError: if a file cannot be read.
         ValueError: if one is broken, or a camera is not a pinhole camera.
     """
-    cameras = _read_cameras(_File(folder / CAMERAS))
-    file = _File(folder / IMAGES)
+    cameras = _read_cameras(ModelFile(folder / CAMERAS))
+    file = ModelFile(folder / IMAGES)
     photos: dict[int, ModelPhoto] = {}
-    for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size)):
-        number, *pose, camera = file.take(_IMAGE)
+    for _ in range(file.count(IMAGE.size + 1 + COUNT.size)):
+        number, *pose, camera = file.take(IMAGE)
         name = file.name()
         if camera not in cameras:
             raise ValueError(f"{IMAGES}: {name} has a camera that is not there")
-        observed = file.array(_OBSERVATION)["point"]
+        observed = file.array(OBSERVATION)["point"]
         photos[number] = ModelPhoto(name, cameras[camera], _matrix(np.array(pose)), observed[observed != UNMATCHED])
     file.end()
     return [photo for _, photo in sorted(photos.items())]
@@ -110,11 +108,11 @@ def read_cloud(folder: Path) -> Cloud:
         OSError: if the file cannot be read.
         ValueError: if it is broken.
     """
-    file = _File(folder / POINTS)
+    file = ModelFile(folder / POINTS)
     rows: dict[int, tuple[float, ...]] = {}
-    for _ in range(file.count(_POINT.size)):
-        number, *values, length = file.take(_POINT)
-        file.skip(length * _ELEMENT_BYTES)
+    for _ in range(file.count(POINT.size)):
+        number, *values, length = file.take(POINT)
+        file.skip(length * ELEMENT_BYTES)
         rows[number] = (*values, length)
     file.end()
     ids = sorted(rows)
@@ -128,10 +126,10 @@ def read_cloud(folder: Path) -> Cloud:
     )
 
 
-def _read_cameras(file: _File) -> dict[int, Pinhole]:
+def _read_cameras(file: ModelFile) -> dict[int, Pinhole]:
     cameras = {}
-    for _ in range(file.count(_CAMERA.size)):
-        number, kind, width, height = file.take(_CAMERA)
+    for _ in range(file.count(CAMERA.size)):
+        number, kind, width, height = file.take(CAMERA)
         if kind not in (SIMPLE_PINHOLE, PINHOLE):
             raise ValueError(f"camera {number} is not PINHOLE (COLMAP's model {kind})")
         *focal, cx, cy = file.take(struct.Struct("<4d" if kind == PINHOLE else "<3d"))
@@ -145,8 +143,8 @@ def _matrix(pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "4 4"]:
 
     The sums are those of Eigen's ``toRotationMatrix``, so that the result equals COLMAP's matrices bit for bit.
     """
-    if not np.isfinite(pose).all():
-        raise ValueError(f"{IMAGES}: a pose that is not finite")
+    if not np.isfinite(pose).all() or not pose[:4].any():
+        raise ValueError(f"{IMAGES}: a pose that is zero or not finite")
     w, x, y, z = pose[:4].tolist()
     tx, ty, tz = 2.0 * x, 2.0 * y, 2.0 * z
     twx, twy, twz, txx, txy, txz = tx * w, ty * w, tz * w, tx * x, ty * x, tz * x
@@ -159,49 +157,3 @@ def _matrix(pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "4 4"]:
     ]
     matrix[:3, 3] = pose[4:]
     return matrix
-
-
-class _File:
-    """Sequential reader of an untrusted file."""
-
-    def __init__(self, path: Path) -> None:
-        with path.open("rb") as file:
-            self._data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-        self._name, self._at = path.name, 0
-
-    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
-        start = self._at
-        self.skip(layout.size)
-        return layout.unpack_from(self._data, start)
-
-    def skip(self, length: int) -> None:
-        if length > len(self._data) - self._at:
-            raise ValueError(f"{self._name} ends too early")
-        self._at += length
-
-    def count(self, least_bytes: int) -> int:
-        """Read a number of entries, each of which takes at least ``least_bytes``."""
-        (number,) = self.take(_COUNT)
-        if number * least_bytes > len(self._data) - self._at:
-            raise ValueError(f"{self._name} claims {number} entries, more than it has bytes for")
-        return int(number)
-
-    def array(self, kind: np.dtype[np.void]) -> np.ndarray:
-        """Read an array of entries, preceded by their number."""
-        number = self.count(kind.itemsize)
-        start = self._at
-        self.skip(number * kind.itemsize)
-        return np.frombuffer(self._data, kind, number, start)
-
-    def name(self) -> str:
-        """Read a zero-terminated text."""
-        window = bytes(self._data[self._at : self._at + LONGEST_NAME_BYTES])
-        length = window.find(0)
-        if length < 0:
-            raise ValueError(f"{self._name} has a name without an end")
-        self._at += length + 1
-        return window[:length].decode("utf-8")  # UnicodeDecodeError is a ValueError
-
-    def end(self) -> None:
-        if self._at != len(self._data):
-            raise ValueError(f"{self._name} goes on after its last entry")

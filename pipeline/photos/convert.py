@@ -11,7 +11,8 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.photos.check import CheckedPhoto, deep_pixels, stored_orientation
-from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, read_checked
+from splatpipe.pipeline.photos.photo_list import read_checked
+from splatpipe.pipeline.photos.picture_file import STRIP_ROWS, load_stored, open_picture, turn_to_decode
 
 PNG_LEVEL = 1  # zlib's fastest: for an intermediate file, half the size is not worth ten times the time
 FULL_RANGE = 65535.0
@@ -72,8 +73,9 @@ def convert_photo(
     Returns:
         Its mask from transparency, 0 where opacity is below half, else 255; None for an opaque photo.
     """
-    pixels, opacity = read_8bit(photo, scale)
-    save_png(pixels, target)
+    with turn_to_decode(photo.width * photo.height):
+        pixels, opacity = read_8bit(photo, scale)
+        save_png(pixels, target)
     if opacity is None or not photo.transparent:
         return None
     return np.where(opacity < 128, 0, 255).astype(np.uint8)
@@ -91,9 +93,13 @@ def _scale(
 ) -> tuple[np.ndarray, UInt8[np.ndarray, "h w"] | None]:
     low, high = scale
     colours = deep[..., :3] if deep.ndim == 3 else deep
-    values = (colours.astype(np.float32) - np.float32(low)) * np.float32(255.0 / max(high - low, 1e-30))
-    values = np.nan_to_num(values, nan=0.0, posinf=255.0, neginf=0.0)
+    scaled = np.empty(colours.shape, np.uint8)
+    for top in range(0, len(colours), STRIP_ROWS):
+        values = colours[top : top + STRIP_ROWS].astype(np.float32) - np.float32(low)
+        values *= np.float32(255.0 / max(high - low, 1e-30))
+        values = np.nan_to_num(values, nan=0.0, posinf=255.0, neginf=0.0)
+        scaled[top : top + STRIP_ROWS] = np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8)
     opacity = None
     if deep.ndim == 3 and deep.shape[2] == 4:
         opacity = (deep[:, :, 3] >> 8).astype(np.uint8)
-    return np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8), opacity
+    return scaled, opacity

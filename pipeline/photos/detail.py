@@ -16,7 +16,8 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.convert import read_8bit
-from splatpipe.pipeline.photos.photo_list import open_picture, read_checked
+from splatpipe.pipeline.photos.photo_list import read_checked
+from splatpipe.pipeline.photos.picture_file import open_picture, turn_to_decode
 
 MIN_SIDE_PX = 2000  # a JPEG is decoded at the smallest of 1/2, 1/4 and 1/8 that still has as many
 PATCH = 32  # pixels: the coarse band includes its three longest waves
@@ -50,14 +51,15 @@ def read_grey(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"]:
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
     """
-    if not photo.plain:
-        pixels, _ = read_8bit(photo, photo.deep_range)
-        return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
-    data = read_checked(photo.path, photo.name, photo.sha256)
-    with open_picture(BytesIO(data)) as picture:
-        share = min(1.0, MIN_SIDE_PX / max(picture.size))
-        picture.draft("L", (max(1, int(picture.width * share)), max(1, int(picture.height * share))))
-        return np.array(picture.convert("L"))
+    with turn_to_decode(photo.width * photo.height):
+        if not photo.plain:
+            pixels, _ = read_8bit(photo, photo.deep_range)
+            return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+        data = read_checked(photo.path, photo.name, photo.sha256)
+        with open_picture(BytesIO(data)) as picture:
+            share = min(1.0, MIN_SIDE_PX / max(picture.size))
+            picture.draft("L", (max(1, int(picture.width * share)), max(1, int(picture.height * share))))
+            return np.array(picture.convert("L"))
 
 
 def brightness_of(grey: UInt8[np.ndarray, "h w"]) -> Brightness:

@@ -15,13 +15,21 @@ from splatpipe.pipeline.engine.digests import is_real_file
 from splatpipe.pipeline.engine.machine import pseudo_devices
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import read_exif
-from splatpipe.pipeline.photos.photo_list import load_stored, open_picture, undo_orientation
+from splatpipe.pipeline.photos.picture_file import (
+    LARGE_PIXELS,
+    STRIP_ROWS,
+    load_stored,
+    open_picture,
+    turn_to_decode,
+    undo_orientation,
+)
 from splatpipe.pipeline.photos.scan import MASK_FOLDER, PHOTO_SUFFIXES
 
 ASPECT_TOLERANCE = 0.01
 IMAGE_FOLDER = "images"
 FEW_LABELS = 128  # a lossless mask with only lower values contains labels (0 and 1, or classes): all but 0 count
 HALF = 128
+MANY_TIMES = 2  # a mask has its photo's size; a larger one may be of photos that were reduced later
 QUARTER_TURNS = (5, 6, 7, 8)
 
 
@@ -123,18 +131,39 @@ def read_mask(mask: MaskFile, photo: CheckedPhoto, max_pixels: int) -> UInt8[np.
     """
     try:
         with open_picture(mask.path, max_pixels=max_pixels) as picture:
+            _require_size(picture, photo)
             exif = read_exif(picture)
             lossless = picture.format in ("PNG", "TIFF")
-            grey = _grey(load_stored(picture, exif.orientation))
+            with turn_to_decode(picture.width * picture.height):
+                grey = _grey(load_stored(picture, exif.orientation))
+    except MaskError:
+        raise
     except Exception as error:  # Pillow's readers raise almost anything on broken images
         raise MaskError(f"cannot be read ({' '.join(str(error).split())[:120]})") from error
     drawn = grey if exif.orientation == photo.exif.orientation else _to_stored(grey, exif.orientation, photo)
     if not _same_shape(drawn.size, (photo.width, photo.height)):
-        raise MaskError(f"has another aspect ratio ({grey.width} × {grey.height}) than its photo")
+        raise _other_shape(grey)
     values = np.asarray(drawn)
     threshold = 1 if lossless and int(values.max()) < FEW_LABELS else HALF
-    binary = Image.fromarray(np.where(values >= threshold, 255, 0).astype(np.uint8))
+    binary = Image.fromarray(np.where(values >= threshold, np.uint8(255), np.uint8(0)))
     return np.asarray(binary.resize((photo.width, photo.height), Image.Resampling.NEAREST))
+
+
+def _require_size(picture: Image.Image, photo: CheckedPhoto) -> None:
+    """Compare the size in a mask's header with its photo's, before any pixel is decoded.
+
+    Raises:
+        MaskError: if its aspect ratio is another, upright or turned, or it is far larger than its photo.
+    """
+    size = (photo.width, photo.height)
+    if not any(_same_shape(picture.size, each) for each in (size, size[::-1])):
+        raise _other_shape(picture)
+    if picture.width * picture.height > max(LARGE_PIXELS, MANY_TIMES * photo.width * photo.height):
+        raise MaskError(f"is far larger ({picture.width} × {picture.height}) than its photo")
+
+
+def _other_shape(picture: Image.Image) -> MaskError:
+    return MaskError(f"has another aspect ratio ({picture.width} × {picture.height}) than its photo")
 
 
 def _to_stored(grey: Image.Image, own_orientation: int, photo: CheckedPhoto) -> Image.Image:
@@ -165,9 +194,15 @@ def _same_shape(first: tuple[int, int], second: tuple[int, int]) -> bool:
 def _grey(picture: Image.Image) -> Image.Image:
     """Convert a mask to grey over black: transparent pixels are ignored ones."""
     if picture.mode.startswith("I") or picture.mode == "F":
-        values = np.nan_to_num(np.asarray(picture).astype(np.float64))
+        values = np.nan_to_num(np.asarray(picture))
         factor = 255.0 / 65535.0 if values.max() > 255.0 else 1.0
-        return Image.fromarray(np.clip(np.ceil(values * factor), 0, 255).astype(np.uint8))
+        grey = np.empty(values.shape, np.uint8)
+        for top in range(0, len(values), STRIP_ROWS):
+            strip = values[top : top + STRIP_ROWS].astype(np.float64)
+            grey[top : top + STRIP_ROWS] = np.clip(np.ceil(strip * factor), 0, 255).astype(np.uint8)
+        return Image.fromarray(grey)
+    if picture.mode == "1":
+        return picture.convert("L")
     if picture.has_transparency_data:
         rgba = picture.convert("RGBA")
         picture = Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba)

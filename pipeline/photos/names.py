@@ -9,6 +9,14 @@ from pathlib import PurePath, PurePosixPath
 PHOTO_SUFFIXES = ("jpg", "jpeg", "jpe", "jfif", "mpo", "png", "tif", "tiff")
 
 
+CONTROL = re.compile("[\\x00-\\x1f\\x7f-\\x9f\\u2028\\u2029]")  # line breaks of any kind, tabs, and the like
+
+
+def is_plain(name: str) -> bool:
+    """Whether a name fits into a line of a file: lists of photos and control files have one photo per line."""
+    return CONTROL.search(name) is None
+
+
 def is_photo(path: PurePath) -> bool:
     """Whether a file's suffix is a photo's."""
     return path.suffix.casefold().lstrip(".") in PHOTO_SUFFIXES

@@ -21,23 +21,13 @@ from PIL import Image
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.engine.source import find_model
+from splatpipe.pipeline.photos.names import is_plain, list_names
+from splatpipe.pipeline.photos.picture_file import STRIP_ROWS, open_picture
 
-# Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
-PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LIST_NAME = "photos.json"
 CONVERTED_DIR = "converted"
 MASK_DIR = "masks"
-STRIP_ROWS = 256  # of a photo, copied at a time
 SKY_DIR = "sky_masks"
-INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}
 
 
 @dataclass(frozen=True)
@@ -101,6 +91,8 @@ def load_photo_list(part: Path) -> PhotoList:
     try:
         records: list[dict[str, Any]] = read_json(part / LIST_NAME)["photos"]
         photos = tuple(Photo(**record) for record in records)
+        if odd := [photo.name for photo in photos if not is_plain(photo.name)]:
+            raise ValueError(f"the name {list_names(odd[:1])} has a control character")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(
             f"The photo list in {part} cannot be read: {error}", hint="Run again with --rerun ingest."
@@ -188,10 +180,7 @@ def open_decoded(photo: Photo, part: Path, photos_dir: Path) -> DecodedPhoto:
     Raises:
         SplatpipeError: as ``decode``.
     """
-    picture = _picture(photo_bytes(photo, part, photos_dir), "RGB", photo.name)
-    if picture.size != (photo.width, photo.height):
-        raise _changed(photo.name, f"it is {picture.width} × {picture.height} px now")
-    return DecodedPhoto(picture)
+    return DecodedPhoto(_picture(photo_bytes(photo, part, photos_dir), "RGB", photo.name, photo))
 
 
 def decode_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None:
@@ -211,52 +200,16 @@ def decode_sky_mask(photo: Photo, part: Path) -> UInt8[np.ndarray, "h w"] | None
 def _decode_mask(photo: Photo, file: str | None, part: Path) -> UInt8[np.ndarray, "h w"] | None:
     if file is None:
         return None
-    mask = np.array(_picture(read_checked(_inside(part, file), file), "L", file))
-    if mask.shape != (photo.height, photo.width):
-        raise _changed(file, f"it is {mask.shape[1]} × {mask.shape[0]} px now")
-    return mask
+    return np.array(_picture(read_checked(_inside(part, file), file), "L", file, photo))
 
 
-def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
-    """Open a JPEG, PNG or TIFF by its content, without Pillow's own size limit.
-
-    Args:
-        source: A path or a binary file object.
-        max_pixels: Refuse an image with more pixels before any of them is decoded.
-
-    Raises:
-        ValueError: if it has more than ``max_pixels`` pixels.
-        OSError: if it is not such an image (Pillow's ``UnidentifiedImageError`` is one).
-    """
-    Image.MAX_IMAGE_PIXELS = None  # Pillow's limit is process-wide and refuses 200 MP panoramas; ours is checked below
-    picture = Image.open(source, formats=PHOTO_FORMATS)
-    if max_pixels is not None and picture.width * picture.height > max_pixels:
-        raise ValueError(f"it has {picture.width} × {picture.height} pixels")
-    return picture
-
-
-def load_stored(picture: Image.Image, orientation: int) -> Image.Image:
-    """Decode an opened image in full, in the stored grid.
-
-    Args:
-        picture: From ``open_picture``, not yet loaded.
-        orientation: Its EXIF orientation, 1 to 8.
-    """
-    picture.load()
-    # Pillow applies the orientation while loading a TIFF, but for no other format.
-    return undo_orientation(picture, orientation) if picture.format == "TIFF" else picture
-
-
-def undo_orientation(picture: Image.Image, orientation: int) -> Image.Image:
-    """Convert an image to which an EXIF orientation (1 to 8) was applied back to the stored grid."""
-    method = INVERSE_ORIENTATION.get(orientation)
-    return picture if method is None else picture.transpose(method)
-
-
-def _picture(data: bytes, mode: str, name: str) -> Image.Image:
+def _picture(data: bytes, mode: str, name: str, photo: Photo) -> Image.Image:
+    """Decode a file of the photo's size."""
     try:
         # Ingest wrote this file or found it plain: it is never a TIFF with an orientation.
         picture = open_picture(BytesIO(data))
+        if picture.size != (photo.width, photo.height):
+            raise _changed(name, f"it is {picture.width} × {picture.height} px now")
         picture.load()
         return picture if picture.mode == mode else picture.convert(mode)
     except (OSError, ValueError, SyntaxError) as error:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.machine import pseudo_devices
 from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.photos.names import is_plain
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"}
 OTHER_PICTURES = {
@@ -140,6 +141,8 @@ def _name_problem(relative: Path) -> str | None:
         str(relative).encode()
     except UnicodeEncodeError:
         return "has a name that is not UTF-8: rename it"
+    if not is_plain(str(relative)):
+        return "has a line break or another control character in its name: rename it"
     # Masks and converted photos are called NAME.png, and file systems allow 255 bytes.
     return "has a name that is too long: rename it" if len(relative.name.encode()) > MAX_NAME_BYTES else None
 

@@ -90,24 +90,6 @@ def plan_views(
     return [placed[name] for name in sorted(placed)]
 
 
-def read_registered(path: Path) -> pycolmap.Reconstruction:
-    """Read the sparse model with the photos' original cameras.
-
-    Args:
-        path: The part ``georef.model``.
-
-    Raises:
-        SplatpipeError: if it is not a COLMAP model.
-    """
-    try:
-        return pycolmap.Reconstruction(path)
-    except (OSError, ValueError, RuntimeError, IndexError) as error:
-        raise SplatpipeError(
-            f"The sparse model cannot be read: {' '.join(str(error).split())[:200]}",
-            hint="It must have COLMAP's cameras, images and points3D files, as .bin or .txt.",
-        ) from error
-
-
 def _camera_for(image: pycolmap.Image, photo: Photo) -> pycolmap.Camera | None:
     """The model's camera scaled to the photo's grid; None if they cannot belong together."""
     camera = pycolmap.Camera(image.camera.todict())

@@ -21,6 +21,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.text_lines import text_lines
 from splatpipe.pipeline.sfm.lens_model import GRID, PARAMETERS, StatedLens, is_known
 
 MAX_BYTES = 32 << 20  # Pix4D's parameters take half a kilobyte per photo
@@ -141,7 +142,7 @@ def _number(text: str) -> float:
 
 
 def _text(text: str) -> list[FileLens]:
-    lines = text.splitlines()
+    lines = text_lines(text)
     if len(lines) > MAX_LINES:
         raise _RefusedError("it has too many lines")
     head = text[:4096]

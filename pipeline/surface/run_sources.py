@@ -20,9 +20,10 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.mvs.depth_maps import DepthMapFile, list_depth_maps
 from splatpipe.pipeline.mvs.filling import fill_gaps
+from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.dataset import load_views
 from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
-from splatpipe.pipeline.photos.undistortion import RegisteredPhoto, plan_views, read_registered
+from splatpipe.pipeline.photos.undistortion import RegisteredPhoto, plan_views
 from splatpipe.pipeline.surface.photo_samples import DistortionGrid, PhotoSource
 from splatpipe.pipeline.surface.site_extent import SiteExtent, load_site
 from splatpipe.pipeline.surface.sources import DepthSource, MetricMap, PosedDepthMap
@@ -71,7 +72,7 @@ def open_run_surface(inputs: Inputs, report: Reporter) -> RunSurface | None:
     local_from_model = frame.world_from_model
     depths = {name: _in_metres(*each, local_from_model) for name, each in maps.items()}
     flown = load_photo_list(inputs["ingest.photos"]).photos
-    placed = plan_views(read_registered(inputs["georef.model"]), flown, math.inf, report)
+    placed = plan_views(read_reconstruction(inputs["georef.model"]), flown, math.inf, report)
     photos = photo_sources(placed, depths, local_from_model, (inputs["ingest.photos"], inputs.photos_dir))
     focal = {view.photo.name: view.source.mean_focal_length() for view in placed}
     finer = statistics.median(focal.get(name, each.camera.fx) / each.camera.fx for name, each in depths.items())

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
+from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.names import match_names
 
 RAY_STEP = 1e-5  # step in x/z for finite differences: about a hundredth of a pixel
@@ -110,13 +111,7 @@ def read_model(path: Path, photos: Iterable[str]) -> SparseModel:
     Raises:
         SplatpipeError: if it cannot be read or has no photo with a pose.
     """
-    try:
-        reconstruction = pycolmap.Reconstruction(str(path))
-    except Exception as error:  # pycolmap raises its C++ errors as several types
-        raise SplatpipeError(
-            f"The sparse model cannot be read: {' '.join(str(error).split())[:200]}",
-            "It must have cameras, images and points3D, as COLMAP writes them (.bin or .txt).",
-        ) from error
+    reconstruction = read_reconstruction(path)
     if not any(image.has_pose for image in reconstruction.images.values()):
         raise SplatpipeError("The sparse model has no photo with a pose.", "Reconstruct again, with more overlap.")
     return model_of(reconstruction, photos)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.text_lines import text_lines
 
 MAX_LINE_CHARS = 2000
 LARGEST = 1e9  # of a coordinate, metres or pixels: larger ones are neither on the earth nor in a photo
@@ -19,7 +20,7 @@ UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
 CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg)\s*[:=]\s*(\S.*)", re.IGNORECASE)
 GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "x/longitude")  # titles of x that name no other CRS
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 
 
 class LineError(ValueError):
@@ -60,7 +61,7 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
         raise SplatpipeError(f"{name} is not UTF-8 text.", "Save it as plain text in UTF-8.") from error
     except OSError as error:
         raise SplatpipeError(f"The {kind.what} {path} cannot be read: {error.strerror}.", "Check the path.") from error
-    lines = text.splitlines()
+    lines = text_lines(text)
     long = next(
         (at for at, line in enumerate(lines, 1) if len(line) > MAX_LINE_CHARS or CONTROL_CHARACTERS.search(line)), None
     )

@@ -16,6 +16,7 @@ import pycolmap
 
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.dataset import IMAGES, MASKS, MODEL, Points, View, load_points, load_views
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.handover import pose_in_world
@@ -34,8 +35,9 @@ def write_colmap(dataset: Path, frame: Frame, folder: Path) -> None:
 
     Raises:
         OSError: if it cannot be written.
+        SplatpipeError: if the dataset's model is broken.
     """
-    model = pycolmap.Reconstruction(dataset / MODEL)
+    model = read_reconstruction(dataset / MODEL)
     similarity = frame.world_from_model
     model.transform(
         pycolmap.Sim3d(float(similarity.scale), pycolmap.Rotation3d(similarity.rotation), similarity.translation)

@@ -15,6 +15,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
 
 BORDER_STEPS = 6  # rays along each side of an image, for its footprint
 GROUND_PERCENTILE = 5.0  # of the sparse points' heights: roofs and walls are above
@@ -113,10 +114,10 @@ def read_geometry(model_path: Path, frame_path: Path | None) -> Geometry:
         frame_path: `frame.json`; None leaves the model in its own frame.
 
     Raises:
-        OSError, ValueError, RuntimeError: if it is empty or any part cannot be read.
+        OSError, ValueError, SplatpipeError: if it is empty or any part cannot be read.
     """
     similarity = Similarity.from_matrix(np.eye(4)) if frame_path is None else _similarity(frame_path)
-    model = pycolmap.Reconstruction(str(model_path))
+    model = read_reconstruction(model_path)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     numbers = sorted(model.points3D)
     if not images or not numbers:

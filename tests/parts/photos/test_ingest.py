@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -32,6 +33,7 @@ from splatpipe.pipeline.photos.photo_list import (
     load_photo_list,
     photo_root,
 )
+from splatpipe.pipeline.photos.picture_file import LARGE_PIXELS
 from splatpipe.stages.ingest import run
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
@@ -384,7 +386,7 @@ def test_duplicates_are_left_out(folder: Path) -> None:
 
 
 def test_strange_names_work(folder: Path) -> None:
-    names = ["mit Leer zeichen.jpg", "фото №1.jpg", "写真/家.jpg", "two\nlines.jpg", "quote'\".jpg", "-rf.jpg", "ö.JPG"]
+    names = ["mit Leer zeichen.jpg", "фото №1.jpg", "写真/家.jpg", "quote'\".jpg", "-rf.jpg", "ö.JPG"]
     for seed, name in enumerate(names):
         save(folder / name, seed + 3)
     (Path(os.fsdecode(os.fsencode(folder) + b"/bad\xff.jpg"))).write_bytes((folder / "a.jpg").read_bytes())
@@ -393,6 +395,68 @@ def test_strange_names_work(folder: Path) -> None:
     assert np.abs(result.pixels("写真/家.jpg").astype(int) - picture(5)).max() <= JPEG_ERROR
     assert result.left_out == {"bad\\xff.jpg": "has a name that is not UTF-8: rename it"}
     assert all("\n" not in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("sign", ["\n", "\r", "\t", "\x1b", "\x85", "\u2028", "\u2029"])
+def test_names_with_control_characters_are_left_out_and_named(folder: Path, sign: str) -> None:
+    save(folder / f"x{sign}y" / "c.jpg", 3)
+    save(folder / f"d{sign}.jpg", 4)
+    result = ingest(folder)
+    assert set(result.photos) == {"a.jpg", "b.jpg"}
+    assert len(result.left_out) == 2
+    assert set(result.left_out.values()) == {"has a line break or another control character in its name: rename it"}
+    assert repr(sign)[1:-1] in result.warnings[0] and sign not in result.warnings[0]
+
+
+def test_a_photo_list_with_such_a_name_is_refused(folder: Path) -> None:
+    part = ingest(folder).out / "photos"
+    path = part / "photos.json"
+    path.write_text(path.read_text().replace("a.jpg", "a\\u2028.jpg"))
+    with pytest.raises(SplatpipeError, match=r"a\\u2028.jpg has a control character"):
+        load_photo_list(part)
+
+
+def hollow_png(path: Path, width: int, height: int, bits: int = 1, colour: int = 0) -> None:
+    """Write a PNG that claims this size; its pixels are missing, as nobody should get to them."""
+    head = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+    chunks = [(b"IHDR", head), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    packed = [struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(packed))
+
+
+@pytest.fixture
+def never_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail if a large picture is decoded."""
+    load = PngImageFile.load
+
+    def checked(picture: PngImageFile) -> object:
+        assert picture.width * picture.height <= LARGE_PIXELS
+        return load(picture)
+
+    monkeypatch.setattr(PngImageFile, "load", checked)
+
+
+@pytest.mark.usefixtures("never_large")
+@pytest.mark.parametrize(("bits", "colour"), [(1, 0), (16, 0), (8, 2), (16, 2)])
+def test_large_photos_without_content_are_refused_before_they_are_decoded(folder: Path, bits: int, colour: int) -> None:
+    hollow_png(folder / "c.png", 7000, 6000, bits, colour)
+    assert "claims 7000 × 6000 pixels in only" in ingest(folder).left_out["c.png"]
+
+
+@pytest.mark.usefixtures("never_large")
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [((7000, 7000), "another aspect ratio (7000 × 7000)"), ((8000, 6000), "far larger (8000 × 6000)")],
+)
+@pytest.mark.parametrize("bits", [1, 16])
+def test_large_masks_are_refused_before_they_are_decoded(
+    folder: Path, size: tuple[int, int], said: str, bits: int
+) -> None:
+    hollow_png(folder / "masks" / "a.jpg.png", *size, bits)
+    result = ingest(folder)
+    assert said in result.warnings[0]
+    assert result.photos["a.jpg"].mask is None
 
 
 def test_links_to_folders_are_named_and_not_followed(folder: Path) -> None:

@@ -29,6 +29,23 @@ def test_odm_list_gives_points_with_their_marks(tmp_path: Path, crs: str) -> Non
     assert found.points[0].role is None
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r\r\n", "\r"])  # also as a spreadsheet on a Mac saves it
+def test_every_systems_line_ends_are_read(tmp_path: Path, end: str) -> None:
+    found = read(tmp_path, end.join(["EPSG:32633", "1 2 3 10 20 A.JPG P1", "4 5 6 10 20 B.JPG P2", ""]))
+    assert [(point.name, point.marks[0].photo) for point in found.points] == [("P1", "A.JPG"), ("P2", "B.JPG")]
+
+
+@pytest.mark.parametrize("sign", ["\x85", "\u2028", "\u2029"])
+def test_lines_end_at_line_feeds_only(tmp_path: Path, sign: str) -> None:
+    found = read(tmp_path, f"EPSG:32633\n1\t2\t3\t10\t20\tA{sign}B.JPG\tP1\n4\t5\t6\t10\t20\tB.JPG\tP2\n")
+    assert [(point.name, point.marks[0].photo) for point in found.points] == [("P1", f"A{sign}B.JPG"), ("P2", "B.JPG")]
+
+
+def test_a_lone_carriage_return_within_a_line_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SplatpipeError, match="no plain text in line 2"):
+        read(tmp_path, "EPSG:32633\n1 2 3 10 20 A.JPG P1\r4 5 6 10 20 B.JPG P2\n")
+
+
 def test_lines_without_names_are_distinguished_by_their_coordinates(tmp_path: Path) -> None:
     found = read(tmp_path, "EPSG:32633\n1 2 3 10 20 A.JPG\n4 5 6 10 20 A.JPG\n1 2 3 11 21 B.JPG\n")
     assert [(point.name, len(point.marks)) for point in found.points] == [("point 1", 2), ("point 2", 1)]

@@ -1,0 +1,81 @@
+"""The one way to open and decode a user's picture, whose size is not to be trusted: a few kB can claim 500 megapixels.
+
+Everybody asks ``why_hollow`` or compares the size that the header states before any pixel is decoded, and large
+pictures are decoded one at a time in a process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from contextlib import AbstractContextManager
+from typing import Any
+
+from PIL import Image
+
+# Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
+PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
+LARGE_PIXELS = 40_000_000  # larger images are decoded one at a time: some hundred megabytes each
+LEAST_BYTES = (
+    0.01  # of a large photo's file per pixel; the smoothest sky in a JPEG of quality 10 takes three times that
+)
+STRIP_ROWS = 256  # of a picture, converted at a time
+INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+_one_large_at_a_time = threading.RLock()
+
+
+def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
+    """Open a JPEG, PNG or TIFF by its content, without Pillow's own size limit.
+
+    Args:
+        source: A path or a binary file object.
+        max_pixels: Refuse an image with more pixels before any of them is decoded.
+
+    Raises:
+        ValueError: if it has more than ``max_pixels`` pixels.
+        OSError: if it is not such an image (Pillow's ``UnidentifiedImageError`` is one).
+    """
+    Image.MAX_IMAGE_PIXELS = None  # Pillow's limit is process-wide and refuses 200 MP panoramas; ours is checked below
+    picture = Image.open(source, formats=PHOTO_FORMATS)
+    if max_pixels is not None and picture.width * picture.height > max_pixels:
+        raise ValueError(f"it has {picture.width} × {picture.height} pixels")
+    return picture
+
+
+def why_hollow(picture: Image.Image, file_bytes: int) -> str:
+    """Why an opened image cannot be a photo: its file is too small for its size; empty if it can be one."""
+    pixels = picture.width * picture.height
+    if pixels <= LARGE_PIXELS or file_bytes >= LEAST_BYTES * pixels:
+        return ""
+    return f"claims {picture.width} × {picture.height} pixels in only {file_bytes / 1e3:,.0f} kB: it is no photo"
+
+
+def turn_to_decode(pixels: int) -> AbstractContextManager[object]:
+    """Wait until no other thread of this process decodes a large picture, if this is one."""
+    return _one_large_at_a_time if pixels > LARGE_PIXELS else contextlib.nullcontext()
+
+
+def load_stored(picture: Image.Image, orientation: int) -> Image.Image:
+    """Decode an opened image in full, in the stored grid.
+
+    Args:
+        picture: From ``open_picture``, not yet loaded.
+        orientation: Its EXIF orientation, 1 to 8.
+    """
+    picture.load()
+    # Pillow applies the orientation while loading a TIFF, but for no other format.
+    return undo_orientation(picture, orientation) if picture.format == "TIFF" else picture
+
+
+def undo_orientation(picture: Image.Image, orientation: int) -> Image.Image:
+    """Convert an image to which an EXIF orientation (1 to 8) was applied back to the stored grid."""
+    method = INVERSE_ORIENTATION.get(orientation)
+    return picture if method is None else picture.transpose(method)

@@ -1,0 +1,36 @@
+"""What must be done in one place, since files of others are read there, is done nowhere else."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+COPIES = ("model", "reconstruction", "self.model")  # names of models in memory
+
+
+def calls(name: str) -> Iterator[tuple[str, ast.Call]]:
+    """Calls of a function like ``module.function``, and the files they are in."""
+    for path in sorted([*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/**/*.py")]):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == name:
+                yield str(path.relative_to(ROOT)), node
+
+
+def test_colmap_models_are_read_after_a_check() -> None:
+    read = {
+        path for path, call in calls("pycolmap.Reconstruction") if call.args and ast.unparse(call.args[0]) not in COPIES
+    }
+    assert read == {"pipeline/photos/colmap_reconstruction.py", "pipeline/sfm/sparse_model.py"}  # which just wrote it
+
+
+def test_pictures_of_users_are_opened_in_one_place() -> None:
+    assert {path for path, _ in calls("Image.open")} == {
+        "pipeline/photos/picture_file.py",
+        "pipeline/app/preflight/sizing.py",  # reads headers only
+        "pipeline/splat/formats/lossless_pictures.py",  # has limits of its own
+    }
+
+
+def test_files_of_users_are_split_at_line_feeds() -> None:
+    split = {path for path, call in calls("text.splitlines")}
+    assert split <= {"pipeline/engine/machine.py", "pipeline/app/batch/snakemake_process.py"}  # the kernel's; a log
