@@ -83,7 +83,7 @@ def relation_of(
 
     Directions that differ turn the same way as the stated ones (``same``), or the other way (``mirrored``). Strips to
     and fro in two opposite directions do either; then only whether they are ``ahead`` or ``backwards`` is known. None
-    where there is no relation.
+    where there is no relation, or one direction only.
 
     Args:
         found: Unit vectors, east + i north.
@@ -99,6 +99,8 @@ def relation_of(
         return None, 0.0
     if mirrored <= SCATTERED:
         return "same", angle
+    if abs(stated.mean()) >= ALIGNED:  # one direction, in which one may as well fly backwards
+        return None, angle
     if abs(angle) >= BACKWARDS_RAD:
         return "backwards", angle
     return ("ahead" if abs(angle) <= AHEAD_RAD else None), angle
