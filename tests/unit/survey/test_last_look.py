@@ -1,12 +1,16 @@
 """What a result is held against before the verdict: wrong places are named, and what is known stops the clearest."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from odd_sites import ALPS, Outcome, Site, joined, orbit, place, strips
+from odd_sites import ALPS, Outcome, Site, Warnings, joined, orbit, place, strips
 
+from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.last_look import report_contradictions
 
 MINNESOTA = Origin(46.84, -91.99, 199.0)
 BARE = ("place",)
@@ -45,6 +49,18 @@ def test_a_mirrored_survey_of_which_only_the_headings_are_known_stops(heading: f
 def test_a_mirrored_survey_without_any_angle_is_the_first_line() -> None:
     found = signed(strips(90.0), longitude=-1.0, tags=BARE)
     assert found.stopped == "" and "upside down or mirrored" in found.says
+
+
+def test_control_that_turns_the_model_upside_down_stops() -> None:
+    placed = place(orbit()).placed
+    assert placed is not None
+    overturned = Similarity(1.0, np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    frame = replace(placed.frame, world_from_model=overturned.compose(placed.world_from_model))
+    turned = replace(placed, frame=frame)
+    control = SimpleNamespace(survey=SimpleNamespace(name="gcp_list.txt"))
+    object.__setattr__(turned, "controlled", control)  # past the types that tests check: only the name is read
+    with pytest.raises(SplatpipeError, match=r"control of gcp_list.txt places the model upside down or mirrored"):
+        report_contradictions(turned, Warnings())
 
 
 def test_positions_of_the_photo_before_are_named() -> None:
