@@ -17,8 +17,8 @@ MIN_STEPS = 6  # fewer agree by chance
 MIN_STEP_M = 3.0  # receivers err by less from one photo to the next
 STEADY_COSINE = math.cos(math.radians(20.0))  # of the headings at both ends: no turn in between
 ALIGNED, SCATTERED = 0.9, 0.7  # length of the mean of headings' differences as unit vectors: they agree, or do not
-AHEAD_RAD, BACKWARDS_RAD = math.radians(45.0), math.radians(110.0)  # sideways is 90°
-Relation = Literal["same", "ahead", "backwards", "mirrored"]
+AHEAD_RAD, ASKEW_RAD, BACKWARDS_RAD = (math.radians(angle) for angle in (45.0, 75.0, 110.0))  # sideways is 90°
+Relation = Literal["same", "ahead", "askew", "backwards", "mirrored"]
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,9 @@ def relation_of(
     """How directions relate to stated ones, and by what angle (radians, counter-clockwise) they are turned.
 
     Directions that differ turn the same way as the stated ones (``same``), or the other way (``mirrored``). Strips to
-    and fro in two opposite directions do either; then only whether they are ``ahead`` or ``backwards`` is known. None
-    where there is no relation, or one direction only.
+    and fro in two opposite directions do either; then only the angle is known: ``ahead``, ``askew`` (mirrored strips
+    are turned by twice their heading; wind is not on the same side of both directions), ``backwards``. None where there
+    is no relation, or one direction only, or sideways.
 
     Args:
         found: Unit vectors, east + i north.
@@ -103,7 +104,9 @@ def relation_of(
         return None, angle
     if abs(angle) >= BACKWARDS_RAD:
         return "backwards", angle
-    return ("ahead" if abs(angle) <= AHEAD_RAD else None), angle
+    if abs(angle) <= AHEAD_RAD:
+        return "ahead", angle
+    return ("askew" if abs(angle) <= ASKEW_RAD else None), angle
 
 
 def flying_relation(

@@ -27,7 +27,7 @@ from splatpipe.pipeline.survey.level import Positions, gimbal_rotation
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.position_lag import position_lag
 from splatpipe.pipeline.survey.position_sources import ALTITUDE_BOUNDS_M, MOST_DATUMS_M
-from splatpipe.pipeline.survey.up_witnesses import check_up, values_of
+from splatpipe.pipeline.survey.up_witnesses import FLYING, check_up, values_of
 
 TURNED_RAD = math.radians(45.0)  # from the gimbal's north: compasses, declinations and conventions differ by less
 HALF_TURN_RAD = math.radians(150.0)
@@ -118,7 +118,12 @@ def _up(placed: Placed) -> Iterator[Contradiction]:
             "Check the order and the signs of its coordinates (east first), and that names and marks match. "
             "--set georef.control=none runs without control.",
         )
-    if verdict.doubtful:
+    if verdict.doubtful and verdict.against == (FLYING,):
+        yield Contradiction(
+            "The flight in the result leads against the aircraft's headings: the positions look turned or mirrored.",
+            "Check the signs of latitude and longitude (S and W), and their order.",
+        )
+    elif verdict.doubtful:
         yield Contradiction(
             f"The model may be placed upside down or mirrored: {verdict.sentence()}.",
             "Check the signs of latitude and longitude (W and S), and that up is up in the result.",

@@ -19,6 +19,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.geometry.upright import camera_axes
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.flight_steps import (
+    FlightSteps,
     Relation,
     flying_relation,
     heading_vectors,
@@ -34,6 +35,7 @@ LEVEL_SINE = np.sin(np.radians(15.0))  # views and edges that are closer to leve
 FLYING_M = 5.0  # above take-off: the ground is below, whatever is being photographed
 ABOVE_SHARE = 0.95  # of the points above flying cameras: no ground is among them
 VERTICAL = 0.9  # of the mean view, whose length is less where views differ
+FLYING = "the direction of flight against the headings"
 STOPPING = 2  # witnesses against a placement
 
 
@@ -115,7 +117,7 @@ def up_witnesses(
         _by_photos("the pictures' upper edges", (up[:, 2] < 0.0)[edges]),
         _by_heading(right, yaw),
         _by_ground(placed, model, height, forward),
-        _by_flying(flying_relation(placed.apply(model.centres), nose if np.isfinite(nose).any() else gimbal, steps)[0]),
+        _by_flying(_flying(placed.apply(model.centres), nose, gimbal, steps)),
     ]
     return [witness for witness in found if witness is not None]
 
@@ -150,15 +152,28 @@ def _by_heading(right: Float64[np.ndarray, "n 3"], yaw_deg: Float64[np.ndarray, 
     return Witness("the gimbal's headings", relation == "mirrored", of_gimbal=True)
 
 
+def _flying(
+    places: Float64[np.ndarray, "n 3"],
+    nose_deg: Float64[np.ndarray, " n"],
+    gimbal_deg: Float64[np.ndarray, " n"],
+    steps: FlightSteps,
+) -> Relation | None:
+    """How the flight leads, by the nose or, without, by the camera, which may look askew in a sound flight."""
+    if np.isfinite(nose_deg).any():
+        return flying_relation(places, nose_deg, steps)[0]
+    relation, _ = flying_relation(places, gimbal_deg, steps)
+    return None if relation == "askew" else relation
+
+
 def _by_flying(relation: Relation | None) -> Witness | None:
     """The aircraft flies where its nose points, or always at the same angle to it; mirrored, it turns the other way.
 
     Strips to and fro do not turn. Those that lead ahead say nothing: mirrored along their own axis, they lead ahead,
     too.
     """
-    if relation not in ("same", "mirrored", "backwards"):
+    if relation not in ("same", "mirrored", "backwards", "askew"):
         return None
-    return Witness("the direction of flight against the headings", relation != "same")
+    return Witness(FLYING, relation != "same")
 
 
 def _by_ground(

@@ -34,16 +34,23 @@ def test_both_signs_missing_turn_the_result_and_the_headings_tell() -> None:
     assert "S and W" in found.says
 
 
-@pytest.mark.parametrize("heading", [90.0, 60.0])
+@pytest.mark.parametrize("heading", [30.0, 90.0, 60.0])
 def test_a_mirrored_survey_of_which_only_the_headings_are_known_stops(heading: float) -> None:
     """The ground's side is one witness; the direction of flight against the headings is the second."""
     site = replace(strips(heading, height=50.0), place=MINNESOTA, tags=("nose", "place"))
-    if heading != 90.0:  # strips to and fro do not turn: another flight across makes them
+    if heading == 60.0:  # strips to and fro do not turn: another flight across makes them
         site = replace(joined(site, strips(heading + 50.0)), place=MINNESOTA, tags=("nose", "place"))
     assert place(site).says == place(site).stopped == ""
     found = signed(site, longitude=-1.0)
     assert "upside down or mirrored" in found.stopped and "direction of flight" in found.stopped
-    assert "mirrored" in found.issues["position-mirrored"]
+    assert ("position-mirrored" in found.issues) == (
+        heading != 30.0
+    )  # 60° askew is a contradiction with the ground only
+
+
+def test_both_signs_missing_are_told_by_the_flight_if_the_gimbal_says_nothing() -> None:
+    found = signed(replace(strips(30.0), place=Origin(-34.6, -58.4, 20.0)), -1.0, -1.0, tags=("nose", "place"))
+    assert "against the aircraft's headings" in found.says and "position-mirrored" in found.issues
 
 
 def test_a_mirrored_survey_without_any_angle_is_the_first_line() -> None:
