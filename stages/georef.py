@@ -5,7 +5,7 @@ cameras are held. The model is copied byte for byte unless the adjustment with c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,7 @@ from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame, Undetermined, save_frame
 from splatpipe.pipeline.survey.georef_input import GeorefInput
 from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit, report_frame
+from splatpipe.pipeline.survey.last_look import Placed, report_contradictions
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of
 from splatpipe.pipeline.survey.model import SparseModel, copy_model, model_of, read_model
@@ -101,6 +102,7 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
             report.warning(
                 f"Control cannot georeference the model: {error}.", "Mark more control points, each in several photos."
             )
+    alone = frame if isinstance(frame, Frame) else None
     if controlled is not None:
         frame = controlled.frame
         scale = scale_by(targets.wanted.bars, controlled.bar_ends) or scale
@@ -126,6 +128,9 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     if found is not None and controlled is None:
         frame = with_adjustment(frame, adjustment)
         accuracy["uncertainty"] = frame.residuals["uncertainty"]
+    contradictions = report_contradictions(
+        Placed(frame, controlled.placed.model if controlled else model, positions, photos, controlled, alone), report
+    )
     save_frame(frame, out / "frame.json")
     accuracy |= scale_json(targets.wanted.bars, scale, frame)
     for name, value in (("control.json", control), ("accuracy.json", accuracy)):
@@ -137,7 +142,8 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     else:
         copy_model(source, out / "sparse" / "0", may_link=inputs.photos_dir not in source.parents)
     report.progress(3, 3, "fitting the control", "steps")
-    return {**_summary(frame, controlled, accuracy), **scale_summary(scale), **bounded}
+    doubts = {"contradictions": [asdict(each) for each in contradictions]} if contradictions else {}
+    return {**_summary(frame, controlled, accuracy), **doubts, **scale_summary(scale), **bounded}
 
 
 def _survey(

@@ -32,7 +32,6 @@ from splatpipe.pipeline.photos.photo_list import (
     photo_root,
     save_photo_list,
 )
-from splatpipe.pipeline.photos.position_outliers import FAR_M, median_distance_m
 from splatpipe.pipeline.photos.preparation import (
     MASKS,
     SKIES,
@@ -48,8 +47,8 @@ from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
 from splatpipe.pipeline.survey.position_issues import find_position_issues
-from splatpipe.pipeline.survey.position_sources import is_on_earth
-from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
+from splatpipe.pipeline.survey.position_sources import stated_places
+from splatpipe.pipeline.survey.stated_positions import FilePlaces, read_places
 
 MIN_PHOTOS = 2
 
@@ -80,8 +79,8 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         masked = prepare_masks(MASKS, root, photos, others, opacity, work)
         skies = prepare_masks(SKIES, root, photos, others, {}, work)
     places = _places(inputs, photos, report)
-    positions = read_positions(photos, places)
-    for issue in find_position_issues(photos, positions):
+    positions = read_positions(photos, places.by_name)
+    for issue in find_position_issues(photos, positions, places.better):
         if issue.severity == "warning":
             report.warning(issue.message, issue.hint)
     described = describe_cameras(photos, groups, camera_of)
@@ -169,13 +168,13 @@ def _lenses(
     return state_lenses(groups, members, path if path.is_file() else None, report)
 
 
-def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) -> Mapping[str, FilePlace]:
-    """Return the positions from the position file by photo name; empty without a file."""
+def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) -> FilePlaces:
+    """Return the positions from the position file; empty without a file."""
     path = inputs["source.geo"]
     if not path.is_file():
-        return {}
+        return FilePlaces({}, (), "")
     approximate = bool(inputs.settings.get("georef.approximate_crs", False))
-    places = read_places(path, [photo.name for photo in photos], approximate=approximate)
+    places = read_places(path, [photo.name for photo in photos], stated_places(photos), approximate=approximate)
     report.note(f"{path.name}: positions of {len(places.by_name)} of {len(photos)} photos, in {places.note}.")
     if places.unknown:
         report.warning(
@@ -188,17 +187,7 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
             f"{path.name} does not name {list_names(others)}: their own positions are used, as a separate flight.",
             "Add better positions for them to the file, if you have any.",
         )
-    both = [(places.by_name[photo.name], photo.exif.gps) for photo in photos if photo.name in places.by_name]
-    known = [(place, gps) for place, gps in both if gps is not None and is_on_earth(gps.latitude, gps.longitude)]
-    apart = median_distance_m(
-        [(place.latitude, place.longitude) for place, _ in known], [(gps.latitude, gps.longitude) for _, gps in known]
-    )
-    if apart > FAR_M:
-        report.warning(
-            f"{path.name} places the photos {apart / 1000.0:,.1f} km from their own positions.",
-            "Check its CRS (the zone, too), and that east or longitude comes first; or set ingest.positions=none.",
-        )
-    return places.by_name
+    return places
 
 
 def _accuracy(positions: PositionList) -> dict[str, JSON]:

@@ -23,6 +23,7 @@ from splatpipe.pipeline.surface.ground_scale import ground_metres
 from splatpipe.pipeline.surface.map_crs import MapCrs
 from splatpipe.pipeline.surface.surface_file import SurfaceFile
 from splatpipe.pipeline.surface.tiles import Tile, tiled
+from splatpipe.pipeline.survey.boundary import DIRECTIONS
 
 WINDOW = 1024  # cells per side
 PARTS = 5  # subdivisions of a cell's side, for the share inside of a cell that the outline crosses
@@ -137,6 +138,7 @@ def measure_volume(
     ground = _Ground(surface, PlanArea.seen_from_above(rings), ground_metres(crs), crs.height_unit_m)
     if not sum(_lengths(ring)[-1] for ring in ground.rings()) <= MAX_RIM * RIM_CELLS * surface.cell:
         raise SplatpipeError("The polygon's outline is far too long.", "Check its coordinates and its CRS.")
+    _require_near(ground)
     plane = _base(ground, base, datum_sigma_m)
     sums = _CutFillSums.zero()
     for part in _windows(ground):
@@ -147,6 +149,29 @@ def measure_volume(
     cut, fill = (_amount(sums, plane, side) for side in (0, 1))
     net = Amount(cut.m3 - fill.m3, _sigma(float(sums.noise.sum()), sums.lever[0] + sums.lever[1], plane))
     return Volume(plane, whole_m2, min(sums.known_m2, whole_m2), cut, fill, net)
+
+
+def _require_near(ground: _Ground) -> None:
+    """Reject a polygon that lies beside the surface model.
+
+    Raises:
+        SplatpipeError: if no part of its bounding box is on the raster; says how far away it is.
+    """
+    lattice, vertices = ground.surface.lattice, np.concatenate(ground.rings())
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    east, north = lattice.east_m, lattice.north_m  # in the CRS's unit
+    first = np.array([east, north - lattice.height * lattice.cell_m])
+    last = np.array([east + lattice.width * lattice.cell_m, north])
+    beside = np.maximum(0.0, np.maximum(first - high, low - last)) * np.where(low > last, 1.0, -1.0) * ground.plan_m
+    away = float(np.hypot(*beside))
+    if away == 0.0:
+        return
+    direction = DIRECTIONS[round(math.atan2(beside[1], beside[0]) / (math.pi / 4.0)) % 8]
+    distance = f"{away / 1000.0:,.1f} km" if away >= 1000.0 else f"{away:,.0f} m"
+    raise SplatpipeError(
+        f"The polygon lies {distance} {direction} of the surface model.",
+        "Check its CRS (GeoJSON without one is in degrees of WGS 84), and that longitude or easting comes first.",
+    )
 
 
 def _in_crs(ring: Ring, crs: MapCrs) -> Ring:

@@ -29,7 +29,7 @@ from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.surveyed_points import Survey
 
-DATUM_M = 20.0  # a larger horizontal offset from the positions (and DATUM_SIGMAS) means another datum
+DATUM_M = 20.0  # a larger height offset from the positions (and DATUM_SIGMAS) means another datum
 DATUM_SIGMAS = 5.0
 EXACT_M = 0.5  # sigma of positions that also tell a pole's length and another base station
 EXACT_DATUM_M = 0.3  # least offset from them that is worth a word
@@ -149,37 +149,14 @@ def is_off(
     return studentised(residual, sigmas, known) > critical(fit.degrees) and float(np.linalg.norm(residual)) > least_m
 
 
-def warn_of_datum_offset(fit: JointFit, survey: Survey, stations: Stations, report: Reporter) -> None:
-    """Warn if the control is offset from the positions by more than their accuracy allows."""
-    if len(stations) == 0:
-        return
-    shift = np.hypot(fit.offsets[:, 0], fit.offsets[:, 1])
-    sigma = float(np.median(stations.sigmas[:, 0]))
-    if float(shift.min()) > max(DATUM_M, DATUM_SIGMAS * sigma):
-        report.warning(
-            f"The control of {survey.name} lies {shift.min():.0f} m horizontally off the photos' positions.",
-            f"Check that {survey.crs.text} is its CRS and datum. The georeference follows the control.",
-        )
-    lift = fit.offsets[:, 2]
-    heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
-    if heights:
-        _tell_heights_apart(lift, survey, stations, report)
-    if heights and float(np.abs(lift).min()) > DATUMS_APART_M:
-        report.warning(
-            f"The heights of {survey.name} lie {abs(lift[0]):.0f} m {'below' if lift[0] > 0 else 'above'} the photos'"
-            " positions, more than vertical datums can differ.",
-            "Check whether they are in feet, or relative to a local benchmark. The georeference follows the control.",
-        )
-
-
-def _tell_heights_apart(lift: Float64[np.ndarray, " k"], survey: Survey, stations: Stations, report: Reporter) -> None:
+def tell_heights_apart(fit: JointFit, survey: Survey, stations: Stations, report: Reporter) -> None:
     """Tell of heights that differ from the positions' as a pole's length, or a geoid from an ellipsoid, does.
 
     Neither can be tested: no other height is known. So they are named as possible.
-
-    Args:
-        lift: Of each flight's positions above the control's heights, metres.
     """
+    if len(stations) == 0 or not stations.absolute or all(p.surveyed.z is None for p in survey.of_role("control")):
+        return
+    lift = fit.offsets[:, 2]  # of each flight's positions above the control's heights
     above = -float(lift[np.abs(lift).argmin()])
     sigma = float(np.median(stations.sigmas[:, 2]))
     side = "above" if above > 0.0 else "below"

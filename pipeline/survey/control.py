@@ -31,7 +31,7 @@ from splatpipe.pipeline.survey.blunders import (
     name_blunders,
     require_near,
     require_shape,
-    warn_of_datum_offset,
+    tell_heights_apart,
     warn_of_weak_control,
 )
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
@@ -135,7 +135,7 @@ def place_by_control(
     fit = fit_jointly(start[0], observed, start[1])
     require_fit(fit, observed, survey)
     factor = fit.noise if fit.noise > QUIET else 1.0
-    warn_of_datum_offset(fit, survey, stations, report)
+    tell_heights_apart(fit, survey, stations, report)
     warn_of_weak_control(fit, observed, model, report)
     placed = GeoreferencedModel(model, fit.similarity, fit.offsets)
     result = ControlResult(_frame(frame, survey, site, fit, config), survey, site, placed, None, None, factor)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.survey.crs import Crs, parse_crs, utm_of
 from splatpipe.pipeline.survey.geodesy import ecef_from_geodetic
-from splatpipe.pipeline.survey.readings import Evidence, Reading, plausible
+from splatpipe.pipeline.survey.readings import TIMES_LESS, Evidence, Reading, plausible
 
 FAR_M = 2000.0  # from the photos; control that they show must be nearer
 ZONE = 1e6  # what a zone number in front of an easting counts
@@ -44,6 +44,9 @@ def nearer_reading(stated: Plane, crs: Crs, positions: Float64[np.ndarray, "m 3"
     """
     if len(stated) == 0:
         return ""
+    as_stated = _evidence(stated, crs, positions)
+    if as_stated.share >= TIMES_LESS:  # no reading explains more than all
+        return ""
     texts, place = [crs.text], None
     if len(positions):
         place = np.median(positions, axis=0)
@@ -63,7 +66,7 @@ def nearer_reading(stated: Plane, crs: Crs, positions: Float64[np.ndarray, "m 3"
                 candidates.append((each.changes + other, how, _evidence(each.xy, read, positions)))
     candidates.sort(key=lambda candidate: candidate[0])
     readings = ((Reading(how, ""), evidence) for _, how, evidence in candidates)
-    found = plausible(_evidence(stated, crs, positions), readings, least=1)
+    found = plausible(as_stated, readings, least=1)
     if found is None:
         return ""
     match = "match the photos' positions" if len(positions) else f"lie where {crs.text} is used"

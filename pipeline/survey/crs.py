@@ -48,6 +48,7 @@ __all__ = [
     "from_geodetic",
     "geodetic_by",
     "open_operation",
+    "outside_area_km",
     "parse_crs",
     "parse_vertical",
     "same_datum",
@@ -287,6 +288,11 @@ def _require_near(crs: Crs, latitude: float, longitude: float, most_km: float = 
             raise SplatpipeError(
                 f"{place} is in another part of the earth, where {crs.text} is not true to scale.", hint
             )
+
+
+def outside_area_km(crs: Crs, latitude: float, longitude: float) -> float:
+    """Distance from a place to a CRS's area of use; 0 inside, and where no area is stated."""
+    return 0.0 if crs.area is None else _outside_km(crs.area, latitude, longitude)
 
 
 def usable_for_maps(crs: Crs) -> bool:

@@ -94,7 +94,7 @@ def georeference(
         except np.linalg.LinAlgError as error:
             raise FrameUndeterminedError("the photo positions determine neither scale nor rotation") from error
         require_determined(fit, points)
-        _require_upright(check_up(fit.noisy.similarity, model, positions))
+        _require_upright(check_up(fit.noisy.similarity, model, positions, photos))
     except FrameUndeterminedError:
         _require_unswapped(points, geodetic, limit, noise)
         raise
@@ -233,12 +233,6 @@ def report_frame(frame: Frame, model: SparseModel, positions: Positions, report:
             f"{list_names(frame.left_out)}.",
             "The photos themselves are used.",
         )
-    up = check_up(frame.world_from_model, model, positions)
-    if up.doubtful:
-        report.warning(
-            f"The model may be placed upside down or mirrored: {up.sentence()}.",
-            "Check the signs of latitude and longitude (W and S), and that up is up in the result.",
-        )
     heights = _heights(frame, model, positions)
     if heights is not None and abs(heights[0] / heights[1] - 1.0) > HEIGHT_TOLERANCE:
         report.warning(
@@ -314,6 +308,6 @@ def read_positions(path: Path) -> Positions:
     try:
         value = read_json(path)
         by_name = {record["name"]: record for record in value["positions"]}
-        return Positions(by_name, value.get("orientations", {}), value.get("wrong", {}))
+        return Positions(by_name, value.get("orientations", {}), value.get("wrong", {}), value.get("elsewhere", {}))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatpipeError(f"The positions {path} cannot be read: {error}", "Run with --rerun ingest.") from error

@@ -39,11 +39,13 @@ class Positions:
         by_name: Records by photo name.
         orientations: EXIF orientations by photo name where they are not 1.
         wrong: Why a photo's position is unusable, by photo name.
+        elsewhere: Metres by which other statements of the positions lie off those used, by source; where they do.
     """
 
     by_name: Mapping[str, Mapping[str, Any]]
     orientations: Mapping[str, int]
     wrong: Mapping[str, str] = field(default_factory=dict)
+    elsewhere: Mapping[str, float] = field(default_factory=dict)
 
 
 def arbitrary_frame(model: SparseModel, positions: Positions, reason: str) -> Frame:

@@ -13,6 +13,7 @@ from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrio
 from splatpipe.pipeline.geometry.joint_fit import JointFit, JointObservations, Priors
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.geometry.upright import rotation_to_up
+from splatpipe.pipeline.survey.assumed_heights import ASSUMED
 from splatpipe.pipeline.survey.crs import to_geodetic
 from splatpipe.pipeline.survey.fitting import MIN_POSITIONS, FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame
@@ -43,6 +44,7 @@ class Stations:
         sigmas: Standard deviations of east, north, up, metres.
         group: Index of the flight.
         flights: Their numbers, by that index.
+        absolute: Whether their heights are above a datum; else above take-off, or assumed.
     """
 
     names: tuple[str, ...]
@@ -51,6 +53,7 @@ class Stations:
     sigmas: Float64[np.ndarray, "n 3"]
     group: Int64[np.ndarray, " n"]
     flights: tuple[int, ...]
+    absolute: bool = True
 
     def __len__(self) -> int:
         return len(self.names)
@@ -114,6 +117,7 @@ def stations_of(model: SparseModel, positions: Positions, frame: Frame | None) -
         np.array(sigmas, dtype=np.float64).reshape(-1, 3) * worse[[0, 0, 1]],
         np.array([flights.index(int(r.get("flight", 0))) for _, _, r in rows], dtype=np.int64),
         tuple(flights),
+        all(record.get("altitude_source", "") not in ("takeoff", ASSUMED) for _, _, record in rows),
     )
 
 

@@ -10,7 +10,7 @@ from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.control_file import SurveyedPoint
 from splatpipe.pipeline.survey.located_points import Sighting, SurveyPoint, locate
 from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.readings import MIN_WITNESSES, Evidence, Reading, plausible
+from splatpipe.pipeline.survey.readings import MIN_CONTRADICTING, Evidence, Reading, plausible
 
 MOST_DISAGREE = 0.5  # of the marks that can contradict: where fewer agree, those that do agree by chance
 MAX_POINTS, MAX_MARKS = 12, 8  # of each point, that other readings are tried on: half a second each
@@ -139,7 +139,8 @@ def require_agreement(
 ) -> None:
     """Refuse a file most of whose marks contradict each other.
 
-    The few that agree do so by chance, and would place the model with the accuracy of a survey.
+    The few that agree do so by chance, and would place the model with the accuracy of a survey. Three points of three
+    marks each, of which none agrees with the other two, are refused, too; their number names no cause.
 
     Args:
         name: Of the file.
@@ -153,14 +154,14 @@ def require_agreement(
         SplatpipeError: if they do; the hint names the convention that explains them, if one does.
     """
     found = _sum([_witnesses(point, len(_posed(point.sightings))) for point in located])
-    if found.of < MIN_WITNESSES or found.share >= MOST_DISAGREE:
+    if found.of < MIN_CONTRADICTING or found.share >= MOST_DISAGREE:
         return
     off = sum(1 for point in located for each in _posed(point.sightings) if point.found is None or not each.agrees)
     count = sum(len(_posed(point.sightings)) for point in located)
     cause = named_reading(marks, model, photos, mark_sigma_px)
     hint = (
-        "Are they of these photos, and each of the point that it names? Marks made roughly:"
-        " --set georef.mark_sigma_px=3."
+        "Are they of these photos, and each of the point that it names? Pixel columns count from the left, rows from"
+        " the top. Marks made roughly: --set georef.mark_sigma_px=3."
         if cause is None
         else sentence_of(*cause)
     )

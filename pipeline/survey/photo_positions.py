@@ -7,7 +7,6 @@ the ``Camera:`` tags. Accuracies are from the file, then XMP, then EXIF, else th
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -20,11 +19,13 @@ from splatpipe.pipeline.photos.camera_angles import Convention, detect_conventio
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import Gps
 from splatpipe.pipeline.photos.names import printable
-from splatpipe.pipeline.photos.position_outliers import find_misplaced
+from splatpipe.pipeline.photos.position_outliers import find_misplaced, median_distance_m
 from splatpipe.pipeline.photos.xmp import xmp_number
 from splatpipe.pipeline.survey.crs_names import ELLIPSOIDAL, UNKNOWN, parse_vertical
+from splatpipe.pipeline.survey.flight_steps import seconds_of
 from splatpipe.pipeline.survey.flights import Stamp, assign_flights
 from splatpipe.pipeline.survey.position_sources import (
+    ELSEWHERE_M,
     MIN_REPEATED,
     SourceDoubts,
     exif_altitude,
@@ -108,6 +109,8 @@ class PositionList:
         altitude_step_m: Median of EXIF's altitude less XMP's where both are given, else None.
         orientations: EXIF orientation of every photo where it is not 1, by name.
         doubts: Where EXIF was not read as it stands.
+        elsewhere: Median distance in metres between the positions and those of a source (``exif``, ``xmp``) that is not
+            used, where it is too large for a correction.
     """
 
     positions: tuple[Position, ...]
@@ -115,6 +118,7 @@ class PositionList:
     altitude_step_m: float | None
     orientations: Mapping[str, int]
     doubts: SourceDoubts = field(default_factory=SourceDoubts)
+    elsewhere: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def impossible(self) -> tuple[str, ...]:
@@ -133,18 +137,22 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
     stamps: list[Stamp] = []
     wrong: dict[str, str] = {}
     steps: list[float] = []
+    others: dict[str, list[tuple[Gps, Gps]]] = {"exif": [], "xmp": []}
     conventions = _conventions(photos)
     photos, doubts = settle_sources(photos)
     for photo in photos:
         place = (places or {}).get(photo.name)
-        stated = [gps for gps in (_file_gps(place), photo.exif.gps, xmp_place(photo.xmp)) if gps and not gps.void]
-        good = [gps for gps in stated if is_on_earth(gps.latitude, gps.longitude)]
+        sources = {"file": _file_gps(place), "exif": photo.exif.gps, "xmp": xmp_place(photo.xmp)}
+        stated = {source: gps for source, gps in sources.items() if gps is not None and not gps.void}
+        good = {source: gps for source, gps in stated.items() if is_on_earth(gps.latitude, gps.longitude)}
         if stated and not good:
             wrong[photo.name] = NOWHERE
         if not good:
             continue
-        source = "file" if place is not None else "exif" if good[0] is photo.exif.gps else "xmp"
-        position = _position(photo, good[0], source, place)
+        source, gps = next(iter(good.items()))
+        position = _position(photo, gps, source, place)
+        for other in others.keys() & good.keys() - {source}:
+            others[other].append((gps, good[other]))
         yaw, pitch, roll = _angles(photo, place, conventions.get(_camera(photo), "nadir"))
         position = replace(position, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
         found.append(position)
@@ -163,7 +171,20 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
         float(np.median(steps)) if steps else None,
         {photo.name: photo.exif.orientation for photo in photos if photo.exif.orientation != 1},
         doubts,
+        _elsewhere(others),
     )
+
+
+def _elsewhere(others: Mapping[str, Sequence[tuple[Gps, Gps]]]) -> dict[str, float]:
+    """How far positions of each source lie from those used, where that is another place."""
+    apart = {
+        source: median_distance_m(
+            *([(gps.latitude, gps.longitude) for gps in side] for side in zip(*pairs, strict=True))
+        )
+        for source, pairs in others.items()
+        if len(pairs) >= MIN_REPEATED
+    }
+    return {source: metres for source, metres in apart.items() if metres > ELSEWHERE_M}
 
 
 def _above_takeoff(found: Sequence[Position]) -> list[Position]:
@@ -207,7 +228,8 @@ def positions_json(positions: PositionList) -> JSON:
         "positions": [asdict(position) for position in positions.positions],
         "orientations": dict(positions.orientations),
     }
-    return value | ({"wrong": dict(positions.wrong)} if positions.wrong else {})
+    doubtful = {"wrong": dict(positions.wrong), "elsewhere": dict(positions.elsewhere)}
+    return value | {key: entries for key, entries in doubtful.items() if entries}
 
 
 def _position(photo: CheckedPhoto, gps: Gps, source: str, place: FilePlace | None) -> Position:
@@ -327,14 +349,7 @@ def _stamp(photo: CheckedPhoto, position: Position) -> Stamp:
     takeoff = math.nan
     if position.altitude_m is not None and position.relative_altitude_m is not None:
         takeoff = position.altitude_m - position.relative_altitude_m
-    return Stamp(device, _seconds(photo.exif.time), takeoff)
-
-
-def _seconds(time: str | None) -> float:
-    try:
-        return datetime.datetime.fromisoformat(time or "").replace(tzinfo=datetime.UTC).timestamp()
-    except ValueError:
-        return math.nan
+    return Stamp(device, seconds_of(photo.exif.time), takeoff)
 
 
 def _file_gps(place: FilePlace | None) -> Gps | None:

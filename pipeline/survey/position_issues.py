@@ -11,8 +11,11 @@ from jaxtyping import Float64
 from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import list_names, printable
+from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.photos.position_outliers import median_distance_m
 from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
+from splatpipe.pipeline.survey.flight_steps import flying_relation, steps_of
+from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.photo_positions import DATUM_STEP_M, NOWHERE, Position, PositionList
 from splatpipe.pipeline.survey.position_sources import MOST_DATUMS_M, is_on_earth, xmp_place
 from splatpipe.pipeline.survey.position_spread import spread_of
@@ -32,19 +35,24 @@ ORIGINS = {
 }  # of altitudes
 
 
-def find_position_issues(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
+def find_position_issues(
+    photos: Sequence[CheckedPhoto], positions: PositionList, better: str = ""
+) -> list[CaptureIssue]:
     """List what is doubtful, one entry per kind.
 
     Args:
         photos: The photos in use.
         positions: Their positions as read.
+        better: A hint at how to read the file of positions, where as it stands it lies far from the photos' own.
     """
     return [
         *_none_on_earth(positions),
         *_missing(photos, positions),
         *_degenerate(positions.positions),
         *_doubted(positions),
+        *_elsewhere(positions, better),
         *_contradicting(photos, positions),
+        *_headings(photos, positions),
         *_altitudes(positions),
         *_datums(positions),
         *_lost_fix(positions.positions),
@@ -172,6 +180,41 @@ def _who(names: Collection[str], positions: PositionList) -> str:
     if len(names) >= len(positions.positions):
         return f"All {len(names)} photos"
     return f"{len(names)} of {len(positions.positions)} photos ({list_names(sorted(names))})"
+
+
+def _elsewhere(positions: PositionList, better: str) -> list[CaptureIssue]:
+    """A file of positions that lie off the photos' own."""
+    used = {each.source for each in positions.positions}
+    if "file" not in used or not positions.elsewhere:
+        return []
+    source, metres = max(positions.elsewhere.items(), key=lambda entry: entry[1])
+    apart = f"{metres / 1000.0:,.1f} km" if metres >= 1000.0 else f"{metres:.0f} m"
+    text = f"The file of positions places the photos {apart} from their own positions ({source.upper()})."
+    hint = better or "Check its CRS and datum (the zone, too), and that east or longitude comes first."
+    hint = f"{hint} The file's are used; --set ingest.positions=none takes the photos' own."
+    return [CaptureIssue("position-contradiction", text, hint)]
+
+
+def _headings(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
+    """A flight that does not lead where the aircraft heads, as mirrored and turned positions do not."""
+    stated = positions.positions
+    if not stated:
+        return []
+    names = [each.name for each in stated]
+    times = {photo.name: Photo(photo.name, photo.sha256, 0, 0, 0, photo.exif.time) for photo in photos}
+    steps = steps_of(names, {each.name: {"flight": each.flight} for each in stated}, times)
+    yaw = [each.yaw_deg if each.flight_yaw_deg is None else each.flight_yaw_deg for each in stated]
+    headings = np.array([np.nan if value is None else value for value in yaw], dtype=np.float64)
+    geodetic = np.array([[each.latitude, each.longitude, 0.0] for each in stated], dtype=np.float64)
+    relation, _ = flying_relation(Origin(*geodetic[0]).enu_from_geodetic(geodetic), headings, steps)
+    hint = "Check the signs of latitude and longitude (S and W), and their order."
+    if relation == "mirrored":
+        text = "The positions lead the other way round than the drone's headings: they look mirrored."
+        return [CaptureIssue("position-mirrored", text, hint)]
+    if relation == "backwards":
+        text = "The positions lead against the drone's headings: they look mirrored or turned by 180°, or it flew"
+        return [CaptureIssue("position-mirrored", f"{text} backwards.", hint)]
+    return []
 
 
 def _contradicting(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:

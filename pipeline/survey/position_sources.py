@@ -24,6 +24,7 @@ NULL_ISLAND_DEG = 1e-6  # receivers without a fix write 0, 0
 PLACE_DIGITS = 8  # degrees: positions equal to a millimetre are one position
 MIN_REPEATED = 3  # photos at one position: two may have been taken on the spot
 MOST_DATUMS_M = 150.0  # vertical datums differ by up to 110 m (geoid) and some metres (levelling)
+ELSEWHERE_M = 20.0  # between two sources' positions: too large for a correction, or for a receiver's error
 SAME_ALTITUDE_M = 1.0  # two statements of one altitude, but for rounding
 TAKEOFF_M = 3.0  # EXIF's altitude less the height above take-off, if it states that
 CAUSE_SHARE, CAUSE_PHOTOS = 0.8, 6  # of the photos, that a cause must explain to be acted on
@@ -87,6 +88,16 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
         _impossible(settled),
     )
     return settled, doubts
+
+
+def stated_places(photos: Sequence[CheckedPhoto]) -> dict[str, tuple[float, float]]:
+    """Latitude and longitude by photos' own EXIF or, without, XMP, by name; those that neither states are left out."""
+    found = {}
+    for photo in photos:
+        for gps in (xmp_place(photo.xmp), photo.exif.gps):
+            if gps is not None and _is_usable(gps):
+                found[photo.name] = gps.latitude, gps.longitude
+    return found
 
 
 def is_on_earth(latitude: float, longitude: float) -> bool:

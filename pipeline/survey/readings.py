@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-MIN_WITNESSES = 6  # marks or positions; fewer agree by chance
+MIN_WITNESSES = 6  # marks or positions that name a cause; fewer agree by chance
+MIN_CONTRADICTING = 3  # that stop a file without naming one; fewer are single mistakes, and told one by one
 EXPLAINED = 0.8  # share that a reading must explain to be named
 TIMES_LESS = 0.5  # of that: the share that the file as it stands may explain at most
 

@@ -11,6 +11,7 @@ import numpy as np
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.camera_angles import detect_convention, gimbal_from_nadir
 from splatpipe.pipeline.photos.names import NameFinder, list_names
+from splatpipe.pipeline.survey.coordinate_readings import nearer_reading
 from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
 from splatpipe.pipeline.survey.position_file import PhotoPlace, read_position_file
 
@@ -44,19 +45,28 @@ class FilePlaces:
         by_name: Entries for photos of the capture, by the photo's name.
         unknown: Names in the file that match no photo.
         note: The CRS and the operation from it to WGS 84, as a sentence.
+        better: A hint at how to read the file, where as it stands it lies far from the photos' own positions.
     """
 
     by_name: Mapping[str, FilePlace]
     unknown: tuple[str, ...]
     note: str
+    better: str = ""
 
 
-def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False) -> FilePlaces:
+def read_places(
+    path: Path,
+    photos: Iterable[str],
+    own: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    approximate: bool = False,
+) -> FilePlaces:
     """Read a position file.
 
     Args:
         path: The file.
         photos: Names of the photos in use.
+        own: Latitude and longitude that they state themselves, by name.
         approximate: Accept a CRS although the grid of its best operation to WGS 84 is missing.
 
     Raises:
@@ -81,7 +91,12 @@ def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False)
     crs = parse_crs(file.crs)
     rows = list(matched.values())
     points = np.array([[row.x, row.y, np.nan if row.z is None else row.z] for row in rows], dtype=np.float64)
-    located = to_geodetic(points, crs, approximate)
+    known = np.array([[*own[name], 0.0] for name in matched if own and name in own], dtype=np.float64).reshape(-1, 3)
+    better = nearer_reading(points[:, :2], crs, known) if len(known) else ""
+    try:
+        located = to_geodetic(points, crs, approximate)
+    except SplatpipeError as error:
+        raise SplatpipeError(f"{path.name}: {error}", better or error.hint) from error
     angles = _gimbal_angles(rows)
     places = {
         name: FilePlace(
@@ -89,7 +104,7 @@ def read_places(path: Path, photos: Iterable[str], *, approximate: bool = False)
         )
         for name, row, turned, (latitude, longitude, up) in zip(matched, rows, angles, located.geodetic, strict=True)
     }
-    return FilePlaces(places, tuple(unknown), f"{crs.text} ({crs.name}) by {located.operation.name}")
+    return FilePlaces(places, tuple(unknown), f"{crs.text} ({crs.name}) by {located.operation.name}", better)
 
 
 def _gimbal_angles(rows: Sequence[PhotoPlace]) -> list[tuple[float, float, float] | None]:

@@ -3,7 +3,7 @@
 A flight at one height that is stated mirrored (west as east, south as north, latitude and longitude swapped) fits its
 model as well as the true one: turned by 180° about a horizontal axis. What does not come from positions tells it: how
 the gimbal was pitched and headed, where the pictures' upper edges point, on which side of a flying camera the ground
-is.
+is, whether the aircraft flies where its nose points.
 """
 
 from __future__ import annotations
@@ -17,6 +17,15 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.geometry.upright import camera_axes
+from splatpipe.pipeline.photos.photo_list import Photo
+from splatpipe.pipeline.survey.flight_steps import (
+    FlightSteps,
+    Relation,
+    flying_relation,
+    heading_vectors,
+    relation_of,
+    steps_of,
+)
 from splatpipe.pipeline.survey.level import Positions
 from splatpipe.pipeline.survey.model import SparseModel
 
@@ -26,7 +35,7 @@ LEVEL_SINE = np.sin(np.radians(15.0))  # views and edges that are closer to leve
 FLYING_M = 5.0  # above take-off: the ground is below, whatever is being photographed
 ABOVE_SHARE = 0.95  # of the points above flying cameras: no ground is among them
 VERTICAL = 0.9  # of the mean view, whose length is less where views differ
-ALIGNED, SCATTERED = 0.9, 0.5  # length of the mean of headings' differences as unit vectors
+FLYING = "the direction of flight against the headings"
 STOPPING = 2  # witnesses against a placement
 
 
@@ -71,15 +80,16 @@ class UpVerdict:
         return f"this contradicts {listed}"
 
 
-def check_up(placed: Similarity, model: SparseModel, positions: Positions) -> UpVerdict:
+def check_up(placed: Similarity, model: SparseModel, positions: Positions, photos: Mapping[str, Photo]) -> UpVerdict:
     """Hold a placement against everything that tells up without positions.
 
     Args:
         placed: From the model to east, north, up.
         model: The sparse model.
         positions: The photos' records.
+        photos: All photos of the capture by name; their times give the direction of flight.
     """
-    witnesses = up_witnesses(placed, model, positions)
+    witnesses = up_witnesses(placed, model, positions, photos)
     against = [witness for witness in witnesses if witness.against]
     confirming = len(witnesses) - len(against)
     independent = any(not witness.of_gimbal for witness in against) or confirming == 0
@@ -87,13 +97,18 @@ def check_up(placed: Similarity, model: SparseModel, positions: Positions) -> Up
     return UpVerdict(tuple(witness.what for witness in against), confirming, refuted)
 
 
-def up_witnesses(placed: Similarity, model: SparseModel, positions: Positions) -> list[Witness]:
+def up_witnesses(
+    placed: Similarity, model: SparseModel, positions: Positions, photos: Mapping[str, Photo]
+) -> list[Witness]:
     """The observations that say something about a placement's up."""
     orientations = np.array([positions.orientations.get(name, 1) for name in model.names], dtype=np.int64)
     axes = camera_axes(model.cam_from_model, orientations)
     right, up, forward = (vectors @ placed.rotation.T for vectors in (axes.right, axes.up, axes.forward))
     records = [positions.by_name.get(name, {}) for name in model.names]
-    pitch, yaw, height = (_values(records, key) for key in ("pitch_deg", "yaw_deg", "relative_altitude_m"))
+    pitch, height = (values_of(records, key) for key in ("pitch_deg", "relative_altitude_m"))
+    gimbal, nose = (values_of(records, key) for key in ("yaw_deg", "flight_yaw_deg"))
+    yaw = gimbal if np.isfinite(gimbal).any() else nose  # without a gimbal, the camera turns with the aircraft
+    steps = steps_of(model.names, positions.by_name, photos)
     sines = np.sin(np.radians(pitch))
     looking = np.abs(sines) > LEVEL_SINE
     edges = np.abs(up[:, 2]) > LEVEL_SINE
@@ -102,11 +117,13 @@ def up_witnesses(placed: Similarity, model: SparseModel, positions: Positions) -
         _by_photos("the pictures' upper edges", (up[:, 2] < 0.0)[edges]),
         _by_heading(right, yaw),
         _by_ground(placed, model, height, forward),
+        _by_flying(_flying(placed.apply(model.centres), nose, gimbal, steps)),
     ]
     return [witness for witness in found if witness is not None]
 
 
-def _values(records: Sequence[Mapping[str, Any]], key: str) -> Float64[np.ndarray, " n"]:
+def values_of(records: Sequence[Mapping[str, Any]], key: str) -> Float64[np.ndarray, " n"]:
+    """A number of each photo's record; NaN where it is unknown."""
     stated = [record.get(key) for record in records]
     return np.array([np.nan if value is None else value for value in stated], dtype=np.float64)
 
@@ -128,13 +145,35 @@ def _by_heading(right: Float64[np.ndarray, "n 3"], yaw_deg: Float64[np.ndarray, 
     known = np.isfinite(yaw_deg) & (np.hypot(right[:, 0], right[:, 1]) > 0.5)
     if known.sum() < MIN_PHOTOS:
         return None
-    stated = np.exp(-1j * np.radians(yaw_deg[known]))  # of the right edge, counter-clockwise from east
     placed = right[known, 0] + 1j * right[known, 1]
-    placed /= np.abs(placed)
-    same, mirrored = abs((placed * stated.conj()).mean()), abs((placed * stated).mean())
-    if max(same, mirrored) < ALIGNED or min(same, mirrored) > SCATTERED:
+    relation, _ = relation_of(placed / np.abs(placed), -1j * heading_vectors(yaw_deg[known]))
+    if relation not in ("same", "mirrored"):
         return None
-    return Witness("the gimbal's headings", bool(mirrored > same), of_gimbal=True)
+    return Witness("the gimbal's headings", relation == "mirrored", of_gimbal=True)
+
+
+def _flying(
+    places: Float64[np.ndarray, "n 3"],
+    nose_deg: Float64[np.ndarray, " n"],
+    gimbal_deg: Float64[np.ndarray, " n"],
+    steps: FlightSteps,
+) -> Relation | None:
+    """How the flight leads, by the nose or, without, by the camera, which may look askew in a sound flight."""
+    if np.isfinite(nose_deg).any():
+        return flying_relation(places, nose_deg, steps)[0]
+    relation, _ = flying_relation(places, gimbal_deg, steps)
+    return None if relation == "askew" else relation
+
+
+def _by_flying(relation: Relation | None) -> Witness | None:
+    """The aircraft flies where its nose points, or always at the same angle to it; mirrored, it turns the other way.
+
+    Strips to and fro do not turn. Those that lead ahead say nothing: mirrored along their own axis, they lead ahead,
+    too.
+    """
+    if relation not in ("same", "mirrored", "backwards", "askew"):
+        return None
+    return Witness(FLYING, relation != "same")
 
 
 def _by_ground(

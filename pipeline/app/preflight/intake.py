@@ -27,7 +27,8 @@ from splatpipe.pipeline.sfm.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairs import Layout
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
 from splatpipe.pipeline.survey.position_issues import find_position_issues
-from splatpipe.pipeline.survey.stated_positions import FilePlace, read_places
+from splatpipe.pipeline.survey.position_sources import stated_places
+from splatpipe.pipeline.survey.stated_positions import FilePlaces, read_places
 
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
@@ -78,8 +79,9 @@ def read_capture(source: RunSource, config: LineConfig, threads: int, report: Re
     groups, camera_of = group_cameras(photos)
     findings += [finding_from_issue(issue) for issue in find_camera_issues(photos, groups, camera_of)]
     places, troubles = _file_places(source, config, photos)
-    positions = read_positions(photos, places)
-    findings += [*troubles, *(finding_from_issue(issue) for issue in find_position_issues(photos, positions))]
+    positions = read_positions(photos, places.by_name)
+    issues = find_position_issues(photos, positions, places.better)
+    findings += [*troubles, *(finding_from_issue(issue) for issue in issues)]
     left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
     intake = Intake(
         tuple(photos),
@@ -131,20 +133,20 @@ def _layout(
 
 def _file_places(
     source: RunSource, config: LineConfig, photos: Sequence[CheckedPhoto]
-) -> tuple[Mapping[str, FilePlace], list[Finding]]:
+) -> tuple[FilePlaces, list[Finding]]:
     """Read the positions file, if any; its errors, which would end a run, become findings."""
     path = source.part_path("source.geo")
     if not path.is_file() or not photos:
-        return {}, []
+        return FilePlaces({}, (), ""), []
     names = [photo.name for photo in photos]
     try:
-        places = read_places(path, names, approximate=bool(config.georef.approximate_crs))
+        places = read_places(path, names, stated_places(photos), approximate=bool(config.georef.approximate_crs))
     except SplatpipeError as error:
-        return {}, [Finding("positions-file", "error", error.message, error.hint)]
+        return FilePlaces({}, (), ""), [Finding("positions-file", "error", error.message, error.hint)]
     if not places.unknown:
-        return places.by_name, []
+        return places, []
     text = f"{path.name} names photos that are missing, or names them twice: {list_names(places.unknown)}."
-    return places.by_name, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
+    return places, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
 
 
 def _unreadable(entries: Sequence[ExcludedPhoto]) -> list[Finding]:

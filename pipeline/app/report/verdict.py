@@ -28,6 +28,8 @@ FEW_CHECKS = 3  # check points; fewer prove little
 PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos at 2 megapixels, exposure compensated (trials.md)
 CAMERAS = "Cameras"
 CAMERAS_BAD = "The camera poses are unreliable"
+PLACE = "Place"
+PLACE_BAD = "The result contradicts what else is known of its place"
 VEIL = 0.03  # share of the light in front of held-out photos' points: 8 of 255 grey values, which begin to show
 
 
@@ -53,7 +55,18 @@ class Verdict:
 def judge(inputs: ReportInputs) -> Verdict:
     """Judge a run by its results so far; unreadable parts are skipped, and reported in their own chapters."""
     findings: list[VerdictLine] = []
-    for criterion in (_heights, _cameras, _photos, _reprojection, _focal, _georeference, _splat, _views, _floaters):
+    for criterion in (
+        _place,
+        _heights,
+        _cameras,
+        _photos,
+        _reprojection,
+        _focal,
+        _georeference,
+        _splat,
+        _views,
+        _floaters,
+    ):
         try:
             findings += filter(None, [criterion(inputs)])
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -66,10 +79,12 @@ def judge(inputs: ReportInputs) -> Verdict:
         what = "other warning" if listed else "warning"
         findings.append(VerdictLine("doubt", "Warnings", f"The run gave {plural(warnings, what)}."))
     wrong = next((it for it in findings if it.title == CAMERAS and it.level == "bad"), None)
-    if ending is not None and (ending.level == "bad" or wrong is None):
+    misplaced = any(it.title == PLACE for it in findings)
+    if ending is not None and (ending.level == "bad" or (wrong is None and not misplaced)):
         return Verdict(ending.level, ending.title, ending.text, findings)
-    if wrong is not None:  # results based on them cannot be better
-        return Verdict("bad", CAMERAS_BAD, " ".join(filter(None, [text, ending.text if ending else ""])), findings)
+    if wrong is not None or misplaced:  # results based on them cannot be better
+        headline = CAMERAS_BAD if wrong is not None else PLACE_BAD
+        return Verdict("bad", headline, " ".join(filter(None, [text, ending.text if ending else ""])), findings)
     doubtful = [finding for finding in findings if finding.level != "good"]
     if any(finding.level == "bad" for finding in doubtful):
         return Verdict("bad", "Finished, but with a serious problem", text, findings)
@@ -81,7 +96,12 @@ def judge(inputs: ReportInputs) -> Verdict:
 def _listed(inputs: ReportInputs) -> tuple[str, ...]:
     """Texts of warnings that are findings of their own, and not counted again."""
     heights = _height_sentence(inputs).partition("; ")[0]
-    return (*(str(reason["text"]) for reason in _mapping_reasons(inputs)), *([f"{heights}."] if heights else []))
+    contradictions = (str(it["text"]) for it in _contradictions(inputs))
+    return (
+        *contradictions,
+        *(str(reason["text"]) for reason in _mapping_reasons(inputs)),
+        *([f"{heights}."] if heights else []),
+    )
 
 
 def _ending(inputs: ReportInputs) -> tuple[VerdictLine | None, str]:
@@ -134,6 +154,19 @@ def _progress_text(inputs: ReportInputs) -> str:
         return ""
     total, unit = stage.messages.progress.get("total"), str(stage.messages.progress.get("unit", ""))
     return f"It had reached {count(stage.reached)} of {count(total)} {unit}."
+
+
+def _place(inputs: ReportInputs) -> VerdictLine | None:
+    """What is known and was not used to georeference, and contradicts the result."""
+    found = _contradictions(inputs)
+    return VerdictLine("bad", PLACE, " ".join(f"{it['text']} {it['hint']}" for it in found)) if found else None
+
+
+def _contradictions(inputs: ReportInputs) -> list[Mapping[str, str]]:
+    """Georeferencing's contradictions; empty if there are none or they cannot be read."""
+    found = inputs.summary("georef").get("contradictions", [])
+    readable = isinstance(found, list) and all(isinstance(it, Mapping) and {"text", "hint"} <= set(it) for it in found)
+    return found if readable else []
 
 
 def _heights(inputs: ReportInputs) -> VerdictLine | None:

@@ -15,6 +15,7 @@ from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.source import AUTO, NONE, open_source
 from splatpipe.pipeline.photos.names import NameFinder
 from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
+from splatpipe.pipeline.survey.assumed_heights import with_assumed_heights
 from splatpipe.pipeline.survey.control_edit import ControlText
 from splatpipe.pipeline.survey.control_file import SAME_PLACE_M, SurveyedPoint, read_control_file, read_points_file
 from splatpipe.pipeline.survey.crs import Crs, parse_crs
@@ -96,7 +97,7 @@ def open_job(run: RunFolder, points_file: Path | None) -> MarkingJob:
     text, points = _text_and_points(run, source.named.get(CONTROL), points_file, (source.folder, config.georef), photos)
     crs = parse_crs(text.table.crs)
     model = read_model(parts["sparse.model"], photos)
-    positions = read_positions(parts["ingest.positions"])
+    positions = with_assumed_heights(model, read_positions(parts["ingest.positions"]))
     command = _command(run, text.path, config.georef.control, source.named.get(CONTROL))
     places = (source.folder, parts["ingest.photos"])
     frame = _frame(model, positions, config.georef, photos)

@@ -221,6 +221,17 @@ def test_the_verdict_starts_with_uncertain_heights_and_counts_their_warning_once
     assert "Heights" not in [finding.title for finding in judge(inputs_of({"adjustment": content})).findings]
 
 
+def test_a_contradiction_is_the_first_line_of_the_verdict() -> None:
+    turned = {"text": "North in the result is 180° off the headings of the gimbal.", "hint": "Check the signs."}
+    inputs = inputs_of({"adjustment": made_up()}, warnings=(turned["text"], "Another one."), contradictions=[turned])
+    verdict = judge(inputs)
+    assert (verdict.level, verdict.headline) == ("bad", "The result contradicts what else is known of its place")
+    assert verdict.findings[0].text == f"{turned['text']} {turned['hint']}"
+    assert verdict.findings[-1].text == "The run gave 1 other warning."
+    damaged_ones = inputs_of({"adjustment": made_up()}, contradictions=[3, {}])
+    assert "Place" not in [finding.title for finding in judge(damaged_ones).findings]
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -159,8 +159,13 @@ def test_an_unknown_base_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SplatpipeError, match="outline has heights"):
         measure_volume(surface, square(4.0), grid.crs, "rim")
     away = PlanArea.seen_from_above([(square(4.0).polygons[0][0] + 100.0,)])
-    with pytest.raises(SplatpipeError, match="no heights inside"):
-        measure_volume(surface, away, grid.crs, 0.0)
+    for base in ("rim", 0.0):
+        with pytest.raises(SplatpipeError, match=r"The polygon lies \d+ m north-east of the surface model"):
+            measure_volume(surface, away, grid.crs, base)
+    abroad = PlanArea.seen_from_above([(square(4.0).polygons[0][0] + np.array([-9e5, 0.0]),)])
+    with pytest.raises(SplatpipeError, match=r"lies 900\.0 km west of the surface model") as caught:
+        measure_volume(surface, abroad, grid.crs, "rim")
+    assert "CRS" in caught.value.hint
     for base in ("rim", 0.0):
         with pytest.raises(SplatpipeError, match="far too long"):
             measure_volume(surface, square(1e7), grid.crs, base)

@@ -12,7 +12,8 @@ from splatpipe.pipeline.geometry.upright import enu_from_gimbal
 from splatpipe.pipeline.survey.assumed_heights import with_assumed_heights
 from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.frames import Frame, Origin
-from splatpipe.pipeline.survey.gps import georeference, report_frame
+from splatpipe.pipeline.survey.gps import georeference
+from splatpipe.pipeline.survey.last_look import Placed, report_contradictions
 from splatpipe.pipeline.survey.level import Positions
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.up_witnesses import check_up
@@ -69,7 +70,7 @@ def up_of(frame: Frame) -> float:
 @pytest.mark.parametrize("pitch", [-90.0, -55.0, -20.0, 20.0])
 def test_every_witness_confirms_a_sound_placement(pitch: float) -> None:
     model, positions = scene(pitch=pitch)
-    verdict = check_up(TRUTH, model, positions)
+    verdict = check_up(TRUTH, model, positions, {})
     assert verdict.against == () and verdict.confirming >= 3 and not verdict.doubtful
     frame, _ = georeference(model, positions, "auto", {})
     assert up_of(frame) > 0.99
@@ -92,10 +93,10 @@ def test_a_survey_without_angles_and_heights_above_takeoff_still_knows_its_groun
     """Only the parallel views straight down speak: enough to warn, not to stop."""
     unknown = {"relative_altitude_m": None, **dict.fromkeys(ANGLES)}
     model, positions = scene(pitch=-90.0, **unknown)
-    assert check_up(TRUTH, model, positions).confirming == 1
+    assert check_up(TRUTH, model, positions, {}).confirming == 1
     model, positions = scene(pitch=-90.0, mirrored=True, **unknown)
     frame, _ = georeference(model, positions, "auto", {})
-    verdict = check_up(frame.world_from_model, model, positions)
+    verdict = check_up(frame.world_from_model, model, positions, {})
     assert verdict.against == ("the ground's side of the cameras",) and verdict.doubtful and not verdict.refuted
 
 
@@ -116,14 +117,14 @@ def test_one_witness_against_warns() -> None:
     model, positions = scene(mirrored=True, relative_altitude_m=None, **dict.fromkeys(ANGLES))
     frame, _ = georeference(model, positions, "auto", {})
     warnings = Warnings()
-    report_frame(frame, model, positions, warnings)
+    report_contradictions(Placed(frame, model, positions, {}), warnings)
     assert any("upside down or mirrored: this contradicts the pictures' upper edges" in text for text in warnings)
 
 
 def test_a_camera_mounted_upside_down_is_outvoted() -> None:
     model, positions = scene()
     turned = Positions(positions.by_name, dict.fromkeys(model.names, 3))
-    verdict = check_up(TRUTH, model, turned)
+    verdict = check_up(TRUTH, model, turned, {})
     assert "the pictures' upper edges" in verdict.against and not verdict.refuted
 
 
