@@ -137,7 +137,7 @@ class Guard:
         """
         headers, folder = Headers(scope=scope), scope["raw_path"].split(b"/")[1]
         if same(folder, self._access.files):
-            return scope["method"] != "POST"
+            return bool(scope["method"] != "POST")
         if not same(folder, self._access.pages) or not self._access.has_cookie(headers.get("cookie", "")):
             return False
         _check_origin(headers)
