@@ -28,23 +28,17 @@ from splatpipe.pipeline.survey.block import Lens
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import PositionObservations
 from splatpipe.pipeline.survey.blunders import (
-    name_blunders,
     require_near,
-    require_shape,
     tell_heights_apart,
     warn_of_weak_control,
 )
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
-from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.georef_input import GeorefInput
 from splatpipe.pipeline.survey.local_survey import (
     MIN_CONTROL,
     LocalSurvey,
-    make_site,
     observed_in,
-    require_fit,
-    start_similarity,
     stations_of,
     with_sigmas_times,
 )
@@ -126,14 +120,9 @@ def place_by_control(
     """
     model = capture.model
     stations = stations_of(model, capture.positions, frame)
-    site = make_site(survey, require_near(survey, config, stations), stations, frame, config)
-    start = start_similarity(site, survey, model, capture.positions, frame)
-    if frame is not None and len(stations) >= MIN_POSITIONS:  # only then is the start level, and in metres
-        require_shape(survey, site, start[0])
-    survey = name_blunders(survey, site, model, start, config, report)
-    observed = observed_in(site, survey, model, start[0].scale, config.mark_sigma_px)
-    fit = fit_jointly(start[0], observed, start[1])
-    require_fit(fit, observed, survey)
+    geodetic = require_near(survey, config, stations)
+    fitted = fit_control(survey, geodetic, stations, (model, capture.positions, frame), config, report)
+    site, survey, start, observed, fit = fitted.site, fitted.survey, fitted.start, fitted.observed, fitted.fit
     factor = fit.noise if fit.noise > QUIET else 1.0
     tell_heights_apart(fit, survey, stations, report)
     warn_of_weak_control(fit, observed, model, report)

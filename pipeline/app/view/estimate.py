@@ -15,18 +15,14 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.app.view.marking_job import MarkingJob
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.geometry.joint_fit import JointFit, fit_jointly
+from splatpipe.pipeline.geometry.joint_fit import JointFit
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json
-from splatpipe.pipeline.survey.blunders import name_blunders, require_near
+from splatpipe.pipeline.survey.blunders import require_near
 from splatpipe.pipeline.survey.control_file import ControlFile
 from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.local_survey import (
     LocalSurvey,
-    make_site,
-    observed_in,
-    require_fit,
-    start_similarity,
     stations_of,
 )
 from splatpipe.pipeline.survey.located_points import Sighting, SurveyPoint, locate, residual_px
@@ -180,17 +176,18 @@ class Estimator:
 
     def _fit(self, survey: Survey, collector: WarningCollector) -> _GeoreferencedSite:
         job, stations = self._job, self._stations
-        site = make_site(survey, self._geodetic, stations, job.frame, job.config)
-        start = start_similarity(site, survey, job.model, job.positions, job.frame)
-        if not survey.of_role("control"):
-            start = (self._shift_to_points(start[0], site), start[1])
-        survey = name_blunders(survey, site, job.model, start, job.config, collector)
-        observed = observed_in(site, survey, job.model, start[0].scale, job.config.mark_sigma_px)
-        fit = fit_jointly(start[0], observed, start[1])
-        require_fit(fit, observed, survey)
-        if not survey.of_role("control"):
-            fit = replace(fit, similarity=start[0])
-        return _GeoreferencedSite(site, fit, survey)
+        marked = bool(survey.of_role("control"))
+        fitted = fit_control(
+            survey,
+            self._geodetic,
+            stations,
+            (job.model, job.positions, job.frame),
+            job.config,
+            collector,
+            None if marked else self._shift_to_points,
+        )
+        fit = fitted.fit if fitted.survey.of_role("control") else replace(fitted.fit, similarity=fitted.start[0])
+        return _GeoreferencedSite(fitted.site, fit, fitted.survey)
 
     def _shift_to_points(self, similarity: Similarity, site: LocalSurvey) -> Similarity:
         """Before any mark: shift the model vertically so that the points lie on it, whatever their datums."""
