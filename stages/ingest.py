@@ -80,7 +80,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         skies = prepare_masks(SKIES, root, photos, others, {}, work)
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places.by_name)
-    for issue in find_position_issues(photos, positions, places.better):
+    for issue in find_position_issues(photos, positions, places):
         if issue.severity == "warning":
             report.warning(issue.message, issue.hint)
     described = describe_cameras(photos, groups, camera_of)

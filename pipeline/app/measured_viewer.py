@@ -14,6 +14,7 @@ from typing import IO, Any
 
 from splatpipe.pipeline.app.measurements import has_measurements, is_number, read_measurements, title_of
 from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.output_file import is_inside
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.web.measured_page import PAGE, SITE_PAGE, with_measurements
 
@@ -38,7 +39,8 @@ def update_viewer(out: Path) -> str:
     Raises:
         OSError: if the disk is full or not writable; each page is either unchanged or updated.
     """
-    pages = [name for name in (PAGE, SITE_PAGE) if (out / name).is_file()]
+    own = [name for name in (PAGE, SITE_PAGE) if is_inside(out, Path(name)) and not (out / name).is_symlink()]
+    pages = [name for name in own if (out / name).is_file()]
     if not pages or not has_measurements(out):
         return ""
     shown, trouble = shown_measurements(out), ""

@@ -19,6 +19,7 @@ from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.photo_positions import DATUM_STEP_M, NOWHERE, Position, PositionList
 from splatpipe.pipeline.survey.position_sources import MOST_DATUMS_M, is_on_earth, xmp_place
 from splatpipe.pipeline.survey.position_spread import spread_of
+from splatpipe.pipeline.survey.stated_positions import FilePlaces
 
 CONTRADICTION_M = 1.0  # between a photo's EXIF and XMP: too large for rounding
 CONTRADICTION_TIMES = 6.0  # times the difference in most photos, whose EXIF may have been post-processed (PPK)
@@ -36,21 +37,21 @@ ORIGINS = {
 
 
 def find_position_issues(
-    photos: Sequence[CheckedPhoto], positions: PositionList, better: str = ""
+    photos: Sequence[CheckedPhoto], positions: PositionList, file: FilePlaces | None = None
 ) -> list[CaptureIssue]:
     """List what is doubtful, one entry per kind.
 
     Args:
         photos: The photos in use.
         positions: Their positions as read.
-        better: A hint at how to read the file of positions, where as it stands it lies far from the photos' own.
+        file: The file of positions, if there is one.
     """
     return [
         *_none_on_earth(positions),
         *_missing(photos, positions),
         *_degenerate(positions.positions),
         *_doubted(positions),
-        *_elsewhere(positions, better),
+        *_elsewhere(positions, file),
         *_contradicting(photos, positions),
         *_headings(photos, positions),
         *_altitudes(positions),
@@ -182,15 +183,14 @@ def _who(names: Collection[str], positions: PositionList) -> str:
     return f"{len(names)} of {len(positions.positions)} photos ({list_names(sorted(names))})"
 
 
-def _elsewhere(positions: PositionList, better: str) -> list[CaptureIssue]:
+def _elsewhere(positions: PositionList, file: FilePlaces | None) -> list[CaptureIssue]:
     """A file of positions that lie off the photos' own."""
-    used = {each.source for each in positions.positions}
-    if "file" not in used or not positions.elsewhere:
+    if file is None or not file.by_name or not positions.elsewhere:
         return []
     source, metres = max(positions.elsewhere.items(), key=lambda entry: entry[1])
     apart = f"{metres / 1000.0:,.1f} km" if metres >= 1000.0 else f"{metres:.0f} m"
-    text = f"The file of positions places the photos {apart} from their own positions ({source.upper()})."
-    hint = better or "Check its CRS and datum (the zone, too), and that east or longitude comes first."
+    text = f"{file.name} places the photos {apart} from their own positions ({source.upper()})."
+    hint = file.better or "Check its CRS and datum (the zone, too), and that east or longitude comes first."
     hint = f"{hint} The file's are used; --set ingest.positions=none takes the photos' own."
     return [CaptureIssue("position-contradiction", text, hint)]
 

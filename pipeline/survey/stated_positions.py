@@ -45,12 +45,14 @@ class FilePlaces:
         by_name: Entries for photos of the capture, by the photo's name.
         unknown: Names in the file that match no photo.
         note: The CRS and the operation from it to WGS 84, as a sentence.
+        name: The file's name.
         better: A hint at how to read the file, where as it stands it lies far from the photos' own positions.
     """
 
     by_name: Mapping[str, FilePlace]
     unknown: tuple[str, ...]
     note: str
+    name: str = ""
     better: str = ""
 
 
@@ -104,7 +106,7 @@ def read_places(
         )
         for name, row, turned, (latitude, longitude, up) in zip(matched, rows, angles, located.geodetic, strict=True)
     }
-    return FilePlaces(places, tuple(unknown), f"{crs.text} ({crs.name}) by {located.operation.name}", better)
+    return FilePlaces(places, tuple(unknown), f"{crs.text} ({crs.name}) by {located.operation.name}", path.name, better)
 
 
 def _gimbal_angles(rows: Sequence[PhotoPlace]) -> list[tuple[float, float, float] | None]:

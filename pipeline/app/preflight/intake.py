@@ -80,7 +80,7 @@ def read_capture(source: RunSource, config: LineConfig, threads: int, report: Re
     findings += [finding_from_issue(issue) for issue in find_camera_issues(photos, groups, camera_of)]
     places, troubles = _file_places(source, config, photos)
     positions = read_positions(photos, places.by_name)
-    issues = find_position_issues(photos, positions, places.better)
+    issues = find_position_issues(photos, positions, places)
     findings += [*troubles, *(finding_from_issue(issue) for issue in issues)]
     left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
     intake = Intake(

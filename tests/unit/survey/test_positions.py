@@ -118,6 +118,26 @@ def test_a_file_of_another_capture_is_refused_and_unknown_names_are_reported(tmp
     assert read_places(tmp_path / "geo.txt", ["a.jpg"]).unknown == ("x.jpg",)
 
 
+@pytest.mark.parametrize(
+    ("row", "cause"),
+    [
+        ("388710.5 5299705.2", ""),
+        ("5299705.2 388710.5", "swapped"),
+        ("33388710.5 5299705.2", "zone number in front of the eastings (33)"),
+        ("1275297.6 17387484.9", "in feet"),
+        ("88710.5 99705.2", "leading digits"),
+    ],
+)
+def test_a_file_far_from_the_photos_own_positions_is_told_how_to_be_read(tmp_path: Path, row: str, cause: str) -> None:
+    (tmp_path / "geo.txt").write_text(f"EPSG:32633\na.jpg {row} 512.0\n")
+    try:
+        hint = read_places(tmp_path / "geo.txt", ["a.jpg"], {"a.jpg": (HERE.latitude, HERE.longitude)}).better
+    except SplatpipeError as error:
+        assert error.message.startswith("geo.txt: ")
+        hint = error.hint
+    assert cause in hint and bool(hint) == bool(cause)
+
+
 @pytest.mark.parametrize("angles", [(30.0, 0.0, 0.0), (120.0, 25.0, 0.0), (-80.0, 10.0, 5.0), (10.0, 80.0, -3.0)])
 def test_nadir_angles_are_the_same_view_as_a_gimbal(angles: tuple[float, float, float]) -> None:
     """Against the definition: nose, right wing and belly of an aircraft turned by yaw, then pitch, then roll."""
