@@ -55,6 +55,13 @@ class _RefusedError(Exception):
     """The file exceeds a limit, or is not what it seems to be."""
 
 
+def _content(path: Path) -> bytes:
+    try:
+        return read_small(path, MAX_BYTES)
+    except OSError as error:
+        raise _RefusedError(error.strerror or str(error)) from error
+
+
 def read_lens_file(path: Path) -> tuple[FileLens, ...]:
     """Read every lens of a file.
 
@@ -62,7 +69,7 @@ def read_lens_file(path: Path) -> tuple[FileLens, ...]:
         SplatpipeError: If the format is not supported, the file is broken, or it contains no usable lens.
     """
     try:
-        data = read_small(path, MAX_BYTES)
+        data = _content(path)
         if b"\0" in data[:4096]:
             raise _RefusedError("it is no text")
         start = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
@@ -72,7 +79,7 @@ def read_lens_file(path: Path) -> tuple[FileLens, ...]:
         if len(lenses) > MAX_LENSES:
             raise _RefusedError(f"it has more than {MAX_LENSES} lenses")
         return tuple(lenses)
-    except (_RefusedError, ValueError, OverflowError, OSError) as error:
+    except (_RefusedError, ValueError, OverflowError) as error:
         raise SplatpipeError(
             f"{path.name} cannot be used as a lens: {str(error)[:200]}.",
             hint=f"Supported are {FORMATS}. Give another with --set ingest.lens=PATH, or =none for no lens file.",

@@ -153,7 +153,7 @@ def _north(placed: Placed) -> Iterator[Contradiction]:
 def _climbs(placed: Placed) -> Iterator[Contradiction]:
     """How far the drone climbed by its barometer; the ground's height does not matter."""
     above, up = placed.stated("relative_altitude_m"), placed.centres()[:, 2]
-    flights = placed.stated("flight")
+    flights = np.nan_to_num(placed.stated("flight"))
     known = np.isfinite(above)
     ours, theirs = up.copy(), above.copy()
     for flight in np.unique(flights[known]):

@@ -76,7 +76,7 @@ def test_the_verdict_states_a_doubtful_focal_length_once() -> None:
         history=RunHistory(stages={"sparse": StageHistory("sparse", "finished", messages=messages)}),
         artifacts={},
         read={"sparse.summary": {"verdict": {"level": "doubt", "reasons": [reason]}}}.get,
-        summary={"sparse": PLACED | {"cameras": [camera]}}.get,
+        summary=lambda stage: {"sparse": PLACED | {"cameras": [camera]}}.get(stage, {}),
     )
     texts = {finding.title: finding.text for finding in judge(inputs).findings}  # type: ignore[arg-type]
     assert texts["Cameras"] == text and "Focal length" not in texts

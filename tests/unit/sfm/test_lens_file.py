@@ -183,5 +183,5 @@ def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "lens.xml"
     with path.open("wb") as file:
         file.truncate(1 << 33)
-    with pytest.raises(SplatpipeError, match="larger than"):
+    with pytest.raises(SplatpipeError, match="more than 32 MiB"):
         read_lens_file(path)

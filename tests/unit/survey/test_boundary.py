@@ -211,7 +211,7 @@ def test_a_large_file_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "boundary.geojson"
     with path.open("wb") as file:
         file.truncate(boundary_file.LARGEST_FILE + 1)
-    with pytest.raises(SplatpipeError, match="more than 8 MB"):
+    with pytest.raises(SplatpipeError, match="more than 8 MiB"):
         read_boundary(path)
 
 
