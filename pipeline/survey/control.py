@@ -32,6 +32,7 @@ from splatpipe.pipeline.survey.blunders import (
     tell_heights_apart,
     warn_of_weak_control,
 )
+from splatpipe.pipeline.survey.control_fit import fit_control
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.georef_input import GeorefInput

@@ -20,6 +20,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json
 from splatpipe.pipeline.survey.blunders import require_near
 from splatpipe.pipeline.survey.control_file import ControlFile
+from splatpipe.pipeline.survey.control_fit import fit_control
 from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.local_survey import (
     LocalSurvey,
