@@ -32,8 +32,8 @@ NO_KEY = (
 )
 # Leads on from within our page: a browser does not send a strict cookie after a redirect of another site's link.
 ENTRANCE = (
-    '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0;url={to}"><title>splatpipe</title>'
-    '<a href="{to}">Continue</a>\n'
+    '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><title>splatpipe</title>'
+    '<meta http-equiv="refresh" content="0;url={to}"><a href="{to}">Continue</a>\n'
 )
 
 CSP_OURS = (
@@ -135,13 +135,14 @@ class Guard:
         Raises:
             RefusedError: if it has a secret, and comes from elsewhere than our pages.
         """
-        headers, folder = Headers(scope=scope), scope["raw_path"].split(b"/")[1]
+        headers, path = Headers(scope=scope), bytes(scope["raw_path"])
+        folder, is_post = path.split(b"/")[1], scope["method"] == "POST"
         if same(folder, self._access.files):
-            return bool(scope["method"] != "POST")
+            return not is_post
         if not same(folder, self._access.pages) or not self._access.has_cookie(headers.get("cookie", "")):
             return False
         _check_origin(headers)
-        if scope["method"] == "POST":
+        if is_post:
             _check_writing(headers)
         return True
 

@@ -181,6 +181,7 @@ def test_report_film_files_and_web_viewer_work_in_their_sandbox(
         page.goto(server.file("report.html"))
         assert page.locator("h1").count() == 1
         assert page.evaluate("[...document.images].every(image => image.naturalWidth > 0)")
+        assert watched.errors == []
         with page.expect_download() as saved:
             page.locator("a[href='splat.ply']").first.click()
         assert Path(saved.value.path()).read_bytes() == (out / "splat.ply").read_bytes()
@@ -188,4 +189,3 @@ def test_report_film_files_and_web_viewer_work_in_their_sandbox(
         page.wait_for_function("document.querySelector('video').readyState >= 2")
         page.goto(server.file("metrics.json"))
         assert "psnr" in page.content()
-        assert watched.errors == []
