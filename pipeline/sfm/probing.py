@@ -13,9 +13,8 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.sfm.agreement import compare
+from splatpipe.pipeline.sfm.agreement import compare, contradicting
 from splatpipe.pipeline.sfm.capture import MappingInput
-from splatpipe.pipeline.sfm.judging import contradicting
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs, tried_pairs
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 

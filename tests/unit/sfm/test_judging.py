@@ -7,10 +7,10 @@ import pycolmap
 import pytest
 from view_graph import FOCAL, Ring, make_ring, model_of, moved, turn_up, with_matches
 
-from splatpipe.pipeline.sfm.agreement import compare, epipolar_errors
+from splatpipe.pipeline.sfm.agreement import compare, contradicting, epipolar_errors
 from splatpipe.pipeline.sfm.cuts import find_cut
 from splatpipe.pipeline.sfm.external_evidence import disagreement
-from splatpipe.pipeline.sfm.judging import contradicting, judge
+from splatpipe.pipeline.sfm.judging import judge
 
 TRUSTED = [{"has_prior": True, "focal_source": "sensor-table"}]
 ROUGH = [{"has_prior": True, "focal_source": "35mm-equivalent"}]
