@@ -76,12 +76,14 @@ def compare(
     Args:
         model: With the keypoints of ``verified``.
         verified: The view graph.
-        instead: Other poses of its photos, camera from world, in a frame of their own.
+        instead: Other poses of its photos, camera from world, in a frame of their own, to which no points belong.
     """
     placed = sorted(model.reg_image_ids())
     rays = {number: rays_of(model, number, verified) for number in placed}
     poses = instead or {number: model.images[number].cam_from_world().matrix() for number in placed}
-    points = {number: _points(model, number, len(verified.keypoints[number])) for number in placed}
+    points = {
+        number: _points(None if instead else model.images[number], len(verified.keypoints[number])) for number in placed
+    }
     pairs = sorted(verified.matches)
     rows = np.zeros((len(pairs), 4), np.int64)
     closeness = np.zeros(len(pairs))
@@ -142,9 +144,16 @@ def epipolar_errors(
     slope = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
     errors = np.abs(off) / np.sqrt(np.maximum(slope, 1e-18))
     turned = first @ turn.T
-    normal = np.cross(turned, second)
-    ahead_one = -np.einsum("ij,ij->i", np.cross(shift, second), normal)
-    ahead_two = -np.einsum("ij,ij->i", np.cross(shift, turned), normal)
+    normal = np.stack(
+        [
+            turned[:, 1] * second[:, 2] - turned[:, 2] * second[:, 1],
+            turned[:, 2] * second[:, 0] - turned[:, 0] * second[:, 2],
+            turned[:, 0] * second[:, 1] - turned[:, 1] * second[:, 0],
+        ],
+        axis=1,
+    )
+    ahead_one = -np.einsum("ij,ij->i", second @ cross.T, normal)
+    ahead_two = -np.einsum("ij,ij->i", lines, normal)
     angle = np.linalg.norm(normal, axis=1) / (np.linalg.norm(turned, axis=1) * np.linalg.norm(second, axis=1))
     behind = (np.minimum(ahead_one, ahead_two) < 0.0) & (angle > MIN_PARALLAX * noise)
     # Where a lens's distortion cannot be inverted, there is no ray.
@@ -156,10 +165,9 @@ def rays_of(model: pycolmap.Reconstruction, number: int, verified: ViewGraph) ->
     return np.asarray(model.images[number].camera.cam_from_img(places), np.float64).reshape(-1, 2)
 
 
-def _points(model: pycolmap.Reconstruction, number: int, count: int) -> Int64[np.ndarray, " n"]:
+def _points(image: pycolmap.Image | None, count: int) -> Int64[np.ndarray, " n"]:
     """Return the id of the point that each keypoint of a photo observes, -1 for none."""
     result = np.full(count, -1, np.int64)
-    for row, point in enumerate(model.images[number].points2D):
-        if point.has_point3D():
-            result[row] = point.point3D_id
+    for row in image.get_observation_point2D_idxs() if image is not None else ():
+        result[row] = image.point2D(row).point3D_id
     return result

@@ -16,94 +16,116 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
-from scipy.spatial import cKDTree
 
+from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
+from splatpipe.pipeline.sfm.cuts import GraphCut, cut_between
+from splatpipe.pipeline.sfm.judging import Level, Reason, who
 from splatpipe.pipeline.sfm.pairs import Pair
-from splatpipe.pipeline.sfm.structure import Structure
+from splatpipe.pipeline.sfm.structure import read_structure
+from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.view_overlaps import BINS, ViewOverlap, compare_views
 
-CELLS = 8  # across an image's longer side
-MIN_VIEWS = 3  # photos of a point: fewer are not found again reliably
 MIN_OWN = 5  # points of the other photo in a cell: it has to show something else
 MIN_EXPECTED = 4.0  # common points expected in a cell: fewer may be missing by chance
 FEW = 0.2  # of those expected
-SAMPLE = 600  # points per photo
-NEAREST = 40  # photos that each photo is compared with: those whose points lie nearest
-ALIKE_DEG = 30.0  # angle between the two views: SIFT finds many points again
-BINS = 6  # of that angle: fewer points are found again from other directions
-ALIKE_SCALE = 0.7  # ratio of the distances to a point, likewise
-HIDDEN = 0.9  # of its distance: a point is hidden if the photo sees one that near, or nearer, beside it
-BESIDE = 0.04  # of the longer side
-BESIDE_COUNT = 6
-FAR = np.full(3, 1e12)  # where photos without points are
-MARGIN = 0.02  # of the longer side: points near an image's edge may be outside
-
-
-def conflicts(
-    model: pycolmap.Reconstruction, structure: Structure, numbers: Int64[np.ndarray, " m"], tried: Collection[Pair]
-) -> tuple[Float64[np.ndarray, "m m"], Float64[np.ndarray, "m m"]]:
-    """Count what each two photos have in common where they should, and what they show differently.
-
-    Args:
-        model: Its poses and lenses.
-        structure: Its points.
-        numbers: Placed photos, sorted.
-        tried: (i, j), i < j, pairs that were matched: the others may lack common points for want of trying.
-
-    Returns:
-        For each two photos, their common points, and how many more there should be in those parts of the image where
-        both have points and hardly any is common; symmetric.
-    """
-    found = _compared(model, structure, numbers, tried)
-    usual = _usual_rates(found)
-    common, against = np.zeros((len(numbers), len(numbers))), np.zeros((len(numbers), len(numbers)))
-    for entry in found:
-        expected = usual[entry.bin] * (entry.hits + entry.lacking)
-        differs = (entry.own >= MIN_OWN) & (expected >= MIN_EXPECTED) & (entry.hits < FEW * expected)
-        common[entry.pair] = entry.hits.sum()
-        against[entry.pair] = (expected - entry.hits)[differs].sum()
-    return common + common.T, against + against.T
+MIN_COMMON = 30.0  # common points of two groups, to avoid dividing by few
+MIN_MISSING = 60.0  # common points that are missing between two groups: fewer are three or four photos' corners
+RATIO_DOUBT, RATIO_BAD = 0.15, 0.25  # of missing to common points between two groups; sound captures have 0 to 0.09
+CUTS = 5  # of ever better ratios
+DIGITS = 6  # decimals that are compared: the last ones vary with the number of threads
 
 
 @dataclass(frozen=True)
-class _Overlap:
-    """A photo's points in another photo that should see them, by cells of its image.
+class Doubles:
+    """Two groups of photos that show different things where the model has them at one place.
 
     Attributes:
-        pair: Rows of the two photos.
-        bin: Of the mean angle between their views.
-        hits: Points that the other observes.
-        lacking: Points that it does not.
-        own: Points that only the other observes.
+        group: Image ids of the smaller group; empty if no two groups differ.
+        ratio: Common points of the groups that are missing, over those that are there.
+        missing: How many are missing.
+        pair: Of the two groups, the photos that differ most, as image ids.
+        places: Where they do, in each of them: pixels of what should show the same.
     """
 
-    pair: tuple[int, int]
-    bin: int
-    hits: Int64[np.ndarray, " cells"]
-    lacking: Int64[np.ndarray, " cells"]
-    own: Int64[np.ndarray, " cells"]
+    group: tuple[int, ...] = ()
+    ratio: float = 0.0
+    missing: float = 0.0
+    pair: tuple[int, int] = (0, 0)
+    places: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
+
+    def level(self) -> Level:
+        """How much they speak against a model."""
+        if self.ratio < RATIO_DOUBT or self.missing < MIN_MISSING:
+            return "good"
+        return "bad" if self.ratio >= RATIO_BAD else "doubt"
+
+    def as_json(self, verified: ViewGraph) -> JSON:
+        """Return the two photos and places to look at for ``models.json``; None where nothing speaks against a model."""
+        if self.level() == "good":
+            return None
+        names = [verified.names[number] for number in self.pair]
+        return {"photos": names, "places_px": [[round(value, 1) for value in place] for place in self.places]}
 
 
-def _compared(
-    model: pycolmap.Reconstruction, structure: Structure, numbers: Int64[np.ndarray, " m"], tried: Collection[Pair]
-) -> list[_Overlap]:
-    seen = _seen(structure, numbers)
-    known = set(tried)
-    centres = np.array([model.images[int(number)].projection_center() for number in numbers])
-    middles = np.array([np.median(structure.points[rows], axis=0) if len(rows) else FAR for rows in seen])
-    found = []
-    for j, number in enumerate(numbers.tolist()):
-        view = _View(model, number, structure, seen[j], centres[j])
-        apart = np.linalg.norm(middles - middles[j], axis=1)
-        apart[j] = np.inf
-        for i in np.argsort(apart, kind="stable")[:NEAREST].tolist():
-            if i != j and (min(number, int(numbers[i])), max(number, int(numbers[i]))) in known:
-                overlap = view.compare((i, j), structure.points, seen[i], centres[i])
-                found += [overlap] if overlap is not None else []
-    return found
+def find_doubles(model: pycolmap.Reconstruction, tried: Collection[Pair]) -> Doubles:
+    """Look for two groups of photos that show different things wherever the model has them at one place.
+
+    Args:
+        model: With points.
+        tried: (i, j), i < j, pairs that were matched.
+    """
+    structure, numbers = read_structure(model), np.array(sorted(model.reg_image_ids()), np.int64)
+    found = compare_views(model, structure, numbers, tried)
+    usual = usual_rates(found)
+    common, against = np.zeros((len(numbers), len(numbers))), np.zeros((len(numbers), len(numbers)))
+    for entry in found:
+        common[entry.pair] += entry.hits.sum()
+        against[entry.pair] += missing(entry, usual).sum()
+    common, against = common + common.T, against + against.T
+    cut = _largest_cut(common, against, numbers)
+    if not cut.group:
+        return Doubles()
+    inside = np.isin(numbers, cut.group)
+    between = against * (inside[:, None] != inside[None, :])
+    worst = max(
+        (entry for entry in found if inside[entry.pair[0]] != inside[entry.pair[1]]),
+        key=lambda entry: (round(float(missing(entry, usual).sum()), DIGITS), entry.pair),
+    )
+    cell = int(np.argmax(np.round(missing(worst, usual), DIGITS)))
+    points = structure.points[worst.rows[worst.rows[:, 1] == cell, 0]]
+    sides = sorted((int(numbers[row]), _middle(model, int(numbers[row]), points)) for row in worst.pair)
+    (first, here), (second, there) = sides
+    return Doubles(cut.group, cut.ratio, float(between.sum()) / 2.0, (first, second), (here, there))
 
 
-def _usual_rates(found: Sequence[_Overlap]) -> Float64[np.ndarray, " bins"]:
+def _largest_cut(
+    common: Float64[np.ndarray, "m m"], against: Float64[np.ndarray, "m m"], numbers: Int64[np.ndarray, " m"]
+) -> GraphCut:
+    """Return the cut with the largest ratio: the common points are weighed by the ratio found so far (Dinkelbach)."""
+    best, scale = GraphCut(), 1.0
+    for _ in range(CUTS):
+        cut = cut_between(scale * common, against, numbers, scale * MIN_COMMON)
+        if scale * cut.ratio <= best.ratio:
+            break
+        scale *= cut.ratio
+        best = GraphCut(cut.group, scale)
+    return best
+
+
+def missing(entry: ViewOverlap, usual: Float64[np.ndarray, " bins"]) -> Float64[np.ndarray, " cells"]:
+    """Return how many more common points there should be in those cells where both have points and hardly any common.
+
+    Args:
+        entry: What one of the photos sees of the other's points.
+        usual: Share of points that are found again, by the angle between the views.
+    """
+    expected = usual[entry.bin] * (entry.hits + entry.lacking)
+    differs = (entry.own >= MIN_OWN) & (expected >= MIN_EXPECTED) & (entry.hits < FEW * expected)
+    return np.asarray(np.where(differs, expected - entry.hits, 0.0))
+
+
+def usual_rates(found: Sequence[ViewOverlap]) -> Float64[np.ndarray, " bins"]:
     """Return the share of points that a photo usually finds again, by angle: the median over pairs that share any."""
     rates: list[list[float]] = [[] for _ in range(BINS)]
     for entry in found:
@@ -113,84 +135,20 @@ def _usual_rates(found: Sequence[_Overlap]) -> Float64[np.ndarray, " bins"]:
     return np.array([np.median(rate) if rate else 0.0 for rate in rates])
 
 
-class _View:
-    """A photo's points, and what lies in front of them."""
-
-    def __init__(
-        self,
-        model: pycolmap.Reconstruction,
-        number: int,
-        structure: Structure,
-        rows: Int64[np.ndarray, " k"],
-        centre: Float64[np.ndarray, "3"],
-    ) -> None:
-        self.camera = model.images[number].camera
-        self.pose = model.images[number].cam_from_world().matrix()
-        self.centre, self.rows = centre, rows
-        self.longer = max(self.camera.width, self.camera.height)
-        self.places, depths = project_through_lens(self.camera, self.pose, structure.points[rows])
-        fine = np.isfinite(self.places).all(axis=1)
-        self.rows, self.places, self.depths = rows[fine], self.places[fine], depths[fine]
-        self.tree = cKDTree(self.places) if len(self.places) else None
-
-    def compare(
-        self,
-        pair: tuple[int, int],
-        points: Float64[np.ndarray, "n 3"],
-        other: Int64[np.ndarray, " k"],
-        centre: Float64[np.ndarray, "3"],
-    ) -> _Overlap | None:
-        """Compare with the points that another photo observes; None if this one should see none of them."""
-        if self.tree is None or not len(other):
-            return None
-        own = self._cells(self.places[~np.isin(self.rows, other, assume_unique=True)])
-        other = other[:: max(1, -(-len(other) // SAMPLE))]
-        shared = np.isin(other, self.rows, assume_unique=True)
-        rows, places, angle = self._visible(points[other], centre, shared)
-        if not len(rows):
-            return None
-        cells, size = self._cells(places), CELLS * CELLS
-        return _Overlap(
-            pair,
-            min(int(BINS * angle / ALIKE_DEG), BINS - 1),
-            np.bincount(cells[shared[rows]], minlength=size),
-            np.bincount(cells[~shared[rows]], minlength=size),
-            np.bincount(own, minlength=size),
-        )
-
-    def _visible(
-        self, points: Float64[np.ndarray, "k 3"], centre: Float64[np.ndarray, "3"], shared: np.ndarray
-    ) -> tuple[np.ndarray, Float64[np.ndarray, "v 2"], float]:
-        """Return the rows of the points that this photo should see from a similar view, where, and the mean angle."""
-        places, depths = project_through_lens(self.camera, self.pose, points)
-        edge = MARGIN * self.longer
-        inside = (places >= edge).all(axis=1) & (places <= [self.camera.width - edge, self.camera.height - edge]).all(1)
-        one, two = points - centre, points - self.centre
-        lengths = np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1)
-        cosines = np.einsum("ij,ij->i", one, two) / np.maximum(lengths[0] * lengths[1], 1e-12)
-        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-        alike = angles <= ALIKE_DEG
-        alike &= np.minimum(*lengths) >= ALIKE_SCALE * np.maximum(*lengths)
-        rows = np.flatnonzero(inside & alike & (depths > 0.0))
-        if len(rows):
-            beside = min(BESIDE_COUNT, len(self.places))
-            _, near = self.tree.query(places[rows], beside, distance_upper_bound=BESIDE * self.longer)
-            near = near.reshape(len(rows), -1)
-            nearest = np.append(self.depths, np.inf)[near].min(axis=1)
-            rows = rows[shared[rows] | (nearest >= HIDDEN * depths[rows])]
-        return rows, places[rows], float(angles[rows].mean()) if len(rows) else 0.0
-
-    def _cells(self, places: Float64[np.ndarray, "k 2"]) -> Int64[np.ndarray, " k"]:
-        cells = np.clip((places * (CELLS / self.longer)).astype(np.int64), 0, CELLS - 1)
-        return np.asarray(cells[:, 0] * CELLS + cells[:, 1])
+def doubles_reasons(verified: ViewGraph, found: Doubles) -> list[Reason]:
+    """Return the reason for doubt that doubles are; none if they may be chance."""
+    if found.level() == "good":
+        return []
+    names = [verified.names[number] for number in found.pair]
+    text = f"{who(found.group, verified)} show other things than the photos that the model has at the same "
+    text += f"place, such as {names[0]} and {names[1]}: two places that look alike may have been taken for one."
+    hint = "Compare the two photos: the report shows that place in both. Add photos that lead from one place to the other, or run the places separately."
+    return [Reason(found.level(), text, hint, "doubles")]
 
 
-def _seen(structure: Structure, numbers: Int64[np.ndarray, " m"]) -> list[Int64[np.ndarray, " _"]]:
-    """Return the rows of the well observed points of each photo."""
-    rows: dict[int, list[int]] = {int(number): [] for number in numbers}
-    for row, track in enumerate(structure.tracks):
-        photos = {photo for photo, _ in track}
-        if len(photos) >= MIN_VIEWS:
-            for photo in photos:
-                rows[photo].append(row)
-    return [np.array(found, np.int64) for found in rows.values()]
+def _middle(model: pycolmap.Reconstruction, number: int, points: Float64[np.ndarray, "k 3"]) -> tuple[float, float]:
+    """Return where a photo should see some points: the median, pixels."""
+    image = model.images[number]
+    places, _ = project_through_lens(image.camera, image.cam_from_world().matrix(), points)
+    x, y = np.nanmedian(np.where(np.isfinite(places), places, np.nan), axis=0)
+    return float(x), float(y)

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.sfm.agreement import Agreement, compare, contradicting
-from splatpipe.pipeline.sfm.cuts import GraphCut, find_cut
+from splatpipe.pipeline.sfm.cuts import find_cut
 from splatpipe.pipeline.sfm.pairs import Pair
 from splatpipe.pipeline.sfm.rearrangement import Rearrangement, find_better
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
@@ -50,7 +50,8 @@ class Reason:
         level: Its severity.
         text: The problem in plain words, a whole sentence.
         hint: What to do about it; may be empty.
-        kind: Machine-readable kind: ``placed``, ``focal``, ``bent``, ``unexplained``, ``lens``, ``positions``.
+        kind: Machine-readable kind: ``placed``, ``focal``, ``bent``, ``doubles``,
+            ``unexplained``, ``lens``, ``positions``.
     """
 
     level: Level
@@ -217,7 +218,7 @@ def _bent(agreement: Agreement, found: Rearrangement, verified: ViewGraph) -> li
         cut = find_cut(agreement, against)
         if cut.ratio < CUT_DOUBT:
             return []
-        text = f"{_who(cut, verified)} match the other photos elsewhere more than where the model has them: the "
+        text = f"{who(cut.group, verified)} match the other photos elsewhere more than where the model has them: the "
         text += "scene repeats itself there, or the model is bent."
         return [Reason("doubt", text, hint, "bent")]
     resolved = int((against & ~contradicting(found.agreement)).sum())
@@ -225,13 +226,14 @@ def _bent(agreement: Agreement, found: Rearrangement, verified: ViewGraph) -> li
     text += f"{resolved} of the {against.sum()} contradicting pairs of photos" if resolved else "the matches better"
     cut = find_cut(agreement, against)
     if cut.ratio >= CUT_DOUBT:
-        text += f": {_who(cut, verified)} disagree with the others"
+        text += f": {who(cut.group, verified)} disagree with the others"
     text += ", so the model is bent or contains duplicates."
     return [Reason("bad" if gain >= GAIN_BAD else "doubt", text, hint, "bent")]
 
 
-def _who(cut: GraphCut, verified: ViewGraph) -> str:
-    names = [verified.names[number] for number in cut.group]
+def who(group: Sequence[int], verified: ViewGraph) -> str:
+    """Name a group of photos."""
+    names = [verified.names[number] for number in group]
     if len(names) <= 2:
         return " and ".join(names)
     return f"{len(names)} photos ({names[0]}, {names[1]}, …)"

@@ -34,8 +34,10 @@ DAMPING = 1e-4  # of the normal matrix' diagonal: the frame of the world and cha
 PASSES = 10  # of the reweighted fit of a group's place
 WEAK_SCALE = 0.01  # weight of a group's scale staying as it is: a single line of sight leaves it open
 GROUPS = 3  # that are moved, one after another
-WORTH_MOVING = 0.3  # contradicting over agreeing matches of a group with the others
-MAX_LINKS = 40  # two-view geometries for a group's place, those of the most matches
+WORTH_MOVING = 0.5  # contradicting over agreeing matches of a group with the others
+MAX_LINKS = 16  # two-view geometries for a group's place, those of the most matches
+WORTH_COMPARING = 0.003  # of the score by the samples: below the least gain that matters
+LINK_SAMPLE = 100  # matches for a two-view geometry
 DIGITS = 6  # decimals of angles that are compared: the last ones vary with the number of threads
 TURN_MOST = 0.2  # radians a step; more is outside of the linearisation
 
@@ -151,7 +153,9 @@ def move_group(
     towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     about = here.centres[list(group)].mean(axis=0)
     arms = (here.centres[inside] - about) @ turn.T
-    across = np.eye(3) - towards[:, :, None] * towards[:, None, :]  # (about + shift + scale arm - outside) x towards = 0
+    across = (
+        np.eye(3) - towards[:, :, None] * towards[:, None, :]
+    )  # (about + shift + scale arm - outside) x towards = 0
     left = np.concatenate([across, (across @ arms[:, :, None])], axis=2)
     right = (across @ (here.centres[outside] - about)[:, :, None])[:, :, 0]
     weights = np.ones(len(links))
@@ -177,6 +181,12 @@ def _middle_rotation(turns: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray,
     return np.asarray(turns[int(np.argmin(np.round(angles.sum(axis=1), DIGITS)))])
 
 
+def _sampled_score(here: Arrangement, samples: Samples) -> float:
+    """Return the score by the samples alone, and without regard to which side of a camera a point is on."""
+    near = np.maximum(1.0 - np.abs(_residuals(here, samples)[0]), 0.0)
+    return float((samples.weights * near).sum() / max(float(samples.weights.sum()), 1e-12))
+
+
 def _stepped(here: Arrangement, samples: Samples, weights: Float64[np.ndarray, "n s"], width: float) -> Arrangement:
     """Return the poses after a damped Gauss-Newton step with the weights of Geman and McClure's loss."""
     off, slopes = _residuals(here, samples)
@@ -197,9 +207,7 @@ def _stepped(here: Arrangement, samples: Samples, weights: Float64[np.ndarray, "
     return Arrangement(_rotations(step[:, :3]) @ here.turns, here.centres + step[:, 3:])
 
 
-def _residuals(
-    here: Arrangement, samples: Samples
-) -> tuple[Float64[np.ndarray, "n s"], Float64[np.ndarray, "n s 12"]]:
+def _residuals(here: Arrangement, samples: Samples) -> tuple[Float64[np.ndarray, "n s"], Float64[np.ndarray, "n s 12"]]:
     """Return signed errors over the bound, and their derivatives by both photos' turns (world frame) and centres."""
     i, j = samples.ends.T
     turn_i, turn_j = here.turns[i], here.turns[j]
@@ -273,6 +281,8 @@ def find_better(model: pycolmap.Reconstruction, verified: ViewGraph, agreement: 
         before = now
         for start in starts:
             moved = rearrange(start, samples, against[agreement.placed])
+            if _sampled_score(moved, samples) < _sampled_score(here, samples) + WORTH_COMPARING:
+                continue
             found = compare(model, verified, dict(zip(numbers, moved.matrices(), strict=True)))
             if found.score > now.score:
                 here, now = moved, found
@@ -309,6 +319,7 @@ def _two_view(
 ) -> Float64[np.ndarray, "3 4"] | None:
     """Return the second photo's pose from the first's frame by their matches alone."""
     rows = verified.matches[min(one, two), max(one, two)]
+    rows = rows[:: max(1, -(-len(rows) // LINK_SAMPLE))]
     rows = rows if one < two else rows[:, ::-1]
     places = [verified.keypoints[number][rows[:, at]].astype(np.float64) for at, number in enumerate((one, two))]
     cameras = [model.images[number].camera for number in (one, two)]

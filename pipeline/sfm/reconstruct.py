@@ -49,6 +49,7 @@ class MappingAttempt:
         models: The models, largest first; may be empty.
         judgement: Of the first model; None if there is none.
         cpu_s: CPU time, seconds.
+        adjusted: Whether an earlier attempt's cameras were adjusted instead of mapping the photos again.
     """
 
     how: str
@@ -57,6 +58,7 @@ class MappingAttempt:
     models: list[Model]
     judgement: Judgement | None
     cpu_s: float
+    adjusted: bool = False
 
     @property
     def placed(self) -> int:
@@ -114,7 +116,8 @@ class Reconstructor:
         models = [model, *answer.models[1:]]
         if not _has_points(model) or model.num_reg_images() < old.num_reg_images():
             return answer
-        return self._judged(MappingAttempt(f"{answer.how}, {how}", answer.mapper, answer.options, models, None, took))
+        fresh = replace(answer, how=f"{answer.how}, {how}", models=models, judgement=None, cpu_s=took, adjusted=True)
+        return self._judged(fresh)
 
     def add_note(self, answer: MappingAttempt, text: str) -> None:
         """Say something about an attempt in its row."""
@@ -224,7 +227,8 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
         note = f"{found.held} of {found.tried} predicted pairs were verified, {found.contradicting} contradict it"
         work.add_note(answer, note)
         work.database, work.verified = found.database, found.verified
-        answer = _judged_again(work, answer)
+        if thin or found.contradicting:
+            answer = _judged_again(work, answer)
         if not thin:
             break
         work.further += number == 0
@@ -272,6 +276,7 @@ def _row(answer: MappingAttempt) -> dict[str, JSON]:
         "mapper": answer.mapper,
         "how": answer.how,
         "placed": answer.placed,
+        "adjusted": answer.adjusted,
         "focal_held": answer.options.hold_focal,
         "cpu_s": round(answer.cpu_s, 1),
     }
