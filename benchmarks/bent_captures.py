@@ -258,6 +258,16 @@ def _verdict(row: Row, error: float, bound: float, total: int) -> str:
     return "right" if row["placed"] >= PLACED * total and error <= bound else "WRONG"
 
 
+def looks_alike(model: pycolmap.Reconstruction, share: float) -> set[int]:
+    """Return the ids of a share of a model's points: those on one side along the scene's longest extent."""
+    numbers = sorted(model.points3D)
+    points = np.array([model.points3D[number].xyz for number in numbers])
+    middle = np.median(points, axis=0)
+    near = points[np.linalg.norm(points - middle, axis=1) <= np.quantile(np.linalg.norm(points - middle, axis=1), 0.9)]
+    along = (points - middle) @ np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][0]
+    return {number for number, place in zip(numbers, along, strict=True) if place <= np.quantile(along, share)}
+
+
 def fold(source: Path, target: Path, model: pycolmap.Reconstruction, share: float) -> None:
     """Write a capture of two places that look alike in a part of the scene.
 
@@ -267,12 +277,7 @@ def fold(source: Path, target: Path, model: pycolmap.Reconstruction, share: floa
         model: Its sound model.
         share: Of the model's points, that look alike: those on one side along the scene's longest direction.
     """
-    numbers = sorted(model.points3D)
-    points = np.array([model.points3D[number].xyz for number in numbers])
-    middle = np.median(points, axis=0)
-    near = points[np.linalg.norm(points - middle, axis=1) <= np.quantile(np.linalg.norm(points - middle, axis=1), 0.9)]
-    along = (points - middle) @ np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][0]
-    alike = {number for number, place in zip(numbers, along, strict=True) if place <= np.quantile(along, share)}
+    alike = looks_alike(model, share)
 
     def kept(image: int, rows: np.ndarray) -> np.ndarray:
         if image not in model.images:
@@ -304,7 +309,7 @@ def try_folds(out: Path, shares: Sequence[float]) -> list[Row]:
             fold(capture.database, database, sound, share)
             everything = frozenset((i, j) for j in sound.images for i in sound.images if i < j)
             _, row = answer(replace(capture, database=database, tried=everything))
-            what = "called bad" if row["verdict"] == "bad" else "called doubtful" if row["verdict"] == "doubt" else "WRONG"
+            what = {"bad": "called bad", "doubt": "called doubtful"}.get(str(row["verdict"]), "WRONG")
             rows.append({"name": f"{out.name}, {100 * share:.0f} % alike", **row, "is": what})
             print({key: rows[-1][key] for key in rows[-1] if key != "focal"}, flush=True)
     return rows

@@ -168,6 +168,7 @@ def rays_of(model: pycolmap.Reconstruction, number: int, verified: ViewGraph) ->
 def _points(image: pycolmap.Image | None, count: int) -> Int64[np.ndarray, " n"]:
     """Return the id of the point that each keypoint of a photo observes, -1 for none."""
     result = np.full(count, -1, np.int64)
-    for row in image.get_observation_point2D_idxs() if image is not None else ():
-        result[row] = image.point2D(row).point3D_id
+    if image is not None:
+        for row in image.get_observation_point2D_idxs():
+            result[row] = image.point2D(row).point3D_id
     return result

@@ -61,7 +61,7 @@ class Doubles:
         return "bad" if self.ratio >= RATIO_BAD else "doubt"
 
     def as_json(self, verified: ViewGraph) -> JSON:
-        """Return the two photos and places to look at for ``models.json``; None where nothing speaks against a model."""
+        """Return the two photos and places to look at, for ``models.json``; None if nothing speaks against a model."""
         if self.level() == "good":
             return None
         names = [verified.names[number] for number in self.pair]
@@ -142,7 +142,8 @@ def doubles_reasons(verified: ViewGraph, found: Doubles) -> list[Reason]:
     names = [verified.names[number] for number in found.pair]
     text = f"{who(found.group, verified)} show other things than the photos that the model has at the same "
     text += f"place, such as {names[0]} and {names[1]}: two places that look alike may have been taken for one."
-    hint = "Compare the two photos: the report shows that place in both. Add photos that lead from one place to the other, or run the places separately."
+    hint = "Compare the two photos: the report shows that place in both. Add photos that lead from one place to the "
+    hint += "other, or run the places separately."
     return [Reason(found.level(), text, hint, "doubles")]
 
 

@@ -304,7 +304,7 @@ def _moved_groups(
     rows = np.flatnonzero(contradicting(agreement))
     rows = rows[np.argsort(-agreement.matches[rows], kind="stable")]
     row_of = {number: row for row, number in enumerate(numbers)}
-    links = []
+    links: list[tuple[int, int, Float64[np.ndarray, "3 4"]]] = []
     for i, j in agreement.pairs[rows].tolist():
         if (i in inside) != (j in inside) and len(links) < MAX_LINKS:
             one, two = (j, i) if i in inside else (i, j)

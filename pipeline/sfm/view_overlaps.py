@@ -137,7 +137,7 @@ class PhotoView:
         alike = angles <= ALIKE_DEG
         alike &= np.minimum(*lengths) >= ALIKE_SCALE * np.maximum(*lengths)
         rows = np.flatnonzero(inside & alike & (depths > 0.0))
-        if len(rows):
+        if len(rows) and self.tree is not None:
             beside = min(BESIDE_COUNT, len(self.places))
             _, near = self.tree.query(places[rows], beside, distance_upper_bound=BESIDE * self.longer)
             near = near.reshape(len(rows), -1)

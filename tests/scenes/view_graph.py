@@ -144,7 +144,7 @@ def with_shifted_matches(ring: Ring, count: int, shift: float = 1.5) -> ViewGrap
         shown = []
         for number, offset in ((i, 0.0), (j, shift)):
             pose = ring.poses[number]
-            seen = np.asarray(lens.img_from_cam((places + [0.0, offset, 0.0]) @ pose[:, :3].T + pose[:, 3]))
+            seen = np.asarray(lens.img_from_cam((places + np.array([0.0, offset, 0.0])) @ pose[:, :3].T + pose[:, 3]))
             shown.append(seen + rng.normal(0.0, NOISE_PX, seen.shape))
         inside = np.all([((it > 0.0) & (it < [WIDTH, HEIGHT])).all(axis=1) for it in shown], axis=0)
         columns = []
