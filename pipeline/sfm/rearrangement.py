@@ -29,7 +29,8 @@ from splatpipe.pipeline.sfm.view_graph import ViewGraph
 SAMPLE = 24  # matches per pair: the adjustment has six unknowns per photo
 WIDTHS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # of the loss, times EXPLAINED_PX
 STEPS = 4  # of Gauss-Newton at each width
-FAVOUR = 4.0  # weight of contradicting pairs at the widest loss; 1 from the middle on
+FAVOUR, WIDE = 4.0, 8.0  # weight of contradicting pairs while the loss is that wide
+MOVED_WIDTHS = (4.0, 2.0, 1.0)  # where a group was moved: its place is nearly right
 DAMPING = 1e-4  # of the normal matrix' diagonal: the frame of the world and chains of photos are undetermined
 PASSES = 10  # of the reweighted fit of a group's place
 WEAK_SCALE = 0.01  # weight of a group's scale staying as it is: a single line of sight leaves it open
@@ -115,17 +116,20 @@ def sample(
     return Samples(ends, first, second, weights, bounds)
 
 
-def rearrange(start: Arrangement, samples: Samples, contradicts: Bool[np.ndarray, " n"]) -> Arrangement:
+def rearrange(
+    start: Arrangement, samples: Samples, contradicts: Bool[np.ndarray, " n"], widths: Sequence[float] = WIDTHS
+) -> Arrangement:
     """Adjust poses to the epipolar lines of all samples, robustly.
 
     Args:
         start: The poses to begin with.
         samples: The matches.
-        contradicts: Which of the pairs the model contradicts.
+        contradicts: Which of the pairs the model contradicts: they have more weight where the loss is wide.
+        widths: Of the loss, one after another.
     """
     here = start
-    for number, width in enumerate(WIDTHS):
-        favour = max(1.0, FAVOUR * (1.0 - 2.0 * number / len(WIDTHS)))
+    for width in widths:
+        favour = FAVOUR if width >= WIDE else 1.0
         weights = samples.weights * np.where(contradicts, favour, 1.0)[:, None]
         for _ in range(STEPS):
             here = _stepped(here, samples, weights, width)
@@ -274,13 +278,14 @@ def find_better(model: pycolmap.Reconstruction, verified: ViewGraph, agreement: 
     here, now = arrangement_of(model, numbers), agreement
     for number in range(GROUPS + 1):
         against = contradicting(now)
-        starts = [here] if number == 0 else []
+        starts = [(here, WIDTHS)] if number == 0 else []
         group = find_cut(now, against)
         if group.ratio >= WORTH_MOVING:
-            starts += _moved_groups(model, verified, (now, here), group.group, numbers)
+            moved = _moved_group(model, verified, (now, here), group.group, numbers)
+            starts += [(moved, MOVED_WIDTHS)] if moved is not None else []
         before = now
-        for start in starts:
-            moved = rearrange(start, samples, against[agreement.placed])
+        for start, widths in starts:
+            moved = rearrange(start, samples, against[agreement.placed], widths)
             if _sampled_score(moved, samples) < _sampled_score(here, samples) + WORTH_COMPARING:
                 continue
             found = compare(model, verified, dict(zip(numbers, moved.matrices(), strict=True)))
@@ -291,13 +296,13 @@ def find_better(model: pycolmap.Reconstruction, verified: ViewGraph, agreement: 
     return Rearrangement(now, dict(zip(numbers, here.matrices(), strict=True)))
 
 
-def _moved_groups(
+def _moved_group(
     model: pycolmap.Reconstruction,
     verified: ViewGraph,
     best: tuple[Agreement, Arrangement],
     group: Sequence[int],
     numbers: Sequence[int],
-) -> list[Arrangement]:
+) -> Arrangement | None:
     """Return the arrangement with a group moved to where its contradicting pairs with the others want it."""
     agreement, here = best
     inside = set(group)
@@ -311,7 +316,7 @@ def _moved_groups(
             pose = _two_view(model, verified, one, two)
             if pose is not None:
                 links.append((row_of[one], row_of[two], pose))
-    return [move_group(here, [row_of[number] for number in group], links)] if links else []
+    return move_group(here, [row_of[number] for number in group], links) if links else None
 
 
 def _two_view(
