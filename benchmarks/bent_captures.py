@@ -1,24 +1,28 @@
-"""Test mapping on captures that provoke bent models, and on sound ones.
+"""Test mapping on captures that provoke bent and folded models, and on sound ones.
 
-    bent_captures.py DEMO_OUT [--sound OUT …] [--only NAME …]
+    bent_captures.py DEMO_OUT [--others OUT …] [--folds OUT …] [--sound OUT …] [--only NAME …]
 
-DEMO_OUT is a run of the demo up to `matches` (``splatpipe demo OUT --until matches``). Ten variants are derived from
-its database: the focal length is no longer known (COLMAP's guess of 1.2 times the longer side, without a prior), and
+Each OUT is a run up to `matches` (``splatpipe demo OUT --until matches``). Ten variants are derived from the demo's
+database: the focal length is no longer known (COLMAP's guess of 1.2 times the longer side, without a prior), and
 verified pairs are thinned by a rule and a seed until incremental mapping goes wrong: random trees of pairs, so that no
 loop closes; trees with a few triangles; the photo sequence with a few bridges; matches only near the image centre.
+Of every other capture (castle and fox, of rows of windows and a patterned wallpaper) five variants are derived.
 
-Each variant is mapped twice: as splatpipe did before this benchmark (COLMAP's incremental mapper with its defaults, on
-one thread, and again with lower thresholds if it registered less than half of the photos), and by the pipeline. The
-error is the RMS distance of the camera centres from the demo's truth after a least-squares similarity. A model is bent
-if nine tenths of the photos are registered but the error is more than three times that of the sound run, and incomplete
-if fewer are registered. The pipeline's answer is right if nine tenths are registered within three times the error, or
-if it reports the model as bad. No sound capture may be reported as bad.
+Each variant is mapped by the pipeline. The error is the RMS distance of the camera centres from the truth after a
+least-squares similarity: the demo's known one, otherwise the cameras of the whole capture. The answer is right if nine
+tenths of the photos are registered within three times the demo's sound error, or within 0.5 % of the cameras' extent
+(RMS distance from their mean), or if the model is reported as bad. No sound capture may be reported as bad.
+
+A folded capture is a sound one whose photos are said to show two places, those of odd numbers one and those of even
+numbers the other, that look alike in a part of the scene: of the matches between the two, only those of points in that
+part are kept. The model in which the two places are one explains all matches. It has to be reported as bad.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -34,6 +38,7 @@ from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.run_folder import open_run_folder
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import MappingInput
+from splatpipe.pipeline.sfm.doubles import doubles_reasons, find_doubles
 from splatpipe.pipeline.sfm.judging import judge
 from splatpipe.pipeline.sfm.ladder import run_ladder
 from splatpipe.pipeline.sfm.options import SparseConfig
@@ -43,7 +48,9 @@ from splatpipe.stages.line import LINE, MATCHES
 
 GUESS = 1.2  # of the longer side: COLMAP's guess if nothing is known
 PLACED = 0.9  # share of the photos
-TIMES = 3.0  # times the sound run's error
+TIMES, SOUND_M = 3.0, 3.6e-3  # times the demo's sound error, metres
+EXTENT = 0.005  # of the RMS distance of the cameras from their mean, for captures without truth
+FOLDED = (0.3, 0.5)  # shares of a scene that look alike
 MIN_MATCHES = 15  # of a pair that is kept
 
 Pair = tuple[int, int]
@@ -101,6 +108,16 @@ VARIANTS = [
 ]
 
 
+OTHERS = [
+    *(ThinnedGraph(f"tree {seed}", tree(seed, 60, 0)) for seed in (1, 2)),
+    *(ThinnedGraph(f"triangles {seed}", tree(seed, 40, 15)) for seed in (1, 2)),
+    ThinnedGraph("sequence", sequence(1, ())),
+]
+COLUMNS = {"capture": "name", "photos": "placed", "mm": "mm:.1f", "attempt": "how", "mappings": "mappings"}
+COLUMNS |= {"against": "against", "gain": "gain:.4f", "missing": "missing:.3f", "verdict": "verdict", "is": "is"}
+COLUMNS |= {"CPU s": "cpu:.0f", "judging s": "judging:.1f"}
+
+
 def thin(source: Path, target: Path, variant: ThinnedGraph) -> None:
     """Write a thinned variant of a match database."""
     verified = read_verified(source)
@@ -135,28 +152,6 @@ def _in_middle(verified: ViewGraph, number: int, rows: np.ndarray, variant: Thin
     return np.asarray((off <= variant.middle * size / 2.0).all(axis=1))
 
 
-def map_as_before(database: Path, scratch: Path) -> pycolmap.Reconstruction | None:
-    """Run COLMAP's incremental mapper with its defaults; again with lower thresholds if it registers under half."""
-    total = len(read_verified(database).names)
-    best = None
-    for relaxed in (False, True):
-        options = pycolmap.IncrementalPipelineOptions()
-        options.min_model_size, options.num_threads, options.extract_colors = 3, 1, False
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
-        if relaxed:
-            options.mapper.init_min_num_inliers, options.mapper.init_min_tri_angle = 50, 6.0
-            options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = 15, 0.15
-        pycolmap.set_random_seed(0)
-        with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            found = pycolmap.incremental_mapping(database, folder, folder, options)
-        for model in found.values():
-            if best is None or model.num_reg_images() > best.num_reg_images():
-                best = model
-        if best is not None and best.num_reg_images() >= total / 2:
-            break
-    return best
-
-
 def error_m(model: pycolmap.Reconstruction, truth: Truth) -> float:
     """Return the RMS distance of the camera centres from the truth after a least-squares similarity, in metres."""
     images = [model.images[number] for number in sorted(model.reg_image_ids())]
@@ -173,19 +168,23 @@ def error_m(model: pycolmap.Reconstruction, truth: Truth) -> float:
 
 def open_capture(out: Path, scratch: Path) -> MappingInput:
     """Open a run's capture as the stage `sparse` would see it."""
-    folder = open_run_folder(out, LINE)
+    folder = open_run_folder(out.resolve(), LINE)
     photos_dir, _ = folder.settings()
     at = {name: part.path for name, part in folder.lineage(MATCHES).items()}
+    photos = load_photo_list(at["ingest.photos"])
+    numbers = {photo.name: number for number, photo in enumerate(photos.photos, start=1)}
+    pairs = json.loads(at["matches.pairs"].read_text(encoding="utf-8"))["pairs"]
     return MappingInput(
         database=at["matches.database"],
         features=at["features.database"],
         colours=np.load(at["features.colours"]),
-        photos=load_photo_list(at["ingest.photos"]),
+        photos=photos,
         photos_part=at["ingest.photos"],
         photos_dir=photos_dir,
         positions=json.loads(at["ingest.positions"].read_text(encoding="utf-8"))["positions"],
         cameras=json.loads(at["ingest.cameras"].read_text(encoding="utf-8"))["cameras"],
         scratch=scratch,
+        tried=frozenset((numbers[first], numbers[second]) for first, second, _ in pairs),
     )
 
 
@@ -195,87 +194,153 @@ def answer(capture: MappingInput) -> tuple[pycolmap.Reconstruction, Row]:
     config, report = SparseConfig(), SilentReporter()
     found = run_ladder(capture, reconstruct(capture, config, report), config, report)
     took = time.process_time() - began
+    began = time.process_time()
     verdict = judge(found.model, found.verified, capture.cameras)
+    doubles = find_doubles(found.model, capture.tried.union(found.verified.matches))
+    judging = time.process_time() - began
+    verdict = verdict.joined(doubles_reasons(found.verified, doubles))
     chosen = next(row["how"] for row in found.tried if row["chosen"])
     row = {
         "how": chosen,
+        "mappings": sum(not row["adjusted"] for row in found.tried),
         "placed": found.model.num_reg_images(),
         "verdict": verdict.level,
         "against": f"{verdict.contradicted}/{verdict.pairs}",
+        "gain": verdict.reachable - verdict.score,
+        "missing": doubles.ratio,
         "cpu": took,
+        "judging": judging,
         "focal": found.model.cameras[min(found.model.cameras)].mean_focal_length(),
     }
     return found.model, row
 
 
-def try_variants(out: Path, only: Sequence[str], sound_mm: float) -> list[Row]:
-    """Return a row for the sound capture, unless its error is given, and one for each variant."""
+def demo_truth() -> Truth:
+    """Return the demo's camera centres, metres."""
     truth_file = json.loads((capture_path().parent / "truth.json").read_text(encoding="utf-8"))
-    truth = {photo["name"]: np.array(photo["centre_m"]) for photo in truth_file["photos"]}
+    return {photo["name"]: np.array(photo["centre_m"]) for photo in truth_file["photos"]}
+
+
+def truth_of(model: pycolmap.Reconstruction) -> Truth:
+    """Return a model's camera centres over their RMS distance from their mean."""
+    images = [model.images[number] for number in sorted(model.reg_image_ids())]
+    centres = np.array([image.projection_center() for image in images])
+    centres = (centres - centres.mean(axis=0)) / np.sqrt(centres.var(axis=0).sum())
+    return {image.name: centre for image, centre in zip(images, centres, strict=True)}
+
+
+def try_variants(out: Path, only: Sequence[str], variants: Sequence[ThinnedGraph], sound_m: float) -> list[Row]:
+    """Return a row for each variant of the demo, if its sound run's error is given, or of another capture."""
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         capture = open_capture(out, scratch)
-        sound = 1e-3 * sound_mm
-        if not sound:
-            before = map_as_before(capture.database, scratch)
-            assert before is not None
-            sound = error_m(before, truth)
-            model, row = answer(capture)
-            first = {"name": "sound", "before_placed": before.num_reg_images(), "before_mm": 1e3 * sound}
-            rows.append({**first, **row, "mm": 1e3 * error_m(model, truth), "is": _verdict(row, 0.0, 1.0, len(truth))})
-        for variant in VARIANTS:
+        truth = demo_truth() if sound_m else truth_of(answer(capture)[0])
+        bound = TIMES * sound_m or EXTENT
+        for variant in variants:
             if only and variant.name not in only:
                 continue
             database = scratch / f"{variant.name}.db"
             thin(capture.database, database, variant)
-            before = map_as_before(database, scratch)
             cameras = [{**camera, "has_prior": False, "focal_source": "guess"} for camera in capture.cameras]
-            model, row = answer(replace(capture, database=database, cameras=cameras))
+            kept = frozenset(read_verified(database).matches)
+            model, row = answer(replace(capture, database=database, cameras=cameras, tried=kept))
             error = error_m(model, truth)
-            result = {"name": variant.name, **row, "mm": 1e3 * error, "is": _verdict(row, error, sound, len(truth))}
-            if before is not None:
-                result |= _before(before, error_m(before, truth), sound, len(truth))
-            rows.append(result)
-            print(variant.name, result["is"], flush=True)
+            result = {"name": f"{out.name} {variant.name}", **row, "mm": 1e3 * error}
+            rows.append({**result, "is": _verdict(row, error, bound, len(truth))})
+            print({key: rows[-1][key] for key in rows[-1] if key != "focal"}, flush=True)
     return rows
 
 
-def _before(model: pycolmap.Reconstruction, error: float, sound: float, total: int) -> Row:
-    placed = model.num_reg_images()
-    what = "incomplete" if placed < PLACED * total else "bent" if error > TIMES * sound else "right"
-    return {"before_placed": placed, "before_mm": 1e3 * error, "before": what}
-
-
-def _verdict(row: Row, error: float, sound: float, total: int) -> str:
+def _verdict(row: Row, error: float, bound: float, total: int) -> str:
     if row["verdict"] == "bad":
         return "called bad"
-    return "right" if row["placed"] >= PLACED * total and error <= TIMES * sound else "WRONG"
+    return "right" if row["placed"] >= PLACED * total and error <= bound else "WRONG"
+
+
+def looks_alike(model: pycolmap.Reconstruction, share: float) -> set[int]:
+    """Return the ids of a share of a model's points: those on one side along the scene's longest extent."""
+    numbers = sorted(model.points3D)
+    points = np.array([model.points3D[number].xyz for number in numbers])
+    middle = np.median(points, axis=0)
+    near = points[np.linalg.norm(points - middle, axis=1) <= np.quantile(np.linalg.norm(points - middle, axis=1), 0.9)]
+    along = (points - middle) @ np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][0]
+    return {number for number, place in zip(numbers, along, strict=True) if place <= np.quantile(along, share)}
+
+
+def fold(source: Path, target: Path, model: pycolmap.Reconstruction, share: float) -> None:
+    """Write a capture of two places that look alike in a part of the scene.
+
+    Args:
+        source: The database of a sound capture.
+        target: The database to write.
+        model: Its sound model.
+        share: Of the model's points, that look alike: those on one side along the scene's longest direction.
+    """
+    alike = looks_alike(model, share)
+
+    def kept(image: int, rows: np.ndarray) -> np.ndarray:
+        if image not in model.images:
+            return np.zeros(len(rows), bool)
+        points2d = model.images[image].points2D
+        return np.array([points2d[int(row)].point3D_id in alike for row in rows], bool)
+
+    shutil.copyfile(source, target)
+    with pycolmap.Database.open(source) as old, pycolmap.Database.open(target) as new:
+        for i, j in sorted(read_verified(source).matches):
+            if (i - j) % 2:
+                geometry = old.read_two_view_geometry(i, j)
+                rows = np.asarray(geometry.inlier_matches)
+                geometry.inlier_matches = rows[kept(i, rows[:, 0]) & kept(j, rows[:, 1])]
+                new.delete_two_view_geometry(i, j)
+                if len(geometry.inlier_matches) >= MIN_MATCHES:
+                    new.write_two_view_geometry(i, j, geometry)
+
+
+def try_folds(out: Path, shares: Sequence[float]) -> list[Row]:
+    """Return a row for each share of a scene that looks alike."""
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        capture = open_capture(out, scratch)
+        sound = reconstruct(capture, SparseConfig(), SilentReporter()).model
+        for share in shares:
+            database = scratch / f"{share}.db"
+            fold(capture.database, database, sound, share)
+            everything = frozenset((i, j) for j in sound.images for i in sound.images if i < j)
+            _, row = answer(replace(capture, database=database, tried=everything))
+            what = {"bad": "called bad", "doubt": "called doubtful"}.get(str(row["verdict"]), "WRONG")
+            rows.append({"name": f"{out.name}, {100 * share:.0f} % alike", **row, "is": what})
+            print({key: rows[-1][key] for key in rows[-1] if key != "focal"}, flush=True)
+    return rows
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--others", type=Path, nargs="*", default=[])
+    parser.add_argument("--folds", type=Path, nargs="*", default=[])
+    parser.add_argument("--shares", type=float, nargs="*", default=FOLDED)
     parser.add_argument("--sound", type=Path, nargs="*", default=[])
     parser.add_argument("--only", nargs="*", default=[])
-    parser.add_argument("--sound-mm", type=float, default=0.0, help="the sound run's error before, where it is known")
     options = parser.parse_args()
-    columns = {"capture": "name", "before": "before_placed", "mm": "before_mm:.1f", "": "before"}
-    columns |= {"now": "placed", "now mm": "mm:.1f", "mapper": "how", "against": "against", "verdict": "verdict"}
-    columns |= {"is": "is", "CPU s": "cpu:.0f"}
-    print_table(
-        "Captures made to bend, of 40 photos", try_variants(options.out, options.only, options.sound_mm), columns
-    )
+    rows = try_variants(options.out, options.only, VARIANTS, SOUND_M)
+    for out in options.others:
+        rows += try_variants(out, options.only, OTHERS, 0.0)
+    print_table("Captures made to bend", rows, COLUMNS)
+    folds = [row for out in options.folds for row in try_folds(out, options.shares)]
+    if folds:
+        print_table("Captures made to fold", folds, {label: key for label, key in COLUMNS.items() if label != "mm"})
     sound = []
     for out in options.sound:
         with tempfile.TemporaryDirectory() as folder:
             _, row = answer(open_capture(out, Path(folder)))
         sound.append({"name": out.name, **row})
+        print(sound[-1], flush=True)
     if sound:
-        columns = {"capture": "name", "photos": "placed", "focal px": "focal:.0f", "mapper": "how"}
-        columns |= {"against": "against", "verdict": "verdict", "CPU s": "cpu:.0f"}
-        print_table("Sound captures", sound, columns)
+        kept = {label: key for label, key in COLUMNS.items() if label not in ("mm", "is")}
+        print_table("Sound captures", sound, {**kept, "focal px": "focal:.0f"})
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=6,
+    version=7,
     config=SparseConfig,
     reads=(
         "matches.database",

@@ -20,9 +20,11 @@ from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, report_cameras
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
+from splatpipe.pipeline.sfm.doubles import doubles_reasons, find_doubles
 from splatpipe.pipeline.sfm.external_evidence import outside_reasons
-from splatpipe.pipeline.sfm.judging import judge
+from splatpipe.pipeline.sfm.judging import FEW_PAIRS, judge
 from splatpipe.pipeline.sfm.ladder import run_ladder
+from splatpipe.pipeline.sfm.ladder_pairs import tried_pairs
 from splatpipe.pipeline.sfm.lens_model import stated_lenses
 from splatpipe.pipeline.sfm.lenses import calibrate, report_lenses
 from splatpipe.pipeline.sfm.options import SparseConfig
@@ -46,17 +48,27 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         stated = stated_lenses(read_json(inputs["ingest.lenses"])["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
+        tried = capture.tried | tried_pairs(found.database)
     model = canonical(found.model, found.colours, _keypoint_counts(found.verified))
     write_model(model, out / "sparse" / "0")
     outside = outside_reasons(model, found.verified, capture.cameras, capture.positions)
-    verdict = judge(model, found.verified, capture.cameras).joined(outside)
-    summary = {**_summary(model, found, capture.cameras), "lenses": list(lenses), "verdict": verdict.as_json()}
+    doubles = find_doubles(model, tried.union(found.verified.matches))
+    verdict = judge(model, found.verified, capture.cameras)
+    reasons = [*outside, *doubles_reasons(found.verified, doubles)]
+    summary = {
+        **_summary(model, found, capture.cameras),
+        "lenses": list(lenses),
+        "alike": [[found.verified.names[number] for number in pair] for pair in verdict.alike],
+        "doubles": doubles.as_json(found.verified),
+        "verdict": verdict.joined(reasons).as_json(),
+    }
     text = json.dumps(_without_times(summary), ensure_ascii=False, indent=1) + "\n"
     write_file(out / "models.json", text)
     _warn(summary, report)
     report_cameras(summary["cameras"], report)
     report_lenses(summary, report)
-    return {**summary, "unregistered": len(summary["unregistered"]), "other_models": len(summary["other_models"])}
+    counted = {key: len(summary[key]) for key in ("unregistered", "other_models", "alike")}
+    return {**summary, **counted}
 
 
 def _capture(inputs: Inputs, scratch: Path) -> MappingInput:
@@ -150,6 +162,10 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
     alone = sorted(set(left).difference(*summary["other_models"]))
     if alone:
         report.warning(f"{len(alone)} of {summary['photos']} photos could not be placed: {list_names(alone)}.")
+    if len(summary["alike"]) >= FEW_PAIRS:
+        report.note(
+            f"{len(summary['alike'])} pairs of photos look alike without showing the same place (rows of windows?)."
+        )
     for reason in summary["verdict"]["reasons"]:
         if reason["kind"] != "placed":  # reported above, by name
             bad = "The camera poses are unreliable: " if reason["level"] == "bad" else ""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.sfm.agreement import Agreement
 
@@ -42,12 +42,28 @@ def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> Graph
     numbers = np.unique(agreement.pairs[agreement.placed])
     if not contradicts.any() or len(numbers) < 2 * SMALLEST_GROUP:
         return GraphCut()
-    agree, against = _weights(agreement, contradicts, numbers)
+    return cut_between(*_weights(agreement, contradicts, numbers), numbers)
+
+
+def cut_between(
+    agree: Float64[np.ndarray, "m m"],
+    against: Float64[np.ndarray, "m m"],
+    numbers: Int64[np.ndarray, " m"],
+    floor: float = MIN_MATCHES_APART,
+) -> GraphCut:
+    """Return the cut with the largest ratio of what speaks against the two groups' places to what agrees.
+
+    Args:
+        agree: Symmetric.
+        against: Likewise.
+        numbers: Image ids of the rows.
+        floor: Least weight of what agrees between two groups.
+    """
     best = GraphCut()
     least = max(SMALLEST_GROUP, int(np.ceil(SMALLEST_SHARE * len(numbers))))
     for order in (np.argsort(_eigenvector(agree, against), kind="stable"), *_detached(agree, against)):
         held, contra = _crossing(agree, order), _crossing(against, order)
-        ratios = contra / np.maximum(held, MIN_MATCHES_APART)
+        ratios = contra / np.maximum(held, floor)
         sizes = np.arange(1, len(order))
         ratios[(sizes < least) | (len(order) - sizes < least)] = 0.0
         at = int(np.argmax(ratios))

@@ -1,25 +1,27 @@
 """Judge whether the estimated cameras are right, by the model itself and not by how it was obtained.
 
 The evidence is what was not used to build the model: all verified matches (``agreement``), the metadata's focal
-lengths where they can be trusted, and simple shares of the photos. A bent model shows as pairs of photos whose matches
-it contradicts. A few contradictions are normal, since windows and roofs repeat; in a bent or ghosted model they are
-numerous, as strong as the consistent pairs, or separate two groups of cameras.
+lengths where they can be trusted, and simple shares of the photos. A bent or ghosted model is known by another
+arrangement of its cameras that explains clearly more of the matches (``rearrangement``). Pairs that contradict the best
+arrangement are wrong matches: windows, tiles and wallpaper repeat.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.sfm.agreement import Agreement, compare
-from splatpipe.pipeline.sfm.cuts import GraphCut, find_cut
+from splatpipe.pipeline.sfm.agreement import Agreement, compare, contradicting
+from splatpipe.pipeline.sfm.cuts import find_cut
+from splatpipe.pipeline.sfm.pairs import Pair
+from splatpipe.pipeline.sfm.rearrangement import Rearrangement, find_better
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 Level = Literal["good", "doubt", "bad"]
@@ -34,11 +36,10 @@ FOCAL_STATED = (0.35, 1.0)  # the same for an untrusted focal length, as a ratio
 FOCAL_LONGER = (0.25, 6.0)  # of the longer side: the lenses used for mapping, 127 to 10 degrees
 FEW_SHARE = 0.1  # of the photos: a wrong lens of fewer photos says nothing about the others
 EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed photos; sound models have 0.93 or more
-CONTRADICTED_DOUBT, CONTRADICTED_BAD = 0.04, 0.10  # of the pairs among placed photos; sound models have 0 to 0.03
-STRONG_BAD = 0.02  # the same, for pairs with at least the median number of matches of consistent pairs
-FEW_PAIRS = 3  # fewer contradicting pairs may be chance
-MIN_MATCHES = 15  # for a pair to count as contradicting; COLMAP's own minimum for a pair
-CUT_DOUBT, CUT_BAD = 0.5, 1.0  # ratio of contradicting to consistent matches between two groups of cameras
+GAIN_DOUBT, GAIN_BAD = 0.01, 0.02  # of the score, by another arrangement; sound models gain at most 0.002
+ALIKE_TIMES = 3.0  # median error of a pair that shows another place, over EXPLAINED_PX; a wrong lens is off by less
+FEW_PAIRS = 3  # fewer pairs that look alike are not worth telling
+CUT_DOUBT = 1.0  # ratio of contradicting to agreeing matches between two groups of cameras
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class Reason:
         level: Its severity.
         text: The problem in plain words, a whole sentence.
         hint: What to do about it; may be empty.
-        kind: Machine-readable kind: ``placed``, ``focal``, ``bent``, ``unexplained``, ``lens``, ``positions``.
+        kind: Machine-readable kind: ``placed``, ``focal``, ``bent``, ``doubles``,
+            ``unexplained``, ``lens``, ``positions``.
     """
 
     level: Level
@@ -71,6 +73,9 @@ class Judgement:
         held_out: The same for matches among placed photos that are not observations of the model.
         contradicted: Number of pairs whose matches the model contradicts.
         pairs: Number of pairs among placed photos.
+        alike: Those of the contradicting pairs that look alike without showing the same place, (i, j), i < j.
+        reachable: The best arrangement's score.
+        better: Poses of another arrangement, camera from world, by image id, if it explains clearly more.
     """
 
     level: Level
@@ -80,6 +85,9 @@ class Judgement:
     held_out: float
     contradicted: int
     pairs: int
+    alike: tuple[Pair, ...] = ()
+    reachable: float = 0.0
+    better: Mapping[int, Float64[np.ndarray, "3 4"]] = field(default_factory=dict)
 
     def joined(self, more: Sequence[Reason]) -> Judgement:
         """Return a copy with more reasons."""
@@ -105,22 +113,29 @@ def judge(
         placeable: Number of photos on which the share of placed photos is based; defaults to all photos.
     """
     agreement = compare(model, verified)
+    found = find_better(model, verified, agreement)
     contradicts = contradicting(agreement)
+    clearly = found.agreement.score >= agreement.score + GAIN_DOUBT
+    left = contradicting(found.agreement) if clearly else contradicts
+    alike = left & (found.agreement.median_px > ALIKE_TIMES * agreement.bounds_px)
     placed = agreement.placed
     reasons = [
         *_placed(model, placeable or len(verified.names)),
         *_focal_lengths(model, verified, cameras),
-        *_unexplained(agreement),
-        *_bent(agreement, contradicts, verified),
+        *_unexplained(agreement, alike),
+        *_bent(agreement, found, verified),
     ]
     return Judgement(
         level="good",
         reasons=(),
-        score=_score(agreement),
+        score=agreement.score,
         explained=_share(agreement.explained, agreement.matches),
         held_out=_share(agreement.held_out_explained[placed], agreement.held_out[placed]),
         contradicted=int(contradicts.sum()),
         pairs=int(placed.sum()),
+        alike=tuple((int(i), int(j)) for i, j in agreement.pairs[alike]),
+        reachable=found.agreement.score,
+        better=found.poses if clearly else {},
     ).joined(reasons)
 
 
@@ -128,21 +143,9 @@ def _worst_first(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
     return tuple(sorted(reasons, key=lambda reason: -LEVELS.index(reason.level)))
 
 
-def contradicting(agreement: Agreement) -> Bool[np.ndarray, " n"]:
-    """Return the mask of pairs of placed photos for which the model explains less than half of the matches."""
-    enough = agreement.placed & (agreement.matches >= MIN_MATCHES)
-    return np.asarray(enough & (2 * agreement.explained < agreement.matches))
-
-
 def is_trusted(camera: Mapping[str, JSON]) -> bool:
     """Whether a camera group's prior focal length is reliable enough to check a model against."""
     return bool(camera.get("has_prior")) and camera.get("focal_source") in TRUSTED_SOURCES
-
-
-def _score(agreement: Agreement) -> float:
-    """Weight pairs by the square root of their matches: a bend shows in wide-baseline pairs, which have few."""
-    weights = np.sqrt(agreement.matches)
-    return _share(weights * agreement.closeness / np.maximum(agreement.matches, 1), weights)
 
 
 def _share(part: np.ndarray, whole: np.ndarray) -> float:
@@ -193,48 +196,44 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras:
     return found
 
 
-def _unexplained(agreement: Agreement) -> list[Reason]:
-    placed = agreement.placed
-    share = _share(agreement.explained[placed], agreement.matches[placed])
-    if share >= EXPLAINED_GOOD or not placed.any():
+def _unexplained(agreement: Agreement, alike: Bool[np.ndarray, " n"]) -> list[Reason]:
+    """Report matches that are not explained, other than those of pairs that only look alike."""
+    counted = agreement.placed & ~alike
+    share = _share(agreement.explained[counted], agreement.matches[counted])
+    if share >= EXPLAINED_GOOD or not counted.any():
         return []
     level: Level = "doubt" if share >= EXPLAINED_DOUBT else "bad"
     text = f"The cameras explain only {100 * share:.0f} % of the matches among the placed photos."
-    return [
-        Reason(
-            level,
-            text,
-            "Check that all photos have the same lens settings and that the scene did not move.",
-            "unexplained",
-        )
-    ]
+    hint = "Check that all photos have the same lens settings and that the scene did not move."
+    return [Reason(level, text, hint, "unexplained")]
 
 
-def _bent(agreement: Agreement, contradicts: Bool[np.ndarray, " n"], verified: ViewGraph) -> list[Reason]:
-    """Report contradictions that go beyond the occasional wrong match."""
-    count = int(contradicts.sum())
-    if count < FEW_PAIRS:
-        return []
-    pairs = int((agreement.placed & (agreement.matches >= MIN_MATCHES)).sum())
-    holding = agreement.matches[agreement.placed & ~contradicts]
-    usual = float(np.median(holding)) if len(holding) else 0.0
-    strong = int((contradicts & (agreement.matches >= usual)).sum())
-    cut = find_cut(agreement, contradicts)
-    bad = count >= CONTRADICTED_BAD * pairs or (strong >= FEW_PAIRS and strong >= STRONG_BAD * pairs)
-    if not bad and cut.ratio < CUT_DOUBT and count < CONTRADICTED_DOUBT * pairs:
-        return []
-    text = f"{count} of {pairs} pairs of photos contradict the reconstructed cameras"
-    if cut.ratio >= CUT_BAD:
-        text += f": {_who(cut, verified)} disagree with the others, so the model is bent or contains duplicates."
-    else:
-        text += ": the model may be bent, or the scene has repeated features."
+def _bent(agreement: Agreement, found: Rearrangement, verified: ViewGraph) -> list[Reason]:
+    """Report that another arrangement of the cameras explains clearly more."""
+    gain = found.agreement.score - agreement.score
     hint = "Look for duplicated objects in sparse.glb. Add photos that close the loop, or try"
     hint += " --set sparse.mapper=global and --set matches.pairing=exhaustive."
-    return [Reason("bad" if bad or cut.ratio >= CUT_BAD else "doubt", text, hint, "bent")]
+    against = contradicting(agreement)
+    if gain < GAIN_DOUBT:
+        cut = find_cut(agreement, against)
+        if cut.ratio < CUT_DOUBT:
+            return []
+        text = f"{who(cut.group, verified)} match the other photos elsewhere more than where the model has them: the "
+        text += "scene repeats itself there, or the model is bent."
+        return [Reason("doubt", text, hint, "bent")]
+    resolved = int((against & ~contradicting(found.agreement)).sum())
+    text = "Another arrangement of the cameras explains "
+    text += f"{resolved} of the {against.sum()} contradicting pairs of photos" if resolved else "the matches better"
+    cut = find_cut(agreement, against)
+    if cut.ratio >= CUT_DOUBT:
+        text += f": {who(cut.group, verified)} disagree with the others"
+    text += ", so the model is bent or contains duplicates."
+    return [Reason("bad" if gain >= GAIN_BAD else "doubt", text, hint, "bent")]
 
 
-def _who(cut: GraphCut, verified: ViewGraph) -> str:
-    names = [verified.names[number] for number in cut.group]
+def who(group: Sequence[int], verified: ViewGraph) -> str:
+    """Name a group of photos."""
+    names = [verified.names[number] for number in group]
     if len(names) <= 2:
         return " and ".join(names)
     return f"{len(names)} photos ({names[0]}, {names[1]}, …)"

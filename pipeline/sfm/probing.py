@@ -6,21 +6,18 @@ it, and their matches help to correct it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.sfm.agreement import compare
+from splatpipe.pipeline.sfm.agreement import compare, contradicting
 from splatpipe.pipeline.sfm.capture import MappingInput
-from splatpipe.pipeline.sfm.judging import contradicting
 from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs, tried_pairs
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
 PROBES = 24  # pairs: a few seconds' work, and enough for a meaningful share
-PROVEN = (3, 0.1)  # minimum of contradicting probes, and share of those verified; look-alikes give only 0 to 0.05
 THIN = 8.0  # verified pairs per photo; drone captures with overlap have 15 or more, chains and trees 2 to 5
 FILL = 6  # new pairs per photo for a sparse graph
 
@@ -42,11 +39,6 @@ class ProbeResult:
     tried: int
     held: int
     contradicting: int
-
-    @property
-    def prove_a_bend(self) -> bool:
-        """Whether enough new pairs contradict the model to prove it bent."""
-        return self.contradicting >= max(PROVEN[0], PROVEN[1] * self.held)
 
 
 def pairs_a_photo(model: pycolmap.Reconstruction, verified: ViewGraph) -> float:
@@ -80,8 +72,6 @@ def probe(
         return ProbeResult(database, verified, 0, 0, 0)
     grown = match_more(capture, database, pairs, seed, report)
     after = read_verified(grown)
-    agreement = compare(model, after)
-    known = set(verified.matches)
-    new = np.array([(int(i), int(j)) not in known for i, j in agreement.pairs], bool)
-    against = contradicting(agreement) & new
-    return ProbeResult(grown, after, len(pairs), int(new.sum()), int(against.sum()))
+    new = {pair: rows for pair, rows in after.matches.items() if pair not in verified.matches}
+    against = contradicting(compare(model, replace(after, matches=new)))
+    return ProbeResult(grown, after, len(pairs), len(new), int(against.sum()))

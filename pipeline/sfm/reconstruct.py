@@ -8,17 +8,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
+import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.coarseness import coarseness
+from splatpipe.pipeline.sfm.completion import complete
 from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.sfm.judging import Judgement, judge
-from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
+from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options, map_global, map_incremental
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.probing import FILL, PROBES, THIN, pairs_a_photo, probe
+from splatpipe.pipeline.sfm.structure import Structure, cameras_of, make_model, poses_of
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
@@ -31,6 +34,8 @@ MAX_SHARE = 0.85  # below this share the other mapper may do better; above it th
 STRAY_UNOBSERVED = 0.03  # relative deviation allowed for a focal length that the photos do not determine
 CLEARLY = 0.005  # score margin by which a second model must be better to replace the first
 ROUNDS = 2  # of matching additional pairs
+FURTHER = 1  # mappings of a doubtful capture
+TEXTS = {"bent": "pairs of photos contradict it", "unexplained": "many matches are unexplained"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +49,7 @@ class MappingAttempt:
         models: The models, largest first; may be empty.
         judgement: Of the first model; None if there is none.
         cpu_s: CPU time, seconds.
+        adjusted: Whether an earlier attempt's cameras were adjusted instead of mapping the photos again.
     """
 
     how: str
@@ -52,6 +58,7 @@ class MappingAttempt:
     models: list[Model]
     judgement: Judgement | None
     cpu_s: float
+    adjusted: bool = False
 
     @property
     def placed(self) -> int:
@@ -68,6 +75,7 @@ class Reconstructor:
         self.verified = read_verified(capture.database)
         self.tried: list[MappingAttempt] = []
         self.notes: dict[int, str] = {}
+        self.further = FURTHER
 
     def map(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:
         """Run one mapper and judge its largest model."""
@@ -81,8 +89,43 @@ class Reconstructor:
 
         models = [model for model in work(self.database, self.capture.scratch, chosen, progress) if _has_points(model)]
         progress(len(self.verified.names), len(self.verified.names), "placing photos")
-        judgement = judge(models[0], self.verified, self.capture.cameras) if models else None
-        answer = MappingAttempt(how, mapper, chosen, models, judgement, time.process_time() - began)
+        return self._judged(MappingAttempt(how, mapper, chosen, models, None, time.process_time() - began))
+
+    def map_further(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:
+        """Run one mapper again, which a doubtful capture may do only a few times."""
+        self.further -= 1
+        return self.map(mapper, how, **options)
+
+    def adjust(self, answer: MappingAttempt, how: str, always: bool = False) -> MappingAttempt:
+        """Triangulate all matches anew with the best arrangement of an attempt's cameras, and adjust everything.
+
+        Args:
+            answer: The attempt; returned as it is if no other arrangement explains more, unless ``always``.
+            how: What this is.
+            always: Also for the attempt's own arrangement, when there are new matches.
+        """
+        better = answer.judgement.better if answer.judgement is not None else {}
+        if not better and not always:
+            return answer
+        began = time.process_time()
+        old = answer.models[0]
+        poses = poses_of(old) | {number: pycolmap.Rigid3d(pose) for number, pose in better.items()}
+        model = make_model(cameras_of(old).values(), poses, self.verified, Structure(np.zeros((0, 3)), []))
+        complete(model, self.database, incremental_options(answer.options), pycolmap.CancellationToken(), False)
+        took = time.process_time() - began
+        models = [model, *answer.models[1:]]
+        if not _has_points(model) or model.num_reg_images() < old.num_reg_images():
+            return answer
+        fresh = replace(answer, how=f"{answer.how}, {how}", models=models, judgement=None, cpu_s=took, adjusted=True)
+        return self._judged(fresh)
+
+    def add_note(self, answer: MappingAttempt, text: str) -> None:
+        """Say something about an attempt in its row."""
+        self.notes[id(answer)] = "; ".join(filter(None, [self.notes.get(id(answer), ""), text]))
+
+    def _judged(self, answer: MappingAttempt) -> MappingAttempt:
+        if answer.models:
+            answer = replace(answer, judgement=judge(answer.models[0], self.verified, self.capture.cameras))
         self.tried.append(answer)
         return answer
 
@@ -98,7 +141,8 @@ def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -
 
     Args:
         capture: The photos and what is known about them.
-        config: Selects the mapper; ``auto`` maps incrementally first, then globally if the result is doubtful.
+        config: Selects the mapper; ``auto`` maps incrementally first, then at most once more if the result is doubtful,
+            and once more after matching more pairs of a thin view graph.
         report: Receives progress.
 
     Returns:
@@ -108,10 +152,10 @@ def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -
         SplatpipeError: If too few photos can be placed.
     """
     work = Reconstructor(capture, config, report)
-    answer = _best(work)
+    answer = _first(work)
     _check_enough(answer.placed, config, len(work.verified.names))
     if config.mapper == "auto":
-        answer = _with_new_pairs(work, answer)
+        answer = _settled(work, _with_new_pairs(work, answer))
     return MappingResult(
         answer.models[0],
         tuple(answer.models[1:]),
@@ -122,33 +166,37 @@ def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -
     )
 
 
-def _best(work: Reconstructor) -> MappingAttempt:
-    """Return the best attempt of the mappers that the configuration allows."""
+def _first(work: Reconstructor) -> MappingAttempt:
+    """Return the best attempt at placing enough photos with the mappers that the configuration allows."""
     mapper: Mapper = "global" if work.config.mapper == "global" else "incremental"
     best = _with_held_focal(work, work.map(mapper, mapper))
     total = len(work.verified.names)
-    doubts = _doubts(best, total, work.verified)
-    if work.config.mapper == "auto" and doubts:
-        work.notes[id(best)] = f"doubtful: {'; '.join(doubts)}"
-        best = _better(best, _with_held_focal(work, work.map("global", "global")))
+    if work.config.mapper == "auto" and best.placed < MAX_SHARE * total:
+        placed = f"{best.placed} of {total} photos placed" if best.placed else "no photo was placed"
+        work.notes[id(best)] = f"doubtful: {placed}"
+        best = _better(best, work.map_further("global", "global"))
     if best.placed < ENOUGH_SHARE * total and work.config.mapper != "global":
-        relaxed = work.map("incremental", "incremental, relaxed thresholds", relaxed=True)
-        best = _better(best, _with_held_focal(work, relaxed))
+        best = _better(best, work.map("incremental", "incremental, relaxed thresholds", relaxed=True))
     return best
 
 
-def _doubts(answer: MappingAttempt, total: int, verified: ViewGraph) -> list[str]:
-    """Return the reasons for also trying the other mapper."""
+def _settled(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
+    """Return the attempt with its cameras rearranged if that explains more, or a better one of the other mapper."""
+    answer = _better(answer, work.adjust(answer, "rearranged"))
+    doubts = _doubts(answer)
+    if doubts and work.further and answer.mapper != "global":
+        work.add_note(answer, f"doubtful: {'; '.join(doubts)}")
+        answer = _better(answer, work.map_further("global", "global"))
+    return answer
+
+
+def _doubts(answer: MappingAttempt) -> list[str]:
+    """Return the reasons for also trying the other mapper, if that can win: not where no arrangement explains more."""
     if answer.judgement is None:
         return ["no photo was placed"]
-    found = []
-    if answer.placed < MAX_SHARE * total:
-        found.append(f"{answer.placed} of {total} photos placed")
-    texts = {"focal": "the focal length diverged", "bent": "pairs of photos contradict it"}
-    texts["unexplained"] = "many matches are unexplained"
-    found += sorted({texts[reason.kind] for reason in answer.judgement.reasons if reason.kind in texts})
-    if not any(verified.cameras[number].has_prior_focal_length for number in _used(answer.models[0])):
-        found.append("the focal length was unknown")
+    found = ["the focal length diverged"] if any(it.kind == "focal" for it in answer.judgement.reasons) else []
+    if answer.judgement.reachable > answer.judgement.score + CLEARLY:
+        found += sorted({TEXTS[it.kind] for it in answer.judgement.reasons if it.kind in TEXTS})
     return found
 
 
@@ -163,11 +211,11 @@ def _better(first: MappingAttempt, second: MappingAttempt) -> MappingAttempt:
 
 
 def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
-    """Match more pairs where the model is uncertain or the graph sparse, and map again if that can help.
+    """Match more pairs where the model is uncertain or the graph thin, and map again if it was.
 
     Returns the given attempt, or a better one from the extended graph.
     """
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         model = answer.models[0]
         thin = pairs_a_photo(model, work.verified) < THIN
         if not thin and not _unsure(answer, work.verified):
@@ -177,18 +225,15 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
         if not found.held:
             break
         note = f"{found.held} of {found.tried} predicted pairs were verified, {found.contradicting} contradict it"
-        work.notes[id(answer)] = "; ".join(filter(None, [work.notes.get(id(answer), ""), note]))
+        work.add_note(answer, note)
         work.database, work.verified = found.database, found.verified
-        answer = _judged_again(work, answer)
-        if not (thin or found.prove_a_bend):
+        if thin or found.contradicting:
+            answer = _judged_again(work, answer)
+        if not thin:
             break
-        again = _with_held_focal(work, work.map(answer.mapper, f"{answer.mapper}, with more pairs"))
-        best = _better(again, answer)  # of two equally good models, prefer the one with more evidence
-        if best.judgement is not None and best.judgement.level == "bad" and answer.mapper == "incremental":
-            best = _better(best, _with_held_focal(work, work.map("global", "global, with more pairs")))
-        if best is answer:
-            break
-        answer = best
+        work.further += number == 0
+        again = work.map_further(answer.mapper, f"{answer.mapper}, with more pairs") if number == 0 else None
+        answer = _better(again or work.adjust(answer, "with more pairs", always=True), answer)
     return answer
 
 
@@ -213,10 +258,9 @@ def _with_held_focal(work: Reconstructor, answer: MappingAttempt) -> MappingAtte
     In that case the held focal length explains the matches just as well.
     """
     enough = answer.placed >= ENOUGH_SHARE * len(work.verified.names)  # a small model says nothing about the lens
-    if not enough or not _focal_unobserved(answer.models[0], work.verified.cameras):
+    if not enough or not work.further or not _focal_unobserved(answer.models[0], work.verified.cameras):
         return answer
-    relaxed = answer.options.relaxed
-    held = work.map(answer.mapper, f"{answer.how}, focal length held", hold_focal=True, relaxed=relaxed)
+    held = work.map_further(answer.mapper, f"{answer.how}, focal length held", hold_focal=True)
     if held.placed < answer.placed:
         return answer
     model, priors = held.models[0], work.verified.cameras
@@ -232,6 +276,7 @@ def _row(answer: MappingAttempt) -> dict[str, JSON]:
         "mapper": answer.mapper,
         "how": answer.how,
         "placed": answer.placed,
+        "adjusted": answer.adjusted,
         "focal_held": answer.options.hold_focal,
         "cpu_s": round(answer.cpu_s, 1),
     }

@@ -125,6 +125,37 @@ def with_matches(ring: Ring, wrong: Mapping[tuple[int, int], int], seed: int = 1
     return ViewGraph(old.names, old.camera_of, old.cameras, old.keypoints, dict(sorted(matches.items())))
 
 
+def with_shifted_matches(ring: Ring, count: int, shift: float = 1.5) -> ViewGraph:
+    """Return the view graph with pairs of distant photos that match as if the scene were shifted sideways by a bay.
+
+    The wrong pairs agree with each other: their matches close, in rotation and translation.
+
+    Args:
+        ring: The ring.
+        count: Number of wrong pairs.
+        shift: World units.
+    """
+    rng = np.random.default_rng(3)
+    matches, keypoints = dict(ring.verified.matches), {k: v.copy() for k, v in ring.verified.keypoints.items()}
+    lens = ring.verified.cameras[1]
+    far = [(i, j) for i in ring.poses for j in ring.poses if i < j and (i, j) not in matches]
+    for i, j in [far[row] for row in np.sort(rng.permutation(len(far))[:count])]:
+        places = ring.points[rng.permutation(len(ring.points))[:30]]
+        shown = []
+        for number, offset in ((i, 0.0), (j, shift)):
+            pose = ring.poses[number]
+            seen = np.asarray(lens.img_from_cam((places + np.array([0.0, offset, 0.0])) @ pose[:, :3].T + pose[:, 3]))
+            shown.append(seen + rng.normal(0.0, NOISE_PX, seen.shape))
+        inside = np.all([((it > 0.0) & (it < [WIDTH, HEIGHT])).all(axis=1) for it in shown], axis=0)
+        columns = []
+        for number, seen in zip((i, j), shown, strict=True):
+            columns.append(len(keypoints[number]) + np.arange(inside.sum()))
+            keypoints[number] = np.concatenate([keypoints[number], seen[inside].astype(np.float32)])
+        matches[i, j] = np.column_stack(columns).astype(np.uint32)
+    old = ring.verified
+    return ViewGraph(old.names, old.camera_of, old.cameras, keypoints, dict(sorted(matches.items())))
+
+
 def write_descriptors(ring: Ring, path: Path) -> None:
     """Write descriptors that match each point again into a database from ``write_database``."""
     rng = np.random.default_rng(11)

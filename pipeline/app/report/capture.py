@@ -60,6 +60,8 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
 
 def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter:
     """The chapter on camera registration: matches, tracks, reprojection errors, calibration."""
+    from splatpipe.pipeline.app.report.pictures import double_crops
+
     sparse, matches, features = (inputs.summary(name) for name in ("sparse", "matches", "features"))
     models = inputs.read("sparse.summary")
     facts = [
@@ -82,6 +84,8 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Cha
         "unregistered_more": max(0, len(unregistered) - MAX_LISTED),
         "other_models": models.get("other_models", []),
         "cameras": [_calibrated(camera, lenses.get(camera.get("id"), {})) for camera in sparse.get("cameras", [])],
+        "alike": len(models.get("alike", [])),
+        "doubles": double_crops(models.get("doubles") or {}, inputs.part("ingest.photos"), inputs.photos_dir),
         "tried": [_attempt_row(row) for row in sparse.get("tried", [])],
         "rungs": [_step_row(row) for row in sparse.get("ladder", [])],
         "adjusted_later": False,

@@ -1,4 +1,4 @@
-"""The report's images: held-out photos beside their renders, and a crop of the photo around each GCP mark."""
+"""The report's images: held-out photos beside their renders, crops around GCP marks, and places that may be doubles."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ CHIP_PIXELS = 96  # most pixels across in the report; the browser enlarges small
 CHIP_QUALITY = 80
 MAX_CHIPS = 600  # about two megabytes; if there are more, the worst of each point have priority
 MAX_DECODED = 1_500_000_000  # pixels of photos decoded for them: about fifteen seconds on one core
+DOUBLE_SHARE = 0.3  # of a photo's longer side, across the crop of a place that may be a double
+DOUBLE_PIXELS = 420  # most pixels across in the report
 ROTATIONS_DEG = {3: 180, 6: 90, 8: 270}  # degrees, clockwise, by EXIF orientation; mirrored ones are left as they are
 ROTATION_CODES = {180: cv2.ROTATE_180, 90: cv2.ROTATE_90_CLOCKWISE, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
@@ -120,6 +122,36 @@ def cut_chips(
             seen = points[place[0]]["observations"][place[1]]
             chips[place] = _chip(seen, pixels, 1 if photo is None else photo.orientation)
     return chips
+
+
+def double_crops(
+    found: Mapping[str, Any], photos_part: Path | None, photos_dir: Path | None
+) -> list[tuple[str, Markup]]:
+    """Crop two photos around the place that should show the same in both.
+
+    Args:
+        found: ``doubles`` of `models.json`.
+        photos_part: The part ``ingest.photos``; None leaves the images out.
+        photos_dir: The user's folder.
+
+    Returns:
+        Name and image, as a data URL, of each; empty if a photo cannot be read.
+    """
+    if photos_part is None or photos_dir is None:
+        return []
+    photos = load_photo_list(photos_part).by_name()
+    crops = []
+    for name, (x, y) in zip(found.get("photos", []), found.get("places_px", []), strict=True):
+        photo = photos.get(name)
+        pixels = None if photo is None else _decoded(photo, photos_part, photos_dir)
+        if photo is None or pixels is None:
+            return []
+        side = max(1, round(DOUBLE_SHARE * max(photo.width, photo.height)))
+        cut = shrunk(_cut(pixels, round(x - side / 2), round(y - side / 2), side), DOUBLE_PIXELS)
+        crops.append(
+            (str(name), jpeg(np.ascontiguousarray(_rotated(cut, photo.orientation)[:, :, ::-1]), CHIP_QUALITY))
+        )
+    return crops
 
 
 def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> Markup:

@@ -12,9 +12,11 @@ from view_graph import Ring, add_points, make_ring, model_of, moved, turn_up, wr
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.photo_list import PhotoList
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
+from splatpipe.pipeline.sfm.judging import judge
+from splatpipe.pipeline.sfm.mapping import MappingOptions
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.probing import probe
-from splatpipe.pipeline.sfm.reconstruct import reconstruct
+from splatpipe.pipeline.sfm.reconstruct import MappingAttempt, Reconstructor, reconstruct
 from splatpipe.pipeline.sfm.view_graph import read_verified
 
 
@@ -110,8 +112,14 @@ def test_pairs_predicted_by_a_bent_model_prove_the_bend(tmp_path: Path) -> None:
     notes = [
         probe(capture, model, (capture.database, verified), 48, 0, corner_photos.Recorder()) for model in (right, bent)
     ]
-    assert notes[0].held > 20 and notes[0].contradicting == 0 and not notes[0].prove_a_bend
-    assert notes[1].prove_a_bend
+    assert notes[0].held > 20 and notes[0].contradicting == 0
+    assert notes[1].contradicting >= 3
+    assert [
+        judge(model, capture.verified, [{}]).level for model, capture in zip((right, bent), notes, strict=True)
+    ] == [
+        "good",
+        "bad",
+    ]
     assert len(notes[1].verified.matches) == len(verified.matches) + notes[1].held
 
 
@@ -122,3 +130,23 @@ def test_a_thin_chain_gets_more_pairs_and_is_mapped_correctly(tmp_path: Path) ->
     assert found.model.num_reg_images() == 24
     assert len(found.verified.matches) >= 2 * len(read_verified(thin.database).matches)
     assert far_off(ring, found.model) < 0.001
+
+
+def test_an_unknown_focal_length_is_no_reason_to_map_twice(tmp_path: Path) -> None:
+    ring = make_ring(count=12, points=500, most=300, prior=False)
+    found = reconstruct(capture_of(ring, tmp_path / "capture"), SparseConfig(), corner_photos.Recorder())
+    assert [(row["how"], row["chosen"]) for row in found.tried] == [("incremental", True)]
+
+
+def test_a_bent_model_is_adjusted_to_the_arrangement_that_explains_more(tmp_path: Path) -> None:
+    ring = make_ring(points=600, most=400)
+    capture = capture_of(ring, tmp_path / "capture")
+    work = Reconstructor(capture, SparseConfig(), corner_photos.Recorder())
+    bent = model_of(ring, moved(ring, range(13, 25), ring.centre(13), turn_up(8.0), 1.15))
+    judgement = judge(bent, work.verified, capture.cameras)
+    attempt = MappingAttempt("bent", "incremental", MappingOptions(), [bent], judgement, 0.0)
+    assert judgement.level == "bad"
+    found = work.adjust(attempt, "rearranged")
+    assert found.judgement is not None and found.judgement.level == "good" and found.adjusted
+    assert far_off(ring, found.models[0]) < 0.002 < far_off(ring, bent)
+    assert work.adjust(found, "rearranged") is found

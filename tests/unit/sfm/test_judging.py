@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from view_graph import FOCAL, Ring, make_ring, model_of, moved, turn_up, with_matches
+from lens_scene import HEIGHT, WIDTH
+from like_sides import folded, make_sides, unfolded
+from view_graph import FOCAL, Ring, make_ring, model_of, moved, turn_up, with_matches, with_shifted_matches
 
-from splatpipe.pipeline.sfm.agreement import compare, epipolar_errors
+from splatpipe.pipeline.sfm.agreement import compare, contradicting, epipolar_errors
 from splatpipe.pipeline.sfm.cuts import find_cut
+from splatpipe.pipeline.sfm.doubles import doubles_reasons, find_doubles
 from splatpipe.pipeline.sfm.external_evidence import disagreement
-from splatpipe.pipeline.sfm.judging import contradicting, judge
+from splatpipe.pipeline.sfm.judging import judge
 
 TRUSTED = [{"has_prior": True, "focal_source": "sensor-table"}]
 ROUGH = [{"has_prior": True, "focal_source": "35mm-equivalent"}]
@@ -140,3 +143,58 @@ def test_matches_that_are_the_models_own_observations_are_distinguished_from_oth
     first = compare(model, ring.verified)
     own = [int(rows[1][point]), int(rows[2][point])] in ring.verified.matches[1, 2].tolist()
     assert first.held_out[0] == first.matches[0] - own
+
+
+def test_rows_of_windows_do_not_speak_against_a_right_model(ring: Ring) -> None:
+    """A quarter of all pairs match a place beside the right one, consistently; the castle has a third."""
+    found = judge(model_of(ring), with_shifted_matches(ring, 40), TRUSTED)
+    assert (found.level, found.reasons) == ("good", ())
+    assert found.contradicted >= 36 and len(found.alike) > 0.7 * found.contradicted  # in the rest the bay is narrow
+    assert found.reachable < found.score + 0.005
+
+
+@pytest.mark.parametrize(("degrees", "level"), [(0.25, "bad"), (0.5, "bad"), (1.0, "bad"), (40.0, "bad")])
+def test_a_ring_bent_by_little_or_much_is_known_by_the_arrangement_that_explains_more(
+    ring: Ring, degrees: float, level: str
+) -> None:
+    bent = model_of(ring, moved(ring, range(13, 25), ring.centre(13), turn_up(degrees), 1.0 + degrees / 100.0))
+    found = judge(bent, ring.verified, TRUSTED)
+    true = judge(model_of(ring), ring.verified, TRUSTED)
+    assert found.level == level and found.reasons[0].kind == "bent"
+    assert found.reachable == pytest.approx(true.score, abs=0.003)  # the arrangement found is the true one
+    assert set(found.better) == set(ring.poses) and not true.better
+
+
+def test_a_group_far_from_its_place_is_moved_back(ring: Ring) -> None:
+    found = judge(
+        model_of(ring, moved(ring, (9, 10, 11, 12), np.zeros(3), turn_up(120.0), 1.0)), ring.verified, TRUSTED
+    )
+    assert found.reachable > 0.89 and not found.alike
+
+
+@pytest.mark.parametrize("alike", [0.1, 0.3, 0.5])
+def test_two_like_sides_that_are_taken_for_one_are_known_by_what_is_missing(alike: float) -> None:
+    """No pair contradicts the folded model, and no arrangement explains more."""
+    sides = make_sides(alike)
+    model = folded(sides, alike)
+    tried = [(i, j) for j in sides.poses for i in range(1, j)]
+    assert judge(model, sides.verified, TRUSTED).level == "good"
+    found = find_doubles(model, tried)
+    (reason,) = doubles_reasons(sides.verified, found)
+    assert (reason.level, reason.kind) == ("bad", "doubles")
+    one, two = found.pair
+    assert one <= 12 < two and all(sides.verified.names[number] in reason.text for number in found.pair)
+    assert len({number <= 12 for number in found.group}) == 1  # all of one side
+    assert all(0.0 < x < WIDTH and 0.0 < y < HEIGHT for x, y in found.places)
+
+
+def test_what_was_never_matched_is_not_missing() -> None:
+    sides = make_sides(0.3)
+    found = find_doubles(folded(sides, 0.3), sorted(pair for pair in sides.verified.matches if pair[1] <= 12))
+    assert doubles_reasons(sides.verified, found) == []
+
+
+def test_a_right_model_lacks_nothing() -> None:
+    sides = make_sides(0.3)
+    found = find_doubles(unfolded(sides), [(i, j) for j in sides.poses for i in range(1, j)])
+    assert found.ratio < 0.02 and found.as_json(sides.verified) is None
