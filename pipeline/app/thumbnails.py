@@ -112,7 +112,7 @@ def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about large images or broken metadata: check has reported these
                 with open_picture(io.BytesIO(data + more)) as image:
-                    if why_hollow(image, len(data)):
+                    if why_hollow(image, data):
                         return None
                     if side is not None:
                         image.draft("RGB", (2 * side, 2 * side))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -16,7 +16,14 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.exif import Exif, read_exif
-from splatpipe.pipeline.photos.picture_file import STRIP_ROWS, load_stored, open_picture, turn_to_decode, why_hollow
+from splatpipe.pipeline.photos.picture_file import (
+    STRIP_ROWS,
+    load_stored,
+    open_picture,
+    strips_of,
+    turn_to_decode,
+    why_hollow,
+)
 from splatpipe.pipeline.photos.scan import Candidate, ExcludedPhoto
 from splatpipe.pipeline.photos.xmp import find_packet, parse_xmp
 
@@ -92,7 +99,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
     except Exception as error:  # Pillow's readers raise almost anything on broken images
         return ExcludedPhoto(candidate.name, _decode_problem(error))
     with picture:
-        reason = _refusal_reason(picture, limits) or why_hollow(picture, len(data))
+        reason = _refusal_reason(picture, limits) or why_hollow(picture, data)
         return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
 
 
@@ -221,16 +228,10 @@ def _deep_facts(values: np.ndarray) -> _Facts | None:
 def _plain_facts(loaded: Image.Image, size: tuple[int, int]) -> _Facts:
     transparent = False
     if loaded.has_transparency_data:
-        transparent = any(bool((np.asarray(strip.convert("RGBA"))[:, :, 3] < 128).any()) for strip in _strips(loaded))
+        transparent = any(bool((np.asarray(strip.convert("RGBA"))[:, :, 3] < 128).any()) for strip in strips_of(loaded))
     step = FINGERPRINT_STEP if loaded.size == size else 1  # a JPEG is decoded at a reduced scale
-    sample = np.concatenate([np.asarray(strip)[::step, ::step] for strip in _strips(loaded)])
+    sample = np.concatenate([np.asarray(strip)[::step, ::step] for strip in strips_of(loaded)])
     return _Facts(_fingerprint(loaded.mode, size, sample), transparent, None)
-
-
-def _strips(picture: Image.Image) -> Iterator[Image.Image]:
-    """The picture in strips, so that conversions take little memory; each begins at a sampled row."""
-    for top in range(0, picture.height, STRIP_ROWS):
-        yield picture.crop((0, top, picture.width, min(picture.height, top + STRIP_ROWS)))
 
 
 def _fingerprint(kind: str, size: tuple[int, ...], pixels: np.ndarray) -> str:

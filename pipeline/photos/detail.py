@@ -13,11 +13,12 @@ from io import BytesIO
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
+from PIL import Image
 
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.convert import read_8bit
 from splatpipe.pipeline.photos.photo_list import read_checked
-from splatpipe.pipeline.photos.picture_file import open_picture, turn_to_decode
+from splatpipe.pipeline.photos.picture_file import LARGE_PIXELS, open_picture, strips_of, turn_to_decode
 
 MIN_SIDE_PX = 2000  # a JPEG is decoded at the smallest of 1/2, 1/4 and 1/8 that still has as many
 PATCH = 32  # pixels: the coarse band includes its three longest waves
@@ -46,7 +47,7 @@ class Brightness:
 
 
 def read_grey(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"]:
-    """Read a photo's grey levels in the stored grid, at full size or, for a large JPEG, at 1/2, 1/4 or 1/8 of it.
+    """Read a photo's grey levels in the stored grid, at full size or, for a large one, at 1/2, 1/4 or 1/8 of it.
 
     Raises:
         SplatpipeError: if the file is gone or is no longer the one that was checked.
@@ -54,12 +55,23 @@ def read_grey(photo: CheckedPhoto) -> UInt8[np.ndarray, "h w"]:
     with turn_to_decode(photo.width * photo.height):
         if not photo.plain:
             pixels, _ = read_8bit(photo, photo.deep_range)
-            return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+            grey = pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+            return _reduced_grey(Image.fromarray(grey)) if grey.size > LARGE_PIXELS else grey
         data = read_checked(photo.path, photo.name, photo.sha256)
         with open_picture(BytesIO(data)) as picture:
             share = min(1.0, MIN_SIDE_PX / max(picture.size))
             picture.draft("L", (max(1, int(picture.width * share)), max(1, int(picture.height * share))))
+            if picture.width * picture.height > LARGE_PIXELS:
+                return _reduced_grey(picture)
             return np.array(picture.convert("L"))
+
+
+def _reduced_grey(picture: Image.Image) -> UInt8[np.ndarray, "h w"]:
+    """The grey levels of a large picture that cannot be reduced while it is decoded: then, strip by strip."""
+    room = max(picture.size) // MIN_SIDE_PX
+    factor = next((by for by in (8, 4, 2) if room >= by), 1)
+    picture.load()
+    return np.concatenate([np.asarray(strip.convert("L").reduce(factor)) for strip in strips_of(picture)])
 
 
 def brightness_of(grey: UInt8[np.ndarray, "h w"]) -> Brightness:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -16,9 +17,8 @@ from PIL import Image
 # Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LARGE_PIXELS = 40_000_000  # larger images are decoded one at a time: some hundred megabytes each
-LEAST_BYTES = (
-    0.01  # of a large photo's file per pixel; the smoothest sky in a JPEG of quality 10 takes three times that
-)
+LEAST_BYTES = 0.01  # of a large photo's file per pixel; one colour all over takes 0.0156 with JPEG's usual tables
+MOST_CHUNKS = 1_000_000  # of a PNG: libpng writes one for 8 kB
 STRIP_ROWS = 256  # of a picture, converted at a time
 INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -50,17 +50,38 @@ def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
     return picture
 
 
-def why_hollow(picture: Image.Image, file_bytes: int) -> str:
-    """Why an opened image cannot be a photo: its file is too small for its size; empty if it can be one."""
+def why_hollow(picture: Image.Image, data: bytes) -> str:
+    """Why an opened image cannot be a photo: its pixels take too few bytes of its file; empty if it can be one."""
     pixels = picture.width * picture.height
-    if pixels <= LARGE_PIXELS or file_bytes >= LEAST_BYTES * pixels:
+    if pixels <= LARGE_PIXELS:
         return ""
-    return f"claims {picture.width} × {picture.height} pixels in only {file_bytes / 1e3:,.0f} kB: it is no photo"
+    taken = _png_bytes(data) if picture.format == "PNG" else len(data)
+    if taken >= LEAST_BYTES * pixels:
+        return ""
+    return f"claims {picture.width} × {picture.height} pixels in only {taken / 1e3:,.0f} kB: it is no photo"
+
+
+def _png_bytes(data: bytes) -> int:
+    """How many bytes of a PNG are pixels: other chunks may have any size."""
+    at, taken = 8, 0
+    for _ in range(MOST_CHUNKS):
+        length = int.from_bytes(data[at : at + 4], "big")
+        taken += length if data[at + 4 : at + 8] == b"IDAT" else 0
+        at += 12 + length
+        if at >= len(data):
+            break
+    return min(taken, len(data))
 
 
 def turn_to_decode(pixels: int) -> AbstractContextManager[object]:
     """Wait until no other thread of this process decodes a large picture, if this is one."""
     return _one_large_at_a_time if pixels > LARGE_PIXELS else contextlib.nullcontext()
+
+
+def strips_of(picture: Image.Image) -> Iterator[Image.Image]:
+    """A decoded picture in strips of ``STRIP_ROWS`` rows, so that converting it takes little memory."""
+    for top in range(0, picture.height, STRIP_ROWS):
+        yield picture.crop((0, top, picture.width, min(picture.height, top + STRIP_ROWS)))
 
 
 def load_stored(picture: Image.Image, orientation: int) -> Image.Image:

@@ -23,6 +23,8 @@ from splatpipe.pipeline.engine.session import Request, open_session
 from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Summary
 from splatpipe.pipeline.photos.camera_groups import focal_prior
+from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.photos.detail import read_grey
 from splatpipe.pipeline.photos.exif import Exif
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
@@ -34,6 +36,7 @@ from splatpipe.pipeline.photos.photo_list import (
     photo_root,
 )
 from splatpipe.pipeline.photos.picture_file import LARGE_PIXELS
+from splatpipe.pipeline.photos.scan import Candidate
 from splatpipe.stages.ingest import run
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
@@ -421,6 +424,7 @@ def hollow_png(path: Path, width: int, height: int, bits: int = 1, colour: int =
     head = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
     chunks = [(b"IHDR", head), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
     path.parent.mkdir(parents=True, exist_ok=True)
+    chunks.insert(1, (b"juNk", bytes(1_000_000)))
     packed = [struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(packed))
 
@@ -442,6 +446,15 @@ def never_large(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_large_photos_without_content_are_refused_before_they_are_decoded(folder: Path, bits: int, colour: int) -> None:
     hollow_png(folder / "c.png", 7000, 6000, bits, colour)
     assert "claims 7000 × 6000 pixels in only" in ingest(folder).left_out["c.png"]
+
+
+def test_large_photos_that_cannot_be_reduced_while_decoding_are_examined_at_a_part_of_their_size(folder: Path) -> None:
+    coarse = np.random.default_rng(0).integers(0, 256, (750, 1000), np.uint8)
+    Image.fromarray(np.kron(coarse, np.ones((8, 8), np.uint8))).save(folder / "c.png", compress_level=1)
+    limits = PictureLimits(320, 500_000_000)
+    photo = check_photo(Candidate("c.png", folder / "c.png"), limits)
+    assert isinstance(photo, CheckedPhoto) and (photo.width, photo.height) == (8000, 6000)
+    assert read_grey(photo).tolist() == np.kron(coarse, np.ones((2, 2), np.uint8)).tolist()
 
 
 @pytest.mark.usefixtures("never_large")
