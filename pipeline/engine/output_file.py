@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterable
+from io import BufferedWriter
 from pathlib import Path, PurePath
 from typing import IO
 
@@ -21,7 +22,7 @@ SAFE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 HINT = "An OUT from somebody else is not to be trusted: remove that file, or choose another OUT."
 
 
-def new_file(path: Path) -> IO[bytes]:
+def new_file(path: Path) -> BufferedWriter:
     """Open a new file for writing; whatever file or link bears its name is removed first.
 
     Raises:
