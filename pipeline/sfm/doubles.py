@@ -116,11 +116,16 @@ def _largest_cut(
 def missing(entry: ViewOverlap, usual: Float64[np.ndarray, " bins"]) -> Float64[np.ndarray, " cells"]:
     """Return how many more common points there should be in those cells where both have points and hardly any common.
 
+    Photos of sand or leaves, from other directions of light, have few points in common everywhere: so no more are
+    expected than the two have in common where they have any, and photos that have none at all say nothing.
+
     Args:
         entry: What one of the photos sees of the other's points.
         usual: Share of points that are found again, by the angle between the views.
     """
-    expected = usual[entry.bin] * (entry.hits + entry.lacking)
+    total, common = entry.hits + entry.lacking, entry.hits > 0
+    own_rate = float(entry.hits[common].sum()) / max(float(total[common].sum()), 1.0)
+    expected = min(float(usual[entry.bin]), own_rate) * total
     differs = (entry.own >= MIN_OWN) & (expected >= MIN_EXPECTED) & (entry.hits < FEW * expected)
     return np.asarray(np.where(differs, expected - entry.hits, 0.0))
 

@@ -278,7 +278,7 @@ def find_better(model: pycolmap.Reconstruction, verified: ViewGraph, agreement: 
     here, now = arrangement_of(model, numbers), agreement
     for number in range(GROUPS + 1):
         against = contradicting(now)
-        starts: list[tuple[Arrangement, tuple[float, ...]]] = [(here, WIDTHS)] if number == 0 else []
+        starts: list[tuple[Arrangement, Sequence[float]]] = [(here, WIDTHS)] if number == 0 else []
         group = find_cut(now, against)
         if group.ratio >= WORTH_MOVING:
             moved = _moved_group(model, verified, (now, here), group.group, numbers)
