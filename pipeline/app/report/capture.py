@@ -12,6 +12,8 @@ from splatpipe.pipeline.app.report.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.wording import count, length, number, share
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
+
     from splatpipe.pipeline.app.report.geometry import Geometry
 
 Chapter = dict[str, Any]
@@ -58,10 +60,14 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
     return chapter
 
 
-def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Chapter:
-    """The chapter on camera registration: matches, tracks, reprojection errors, calibration."""
+def _doubles(inputs: ReportInputs, found: Mapping[str, Any]) -> list[tuple[str, Markup]]:
     from splatpipe.pipeline.app.report.pictures import double_crops
 
+    return double_crops(found, inputs.part("ingest.photos"), inputs.photos_dir)
+
+
+def registration_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: bool) -> Chapter:
+    """The chapter on camera registration: matches, tracks, reprojection errors, calibration."""
     sparse, matches, features = (inputs.summary(name) for name in ("sparse", "matches", "features"))
     models = inputs.read("sparse.summary")
     facts = [
@@ -85,7 +91,7 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None) -> Cha
         "other_models": models.get("other_models", []),
         "cameras": [_calibrated(camera, lenses.get(camera.get("id"), {})) for camera in sparse.get("cameras", [])],
         "alike": len(models.get("alike", [])),
-        "doubles": double_crops(models.get("doubles") or {}, inputs.part("ingest.photos"), inputs.photos_dir),
+        "doubles": _doubles(inputs, models["doubles"]) if drawn and models.get("doubles") else [],
         "tried": [_attempt_row(row) for row in sparse.get("tried", [])],
         "rungs": [_step_row(row) for row in sparse.get("ladder", [])],
         "adjusted_later": False,

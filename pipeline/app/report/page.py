@@ -47,7 +47,9 @@ def report_page(inputs: ReportInputs, *, drawn: bool) -> str:
 def _render(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> str:
     chapters = {
         "capture": _guarded(lambda: capture_chapter(inputs, geometry, drawn=drawn) if _checked(inputs) else None),
-        "registration": _guarded(lambda: registration_chapter(inputs, geometry) if _matched(inputs) else None),
+        "registration": _guarded(
+            lambda: registration_chapter(inputs, geometry, drawn=drawn) if _matched(inputs) else None
+        ),
         "georeferencing": _guarded(lambda: georeferencing_chapter(inputs, geometry)),
         "training": _guarded(lambda: training_chapter(inputs, drawn=drawn)),
         "views": _guarded(lambda: views_chapter(inputs, drawn=drawn)),

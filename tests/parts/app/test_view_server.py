@@ -1,6 +1,7 @@
 """Access control of ``splatpipe view``, against the real server process: requests meant for others are refused."""
 
 import contextlib
+import hashlib
 import http.client
 import json
 import os
@@ -42,13 +43,24 @@ def home(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     sky.mkdir(parents=True)
     (sky / "secret.txt").write_bytes(b"its own")
     (out / "deep").symlink_to(home / "elsewhere")
-    # The viewer for web hosts, as in OUT.
+    # The viewer for web hosts, as in OUT, which the stage's manifest lists.
     for folder in (sky.parent, out):
         for name, content in WEB.items():
             (folder / "web" / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / "web" / name).write_bytes(content)
+    _list_in_manifest(sky.parents[1], [f"sky/web/{name}" for name in WEB])
     (out / "web/secret.txt").write_bytes(SECRET)
     return home
+
+
+def _list_in_manifest(artifact: Path, names: list[str]) -> None:
+    manifest = json.loads((artifact / "manifest.json").read_text(encoding="utf-8"))
+    for name in names:
+        content = (artifact / name).read_bytes()
+        entry = {"path": name, "size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+        manifest["parts"]["sky"]["files"].append(entry)
+    (artifact / "manifest.json").unlink()  # a hard link to the demo run's
+    (artifact / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
