@@ -303,7 +303,7 @@ window.tried = (async (ours, file) => {
     photo: await attempt(() => fetch(`${ours}/photo/3`, { credentials: "include", mode: "no-cors" })),
     write: await attempt(() => fetch(`${ours}/api/mark/change`, post)),
     open: await attempt(() => window.open(`${ours}/mark`)),
-    beside: await attempt(() => fetch("metrics.json").then((answer) => answer.status)),
+    beside: await attempt(() => fetch("report.html").then((answer) => answer.status)),
   };
 })("OURS", "FILE");
 </script>"""

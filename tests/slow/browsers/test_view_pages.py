@@ -169,9 +169,9 @@ def test_report_film_files_and_web_viewer_work_in_their_sandbox(
     out = linked_copy(demo_run, tmp_path / "out")
     answered("export", out, "--format", "web")
     with serving(out) as server:
-        watched = open_page(server.page())
+        watched = open_page(server.page(), 390, 400)  # drawn in software
         page = watched.page
-        for name in ("viewer.html", "web/index.html"):
+        for name in ("web/index.html", "viewer.html"):
             page.goto(server.file(name))
             page.evaluate("splatpipe.ready")
             assert page.evaluate("origin") == "null"
