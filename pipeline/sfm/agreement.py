@@ -70,6 +70,7 @@ def compare(
     model: pycolmap.Reconstruction,
     verified: ViewGraph,
     instead: Mapping[int, Float64[np.ndarray, "3 4"]] | None = None,
+    rays: Mapping[int, Rays] | None = None,
 ) -> Agreement:
     """Check every verified pair against a model.
 
@@ -77,9 +78,10 @@ def compare(
         model: With the keypoints of ``verified``.
         verified: The view graph.
         instead: Other poses of its photos, camera from world, in a frame of their own, to which no points belong.
+        rays: ``rays_of`` the same, if they are known.
     """
     placed = sorted(model.reg_image_ids())
-    rays = {number: rays_of(model, number, verified) for number in placed}
+    rays = rays_of(model, verified) if rays is None else rays
     poses = instead or {number: model.images[number].cam_from_world().matrix() for number in placed}
     points = {
         number: _points(None if instead else model.images[number], len(verified.keypoints[number])) for number in placed
@@ -160,9 +162,13 @@ def epipolar_errors(
     return np.where(behind | ~np.isfinite(errors), np.inf, errors)
 
 
-def rays_of(model: pycolmap.Reconstruction, number: int, verified: ViewGraph) -> Rays:
-    places = np.asarray(verified.keypoints[number], np.float64).reshape(-1, 2)
-    return np.asarray(model.images[number].camera.cam_from_img(places), np.float64).reshape(-1, 2)
+def rays_of(model: pycolmap.Reconstruction, verified: ViewGraph) -> dict[int, Rays]:
+    """Return the keypoints of each placed photo, undistorted, in units of the focal length."""
+    result = {}
+    for number in sorted(model.reg_image_ids()):
+        places = np.asarray(verified.keypoints[number], np.float64).reshape(-1, 2)
+        result[number] = np.asarray(model.images[number].camera.cam_from_img(places), np.float64).reshape(-1, 2)
+    return result
 
 
 def _points(image: pycolmap.Image | None, count: int) -> Int64[np.ndarray, " n"]:

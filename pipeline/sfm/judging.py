@@ -18,7 +18,7 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.sfm.agreement import Agreement, compare, contradicting
+from splatpipe.pipeline.sfm.agreement import Agreement, compare, contradicting, rays_of
 from splatpipe.pipeline.sfm.cuts import find_cut
 from splatpipe.pipeline.sfm.pairs import Pair
 from splatpipe.pipeline.sfm.rearrangement import Rearrangement, find_better
@@ -112,8 +112,9 @@ def judge(
             from 1 in their order.
         placeable: Number of photos on which the share of placed photos is based; defaults to all photos.
     """
-    agreement = compare(model, verified)
-    found = find_better(model, verified, agreement)
+    rays = rays_of(model, verified)
+    agreement = compare(model, verified, rays=rays)
+    found = find_better(model, verified, agreement, rays)
     contradicts = contradicting(agreement)
     clearly = found.agreement.score >= agreement.score + GAIN_DOUBT
     left = contradicting(found.agreement) if clearly else contradicts

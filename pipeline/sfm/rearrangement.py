@@ -21,7 +21,8 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Bool, Float64, Int64
 
-from splatpipe.pipeline.sfm.agreement import EXPLAINED_PX, Agreement, compare, contradicting, rays_of
+from splatpipe.pipeline.geometry.similarity import rotation_from_vector
+from splatpipe.pipeline.sfm.agreement import EXPLAINED_PX, Agreement, Rays, compare, contradicting
 from splatpipe.pipeline.sfm.coarseness import coarseness
 from splatpipe.pipeline.sfm.cuts import find_cut
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
@@ -90,12 +91,12 @@ def arrangement_of(model: pycolmap.Reconstruction, numbers: Sequence[int]) -> Ar
 
 
 def sample(
-    model: pycolmap.Reconstruction, verified: ViewGraph, agreement: Agreement, numbers: Sequence[int]
+    model: pycolmap.Reconstruction, verified: ViewGraph, agreement: Agreement, rays: Mapping[int, Rays]
 ) -> Samples:
     """Return evenly strided matches of all pairs of placed photos."""
     rows = np.flatnonzero(agreement.placed)
-    row_of = {number: row for row, number in enumerate(numbers)}
-    rays = {number: _unit(rays_of(model, number, verified)) for number in numbers}
+    row_of = {number: row for row, number in enumerate(sorted(rays))}
+    units = {number: _unit(each) for number, each in rays.items()}
     first, second = np.zeros((len(rows), SAMPLE, 3)), np.zeros((len(rows), SAMPLE, 3))
     first[:, :, 2] = second[:, :, 2] = 1.0
     weights, bounds = np.zeros((len(rows), SAMPLE)), np.zeros(len(rows))
@@ -104,15 +105,14 @@ def sample(
         i, j = agreement.pairs[row].tolist()
         found = verified.matches[i, j]
         found = found[np.linspace(0, len(found) - 1, min(len(found), SAMPLE)).astype(np.int64)]
-        one, two = rays[i][found[:, 0]], rays[j][found[:, 1]]
+        one, two = units[i][found[:, 0]], units[j][found[:, 1]]
         known = np.isfinite(one).all(axis=1) & np.isfinite(two).all(axis=1)
         count = int(known.sum())
         ends[at] = row_of[i], row_of[j]
         first[at, :count], second[at, :count] = one[known], two[known]
         weights[at, :count] = np.sqrt(agreement.matches[row]) / max(count, 1)
-        cameras = model.images[i].camera, model.images[j].camera
-        focal = (cameras[0].mean_focal_length() + cameras[1].mean_focal_length()) / 2.0
-        bounds[at] = EXPLAINED_PX * coarseness(cameras) / focal
+        focal = (model.images[i].camera.mean_focal_length() + model.images[j].camera.mean_focal_length()) / 2.0
+        bounds[at] = agreement.bounds_px[row] / focal
     return Samples(ends, first, second, weights, bounds)
 
 
@@ -157,10 +157,9 @@ def move_group(
     towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     about = here.centres[list(group)].mean(axis=0)
     arms = (here.centres[inside] - about) @ turn.T
-    across = (
-        np.eye(3) - towards[:, :, None] * towards[:, None, :]
-    )  # (about + shift + scale arm - outside) x towards = 0
-    left = np.concatenate([across, (across @ arms[:, :, None])], axis=2)
+    # What of (about + shift + scale arm - outside) is across the line of sight is to be 0.
+    across = np.eye(3) - towards[:, :, None] * towards[:, None, :]
+    left = np.concatenate([across, across @ arms[:, :, None]], axis=2)
     right = (across @ (here.centres[outside] - about)[:, :, None])[:, :, 0]
     weights = np.ones(len(links))
     for _ in range(PASSES):
@@ -208,7 +207,7 @@ def _stepped(here: Arrangement, samples: Samples, weights: Float64[np.ndarray, "
     step = -scipy.sparse.linalg.splu(damped.tocsc()).solve(right).reshape(-1, 6)
     angles = np.linalg.norm(step[:, :3], axis=1)
     step *= (np.minimum(1.0, TURN_MOST / np.maximum(angles, 1e-12)))[:, None]
-    return Arrangement(_rotations(step[:, :3]) @ here.turns, here.centres + step[:, 3:])
+    return Arrangement(rotation_from_vector(step[:, :3]) @ here.turns, here.centres + step[:, 3:])
 
 
 def _residuals(here: Arrangement, samples: Samples) -> tuple[Float64[np.ndarray, "n s"], Float64[np.ndarray, "n s 12"]]:
@@ -237,16 +236,6 @@ def _across(normals: Float64[np.ndarray, "n s 3"], rays: Float64[np.ndarray, "n 
     return np.asarray((normals**2).sum(axis=2) - along**2)
 
 
-def _rotations(turns: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 3 3"]:
-    """Return rotation matrices of rotation vectors (Rodrigues)."""
-    angle = np.linalg.norm(turns, axis=1)[:, None, None]
-    zero = np.zeros(len(turns))
-    x, y, z = turns.T
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    safe = np.maximum(angle, 1e-12)
-    return np.asarray(np.eye(3) + np.sin(safe) / safe * cross + (1.0 - np.cos(safe)) / safe**2 * (cross @ cross))
-
-
 def _unit(rays: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
     whole = np.column_stack([rays, np.ones(len(rays))])
     return np.asarray(whole / np.linalg.norm(whole, axis=1, keepdims=True))
@@ -265,16 +254,19 @@ class Rearrangement:
     poses: Mapping[int, Float64[np.ndarray, "3 4"]]
 
 
-def find_better(model: pycolmap.Reconstruction, verified: ViewGraph, agreement: Agreement) -> Rearrangement:
+def find_better(
+    model: pycolmap.Reconstruction, verified: ViewGraph, agreement: Agreement, rays: Mapping[int, Rays]
+) -> Rearrangement:
     """Look for an arrangement of the cameras that explains more of the matches.
 
     Args:
         model: With the keypoints of ``verified``.
         verified: The view graph.
         agreement: How well the model explains it.
+        rays: ``rays_of`` these.
     """
-    numbers = sorted(model.reg_image_ids())
-    samples = sample(model, verified, agreement, numbers)
+    numbers = sorted(rays)
+    samples = sample(model, verified, agreement, rays)
     here, now = arrangement_of(model, numbers), agreement
     for number in range(GROUPS + 1):
         against = contradicting(now)
@@ -288,7 +280,7 @@ def find_better(model: pycolmap.Reconstruction, verified: ViewGraph, agreement: 
             moved = rearrange(start, samples, against[agreement.placed], widths)
             if _sampled_score(moved, samples) < _sampled_score(here, samples) + WORTH_COMPARING:
                 continue
-            found = compare(model, verified, dict(zip(numbers, moved.matrices(), strict=True)))
+            found = compare(model, verified, dict(zip(numbers, moved.matrices(), strict=True)), rays)
             if found.score > now.score:
                 here, now = moved, found
         if now is before:

@@ -19,7 +19,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 from splatpipe.pipeline.sfm.focal import UNOBSERVED
-from splatpipe.pipeline.survey.block import Block, Distances, Lens
+from splatpipe.pipeline.survey.block import Block
 from splatpipe.pipeline.survey.block_adjustment import (
     AdjustedBlock,
     PositionObservations,
@@ -27,6 +27,8 @@ from splatpipe.pipeline.survey.block_adjustment import (
     joint_system,
     solve,
 )
+from splatpipe.pipeline.survey.block_distances import Distances
+from splatpipe.pipeline.survey.block_lens import Lens
 from splatpipe.pipeline.survey.tie_points import TieTable, whole_model
 
 UNBOUND_M = 1e4  # sigma of a height that was not measured

@@ -12,127 +12,24 @@ photo (metres), and the free parameters of each lens.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pycolmap
 import scipy.sparse
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.similarity import cross_matrix, rotation_from_vector
-from splatpipe.pipeline.sfm.lens_model import NAMES
+from splatpipe.pipeline.survey.block_distances import NO_DISTANCES, Distances, JoinedPoints
+from splatpipe.pipeline.survey.block_lens import MIN_DEPTH, Lens, lens_derivatives, project
 
-LENS_STEP = 1e-3  # of central differences, pixels at the corner
-LENGTHS = frozenset({"f", "cx", "cy"})  # parameters in pixels
-RAY_STEP = 1e-5
-MIN_DEPTH = 1e-6  # metres in front of a camera
 MAX_DENSE = 6000  # unknowns of a dense system: a thousand photos
 FLAT = 1e-12  # least ratio of a tie point's eigenvalues: nearly parallel rays
 
 
 # A symmetric matrix of normal equations: an array, or scipy's sparse array for very many unknowns.
 Normal = Any
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A lens and what an adjustment may change in it.
-
-    Attributes:
-        camera: COLMAP's.
-        names: Of the free parameters: those of the wide models, but ``f`` for both focal lengths together and
-            ``aspect`` for the second one's relative excess.
-        directions: Change of the camera's parameters per unit of each.
-        values: Their present values.
-        mean: Prior means.
-        sigmas: Prior standard deviations; infinite for none.
-    """
-
-    camera: pycolmap.Camera
-    names: tuple[str, ...]
-    directions: Float64[np.ndarray, "k _"]
-    values: Float64[np.ndarray, " k"]
-    mean: Float64[np.ndarray, " k"]
-    sigmas: Float64[np.ndarray, " k"]
-
-    def moved(self, step: Float64[np.ndarray, " k"]) -> Lens:
-        """The same lens with its free parameters changed."""
-        return replace(self, camera=self._after(step), values=self.values + step)
-
-    def _after(self, step: Float64[np.ndarray, " k"]) -> pycolmap.Camera:
-        camera = pycolmap.Camera(self.camera.todict())
-        camera.params = np.asarray(self.camera.params, np.float64) + step @ self.directions
-        return camera
-
-
-def free_lens(
-    camera: pycolmap.Camera, names: Sequence[str], mean: Mapping[str, float], sigmas: Mapping[str, float]
-) -> Lens:
-    """A lens with some free parameters.
-
-    Args:
-        camera: Of a wide model.
-        names: Of the free parameters.
-        mean: Prior means by name; missing ones are the present values.
-        sigmas: Prior standard deviations by name; missing ones are infinite.
-    """
-    own, params = NAMES.get(camera.model_name, ()), np.asarray(camera.params, np.float64)
-    directions = np.zeros((len(names), len(params)))
-    values = np.zeros(len(names))
-    for row, name in enumerate(names):
-        if name == "f":
-            directions[row, :2], values[row] = (1.0, params[1] / params[0]), params[0]
-        elif name == "aspect":
-            directions[row, 1], values[row] = params[0], params[1] / params[0] - 1.0
-        else:
-            directions[row, own.index(name)], values[row] = 1.0, params[own.index(name)]
-    return Lens(
-        pycolmap.Camera(camera.todict()),
-        tuple(names),
-        directions,
-        values,
-        np.array([mean.get(name, value) for name, value in zip(names, values.tolist(), strict=True)]),
-        np.array([sigmas.get(name, np.inf) for name in names]),
-    )
-
-
-@dataclass(frozen=True)
-class Distances:
-    """Measured distances between points of a block.
-
-    Attributes:
-        ends: Indices of the two points of each.
-        lengths: Metres.
-        sigmas: Their standard deviations.
-    """
-
-    ends: Int64[np.ndarray, "b 2"]
-    lengths: Float64[np.ndarray, " b"]
-    sigmas: Float64[np.ndarray, " b"]
-
-    def residuals(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, " b"]:
-        """Distance less measured one, over the standard deviations."""
-        apart = points[self.ends[:, 0]] - points[self.ends[:, 1]]
-        return np.asarray((np.linalg.norm(apart, axis=1) - self.lengths) / self.sigmas)
-
-    def design(self, points: Float64[np.ndarray, "p 3"]) -> scipy.sparse.csr_array:
-        """(b, 3p) derivatives of the residuals by the points."""
-        apart = points[self.ends[:, 0]] - points[self.ends[:, 1]]
-        way = apart / np.linalg.norm(apart, axis=1, keepdims=True) / self.sigmas[:, None]
-        columns = (3 * self.ends[:, :, None] + np.arange(3)).reshape(len(way), 6)
-        rows = np.repeat(np.arange(len(way)), 6)
-        at = (rows, columns.ravel())
-        return scipy.sparse.csr_array((np.hstack([way, -way]).ravel(), at), shape=(len(way), 3 * len(points)))
-
-    def of_points(self, kept: Bool[np.ndarray, " p"]) -> Distances:
-        """Those of which both ends are kept, by their new indices."""
-        both = kept[self.ends].all(axis=1)
-        return Distances((np.cumsum(kept) - 1)[self.ends[both]], self.lengths[both], self.sigmas[both])
-
-
-NO_DISTANCES = Distances(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -165,7 +62,7 @@ class Block:
     sigmas: Float64[np.ndarray, " m"]
     stated: Float64[np.ndarray, "p 3"]
     weights: Float64[np.ndarray, "p 3"]
-    distances: Distances = field(default=NO_DISTANCES)
+    distances: Distances = NO_DISTANCES
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -199,7 +96,7 @@ class Block:
         projected = np.full((len(rays), 2), np.nan)
         for number, lens in enumerate(self.lenses):
             rows = (self.lens_of[self.photo] == number) & (rays[:, 2] > MIN_DEPTH)
-            projected[rows] = _project(lens.camera, rays[rows])
+            projected[rows] = project(lens.camera, rays[rows])
         return np.asarray((projected - self.pixels) / self.sigmas[:, None])
 
     def cost(self) -> float:
@@ -284,43 +181,16 @@ def reduce_block(block: Block) -> ReducedBlock:
 def _pull(block: Block) -> Float64[np.ndarray, "p 3"]:
     """Gradient of the distances by the points."""
     bars = block.distances
-    if not len(bars.lengths):
+    if not len(bars):
         return np.zeros_like(block.points)
     return np.asarray(bars.design(block.points).T @ bars.residuals(block.points)).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
-class _Joined:
-    """What distances add to tie points that were eliminated one by one (Woodbury's identity).
-
-    Attributes:
-        design: (b, 3p) derivatives of the distances.
-        spread: (3p, b) the points' own covariance times its transpose.
-        inverse: (b, b) inverse covariance of the distances as the points have them, and as measured.
-    """
-
-    design: scipy.sparse.csr_array
-    spread: scipy.sparse.csr_array
-    inverse: Float64[np.ndarray, "b b"]
-
-    @classmethod
-    def of(cls, block: Block, own: Float64[np.ndarray, "p 3 3"]) -> _Joined:
-        design = block.distances.design(block.points)
-        p = len(block.points)
-        blocks = scipy.sparse.bsr_array((own, np.arange(p), np.arange(p + 1)), shape=(3 * p, 3 * p))
-        spread = scipy.sparse.csr_array(blocks @ design.T)
-        return cls(design, spread, np.linalg.inv(np.eye(len(block.distances.lengths)) + (design @ spread).todense()))
-
-    def corrected(self, step: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
-        """The points' step with the distances."""
-        return np.asarray(step - (self.spread @ (self.inverse @ (self.design @ step.ravel()))).reshape(-1, 3))
-
-
 def _with_distances(reduced: ReducedBlock, block: Block) -> ReducedBlock:
     """Add distances to equations whose gradient has them already."""
-    if not len(block.distances.lengths):
+    if not len(block.distances):
         return reduced
-    joined = _Joined.of(block, reduced.own)
+    joined = JoinedPoints.of(block.distances, block.points, reduced.own)
     crossed = scipy.sparse.csr_array(joined.design @ reduced.carry)
     weighed = scipy.sparse.csr_array(joined.inverse @ crossed.todense())
     own = reduced.own.copy()
@@ -349,8 +219,8 @@ def settle_points(block: Block, rounds: int = 2) -> Block:
         gradient = _summed(np.einsum("mka,mk->ma", point, residual), starts, block.point, p)
         gradient += block.weights * (block.points - block.stated) + _pull(block)
         step = -np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
-        if len(block.distances.lengths):
-            step = _Joined.of(block, np.linalg.inv(information)).corrected(step)
+        if len(block.distances):
+            step = JoinedPoints.of(block.distances, block.points, np.linalg.inv(information)).corrected(step)
         block = replace(block, points=block.points + step)
     return block
 
@@ -424,7 +294,7 @@ def _jacobians(
     by_ray, by_lens, projected = np.zeros((m, 2, 3)), np.zeros((m, 2, widest)), np.zeros((m, 2))
     for number, lens in enumerate(block.lenses):
         rows = np.flatnonzero(block.lens_of[block.photo] == number)
-        by_ray[rows], by_lens[rows, :, : len(lens.names)], projected[rows] = _derivatives(lens, rays[rows], lenses)
+        by_ray[rows], by_lens[rows, :, : len(lens.names)], projected[rows] = lens_derivatives(lens, rays[rows], lenses)
     turned = block.rotations[block.photo]
     by_point = by_ray @ turned
     by_turn = -by_ray @ cross_matrix(rays)
@@ -435,40 +305,6 @@ def _jacobians(
     pose = scale * np.nan_to_num(np.concatenate([by_turn, -by_point], axis=2))
     residual = np.where(sound[:, None], residual, 0.0)
     return pose, scale * np.nan_to_num(by_lens), scale * np.nan_to_num(by_point), residual
-
-
-def _derivatives(
-    lens: Lens, rays: Float64[np.ndarray, "m 3"], parameters: bool
-) -> tuple[Float64[np.ndarray, "m 2 3"], Float64[np.ndarray, "m 2 k"], Float64[np.ndarray, "m 2"]]:
-    """Derivatives of pixels by the point in the camera's axes and by the free parameters, and the pixels."""
-    depth = rays[:, 2:]
-    flat = rays / np.where(depth > MIN_DEPTH, depth, np.nan)
-    columns = []
-    for axis in range(2):
-        step = np.zeros(3)
-        step[axis] = RAY_STEP
-        columns.append((_project(lens.camera, flat + step) - _project(lens.camera, flat - step)) / (2.0 * RAY_STEP))
-    by_flat = np.stack(columns, axis=2)
-    inner = np.zeros((len(rays), 2, 3))
-    inner[:, 0, 0] = inner[:, 1, 1] = 1.0
-    inner[:, :, 2] = -flat[:, :2]
-    by_ray = by_flat @ (inner / depth[:, :, None])
-    by_lens = np.zeros((len(rays), 2, len(lens.names)))
-    for k, name in enumerate(lens.names if parameters else ()):
-        step = np.zeros(len(lens.names))
-        step[k] = LENS_STEP if name in LENGTHS else LENS_STEP / lens.camera.width
-        ahead, back = _project(lens._after(step), flat), _project(lens._after(-step), flat)
-        by_lens[:, :, k] = (ahead - back) / (2.0 * step[k])
-    return by_ray, by_lens, _project(lens.camera, flat)
-
-
-def _project(camera: pycolmap.Camera, rays: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 2"]:
-    if len(rays) == 0:
-        return np.zeros((0, 2))
-    sound = np.isfinite(rays).all(axis=1)
-    result = np.full((len(rays), 2), np.nan)
-    result[sound] = np.asarray(camera.img_from_cam(rays[sound]), np.float64)
-    return result
 
 
 def _summed(

@@ -24,9 +24,9 @@ from splatpipe.pipeline.survey.adjustment import (
     can_adjust,
     moved_px,
 )
-from splatpipe.pipeline.survey.block import Lens
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import PositionObservations
+from splatpipe.pipeline.survey.block_lens import Lens
 from splatpipe.pipeline.survey.blunders import (
     require_near,
     tell_heights_apart,

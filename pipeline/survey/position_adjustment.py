@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.sfm.lens_model import PARAMETERS, WIDE, is_known
-from splatpipe.pipeline.survey.block import Block, Lens, free_lens, part_of, reduce_block
+from splatpipe.pipeline.survey.block import Block, part_of, reduce_block
 from splatpipe.pipeline.survey.block_accuracy import BlockAccuracy, accuracy_of
 from splatpipe.pipeline.survey.block_adjustment import AdjustedBlock, PositionObservations, adjust_block
+from splatpipe.pipeline.survey.block_lens import Lens, free_lens
 from splatpipe.pipeline.survey.position_noise import (
     CentreSystem,
     PositionNoise,

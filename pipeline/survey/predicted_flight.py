@@ -17,9 +17,10 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.geometry.upright import display_from_stored, enu_from_gimbal
 from splatpipe.pipeline.sfm.lens_model import NAMES, WIDE
 from splatpipe.pipeline.survey.adjusted_positions import ACCURATE_M, MIN_POSITIONS
-from splatpipe.pipeline.survey.block import Block, Lens, reduce_block
+from splatpipe.pipeline.survey.block import Block, reduce_block
 from splatpipe.pipeline.survey.block_accuracy import BlockAccuracy, accuracy_of, with_control, with_cross_strip
 from splatpipe.pipeline.survey.block_adjustment import AdjustedBlock, PositionObservations
+from splatpipe.pipeline.survey.block_lens import Lens
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.photo_positions import Position
 from splatpipe.pipeline.survey.position_adjustment import MIN_PHOTOS, SIMPLE, LensKnowledge, prior_lens

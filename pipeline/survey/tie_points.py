@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.sfm.lens_model import NAMES, is_known, narrow, set_lens, widen
 from splatpipe.pipeline.sfm.retriangulation import MAX_ERROR_PX
-from splatpipe.pipeline.survey.block import NO_DISTANCES, Block, Lens, settle_points
+from splatpipe.pipeline.survey.block import Block, settle_points
+from splatpipe.pipeline.survey.block_distances import NO_DISTANCES
+from splatpipe.pipeline.survey.block_lens import Lens
 
 PER_PHOTO = 150  # tie points of a photo: errors within one are not independent, and more add cost, not accuracy
 PER_CELL = 2

@@ -8,7 +8,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from splatpipe.pipeline.survey.block import Block, Lens
+from splatpipe.pipeline.survey.block import Block
+from splatpipe.pipeline.survey.block_lens import Lens
 from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens
 from splatpipe.pipeline.survey.position_noise import StatedPositions
 from splatpipe.pipeline.survey.tie_points import intersected

@@ -22,10 +22,7 @@ from splatpipe.pipeline.survey.blunders import require_near
 from splatpipe.pipeline.survey.control_file import ControlFile
 from splatpipe.pipeline.survey.control_fit import fit_control
 from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.local_survey import (
-    LocalSurvey,
-    stations_of,
-)
+from splatpipe.pipeline.survey.local_survey import LocalSurvey, stations_of
 from splatpipe.pipeline.survey.located_points import Sighting, SurveyPoint, locate, residual_px
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.surveyed_points import Survey, with_roles

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ipaddress
 import math
-import signal
 import socket
 import threading
 import time
@@ -92,7 +91,6 @@ def serve(out: Path, options: ViewOptions, print_line: Callable[[str], None]) ->
         ours = [*(_marking(pages, options, print_line) if options.mark else ()), *pages.routes()]
         start = f"http://{ADDRESS if bind == EVERYWHERE else bind}:{listening.getsockname()[1]}/"
         start += "mark" if options.mark else "live" if run.is_running else ""
-        _restore_signal_handlers()
 
         def ready() -> None:
             if bind != ADDRESS:
@@ -123,12 +121,6 @@ class _Server(uvicorn.Server):
         """Start listening."""
         await super().startup(sockets)
         self._ready()
-
-
-def _restore_signal_handlers() -> None:
-    """Restore Python's signal handlers: pyceres, once imported, treats SIGTERM as a crash and prints its stack."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.getsignal(number))
 
 
 def _marking(pages: Pages, options: ViewOptions, print_line: Callable[[str], None]) -> list[Route]:

@@ -8,9 +8,11 @@ import pytest
 
 from splatpipe.pipeline.survey import block as block_module
 from splatpipe.pipeline.survey.adjusted_positions import height_sentence
-from splatpipe.pipeline.survey.block import Block, Distances, free_lens, part_of, reduce_block, settle_points
+from splatpipe.pipeline.survey.block import Block, part_of, reduce_block, settle_points
 from splatpipe.pipeline.survey.block_accuracy import accuracy_of, with_control, with_cross_strip
 from splatpipe.pipeline.survey.block_adjustment import adjust_block, joint_system, solve
+from splatpipe.pipeline.survey.block_distances import Distances
+from splatpipe.pipeline.survey.block_lens import free_lens
 from splatpipe.pipeline.survey.position_adjustment import BlockFit, LensKnowledge, converge, parts_of, prior_lens
 from splatpipe.pipeline.survey.position_noise import as_stated, strip_pieces
 from splatpipe.pipeline.survey.tie_points import image_errors, tie_sigma
