@@ -15,6 +15,9 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shards, Stage, Sta
 
 KILL_VARIABLE = "SHARDED_KILL"  # names the shard whose process dies of SIGKILL halfway
 FAIL_VARIABLE = "SHARDED_FAIL"  # names the shard that raises
+HOLD_VARIABLE = (
+    "SHARDED_HOLD"  # a folder: while it has a file of a shard's number, the shard waits before its second step
+)
 
 
 class DivideConfig(StageConfig):
@@ -55,6 +58,8 @@ def sum_piece(config: SumConfig, inputs: Inputs, out: Path, report: Reporter) ->
     begun, total = json.loads(checkpoint.read_text()) if checkpoint.exists() else (0, 0)
     for at in range(begun, len(piece)):
         report.progress(at, len(piece), "adding", "numbers")
+        while at and (hold := os.environ.get(HOLD_VARIABLE)) and Path(hold, str(inputs.shard.number)).exists():
+            time.sleep(0.05)
         time.sleep(config.step_s)
         total += piece[at] ** 2 + config.offset
         checkpoint.with_suffix(".new").write_text(json.dumps([at + 1, total]))

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import sharded
 from sharded_runs import NUMBERS, SHARDS, make_shard, request_of, statuses, walk
 
 from splatpipe.pipeline.engine.errors import UsageError
@@ -48,6 +49,15 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
+@pytest.fixture
+def hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder: a file of a shard's number in it holds the shard before its second number, however slow the machine."""
+    folder = tmp_path / "hold"
+    folder.mkdir()
+    monkeypatch.setenv(sharded.HOLD_VARIABLE, str(folder))
+    return folder
+
+
 def alone(numbers: Path, out: Path, shard: str, *more: str, **options: object) -> subprocess.Popen[str]:
     """A process that makes a shard, or with an empty name runs the pipeline."""
     words = [sys.executable, "-c", ALONE, str(numbers), str(out), shard, json.dumps(options), *more]
@@ -63,7 +73,9 @@ def digests(out: Path) -> dict[str, object]:
     }
 
 
-def test_shards_of_many_processes_each_killed_once_have_the_bits_of_a_single_run(numbers: Path, tmp_path: Path) -> None:
+def test_shards_of_many_processes_each_killed_once_have_the_bits_of_a_single_run(
+    numbers: Path, tmp_path: Path, hold: Path
+) -> None:
     """Each is killed with -9 between its two numbers, restarted in another order, all three at once; then merged."""
     one, many = tmp_path / "one", tmp_path / "many"
     slow = {"sum": {"step_s": 0.4}}
@@ -71,6 +83,9 @@ def test_shards_of_many_processes_each_killed_once_have_the_bits_of_a_single_run
     walk(request_of(numbers, many, **slow), until="divide")
     before = {path: path.read_bytes() for path in many.iterdir() if path.is_file()}
     for again in (False, True):
+        for number in range(1, 4):
+            held = hold / str(number)
+            held.unlink() if again else held.touch()
         running = [alone(numbers, many, name, **slow) for name in reversed(SHARDS)]
         for process in running:
             assert process.stdout is not None and process.stdout.readline() == "adding\n"
@@ -88,23 +103,26 @@ def test_shards_of_many_processes_each_killed_once_have_the_bits_of_a_single_run
     assert (many / "shown.txt").read_bytes() == (one / "shown.txt").read_bytes()
 
 
-def test_a_run_killed_in_a_shard_keeps_those_before_it(numbers: Path, out: Path) -> None:
+def test_a_run_killed_in_a_shard_keeps_those_before_it(numbers: Path, out: Path, hold: Path) -> None:
+    (hold / "2").touch()
     slow = {"sum": {"step_s": 0.4}}
     with alone(numbers, out, "", **slow) as process:
         assert process.stdout is not None
         assert [process.stdout.readline() for _ in range(2)] == ["adding\n"] * 2
         os.killpg(process.pid, signal.SIGKILL)
+    (hold / "2").unlink()
     outcome, _ = walk(request_of(numbers, out, **slow))
     assert outcome.ran == ["sum.2", "sum.3", "sum", "show"]
     assert outcome.artifacts["sum.2"].summary["began_at"] == 1
 
 
 def test_two_processes_may_write_two_artifacts_but_not_the_same_one(
-    numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+    numbers: Path, out: Path, hold: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
-    slow = {"sum": {"step_s": 1.0}}
+    slow = {"sum": {"step_s": 0.4}}
     walk(request_of(numbers, out, **slow), until="divide")
+    (hold / "2").touch()
     with alone(numbers, out, "sum.2", **slow) as process:
         assert process.stdout is not None
         process.stdout.readline()
@@ -117,6 +135,7 @@ def test_two_processes_may_write_two_artifacts_but_not_the_same_one(
         assert statuses(request)["sum.2"].reason == "is running"
         assert make_shard(request, 1).ran == ["sum.1"]
         with alone(numbers, out, "sum.2", "--wait", **slow) as waiting:
+            (hold / "2").unlink()
             _, said = waiting.communicate()
             assert waiting.returncode == 0 and process.wait() == 0, said
     kinds = [json.loads(line)["kind"] for line in shard_events(out, "sum.2").read_text().splitlines()]
