@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.heap import return_free_heap
@@ -84,17 +83,21 @@ def measure(render: Pixels, photo: Pixels, mask: Mask | None) -> dict[str, float
     """
     x, y = (torch.from_numpy(pixels.astype(np.float32) / np.float32(255.0)) for pixels in (render, photo))
     counted = None if mask is None else torch.from_numpy(mask)
-    return {name: _measured(function, x, y, counted) for name, function in metrics.METRICS.items()}
-
-
-def _measured(function: Callable[..., float], render: Tensor, photo: Tensor, mask: Tensor | None) -> float | None:
     try:
-        value = float(function(render, photo, mask))
+        pair = metrics.pair_of(x, y, counted)
+    except ValueError:  # no pixel counts
+        return dict.fromkeys(metrics.METRICS)
+    return {name: _measured(metric, pair) for name, metric in metrics.METRICS.items()}
+
+
+def _measured(metric: metrics.Metric, pair: metrics.ImagePair) -> float | None:
+    try:
+        value = float(metric.of_pair(pair))
     except ValueError:  # too few pixels for this metric
         return None
     finally:
         return_free_heap()  # metrics free hundreds of megabytes, which the heaps of several threads would keep
-    value = min(value, EQUAL_DB) if function in (metrics.psnr, metrics.psnr_cc) else value
+    value = min(value, EQUAL_DB) if metric in (metrics.psnr, metrics.psnr_cc) else value
     return round(value, 6) if math.isfinite(value) else None
 
 

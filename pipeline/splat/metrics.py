@@ -8,8 +8,12 @@ float64, and every sum has a fixed order: bit-identical for any number of thread
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -36,7 +40,75 @@ _SHARPNESS_FLOOR = 1.0 / 255.0
 """A gradient of one grey level per pixel: a photo with less has no edges to compare."""
 
 
-def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
+@dataclass(frozen=True, eq=False)
+class ImagePair:
+    """A render and its photo, prepared once for every metric.
+
+    Attributes:
+        x: The render's channels; pixels that do not count are the photo's.
+        y: The photo's channels.
+        counts: Which pixels count.
+    """
+
+    x: Float[Tensor, "3 h w"]
+    y: Float[Tensor, "3 h w"]
+    counts: Bool[Tensor, "h w"]
+
+    @cached_property
+    def lumas(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """Both images' luma."""
+        return _luma(self.x), _luma(self.y)
+
+    @cached_property
+    def windows(self) -> list[list[float]]:
+        """For each channel: the sum of SSIM over all counting pixels with the borders reflected; and the sums of SSIM
+        and of its contrast · structure factor over the whole windows, as the finest scale of MS-SSIM needs them."""
+        radius = SSIM_WINDOW // 2
+        whole = self.counts.clone()
+        for border in (whole[:radius], whole[-radius:], whole[:, :radius], whole[:, -radius:]):
+            border.zero_()
+        sums = []
+        for channel in zip(self.x, self.y, strict=True):
+            around_x, around_y = (pad(image[None], [radius] * 4, mode="reflect")[0] for image in channel)
+            sums.append(_window_sums(around_x, around_y, (self.counts, whole, whole)))
+        return sums
+
+
+def pair_of(render: Image, photo: Image, mask: Mask | None = None) -> ImagePair:
+    """Prepare a render and its photo for the metrics.
+
+    Raises:
+        ValueError: if the shapes differ, a value is not finite, or no pixel counts.
+    """
+    if render.shape != photo.shape or render.ndim != 3 or render.shape[2] != 3:
+        raise ValueError(f"render {tuple(render.shape)} and photo {tuple(photo.shape)} are not both (h, w, 3)")
+    counts = torch.ones(render.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
+    if counts.shape != render.shape[:2]:
+        raise ValueError(f"mask {tuple(counts.shape)} is not {tuple(render.shape[:2])}")
+    _require_pixels(counts)
+    if not bool(torch.isfinite(photo).all() and (torch.isfinite(render).all() if mask is None else True)):
+        raise ValueError("the render or the photo has values that are not finite")
+    x, y = (_planes(image.detach().cpu()) for image in (render, photo))
+    if mask is not None:
+        for channel, other in zip(x, y, strict=True):
+            channel.copy_(torch.where(counts, channel, other))
+            if not bool(torch.isfinite(channel).all()):
+                raise ValueError("the render or the photo has values that are not finite")
+    return ImagePair(x, y, counts)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric, called with a render, its photo and their mask, or ``of_pair`` where several share the preparation."""
+
+    of_pair: Callable[[ImagePair], float]
+
+    def __call__(self, render: Image, photo: Image, mask: Mask | None = None) -> float:
+        return self.of_pair(pair_of(render, photo, mask))
+
+
+@Metric
+def psnr(pair: ImagePair) -> float:
     """Peak signal-to-noise ratio, 10 log10(1 / MSE) over all counting pixels and channels.
 
     Returns:
@@ -45,13 +117,14 @@ def psnr(render: Image, photo: Image, mask: Mask | None = None) -> float:
     Raises:
         ValueError: if the shapes differ, a value is not finite, or no pixel counts (likewise for every metric here).
     """
-    x, y, counts = _prepare(render, photo, mask)
+    x, y, counts = pair.x, pair.y, pair.counts
     errors = (_sum((a - b).square_(), counts) for a, b in zip(x, y, strict=True))
     error = math.fsum(errors) / (3 * int(counts.sum()))
     return 10.0 * math.log10(1.0 / error) if error > 0.0 else math.inf
 
 
-def psnr_cc(render: Image, photo: Image, mask: Mask | None = None) -> float:
+@Metric
+def psnr_cc(pair: ImagePair) -> float:
     """PSNR after an affine colour map (3 × 4) of the render, fitted by least squares on the other half of the image.
 
     It ignores differences in exposure and white balance between photos. A map is fitted on each half and scored on the
@@ -64,15 +137,16 @@ def psnr_cc(render: Image, photo: Image, mask: Mask | None = None) -> float:
     Raises:
         ValueError: also if one half has no pixel that counts.
     """
-    x, y, counts = _prepare(render, photo, mask)
+    x, y, counts = pair.x, pair.y, pair.counts
     board = _chessboard(counts.shape[0], counts.shape[1])
     halves = (counts & board, counts & ~board)
     maps = _colour_maps(x, y, halves)
     errors = []
     for colour, scored in zip(reversed(maps), halves, strict=True):
-        for channel, into in zip(y, colour.T.tolist(), strict=True):
-            corrected = into[0] * x[0] + into[1] * x[1] + into[2] * x[2] + into[3]
-            errors.append(_sum((corrected.clamp_(0.0, 1.0) - channel).square_(), scored))
+        for source, target in _chosen_strips(x, y, scored):
+            for channel, into in zip(target, colour.T.tolist(), strict=True):
+                corrected = into[0] * source[0] + into[1] * source[1] + into[2] * source[2] + into[3]
+                errors.append(float((corrected.clamp_(0.0, 1.0) - channel).square_()[None].sum(dim=1)))
     error = math.fsum(errors) / (3 * int(counts.sum()))
     return 10.0 * math.log10(1.0 / error) if error > 0.0 else math.inf
 
@@ -85,24 +159,29 @@ def _chessboard(height: int, width: int) -> Bool[Tensor, "h w"]:
 
 def _colour_maps(x: Tensor, y: Tensor, halves: tuple[Tensor, Tensor]) -> list[Float[Tensor, "4 3"]]:
     """The least-squares map from ``x`` to ``y`` for each half; the last row is the offset."""
+    solutions = []
     for half in halves:
         _require_pixels(half)
-    source = [*x, torch.ones_like(x[0])]
-    normal, right = torch.zeros(2, 4, 4, dtype=torch.float64), torch.zeros(2, 4, 3, dtype=torch.float64)
-    for i, one in enumerate(source):
-        for j, other in enumerate((*source[: i + 1], *y)):
-            product = one * other
-            for k, half in enumerate(halves):
-                value = _sum(product, half)
-                if j <= i:
-                    normal[k, i, j] = normal[k, j, i] = value
-                else:
-                    right[k, i, j - i - 1] = value
-    # gelsd returns the minimum-norm solution: a render of one colour leaves the map undetermined
-    return [torch.linalg.lstsq(normal[k], right[k], driver="gelsd").solution for k in range(2)]
+        sums = torch.zeros(4, 7, dtype=torch.float64)  # of the products of (x, 1) with (x, 1, y)
+        for source, target in _chosen_strips(x, y, half):
+            every = torch.cat([source, torch.ones_like(source[:1]), target])  # (7, n)
+            sums += torch.stack([(one * every).sum(dim=1) for one in every[:4]])
+        # gelsd returns the minimum-norm solution: a render of one colour leaves the map undetermined
+        solutions.append(torch.linalg.lstsq(sums[:, :4], sums[:, 4:], driver="gelsd").solution)
+    return solutions
 
 
-def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
+def _chosen_strips(x: Tensor, y: Tensor, chosen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """The chosen pixels (3, n) of both images, strip by strip."""
+    for top in range(0, chosen.shape[0], _STRIP_ROWS):
+        rows = slice(top, top + _STRIP_ROWS)
+        places = torch.nonzero(chosen[rows].reshape(-1))[:, 0]
+        source, target = (image[:, rows].reshape(3, -1).index_select(1, places) for image in (x, y))
+        yield source, target
+
+
+@Metric
+def ssim(pair: ImagePair) -> float:
     """Mean structural similarity: ``kornia.metrics.ssim`` with window 11 and "same" padding, to rounding.
 
     Wang, Bovik, Sheikh, Simoncelli: Image Quality Assessment: From Error Visibility to Structural Similarity, IEEE TIP
@@ -111,18 +190,14 @@ def ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
     Raises:
         ValueError: also if a side is under 6 pixels, which is too short to reflect by half a window.
     """
-    x, y, counts = _prepare(render, photo, mask)
     radius = SSIM_WINDOW // 2
-    if min(x.shape[1:]) <= radius:
-        raise ValueError(f"SSIM needs images of {radius + 1} pixels a side, got {tuple(x.shape[1:])}")
-    sums = []
-    for channel in zip(x, y, strict=True):
-        around_x, around_y = (pad(image[None], [radius] * 4, mode="reflect")[0] for image in channel)
-        sums.append(_window_sums(around_x, around_y, counts)[0])
-    return math.fsum(sums) / (3 * int(counts.sum()))
+    if min(pair.counts.shape) <= radius:
+        raise ValueError(f"SSIM needs images of {radius + 1} pixels a side, got {tuple(pair.counts.shape)}")
+    return math.fsum(sums[0] for sums in pair.windows) / (3 * int(pair.counts.sum()))
 
 
-def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
+@Metric
+def ms_ssim(pair: ImagePair) -> float:
     """Multi-scale structural similarity.
 
     Wang, Simoncelli, Bovik: Multi-scale Structural Similarity for Image Quality Assessment, Asilomar 2003: five
@@ -133,14 +208,17 @@ def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
     Raises:
         ValueError: also if not even one window fits.
     """
-    x, y, counts = _prepare(render, photo, mask)
+    x, y, counts = pair.x, pair.y, pair.counts
     radius = SSIM_WINDOW // 2
     scales: list[tuple[list[float], list[float]]] = []  # (similarity, contrast · structure) of each channel
     for _ in _MS_SSIM_WEIGHTS:
         inner = counts[radius:-radius, radius:-radius]
         if min(x.shape[1:]) < SSIM_WINDOW or not bool(inner.any()):
             break
-        sums = [_window_sums(*channel, inner) for channel in zip(x, y, strict=True)]
+        if not scales:
+            sums = [channel[1:] for channel in pair.windows]
+        else:
+            sums = [_window_sums(*channel, (inner, inner)) for channel in zip(x, y, strict=True)]
         similarity, structure = ([total[k] / int(inner.sum()) for total in sums] for k in (0, 1))
         scales.append((similarity, structure))
         x, y = avg_pool2d(x, 2), avg_pool2d(y, 2)
@@ -157,7 +235,8 @@ def ms_ssim(render: Image, photo: Image, mask: Mask | None = None) -> float:
     return math.fsum(product) / 3.0
 
 
-def gmsd(render: Image, photo: Image, mask: Mask | None = None) -> float:
+@Metric
+def gmsd(pair: ImagePair) -> float:
     """Gradient magnitude similarity deviation: 0 for equal images, larger is worse.
 
     Xue, Zhang, Mou, Bovik: Gradient Magnitude Similarity Deviation: A Highly Efficient Perceptual Image Quality Index,
@@ -166,35 +245,34 @@ def gmsd(render: Image, photo: Image, mask: Mask | None = None) -> float:
     Raises:
         ValueError: also if the images are under 2 pixels a side.
     """
-    x, y, counts = _prepare(render, photo, mask)
-    if min(x.shape[1:]) < 2:
-        raise ValueError(f"GMSD needs images of 2 pixels a side, got {tuple(x.shape[1:])}")
-    counts = _halved(counts)
+    if min(pair.counts.shape) < 2:
+        raise ValueError(f"GMSD needs images of 2 pixels a side, got {tuple(pair.counts.shape)}")
+    counts = _halved(pair.counts)
     _require_pixels(counts)
-    gx, gy = (_gradient(avg_pool2d(_luma(image)[None], 2)[0], (1.0, 1.0, 1.0)) for image in (x, y))
+    gx, gy = (_gradient(avg_pool2d(luma[None], 2)[0], (1.0, 1.0, 1.0)) for luma in pair.lumas)
     similarity = (2.0 * gx * gy + _GMSD_C) / (gx.square() + gy.square() + _GMSD_C)
     mean = _mean(similarity[None], counts)
     return math.sqrt(_mean((similarity - mean).square()[None], counts))
 
 
-def sharpness(render: Image, photo: Image, mask: Mask | None = None) -> float:
+@Metric
+def sharpness(pair: ImagePair) -> float:
     """Sharpness of the photo's edges in the render: 1 as in the photo, less if blurred, more if overshooting.
 
     The ratio of the RMS Sobel gradients (Tenengrad: Krotkov, Focusing, IJCV 1, 1987) of the luma, over the tenth of the
     counting pixels where the photo's gradient is largest.
     """
-    x, y, counts = _prepare(render, photo, mask)
-    lumas = (_luma(x), _luma(y))
-    del x, y
-    gx, gy = (_gradient(pad(luma[None], [1] * 4, mode="replicate")[0], (1.0, 2.0, 1.0)) for luma in lumas)
-    gx, gy = gx[1:-1, 1:-1][counts], gy[1:-1, 1:-1][counts]  # (pixels,)
+    gx, gy = (_gradient(pad(luma[None], [1] * 4, mode="replicate")[0], (1.0, 2.0, 1.0)) for luma in pair.lumas)
+    gx, gy = (gradient[1:-1, 1:-1][pair.counts] for gradient in (gx, gy))  # (pixels,)
     edges = max(1, math.ceil(_EDGE_SHARE * gy.numel()))
-    order = torch.sort(gy, descending=True, stable=True).indices[:edges]
-    rms = [math.sqrt(math.fsum(g[order].square().tolist()) / edges) for g in (gx, gy)]
+    least = float(np.partition(gy.numpy(), gy.numel() - edges)[gy.numel() - edges])
+    above, level = torch.nonzero(gy > least)[:, 0], torch.nonzero(gy == least)[:, 0]
+    chosen = torch.cat([above, level[: edges - above.numel()]])  # of equal ones, the first
+    rms = [math.sqrt(math.fsum(g[chosen].square().tolist()) / edges) for g in (gx, gy)]
     return (rms[0] + _SHARPNESS_FLOOR) / (rms[1] + _SHARPNESS_FLOOR)
 
 
-METRICS: dict[str, Callable[..., float]] = {
+METRICS: dict[str, Metric] = {
     "psnr": psnr,
     "psnr_cc": psnr_cc,
     "ssim": ssim,
@@ -210,23 +288,6 @@ def ssim_window(dtype: torch.dtype = torch.float64) -> Float[Tensor, " 11"]:
     offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     taps = torch.exp(-0.5 * (offset / SSIM_SIGMA).square())
     return (taps / taps.sum()).to(dtype)
-
-
-def _prepare(render: Tensor, photo: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Render (masked pixels taken from the photo) and photo as (3, h, w) in float64, and which pixels count."""
-    if render.shape != photo.shape or render.ndim != 3 or render.shape[2] != 3:
-        raise ValueError(f"render {tuple(render.shape)} and photo {tuple(photo.shape)} are not both (h, w, 3)")
-    counts = torch.ones(render.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
-    if counts.shape != render.shape[:2]:
-        raise ValueError(f"mask {tuple(counts.shape)} is not {tuple(render.shape[:2])}")
-    _require_pixels(counts)
-    x, y = (_planes(image.detach().cpu()) for image in (render, photo))
-    for channel, other in zip(x, y, strict=True):
-        if mask is not None:
-            channel.copy_(torch.where(counts, channel, other))
-        if not bool(torch.isfinite(channel).all() and torch.isfinite(other).all()):
-            raise ValueError("the render or the photo has values that are not finite")
-    return x, y, counts
 
 
 def _planes(image: Tensor) -> Float[Tensor, "3 h w"]:
@@ -253,37 +314,37 @@ def _mean(values: Float[Tensor, "c h w"], counts: Bool[Tensor, "h w"]) -> float:
 
 
 def _window_sums(
-    x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counts: Bool[Tensor, "h-10 w-10"]
-) -> tuple[float, float]:
-    """Sums of SSIM and of its contrast · structure factor over the whole windows whose centres count."""
-    rows: tuple[list[float], list[float]] = ([], [])
-    for top in range(0, counts.shape[0], _STRIP_ROWS):
+    x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counts: Sequence[Bool[Tensor, "h-10 w-10"]]
+) -> list[float]:
+    """Sums of SSIM, for each of the ``counts`` but the last, and of its contrast · structure factor, for the last,
+    over the whole windows whose centres count."""
+    rows: list[list[float]] = [[] for _ in counts]
+    for top in range(0, counts[0].shape[0], _STRIP_ROWS):
         strip = slice(top, top + _STRIP_ROWS + SSIM_WINDOW - 1)
-        here = counts[top : top + _STRIP_ROWS]
-        for found, values in zip(rows, _similarity(x[strip], y[strip]), strict=True):
-            found += torch.where(here, values, 0.0).sum(dim=1).tolist()
-    return math.fsum(rows[0]), math.fsum(rows[1])
+        similarity, structure = _similarity(x[strip], y[strip])
+        values = [similarity] * (len(counts) - 1) + [structure]
+        for found, one, counted in zip(rows, values, counts, strict=True):
+            found += torch.where(counted[top : top + _STRIP_ROWS], one, 0.0).sum(dim=1).tolist()
+    return [math.fsum(found) for found in rows]
 
 
 def _blur(image: Float[Tensor, "h w"]) -> Tensor:
-    """Means of whole windows (h - 10, w - 10), tap by tap: elementwise, so independent of the threads."""
-    for dim in (1, 0):
-        length = image.shape[dim] - SSIM_WINDOW + 1
-        parts = (tap * image.narrow(dim, i, length) for i, tap in enumerate(ssim_window().tolist()))
-        total = next(parts)
-        for part in parts:
-            total = total.add_(part)
-        image = total
-    return image
+    """Means of whole windows (h - 10, w - 10), by OpenCV's separable filter, which runs in one thread."""
+    taps, radius = ssim_window().numpy(), SSIM_WINDOW // 2
+    blurred = cv2.sepFilter2D(np.ascontiguousarray(image.numpy()), cv2.CV_64F, taps, taps)
+    return torch.from_numpy(np.asarray(blurred))[radius:-radius, radius:-radius]
 
 
 def _similarity(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
     """SSIM of every whole window, and its contrast · structure factor: (h - 10, w - 10) each."""
     mx, my = _blur(x), _blur(y)
-    sxx, syy, sxy = _blur(x * x) - mx * mx, _blur(y * y) - my * my, _blur(x * y) - mx * my
-    up, down = 2.0 * sxy + SSIM_C2, sxx + syy + SSIM_C2
-    luminance_up, luminance_down = 2.0 * mx * my + SSIM_C1, mx * mx + my * my + SSIM_C1
-    return luminance_up * up / (luminance_down * down + SSIM_EPS), up / down
+    product = mx * my
+    squares = mx.square_().add_(my.square_())
+    up = (_blur(x * y) - product).mul_(2.0).add_(SSIM_C2)
+    down = (_blur((x * x).add_(y * y)) - squares).add_(SSIM_C2)
+    structure = up / down
+    similarity = product.mul_(2.0).add_(SSIM_C1).mul_(up)
+    return similarity.div_(squares.add_(SSIM_C1).mul_(down).add_(SSIM_EPS)), structure
 
 
 def _luma(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:

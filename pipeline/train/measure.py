@@ -201,9 +201,10 @@ def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Traini
         colour = rasterizer.render(gaussians, photo.camera, options).colour.clamp(0.0, 1.0)
     shown = photo.colour.cpu()
     mask = None if photo.mask is None else photo.mask.cpu()
-    for function in metrics.METRICS.values():
+    pair = metrics.pair_of(colour.cpu(), shown, mask)
+    for metric in metrics.METRICS.values():
         try:
-            function(colour.cpu(), shown, mask)
+            metric.of_pair(pair)
         except ValueError:
             continue  # too few pixels for this metric: `evaluate` leaves it out too
     pixels = (shown * 255.0).to(torch.uint8).numpy()

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import kornia
 import numpy as np
 import pytest
@@ -239,14 +240,14 @@ def test_no_metric_depends_on_masked_pixels(name):
 @pytest.mark.parametrize("name", sorted(METRICS))
 def test_metrics_are_bit_identical_for_any_number_of_threads(name):
     photo = image(230, 310, dtype=torch.float32)
-    render, threads = noisy(photo), torch.get_num_threads()
+    render, threads = noisy(photo), (torch.get_num_threads(), cv2.getNumThreads())
     values = []
     try:
         for n in (1, 2, 5):
-            torch.set_num_threads(n)
+            torch.set_num_threads(n), cv2.setNumThreads(n)
             values.append(METRICS[name](render, photo, half_mask(230, 310)))
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(threads[0]), cv2.setNumThreads(threads[1])
     assert len(set(values)) == 1
 
 
