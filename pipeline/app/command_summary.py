@@ -90,11 +90,14 @@ class CommandSummary:
             print_line(trouble)
 
     def _report(self, error: BaseException | None) -> None:
-        """Write the report; its problems are reported and do not affect the run."""
+        """Write the report, unless it is there and no stage ran; its problems do not affect the run."""
         from splatpipe.pipeline.app.console import print_line
-        from splatpipe.pipeline.app.report import make_report
+        from splatpipe.pipeline.app.report import REPORT_FILE, is_current, make_report
         from splatpipe.pipeline.engine.run_folder import LOG_FILE
 
+        if error is None and self.outcome is not None and not self.outcome.ran and is_current(self._out):
+            self._report_path = self._out / REPORT_FILE
+            return
         until_s = error.at_s + STOP_S if isinstance(error, StopSignal) else None
         try:
             self._report_path = make_report(self._out, self._out / LOG_FILE, until_s=until_s)

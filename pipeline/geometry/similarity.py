@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 SIMILARITY = 7  # unknowns of a small change: a rotation vector, the log scale, the position of the points' mean
 FREE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: its direction is not determined
@@ -107,6 +106,8 @@ def fit_similarity(
 
 def rotation_from_vector(vector: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
     """The rotation matrices of rotation vectors in radians."""
+    from scipy.spatial.transform import Rotation  # half a CPU second, which the report need not pay
+
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 

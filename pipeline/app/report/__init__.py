@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import IO
 
 from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
-from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.heap import importing
 from splatpipe.pipeline.engine.output_file import appended_file
 from splatpipe.pipeline.engine.python_module import python_module
+from splatpipe.pipeline.engine.small_file import open_regular
 
 REPORT_FILE = "report.html"
+HEAD_BYTES = 4096  # of the page, with the digest of its results
 PATIENCE_S = 600.0  # far more than hundreds of photos take
 MIN_S = 2.0  # minimum time granted: enough for the report without images, even on a busy machine
 POLL_S = 0.02
@@ -45,6 +47,23 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
     path = out / REPORT_FILE
     write_durably(path, report_page(read_report_inputs(out), drawn=drawn))
     return path
+
+
+def is_current(out: Path) -> bool:
+    """Whether OUT/report.html is the full report of a finished run's present results, so that another would be alike.
+
+    Args:
+        out: The run's folder.
+    """
+    from splatpipe.pipeline.app.report.report_inputs import read_report_inputs, results_digest
+
+    try:
+        with open_regular(out / REPORT_FILE) as file:
+            head = file.read(HEAD_BYTES)
+        digest = results_digest(read_report_inputs(out))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, SplatpipeError):
+        return False
+    return bool(digest) and f'<meta name="splatpipe-results" content="{digest}">'.encode() in head
 
 
 def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:

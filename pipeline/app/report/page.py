@@ -12,7 +12,7 @@ from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.app.report.capture import capture_chapter, registration_chapter
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.processing import files_chapter, messages_chapter, processing_chapter
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.report_inputs import ReportInputs, results_digest
 from splatpipe.pipeline.app.report.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.training import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.verdict import judge
@@ -71,6 +71,7 @@ def _render(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None
         verdict=judge(inputs),
         key_figures=_guarded(lambda: {"cards": _cards(inputs)}),
         drawn=drawn,
+        results=results_digest(inputs) if drawn else "",
         geometry_trouble=trouble,
         **chapters,
     )

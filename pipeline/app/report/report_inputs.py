@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES
 from splatpipe.pipeline.app.report.run_history import RunHistory, read_history
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json
@@ -104,6 +108,28 @@ def read_report_inputs(out: Path) -> ReportInputs:
     unfinished = {name for name, stage in history.stages.items() if stage.state in BAD}
     contents = run.contents(config, history.keys, unfinished)
     return ReportInputs(run.out, history, config, photos_dir, contents, _deliverables(run, contents))
+
+
+def results_digest(inputs: ReportInputs) -> str:
+    """Digest of the results that a report shows, whichever command last found them finished; empty if it did not.
+
+    Args:
+        inputs: The report's inputs.
+    """
+    history = inputs.history
+    if history.exit_code or not all(stage.state in ("finished", "reused") for stage in history.stages.values()):
+        return ""
+    measured = [inputs.out / VOLUMES, *sorted((inputs.out / SECTIONS).glob("*"))]
+    shown = [
+        importlib.metadata.version("splatpipe"),
+        inputs.out.resolve().name,
+        str(inputs.photos_dir),
+        None if inputs.config is None else inputs.config.model_dump(mode="json"),
+        {name: artifact.key for name, artifact in inputs.artifacts.items()},
+        [(file.name, file.size, file.current) for file in inputs.deliverables],
+        [(path.name, path.stat().st_mtime_ns) for path in measured if path.is_file()],
+    ]
+    return hashlib.sha256(json.dumps(shown).encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _configuration(run: RunFolder) -> tuple[LineConfig | None, Path | None]:

@@ -21,7 +21,7 @@ from PIL import Image
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.console import show_bad_cameras
-from splatpipe.pipeline.app.report import make_report, write_report
+from splatpipe.pipeline.app.report import is_current, make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
@@ -61,6 +61,25 @@ def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
         true = photo.convert("RGB").crop((left, top, left + CHIP_SIDE, top + CHIP_SIDE))
     differences = [abs(a - b) for a, b in zip(cut.tobytes(), true.tobytes(), strict=True)]
     assert sum(differences) / len(differences) < 6.0  # JPEG's
+
+
+def test_a_report_of_the_same_results_is_current_until_one_changes(copy_of_run: Path) -> None:
+    report = copy_of_run / "report.html"
+    write_report(copy_of_run, drawn=False)
+    assert not is_current(copy_of_run)  # one without pictures is to be completed
+    write_report(copy_of_run)
+    assert is_current(copy_of_run)
+    write_apart(copy_of_run / "events.jsonl", (copy_of_run / "events.jsonl").read_text() * 2)  # run again
+    assert is_current(copy_of_run)
+    measured = copy_of_run / "volumes.json"
+    measured.write_text("{}")
+    assert not is_current(copy_of_run)
+    measured.unlink()
+    assert is_current(copy_of_run)
+    write_apart(copy_of_run / "georef.json", (copy_of_run / "georef.json").read_text() + "\n")
+    assert not is_current(copy_of_run)
+    report.unlink()
+    assert not is_current(copy_of_run)
 
 
 def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_of_run: Path) -> None:
