@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -39,8 +41,8 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         return {"removed": 0}
     gaussians = read_splat(trained)
     device = choose_device(inputs.machine.device)
-    with same_bits(inputs.machine.threads):
-        cleaned = _clean(gaussians.to(device.tensors), inputs, report)
+    with same_bits(inputs.machine.threads), tempfile.TemporaryDirectory(prefix="photos-", dir=out) as folder:
+        cleaned = _clean(gaussians.to(device.tensors), inputs, Path(folder), report)
     removed = sum(cleaned.removed.values())
     if removed:
         kept = (piece.select(keep) for piece, keep in _pieces(gaussians, cleaned.keep))
@@ -58,16 +60,25 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     }
 
 
-def _clean(gaussians: Gaussians, inputs: Inputs, report: Reporter) -> CleaningResult:
-    """Clean by the training photos only: the held-out ones must stay independent for evaluation."""
+def _clean(gaussians: Gaussians, inputs: Inputs, folder: Path, report: Reporter) -> CleaningResult:
+    """Clean by the training photos only: the held-out ones must stay independent for evaluation.
+
+    Every photo is looked at several times; it is decoded once, and reduced it is kept in the folder.
+    """
     held_out = set(load_split(inputs["split.views"]).held_out)
     views = [view for view in load_views(inputs["undistort.dataset"]) if view.camera.name not in held_out]
     options, _ = as_trained(inputs["train.rendering"], gaussians)
     sky = read_panorama(inputs["train.sky"])
 
     def picture(index: int) -> tuple[Pixels, Mask | None]:
-        _, photo, mask = reduced_view(views[index], SEEN_MEGAPIXELS)
-        return photo, mask
+        path = folder / f"{index}.npz"
+        if not path.exists():
+            _, photo, mask = reduced_view(views[index], SEEN_MEGAPIXELS)
+            np.savez(path, photo=photo, masks=np.zeros((0, *photo.shape[:2]), np.bool_) if mask is None else mask[None])
+            return photo, mask
+        with np.load(path) as arrays:
+            masks = arrays["masks"]
+            return arrays["photo"], masks[0] if len(masks) else None
 
     photos = TrainingPhotos(
         [reduced_camera(view.camera, SEEN_MEGAPIXELS) for view in views],

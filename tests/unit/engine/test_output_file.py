@@ -41,7 +41,7 @@ ALLOWED = {
     "pipeline/sfm/reduction.py": "COLMAP's database",
     "pipeline/sfm/view_graph.py": "COLMAP's database",
     "stages/features.py": "COLMAP's database",
-    "stages/clean.py": "a copy of the trained model",
+    "stages/clean.py": "a copy of the trained model; photos in a new temporary folder",
     "pipeline/train/blocks/assembly.py": "copies of the coarse pass's files",
     "pipeline/survey/model.py": "copies of the model's files",
     "pipeline/survey/trainer_dataset.py": "copies of the dataset's files",
