@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,10 +14,12 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.photos.position_outliers import median_distance_m
+from splatpipe.pipeline.survey.barometer import altitude_climbs
 from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
-from splatpipe.pipeline.survey.flight_steps import flying_relation, steps_of
+from splatpipe.pipeline.survey.flight_steps import FlightSteps, flying_relation, steps_of
 from splatpipe.pipeline.survey.geodesy import Origin
 from splatpipe.pipeline.survey.photo_positions import DATUM_STEP_M, NOWHERE, Position, PositionList
+from splatpipe.pipeline.survey.position_repeats import copied_coordinate, repeats, two_places
 from splatpipe.pipeline.survey.position_sources import MOST_DATUMS_M, is_on_earth, xmp_place
 from splatpipe.pipeline.survey.position_spread import spread_of
 from splatpipe.pipeline.survey.stated_positions import FilePlaces
@@ -28,6 +31,7 @@ WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
 RTK_SHARE = 0.5  # of the photos with a fix: above, the others have lost it
 ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
 MIN_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
+MIN_REPEATS = 6  # photos
 ORIGINS = {
     "file": "from the file of positions",
     "exif": "from EXIF",
@@ -50,6 +54,7 @@ def find_position_issues(
         *_none_on_earth(positions),
         *_missing(photos, positions),
         *_degenerate(positions.positions),
+        *_repeating(photos, positions),
         *_doubted(positions),
         *_elsewhere(positions, file),
         *_contradicting(photos, positions),
@@ -69,7 +74,8 @@ def _none_on_earth(positions: PositionList) -> list[CaptureIssue]:
                 f"Impossible positions: {list_names(positions.impossible)}."
                 if positions.positions
                 else "All stated positions are impossible: the result will have neither scale nor georeference.",
-                "They are none on Earth, 0, 0, or of no known hemisphere. These photos are used without them.",
+                "They are none on Earth, 0, 0, of no known hemisphere, or not in degrees, minutes and seconds. "
+                "These photos are used without them.",
                 positions.impossible,
             )
         )
@@ -132,6 +138,38 @@ def _degenerate(positions: Sequence[Position]) -> list[CaptureIssue]:
     return []
 
 
+def _repeating(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
+    """Positions that repeat: a copied coordinate, two places, a receiver slower than the camera."""
+    places = [(each.latitude, each.longitude) for each in positions.positions]
+    issues = []
+    copied = copied_coordinate(places)
+    if copied:
+        text = f"All {len(places)} photos state one and the same {copied}, as no receiver does: it looks copied."
+        hint = "The scale would be wrong: correct it, or give positions in geo.txt."
+        issues.append(CaptureIssue("position-copied", text, hint))
+    split = two_places(places)
+    if split is not None:
+        text = f"The positions are at two places, {split[2] / 1000.0:,.1f} km apart ({split[0]} and {split[1]} photos)."
+        hint = (
+            "If it is one site, those of one place are wrong (an earlier fix?): leave them out. If not, run each alone."
+        )
+        issues.append(CaptureIssue("position-two-places", text, hint))
+    names = [each.name for each in positions.positions]
+    again = repeats(places, _steps(photos, positions))
+    if len(again) >= MIN_REPEATS and len(set(places)) >= MIN_POSITIONS:
+        text = f"{len(again)} of {len(names)} photos state the position of the photo before."
+        hint = "In flight, the receiver is then slower than the camera; the run tells whether they moved."
+        issues.append(CaptureIssue("position-repeated", text, hint, severity="note"))
+    return issues
+
+
+def _steps(photos: Sequence[CheckedPhoto], positions: PositionList) -> FlightSteps:
+    """From photo to photo, in order of time."""
+    times = {photo.name: Photo(photo.name, photo.sha256, 0, 0, 0, photo.exif.time) for photo in photos}
+    stated = positions.positions
+    return steps_of([each.name for each in stated], {each.name: {"flight": each.flight} for each in stated}, times)
+
+
 def _doubted(positions: PositionList) -> list[CaptureIssue]:
     """Photos whose EXIF is not read as it stands."""
     doubts = positions.doubts
@@ -169,6 +207,11 @@ def _doubted(positions: PositionList) -> list[CaptureIssue]:
         ),
         ("altitude-zero", doubts.zero, "state an altitude of exactly 0 m.", "It is read as no altitude."),
     ]
+    for datum in sorted(set(doubts.datum.values())):
+        names = frozenset(name for name, stated in doubts.datum.items() if stated == datum)
+        text = f"state the datum {printable(datum)} in EXIF: their positions are read as WGS 84, which may be hundreds"
+        hint = "Convert them to WGS 84, or give positions with their CRS in geo.txt."
+        texts.append(("position-datum", names, f"{text} of metres off.", hint))
     return [
         CaptureIssue(code, f"{_who(names, positions)} {text}", hint, tuple(sorted(names)))
         for code, names, text, hint in texts
@@ -200,9 +243,7 @@ def _headings(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[C
     stated = positions.positions
     if not stated:
         return []
-    names = [each.name for each in stated]
-    times = {photo.name: Photo(photo.name, photo.sha256, 0, 0, 0, photo.exif.time) for photo in photos}
-    steps = steps_of(names, {each.name: {"flight": each.flight} for each in stated}, times)
+    steps = _steps(photos, positions)
     yaw = [each.yaw_deg if each.flight_yaw_deg is None else each.flight_yaw_deg for each in stated]
     headings = np.array([np.nan if value is None else value for value in yaw], dtype=np.float64)
     geodetic = np.array([[each.latitude, each.longitude, 0.0] for each in stated], dtype=np.float64)
@@ -262,6 +303,9 @@ def _altitudes(of: PositionList) -> list[CaptureIssue]:
         issues.append(CaptureIssue("altitude-missing", text, hint))
     elif lacking:
         issues.append(_without_altitude(sorted(lacking), len(stated)))
+    climbs = altitude_climbs([asdict(each) for each in positions])
+    if climbs is not None:
+        issues.append(CaptureIssue("altitude-climbs", *climbs))
     return [*issues, *_far_altitudes(stated)]
 
 
