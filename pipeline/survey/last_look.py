@@ -19,7 +19,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.barometer import altitude_climbs, climb_ratio, climb_sentence
-from splatpipe.pipeline.survey.control import ControlResult
+from splatpipe.pipeline.survey.control import MISTAKEN, ControlResult
 from splatpipe.pipeline.survey.crs import Crs, outside_area_km, parse_crs
 from splatpipe.pipeline.survey.flight_steps import MIN_STEP_M, FlightSteps, steps_of
 from splatpipe.pipeline.survey.foot_readings import other_foot
@@ -41,6 +41,7 @@ CLOCK_S = 1.0  # EXIF's times are whole seconds
 DRONE_M_S, AIRCRAFT_M_S = 50.0, 150.0  # no survey is flown faster: drones, and manned aircraft (or unknown)
 OUTSIDE_KM = 100.0  # from the CRS's area of use: surveyors stay in their zone across a border
 DATUM_M, DATUM_SIGMAS = 20.0, 5.0  # control off the positions: more is another datum or CRS
+MISSHAPEN = 0.05  # of the control's width: tape and hand-held receivers do better, or are stated to be worse
 SCALE_APART, SCALE_SIGMAS = 0.2, 5.0  # likewise, of the scale
 HEADING_APART_RAD = math.radians(20.0)  # likewise, of north
 
@@ -304,6 +305,24 @@ def _control(placed: Placed) -> Iterator[Contradiction]:
         yield from _shape(placed.world_from_model, alone, survey.name)
 
 
+def _agreement(placed: Placed) -> Iterator[Contradiction]:
+    """Control whose points lie off each other by a good part of the site: they do not have the model's shape."""
+    controlled = placed.controlled
+    if controlled is None or controlled.sigma_factor <= MISTAKEN:
+        return
+    chosen = [k for k, point in enumerate(controlled.survey.points) if point.role == "control"]
+    targets = controlled.site.targets
+    apart = controlled.sigma_factor * float(np.median(targets.sigmas[chosen, 0]))
+    extent = float(np.linalg.norm(np.ptp(targets.enu[chosen, :2], axis=0)))
+    if apart > MISSHAPEN * extent:
+        yield Contradiction(
+            f"The control points of {controlled.survey.name} agree with the photos to {apart:.1f} m only,"
+            f" {apart / extent:.0%} of the width of their area.",
+            "Check the order and signs of the coordinates (latitude and longitude swapped mirror them), the names and "
+            "the marks.",
+        )
+
+
 def _shape(ours: Similarity, alone: Frame, name: str) -> Iterator[Contradiction]:
     """Scale and north by control against those by the positions alone."""
     theirs = alone.world_from_model
@@ -328,6 +347,7 @@ LOOKS: tuple[Callable[[Placed], Iterator[Contradiction]], ...] = (
     _up,
     _north,
     _control,
+    _agreement,
     _other_sources,
     _left_out,
     _repeats,

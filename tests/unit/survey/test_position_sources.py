@@ -11,6 +11,7 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import Exif, Gps
 from splatpipe.pipeline.survey.photo_positions import PositionList, read_positions
 from splatpipe.pipeline.survey.position_issues import find_position_issues
+from splatpipe.pipeline.survey.stated_positions import FilePlace
 
 ONE = Gps(47.8412, 13.5127, 520.0)
 
@@ -183,3 +184,18 @@ def test_altitudes_of_a_poor_receiver_or_a_level_flight_say_nothing_against_the_
 def test_a_datum_far_from_wgs84_is_told() -> None:
     _, issues = told([photo(k, replace(at(k), datum="TOKYO")) for k in range(8)])
     assert "All 8 photos state the datum TOKYO in EXIF" in issues["position-datum"]
+
+
+@pytest.mark.parametrize(
+    ("height", "says"),
+    [(522.0, None), (473.0, "lie 47 m below the photos' own."), (8.0, "more than any two datums do")],
+)
+def test_altitudes_of_a_file_against_the_photos_own(height: float, says: str | None) -> None:
+    photos = [photo(k, at(k)) for k in range(8)]
+    places = {
+        each.name: FilePlace(at(k).latitude, at(k).longitude, height, "unknown", None, (None, None))
+        for k, each in enumerate(photos)
+    }
+    positions = read_positions(photos, places)
+    told = [each.message for each in find_position_issues(photos, positions) if each.code.startswith("altitude")]
+    assert (says is None and told == []) or (says is not None and says in told[0])
