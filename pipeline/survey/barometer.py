@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.survey.position_sources import is_altitude
 from splatpipe.pipeline.survey.readings import MIN_WITNESSES, Evidence, Reading, plausible
 from splatpipe.pipeline.survey.up_witnesses import values_of
 
@@ -20,7 +21,8 @@ CLIMB_M = 5.0  # spread of the heights above take-off that tells a scale: five t
 CLIMB_RATIO = 1.5  # of climbs, either way: barometers drift by metres, not by halves
 CLIMB_SIGMAS = 5.0  # of the ratio's standard deviation: altitudes of poor receivers climb by chance
 LIKE = 1.25  # a ratio within this of a cause's is that cause's
-FIT = 0.5  # of the misfit as stated: a cause's must be less
+MIN_FLIGHTS = 3
+FIT = 0.6  # of the misfit as stated: a cause's must be less
 SIGN = Reading(
     "they are above the sea instead of below it",
     "Correct EXIF's GPSAltitudeRef or the sign in the file of positions; or give better altitudes in geo.txt.",
@@ -66,10 +68,16 @@ def altitude_climbs(records: Sequence[Mapping[str, Any]]) -> tuple[str, str] | N
     heights, above = values_of(stated, "altitude_m"), values_of(records, "relative_altitude_m")
     flights = np.nan_to_num(values_of(records, "flight"))
     ratio = climb_ratio(heights, above, flights)
+    between = ratio is None and len(np.unique(flights)) >= MIN_FLIGHTS
+    if between:  # flights that are level: another take-off point makes no such ratio of three
+        flights = np.zeros(len(flights))
+        ratio = climb_ratio(heights, above, flights)
     if ratio is None:
         return None
     cause = _cause(ratio, heights, above, flights)
     text = climb_sentence(ratio, "the stated altitude")
+    if cause is None and between:
+        return None
     if cause is None:
         return f"{text}.", "Check the altitudes' sign and unit, and that each is its photo's."
     reading, evidence = cause
@@ -86,8 +94,11 @@ def _cause(
     ours, theirs = _climbs(heights_m, above_m, flights)
     telling = np.abs(theirs) > CLIMB_M / 2.0
     ours, theirs = ours[telling], theirs[telling]
+    middle = float(np.nanmedian(heights_m))
     candidates = []
     for factor, reading in CAUSES:
+        if not is_altitude(middle / factor):
+            continue
         fits = np.linalg.norm(ours - factor * theirs) < FIT * np.linalg.norm(ours - theirs)
         if factor * ratio > 0.0 and abs(math.log(ratio / factor)) < math.log(LIKE) and fits:
             nearer = np.abs(ours - factor * theirs) < np.abs(ours - theirs)

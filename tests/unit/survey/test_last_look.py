@@ -10,7 +10,7 @@ from odd_sites import ALPS, Outcome, Site, Warnings, joined, orbit, place, strip
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.last_look import report_contradictions
+from splatpipe.pipeline.survey.last_look import _agreement, report_contradictions
 
 MINNESOTA = Origin(46.84, -91.99, 199.0)
 BARE = ("place",)
@@ -168,3 +168,24 @@ def test_a_copied_coordinate_is_told() -> None:
     copied = site.geodetic()
     copied[:, 1] = copied[0, 1]
     assert "one and the same longitude" in place(site, site.photos(copied)).issues["position-copied"]
+
+
+@pytest.mark.parametrize(("factor", "told"), [(157.0, True), (40.0, False)])
+def test_control_that_has_not_the_shape_of_the_model_is_told(factor: float, told: bool) -> None:
+    placed = place(orbit()).placed
+    assert placed is not None
+    points = [SimpleNamespace(role="control", surveyed=SimpleNamespace(z=1.0)) for _ in range(6)]
+    targets = SimpleNamespace(enu=np.arange(18.0).reshape(6, 3), sigmas=np.full((6, 3), 0.02))
+    control = SimpleNamespace(
+        survey=SimpleNamespace(name="gcp_list.txt", points=points),
+        site=SimpleNamespace(targets=targets),
+        sigma_factor=factor,
+    )
+    bent = replace(placed)
+    object.__setattr__(bent, "controlled", control)  # past the types that tests check
+    found = [each.text for each in _agreement(bent)]
+    assert found == (
+        ["The control points of gcp_list.txt agree with the photos to 3.1 m only, 15% of the width of their area."]
+        if told
+        else []
+    )

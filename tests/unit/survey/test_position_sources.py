@@ -163,6 +163,7 @@ def test_altitudes_too_far_apart_for_datums_are_named_heights_above_takeoff() ->
         (lambda rise: 90.0 + rise, None),
         (lambda rise: -90.0 - rise, "if they are above the sea instead of below it, 100% of the altitudes agree"),
         (lambda rise: (90.0 + rise) / 0.3048, "if they are in feet, 100% of the altitudes agree"),
+        (lambda rise: 590.0 - rise, "the stated altitude falls by 10.0 m."),  # no place lies at -590 m
         (lambda rise: 90.0 + 6.0 * rise, "the stated altitude climbs by 60.0 m."),
     ],
 )
@@ -199,3 +200,16 @@ def test_altitudes_of_a_file_against_the_photos_own(height: float, says: str | N
     positions = read_positions(photos, places)
     told = [each.message for each in find_position_issues(photos, positions) if each.code.startswith("altitude")]
     assert (says is None and told == []) or (says is not None and says in told[0])
+
+
+def test_level_flights_whose_altitudes_have_the_wrong_sign_are_told() -> None:
+    """The climbs are between the flights; two that start at other heights would say nothing."""
+    for rises, says in (((10.0, 21.0, 27.0), True), ((10.0, 27.0), False)):
+        photos = []
+        for flight, rise in enumerate(rises):
+            for k in range(6):
+                each = photo(6 * flight + k, at(k, -60.0 - rise), {"RelativeAltitude": rise})
+                photos.append(replace(each, exif=replace(each.exif, time=f"2026-05-01T{10 + 2 * flight}:{k:02d}:00")))
+        positions, issues = told(photos)
+        assert len({each.flight for each in positions.positions}) == len(rises)
+        assert ("altitude-climbs" in issues) == says
