@@ -28,7 +28,8 @@ SIGN = Reading(
     "Correct EXIF's GPSAltitudeRef or the sign in the file of positions; or give better altitudes in geo.txt.",
 )
 FEET = Reading("they are in feet", "Convert them to metres, or name a CRS whose heights are in feet.")
-CAUSES = ((-1.0, SIGN), (1.0 / 0.3048, FEET), (0.3048, FEET))
+METRES = Reading("they are in metres and read as feet", "Name a CRS whose heights are in metres, or convert them.")
+CAUSES = ((-1.0, SIGN), (1.0 / 0.3048, FEET), (0.3048, METRES))
 
 
 def climb_ratio(

@@ -163,6 +163,7 @@ def test_altitudes_too_far_apart_for_datums_are_named_heights_above_takeoff() ->
         (lambda rise: 90.0 + rise, None),
         (lambda rise: -90.0 - rise, "if they are above the sea instead of below it, 100% of the altitudes agree"),
         (lambda rise: (90.0 + rise) / 0.3048, "if they are in feet, 100% of the altitudes agree"),
+        (lambda rise: 0.3048 * (90.0 + rise), "if they are in metres and read as feet, 100% of the altitudes agree"),
         (lambda rise: 590.0 - rise, "the stated altitude falls by 10.0 m."),  # no place lies at -590 m
         (lambda rise: 90.0 + 6.0 * rise, "the stated altitude climbs by 60.0 m."),
     ],
