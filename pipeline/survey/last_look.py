@@ -19,6 +19,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.survey.barometer import altitude_climbs, climb_ratio, climb_sentence
+from splatpipe.pipeline.survey.blunders import EXACT_M
 from splatpipe.pipeline.survey.control import MISTAKEN, ControlResult
 from splatpipe.pipeline.survey.crs import Crs, outside_area_km, parse_crs
 from splatpipe.pipeline.survey.flight_steps import MIN_STEP_M, FlightSteps, steps_of
@@ -42,6 +43,7 @@ DRONE_M_S, AIRCRAFT_M_S = 50.0, 150.0  # no survey is flown faster: drones, and 
 OUTSIDE_KM = 100.0  # from the CRS's area of use: surveyors stay in their zone across a border
 DATUM_M, DATUM_SIGMAS = 20.0, 5.0  # control off the positions: more is another datum or CRS
 MISSHAPEN = 0.05  # of the control's width: tape and hand-held receivers do better, or are stated to be worse
+BASE_M = 3.0  # likewise, of positions stated to EXACT_M: modern datums differ by less, wrong bases and points by more
 SCALE_APART, SCALE_SIGMAS = 0.2, 5.0  # likewise, of the scale
 HEADING_APART_RAD = math.radians(20.0)  # likewise, of north
 
@@ -287,10 +289,12 @@ def _control(placed: Placed) -> Iterator[Contradiction]:
             f"{reading.remedy} {follows}",
         )
     shift = np.hypot(offsets[:, 0], offsets[:, 1])
-    if float(shift.min()) > max(DATUM_M, DATUM_SIGMAS * float(np.median(stations.sigmas[:, 0]))):
+    sigma = float(np.median(stations.sigmas[:, 0]))
+    if float(shift.min()) > max(BASE_M if sigma <= EXACT_M else DATUM_M, DATUM_SIGMAS * sigma):
         yield Contradiction(
             f"The control of {survey.name} lies {shift.min():.0f} m horizontally off the photos' positions.",
-            f"Check that {survey.crs.text} is its CRS and datum. {follows}",
+            f"Check that {survey.crs.text} is its CRS and datum"
+            f"{', and the coordinates of the base station' if sigma <= EXACT_M else ''}. {follows}",
         )
     lift = offsets[:, 2]
     has_heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
