@@ -21,6 +21,7 @@ from splatpipe.pipeline.engine.stage import JSON, Stage
 Table = dict[str, JSON]
 Model = TypeVar("Model", bound=BaseModel)
 MAX_CONFIG_BYTES = 1 << 20  # a configuration is a page of text
+LONGEST_LINE = 1 << 15  # bytes of TOML: a key with 400,000 dots, in one line as keys are, takes minutes
 
 
 def preset_names() -> list[str]:
@@ -40,6 +41,18 @@ def load_preset(name: str) -> Table:
     return tomllib.loads((resources.files("splatpipe.configs") / f"{name}.toml").read_text(encoding="utf-8"))
 
 
+def parse_toml(data: bytes) -> Table:
+    """The table of TOML text in UTF-8, with or without a byte order mark.
+
+    Raises:
+        ValueError: if it is not TOML, or has a line of more than ``LONGEST_LINE`` bytes.
+        RecursionError: if it is nested too deeply.
+    """
+    if max(map(len, data.split(b"\n"))) > LONGEST_LINE:
+        raise ValueError(f"it has a line of more than {LONGEST_LINE >> 10} kB")
+    return tomllib.loads(data.decode("utf-8-sig"))
+
+
 def load_file(path: Path) -> Table:
     """Read a TOML file.
 
@@ -47,7 +60,7 @@ def load_file(path: Path) -> Table:
         UsageError: if it cannot be read or is not TOML; the message includes the line.
     """
     try:
-        return tomllib.loads(read_small(path, MAX_CONFIG_BYTES).decode("utf-8"))
+        return parse_toml(read_small(path, MAX_CONFIG_BYTES))
     except OSError as error:
         raise UsageError(
             f"Cannot read {path}: {error.strerror}.", hint="Check the path given with --config."
