@@ -213,7 +213,11 @@ class Store:
             How many folders were removed, and how many bytes that freed.
         """
         names = {_folder_name(stage, key) for stage, key in keep}
-        folders = [path for path in [*self.stages.glob("*-*"), *self.partials.glob("*-*")] if path.is_dir()]
+        folders = [
+            path
+            for path in [*self.stages.glob("*-*"), *self.partials.glob("*-*")]
+            if path.is_dir() and not path.is_symlink()
+        ]
         stale = [folder for folder in folders if folder.name not in names]
         freed = sum(file.stat().st_size for folder in stale for file in folder.rglob("*") if file.is_file())
         for folder in stale:

@@ -50,7 +50,9 @@ def test_too_large_a_configuration_is_refused_by_name(tmp_path: Path) -> None:
         load_file(path)
 
 
-@pytest.mark.parametrize("text", ["9" * 400, f'{{"psnr": -{"9" * 400}}}', "[" * 100_000, "", "{", "\udcff"])
+@pytest.mark.parametrize(
+    "text", ["9" * 400, "1," * 9 + "7" * 300, f'{{"psnr": -{"9" * 400}}}', "[" * 100_000, "", "{", "\udcff"]
+)
 def test_what_no_number_can_hold_and_no_stack_can_nest_is_no_json(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         parse_json(text.encode("utf-8", "surrogateescape"))
@@ -89,5 +91,5 @@ def test_more_values_than_memory_has_room_for_are_no_json(many: str) -> None:
 def test_a_configuration_with_a_line_of_dots_is_refused_at_once(tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
     path.write_text("a" + ".a" * 400_000 + " = 1\n")
-    with pytest.raises(UsageError, match=r"is not valid TOML: it has a line of more than 32 kB"):
+    with pytest.raises(UsageError, match=r"is not valid TOML: it has lines with thousands of dots"):
         load_file(path)
