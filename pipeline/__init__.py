@@ -28,7 +28,7 @@ os.environ.setdefault("GLOG_logtostderr", "1")
 
 
 class _SignalKeeper(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Loads these libraries and then puts back what SIGTERM does: they would print a C++ stack as if it were a crash.
+    """Loads these libraries without log files, and puts back what SIGTERM does: they print a stack as after a crash.
 
     The C library is asked, as Python allows only its main thread to set a handler, and others import, too.
     """
@@ -56,6 +56,15 @@ class _SignalKeeper(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self._loaders[module.__name__].exec_module(module)
         if known:
             library.sigaction(signal.SIGTERM, before, None)
+        _log_to_no_file(module)
+
+
+def _log_to_no_file(module: ModuleType) -> None:
+    """Take the log files' names from glog: pycolmap's bundle adjustment undoes ``GLOG_logtostderr``."""
+    log = getattr(module, "logging", None)
+    if log is not None and hasattr(log, "set_log_destination"):
+        for level in ("INFO", "WARNING", "ERROR", "FATAL"):
+            log.set_log_destination(getattr(log.Level, level), "")
 
 
 sys.meta_path.insert(0, _SignalKeeper())

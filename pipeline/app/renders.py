@@ -112,7 +112,7 @@ class RenderRequest:
         folder = target if self.stills else target.absolute().parent
         try:
             if self.to is None:
-                own_folder(out, FOLDER)
+                own_folder(out, FOLDER, *([target.name] if self.stills else []))
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise MachineError(

@@ -13,6 +13,7 @@ from pathlib import Path
 from markupsafe import Markup
 from PIL import Image, ImageOps
 
+from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.picture_file import open_picture, turn_to_decode, why_hollow
 
 MAX_BYTES = 512 << 20  # of a file
@@ -104,7 +105,8 @@ def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
     if _file_stamp(path) is None:
         return None
     try:
-        data = path.read_bytes()
+        with open_regular(path) as file:
+            data = file.read() or b""  # nothing: the kernel's log has nothing to say
     except (OSError, ValueError):
         return None
     for more in (b"", END_OF_JPEG):  # with an end marker, libjpeg fills the missing part with grey

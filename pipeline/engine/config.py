@@ -21,6 +21,7 @@ from splatpipe.pipeline.engine.stage import JSON, Stage
 Table = dict[str, JSON]
 Model = TypeVar("Model", bound=BaseModel)
 MAX_CONFIG_BYTES = 1 << 20  # a configuration is a page of text
+MAX_DOTS = 20_000_000  # squares of the dots in each line: of a key with so many, tomllib keeps all beginnings
 
 
 def preset_names() -> list[str]:
@@ -40,6 +41,18 @@ def load_preset(name: str) -> Table:
     return tomllib.loads((resources.files("splatpipe.configs") / f"{name}.toml").read_text(encoding="utf-8"))
 
 
+def parse_toml(data: bytes) -> Table:
+    """The table of TOML text in UTF-8, with or without a byte order mark.
+
+    Raises:
+        ValueError: if it is not TOML, or could have keys of thousands of parts.
+        RecursionError: if it is nested too deeply.
+    """
+    if sum(line.count(b".") ** 2 for line in data.split(b"\n")) > MAX_DOTS:
+        raise ValueError("it has lines with thousands of dots")
+    return tomllib.loads(data.decode("utf-8-sig"))
+
+
 def load_file(path: Path) -> Table:
     """Read a TOML file.
 
@@ -47,7 +60,7 @@ def load_file(path: Path) -> Table:
         UsageError: if it cannot be read or is not TOML; the message includes the line.
     """
     try:
-        return tomllib.loads(read_small(path, MAX_CONFIG_BYTES).decode("utf-8"))
+        return parse_toml(read_small(path, MAX_CONFIG_BYTES))
     except OSError as error:
         raise UsageError(
             f"Cannot read {path}: {error.strerror}.", hint="Check the path given with --config."

@@ -12,10 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from splatpipe.pipeline.engine.output_file import new_file, token
+from splatpipe.pipeline.engine.output_file import UNFINISHED, new_file, token
 from splatpipe.pipeline.engine.small_file import kind_of
-
-UNFINISHED = ".new"
 
 
 def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None:

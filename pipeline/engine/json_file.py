@@ -13,8 +13,9 @@ from splatpipe.pipeline.engine.small_file import read_small
 if TYPE_CHECKING:  # it imports pydantic
     from splatpipe.pipeline.engine.stage import JSON
 
-MAX_JSON_BYTES = 256 << 20  # the pairs of 100,000 photos are smaller
-TOO_MANY_DIGITS = re.compile(rb"[0-9]{300}")  # neither a number that a float can hold nor a name
+MAX_JSON_BYTES = 128 << 20  # the pairs of 100,000 photos are smaller
+MAX_VALUES = 10_000_000  # those pairs are 8 million; a value takes up to 100 bytes, and three of the file's (`{},`)
+TOO_MANY_DIGITS = re.compile(rb"(?<![0-9])[0-9]{300}")  # neither a number that a float can hold nor a name
 
 
 def json_text(value: JSON) -> str:
@@ -35,8 +36,10 @@ def parse_json(data: bytes) -> Any:
     """The value of JSON text in UTF-8.
 
     Raises:
-        ValueError: if it is not JSON, is nested too deeply, or has a number that no float can hold.
+        ValueError: if it is not JSON, is nested too deeply, has too many values, or a number that no float can hold.
     """
+    if sum(map(data.count, (b",", b"[", b"{"))) > MAX_VALUES:
+        raise ValueError(f"it has more than {MAX_VALUES:,} values")
     if TOO_MANY_DIGITS.search(data):
         raise ValueError("it has a number of 300 digits or more")
     try:
@@ -54,6 +57,6 @@ def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
 
     Raises:
         OSError: if it cannot be read, is not a regular file, or is larger.
-        ValueError: if it is not JSON, is nested too deeply, or has a number that no float can hold.
+        ValueError: as ``parse_json``.
     """
     return parse_json(read_small(path, max_bytes))

@@ -8,6 +8,7 @@ its path do so in a working folder that was made here, or in which ``require_own
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 from collections.abc import Iterable
 from io import BufferedWriter
@@ -19,6 +20,7 @@ from splatpipe.pipeline.engine.small_file import kind_of
 
 MODE = 0o666  # less the user's umask, as for any other program's files
 SAFE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+UNFINISHED = ".new"  # the ending of temporary names
 HINT = "An OUT from somebody else is not to be trusted: remove that file, or choose another OUT."
 
 
@@ -49,6 +51,9 @@ def write_file(path: Path, content: str | bytes) -> None:
 def open_own(path: Path, flags: int) -> int:
     """Open a file of ours in place, created if it is missing.
 
+    One with a second name elsewhere (a hard link) is replaced by a copy first, so that only OUT changes: copies of an
+    OUT made by ``cp -al`` have such files, and somebody else's may be yours.
+
     Args:
         path: The file.
         flags: As for ``os.open``, for reading or writing; that it is created and not followed is added.
@@ -62,10 +67,26 @@ def open_own(path: Path, flags: int) -> int:
     """
     _require(path, files=True, folders=False)
     descriptor = os.open(path, flags | os.O_CREAT | SAFE, MODE)
-    if not stat.S_ISREG(mode := os.fstat(descriptor).st_mode):  # it has been replaced meanwhile
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode):  # it has been replaced meanwhile
         os.close(descriptor)
-        raise _refusal(path, mode)
+        raise _refusal(path, status.st_mode)
+    if status.st_nlink > 1:
+        os.close(descriptor)
+        _separate(path)
+        return open_own(path, flags)
     return descriptor
+
+
+def _separate(path: Path) -> None:
+    """Replace a file that has further names by a copy that has none."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}.{token()}{UNFINISHED}")
+    try:
+        new_file(aside).close()
+        shutil.copy2(path, aside, follow_symlinks=False)
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 def appended_file(path: Path) -> IO[bytes]:

@@ -125,7 +125,7 @@ class RunFolder:
                 chosen[stage.name] = artifact
                 digests |= {name: part.digest for name, part in artifact.parts.items()}
                 continue
-            if key and folder.is_dir():
+            if key and self._is_working_folder(folder):
                 working[stage.name] = folder
             working |= self._shard_working_folders(stage, keys)
         return Contents(chosen, working)
@@ -136,7 +136,11 @@ class RunFolder:
             return {}
         names = [name for name in keys if name != stage.name and stage_name(name) == stage.name]
         folders = {name: self.store.working_folder(replace(stage, name=name), keys[name]) for name in names}
-        return {name: folder for name, folder in folders.items() if folder.is_dir()}
+        return {name: folder for name, folder in folders.items() if self._is_working_folder(folder)}
+
+    def _is_working_folder(self, folder: Path) -> bool:
+        """Whether it exists, as a folder of ours: keys and shards' names are from events, which may say anything."""
+        return folder.parent == self.store.partials and folder.is_dir() and not folder.is_symlink()
 
     def lineage(self, *stages: Stage) -> dict[str, Part]:
         """The parts from which the deliverables in OUT were made, traced by digest alone, across versions.

@@ -213,7 +213,11 @@ class Store:
             How many folders were removed, and how many bytes that freed.
         """
         names = {_folder_name(stage, key) for stage, key in keep}
-        folders = [path for path in [*self.stages.glob("*-*"), *self.partials.glob("*-*")] if path.is_dir()]
+        folders = [
+            path
+            for path in [*self.stages.glob("*-*"), *self.partials.glob("*-*")]
+            if path.is_dir() and not path.is_symlink()
+        ]
         stale = [folder for folder in folders if folder.name not in names]
         freed = sum(file.stat().st_size for folder in stale for file in folder.rglob("*") if file.is_file())
         for folder in stale:
@@ -261,7 +265,7 @@ def _read_artifact(folder: Path) -> Artifact | None:
     """The artifact in a folder; None unless it has all that its manifest lists, as files of its own."""
     try:
         manifest = read_json(folder / MANIFEST)
-        if manifest["format"] != FORMAT:
+        if manifest["format"] != FORMAT or not _is_complete(manifest):
             return None
         folders = {""}
         for part in manifest["parts"].values():
@@ -271,6 +275,21 @@ def _read_artifact(folder: Path) -> Artifact | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     return Artifact(folder, manifest)
+
+
+def _is_complete(manifest: Mapping[str, JSON]) -> bool:
+    """Whether a manifest has what we read of it; somebody else's may not.
+
+    Raises:
+        KeyError, TypeError, AttributeError: if it lacks something.
+    """
+    inputs = manifest["inputs"]
+    texts = [manifest["stage"], manifest["key"], *(part["digest"] for part in manifest["parts"].values())]
+    tables = [manifest["summary"], inputs["config"], inputs["borrowed"], inputs["reads"]]
+    texts += inputs["reads"].values()
+    numbers = [manifest["finished_s"], inputs["version"]]
+    kinds = ((str, texts), (dict, tables), (int | float, numbers))
+    return all(isinstance(value, kind) for kind, values in kinds for value in values)
 
 
 def _folders_of(folder: str, part: str, files: Iterable[Mapping[str, JSON]]) -> set[str]:
@@ -360,13 +379,18 @@ def _require_own(store: Store) -> None:
     """Check that no link or the like lies where a run writes; files of artifacts are checked where they are read.
 
     Raises:
-        UsageError: naming what is not a file or a folder.
+        UsageError: naming what is not a file or a folder, or nested too deeply.
     """
     require_own_files([store.stages])
     if store.stages.exists():
         require_own_files(store.stages.iterdir())
         for folder in (store.partials, store.shards):
-            require_own_files(folder.rglob("*"))
+            try:
+                require_own_files(folder.rglob("*"))
+            except RecursionError as error:
+                raise UsageError(
+                    f"{folder} has folders a thousand deep.", hint="Remove it: no run made that."
+                ) from error
 
 
 def write_error(out: Path, error: OSError) -> MachineError:

@@ -24,6 +24,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_search import AGREEING, ConfirmedDepths, DepthSearch, SearchPlan
 from splatpipe.pipeline.mvs.edges import pixels_behind
 from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.splat.archives import open_archive
 
 LIST = "maps.json"
 COMPARED = 16  # neighbours that a photo is matched with: few photos, and not the nearest, see behind hedges
@@ -63,7 +64,7 @@ class DepthMapFile:
             StageError: if the file is not a depth map of the camera's size.
         """
         try:
-            with self.path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+            with open_archive(self.path) as kept:
                 found = DepthMap(np.asarray(kept["depth"], np.float32), np.asarray(kept["confidence"], np.uint8))
         except (OSError, EOFError, ValueError, TypeError, KeyError, BadZipFile) as error:
             raise _unreadable(self.path.name) from error

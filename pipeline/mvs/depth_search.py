@@ -27,6 +27,7 @@ from splatpipe.pipeline.photos.small_views import small_view
 from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.archives import open_archive
 
 AGREEING = 2  # other photos that have to agree, at least
 TOLERANCE = 0.01  # share of the depth within which two photos agree;
@@ -134,7 +135,7 @@ class DepthSearch:
 
     def colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         """A photo's colours, RGB."""
-        with np.load(self._photo_path(number)) as kept:
+        with open_archive(self._photo_path(number)) as kept:
             return np.asarray(kept["colour"], np.uint8)
 
     def depths(self, number: int) -> DepthEstimate | None:
@@ -142,7 +143,7 @@ class DepthSearch:
         path = self._depths_path(number)
         if not path.is_file():
             return None
-        with np.load(path) as kept:
+        with open_archive(path) as kept:
             return DepthEstimate(kept["inverse"], kept["cost"])
 
     def inverse(self, number: int) -> Inverse | None:
@@ -150,7 +151,7 @@ class DepthSearch:
         path = self._depths_path(number)
         if not path.is_file():
             return None
-        with np.load(path) as kept:
+        with open_archive(path) as kept:
             return np.asarray(kept["inverse"], np.float32)
 
     def agreement(self, number: int) -> ConfirmedDepths | None:
@@ -184,7 +185,7 @@ class DepthSearch:
         save_arrays(self._depths_path(number), inverse=found.inverse, cost=found.cost)
 
     def _picture(self, number: int) -> Picture:
-        with np.load(self._photo_path(number)) as kept:
+        with open_archive(self._photo_path(number)) as kept:
             grey = np.asarray(cv2.cvtColor(kept["colour"], cv2.COLOR_RGB2GRAY), np.uint8)
             return Picture(self.cameras[number], grey, kept["counts"])
 

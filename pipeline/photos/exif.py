@@ -17,6 +17,11 @@ MAX_SIDE_PX = 1_000_000
 MM_PER_FOCAL_PLANE_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF 2.32, FocalPlaneResolutionUnit; 4, 5 by TIFF/EP
 BELOW_SEA_LEVEL = (1, 3)  # GPSAltitudeRef: below sea level; EXIF 3.0 adds 3, below the ellipsoid
 NO_FIX = "V"  # GPSStatus of a receiver without a fix
+# Names of datums that are 50 m or more off WGS84; EXIF 2.32 itself names TOKYO. Others are metres off, or no datum.
+FAR_DATUMS = ("TOKYO", "NAD27", "NAD1927", "ED50", "OSGB", "PULKOVO", "AGD66", "AGD84", "DHDN", "POTSDAM", "CH1903")
+FAR_DATUMS += ("NTF", "GCJ02", "BD09", "BEIJING", "XIAN", "INDIAN", "ARC19", "CAPE")
+SIXTY = 60.0  # minutes in a degree; 60 itself is what 59.9999 is rounded to
+WHOLE = 1e-6  # by which a whole number may be off: fractions of large terms
 LATITUDE_SIGNS = {"N": 1.0, "S": -1.0}  # first letters of GPSLatitudeRef; some programs write whole words
 LONGITUDE_SIGNS = {"E": 1.0, "W": -1.0}
 
@@ -33,6 +38,7 @@ class Gps:
         void: Whether the receiver reported that it had no fix.
         hemispheres: Whether both hemispheres are stated, by their tags or by a sign; else they are read as north and
             east.
+        datum: GPSMapDatum if it is one that is far from WGS84; else empty.
     """
 
     latitude: float
@@ -41,6 +47,7 @@ class Gps:
     horizontal_error_m: float | None = None
     void: bool = False
     hemispheres: bool = True
+    datum: str = ""
 
 
 @dataclass(frozen=True)
@@ -186,11 +193,21 @@ def _gps(tags: Mapping[int, Any]) -> Gps | None:
         horizontal_error_m=_number(tags.get(GPS.GPSHPositioningError), 1e-4, 1e5),
         void=_text(tags.get(GPS.GPSStatus)).upper() == NO_FIX,
         hemispheres=latitude_stated and longitude_stated,
+        datum=_far_datum(_text(tags.get(GPS.GPSMapDatum))),
     )
+
+
+def _far_datum(name: str) -> str:
+    """The name if it is that of a datum far from WGS84, else an empty one."""
+    letters = "".join(filter(str.isalnum, name.upper()))
+    return name if letters.startswith(FAR_DATUMS) else ""
 
 
 def _degrees(value: Any, reference: Any, signs: Mapping[str, float]) -> tuple[float, bool]:
     """Convert degrees, minutes, seconds (or fewer of them) to signed degrees.
+
+    A sign of any of them is that of all. Minutes or seconds above 60, and a fraction of a number that others follow,
+    are no angle: decimals written as minutes would be kilometres off.
 
     Args:
         value: The numbers.
@@ -204,7 +221,12 @@ def _degrees(value: Any, reference: Any, signs: Mapping[str, float]) -> tuple[fl
     numbers = [_number(part, -1e6, 1e6) for part in parts]
     if not 1 <= len(numbers) <= 3 or any(number is None for number in numbers):
         return math.nan, True
-    degrees = sum(number / 60.0**power for power, number in enumerate(numbers) if number is not None)
+    sizes = [abs(number) for number in numbers if number is not None]
+    cut = any(abs(size - round(size)) > WHOLE and any(sizes[at + 1 :]) for at, size in enumerate(sizes))
+    if cut or any(size > SIXTY for size in sizes[1:]):
+        return math.nan, True
+    degrees = sum(size / 60.0**power for power, size in enumerate(sizes))
+    degrees = -degrees if any(number is not None and number < 0.0 for number in numbers) else degrees
     word = _text(reference).upper()
     if not word:
         return degrees, degrees < 0.0

@@ -20,6 +20,7 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.engine.source import find_model
 from splatpipe.pipeline.photos.names import is_plain, list_names
 from splatpipe.pipeline.photos.picture_file import STRIP_ROWS, open_picture
@@ -134,7 +135,8 @@ def read_checked(path: Path, name: str, sha256: str | None = None) -> bytes:
         SplatpipeError: if it is gone or was replaced.
     """
     try:
-        data = path.read_bytes()
+        with open_regular(path) as file:
+            data = file.read()
     except OSError as error:
         raise _changed(name, str(error)) from error
     if sha256 not in (None, hashlib.sha256(data).hexdigest()):

@@ -19,6 +19,8 @@ PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LARGE_PIXELS = 40_000_000  # larger images are decoded one at a time: some hundred megabytes each
 LEAST_BYTES = 0.01  # of a large photo's file per pixel; one colour all over takes 0.0156 with JPEG's usual tables
 MOST_CHUNKS = 1_000_000  # of a PNG: libpng writes one for 8 kB
+TILE_TAGS = (322, 323)  # width and length of a TIFF's tiles
+LEAST_TILE = 4096  # pixels per side that a tile may have in a picture of any size
 STRIP_ROWS = 256  # of a picture, converted at a time
 INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -41,13 +43,27 @@ def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
 
     Raises:
         ValueError: if it has more than ``max_pixels`` pixels.
-        OSError: if it is not such an image (Pillow's ``UnidentifiedImageError`` is one).
+        OSError: if it is not such an image (Pillow's ``UnidentifiedImageError`` is one), or its tiles are too large.
     """
     Image.MAX_IMAGE_PIXELS = None  # Pillow's limit is process-wide and refuses 200 MP panoramas; ours is checked below
     picture = Image.open(source, formats=PHOTO_FORMATS)
     if max_pixels is not None and picture.width * picture.height > max_pixels:
         raise ValueError(f"it has {picture.width} × {picture.height} pixels")
+    _check_tiles(picture)
     return picture
+
+
+def _check_tiles(picture: Image.Image) -> None:
+    """Refuse a TIFF with tiles much larger than itself: libtiff decodes whole tiles, here 2 GB of 1.5 MB.
+
+    Raises:
+        OSError: if one is.
+    """
+    tags = getattr(picture, "tag_v2", {})
+    for tag, side in zip(TILE_TAGS, picture.size, strict=True):
+        found = tags.get(tag, 0)
+        if not isinstance(found, int) or found > max(LEAST_TILE, 2 * side):
+            raise OSError(f"its tiles of {found} pixels are larger than the picture")
 
 
 def why_hollow(picture: Image.Image, data: bytes) -> str:

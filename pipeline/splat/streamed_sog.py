@@ -13,14 +13,14 @@ import re
 import shutil
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.output_file import own_folder, write_file
 from splatpipe.pipeline.splat.formats.sog import AXES, encode_sog
 from splatpipe.pipeline.splat.formats.sog_images import META, RECORD
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -78,8 +78,7 @@ class _Files:
     def close(self, level: int) -> None:
         """Write a level's file."""
         file, parts = self.open.pop(level)
-        folder = (self.folder / self.names[file]).parent
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = own_folder(self.folder, PurePosixPath(self.names[file]).parent)
         turned = Scene(Gaussians.concat(parts), self.facts).turned(AXES).gaussians
         for name, data in encode_sog(turned, self.facts.antialias, in_order=True).files().items():
             write_file(folder / name, data)
@@ -126,7 +125,8 @@ def write_streamed_sog(folder: Path, scene: Scene, root: LevelNode) -> None:
 def _drop_earlier(folder: Path, named: Set[str]) -> None:
     """Delete folders of levels that the index no longer references."""
     for path in sorted(folder.iterdir()):
-        if _LEVEL.fullmatch(path.name) and path.name not in named and (path / META).is_file():
+        earlier = _LEVEL.fullmatch(path.name) and path.name not in named
+        if earlier and not path.is_symlink() and (path / META).is_file():
             shutil.rmtree(path)
 
 

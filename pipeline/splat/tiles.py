@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file, write_file
+from splatpipe.pipeline.engine.output_file import new_file, own_folder, write_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import FLOAT, UNSIGNED_BYTE, padded, write_head
 from splatpipe.pipeline.splat.glb_splats import EXTENSION, KERNEL, RECORD, SPZ_EXTENSION, harmonics_names
@@ -81,7 +81,7 @@ def write_tiles(
         OSError: if a file cannot be written.
     """
     refuse_nowhere(scene.facts)
-    (folder / TILES).mkdir(parents=True, exist_ok=True)
+    own_folder(folder, TILES)
     names = {}
     for number, node in enumerate(root.nodes()):
         if len(node.gaussians):

@@ -15,13 +15,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import rasterio
 from contourpy import LineType, contour_generator
 from jaxtyping import Float64
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface.geotiff import gdal
+from splatpipe.pipeline.surface.geotiff import gdal, open_raster
 
 INDEX_EVERY = 5  # every fifth contour is drawn bold, as on maps
 CELLS_PER_INTERVAL = 6.0  # 95 % of heights are within 3 cells: half an interval, as map standards require
@@ -88,7 +87,7 @@ def trace_contours(dsm: Path, interval: float | None = None) -> Contours:
     Raises:
         SplatpipeError: if the interval is invalid, or so small that there are too many lines.
     """
-    with gdal(dsm.parent), rasterio.open(dsm) as raster:
+    with gdal(dsm.parent), open_raster(dsm) as raster:
         low, high = _height_range(raster)
         if interval is None:
             interval = neat_interval(abs(raster.transform.a) * _cell_in_heights(raster), max(high - low, 0.0))

@@ -13,6 +13,7 @@ import numpy as np
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
+from splatpipe.pipeline.splat.archives import open_archive
 from splatpipe.pipeline.surface.fusion import FusedPoints, concatenate_clouds, finest_of_cubes, fuse_depths
 from splatpipe.pipeline.surface.grid import make_grid
 from splatpipe.pipeline.surface.lattice import Lattice
@@ -117,5 +118,5 @@ def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: HeightRange, tile: Ti
 
 def _load_chunks(work: Path, count: int) -> Iterator[CloudChunk]:
     for number in range(count):
-        with np.load(work / f"{number:06d}.npz", allow_pickle=False) as kept:
+        with open_archive(work / f"{number:06d}.npz") as kept:
             yield CloudChunk(**kept)

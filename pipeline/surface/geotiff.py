@@ -131,6 +131,18 @@ def raster_file(path: Path, grid: Grid, form: RasterForm) -> Iterator[RasterFile
             raise MachineError(f"{path} cannot be written: {error}", "Is there space on the disk?") from error
 
 
+def open_raster(path: Path) -> rasterio.DatasetReader:
+    """Open a GeoTIFF for reading, within ``gdal``, and nothing else that bears its name.
+
+    GDAL looks at a file's content, and other formats name further files and addresses: a `dsm.tif` of an OUT from
+    somebody else, a virtual raster in truth, put bytes of a private file into results and asked a server for more.
+
+    Raises:
+        RasterioIOError: if it is not a GeoTIFF.
+    """
+    return rasterio.open(path, driver="GTiff")
+
+
 def gdal(scratch: Path) -> rasterio.Env:
     """GDAL environment for writing files: no network, no sidecar files, little memory, one thread.
 
@@ -204,7 +216,7 @@ def _require_whole(path: Path, grid: Grid) -> None:
     Raises:
         RasterioError: if the file is incomplete.
     """
-    with rasterio.open(path) as raster:
+    with open_raster(path) as raster:
         if raster.shape != (grid.height, grid.width):
             raise RasterioIOError("its size is another one")
         for row, column in ((0, 0), (grid.height - 1, grid.width - 1)):

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from jaxtyping import Bool
 from rasterio.windows import Window
 
-from splatpipe.pipeline.surface.geotiff import gdal
+from splatpipe.pipeline.surface.geotiff import gdal, open_raster
 from splatpipe.pipeline.surface.tiles import Tile
 
 BLOCK = 64  # cells a side that are known together: a plan of 16 million cells is 4,000 blocks
@@ -39,7 +38,7 @@ def known_cells(dsm: Path) -> KnownCells:
     Args:
         dsm: A tiled GeoTIFF of heights; it is read once, one row of blocks at a time.
     """
-    with gdal(dsm.parent), rasterio.open(dsm) as raster:
+    with gdal(dsm.parent), open_raster(dsm) as raster:
         rows = []
         for top in range(0, raster.height, BLOCK):
             window = Window(0, top, raster.width, min(BLOCK, raster.height - top))

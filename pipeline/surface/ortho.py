@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from jaxtyping import Float64, UInt8
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.surface.dsm import CACHE_BYTES, height_range
 from splatpipe.pipeline.surface.exposures import COMPARED_POINTS, exposure_levels
-from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, raster_file
+from splatpipe.pipeline.surface.geotiff import COLOURS, gdal, open_raster, raster_file
 from splatpipe.pipeline.surface.grid import Grid, make_grid
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.known_cells import KnownCells, known_cells
@@ -157,7 +156,7 @@ def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
 
 def _read(dsm: Path, part: Tile) -> Float64[np.ndarray, "h w"]:
     """Heights of the DSM's cells, NaN where there are none."""
-    with gdal(dsm.parent), rasterio.open(dsm) as raster:
+    with gdal(dsm.parent), open_raster(dsm) as raster:
         window = Window(part.column, part.row, part.width, part.height)
         found = raster.read(1, window=window, masked=True, boundless=False)
     return np.asarray(found.astype(np.float64).filled(np.nan))
@@ -172,7 +171,7 @@ def _places(dsm: Path, heights: Grid) -> Float64[np.ndarray, "m 3"]:
     row = (np.arange(min(rows, heights.height)) + 0.5) * heights.height / min(rows, heights.height)
     column = (np.arange(min(columns, heights.width)) + 0.5) * heights.width / min(columns, heights.width)
     found = []
-    with gdal(dsm.parent), rasterio.open(dsm) as raster:
+    with gdal(dsm.parent), open_raster(dsm) as raster:
         for at in row.astype(np.int64):
             line = raster.read(1, window=Window(0, int(at), heights.width, 1), masked=True)[0]
             height = line.astype(np.float64).filled(np.nan)[column.astype(np.int64)]

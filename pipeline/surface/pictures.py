@@ -11,7 +11,7 @@ import rasterio
 from jaxtyping import Float64, UInt8
 from rasterio.enums import Resampling
 
-from splatpipe.pipeline.surface.geotiff import gdal
+from splatpipe.pipeline.surface.geotiff import gdal, open_raster
 
 EMPTY = 255  # grey of what has no data
 LIGHT_FROM = np.array([-0.5, 0.5, np.sqrt(0.5)])  # east, north, up: from the north-west at 45°, as on maps
@@ -41,7 +41,7 @@ def ortho_picture(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
         path: The file.
         side: Maximum length of the longer side, pixels.
     """
-    with gdal(path.parent), rasterio.open(path) as raster:
+    with gdal(path.parent), open_raster(path) as raster:
         bands = raster.read(out_shape=(raster.count, *_shape(raster, side)), resampling=Resampling.average)
     return np.asarray(np.where(bands[3:] > 0, bands[:3], EMPTY).transpose(1, 2, 0), np.uint8)
 
@@ -53,7 +53,7 @@ def relief_picture(path: Path, side: int) -> ReliefPicture | None:
         path: The file.
         side: Maximum length of the longer side, pixels.
     """
-    with gdal(path.parent), rasterio.open(path) as raster:
+    with gdal(path.parent), open_raster(path) as raster:
         shape = _shape(raster, side)
         found = raster.read(1, out_shape=shape, masked=True, resampling=Resampling.average)
         step = raster.transform.a * raster.width / shape[1]

@@ -11,6 +11,7 @@ import numpy as np
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.mvs.array_file import save_arrays
+from splatpipe.pipeline.splat.archives import open_archive
 from splatpipe.pipeline.surface.sheet import GridSheet
 from splatpipe.pipeline.surface.tiles import Tile
 
@@ -69,7 +70,7 @@ class SheetWork:
         for number, sheet in enumerate(self.sheets):
             path = self._path(number)
             if path.is_file():
-                with np.load(path, allow_pickle=False) as kept:
+                with open_archive(path) as kept:
                     yield sheet.part, dict(kept)
 
     def _path(self, number: int) -> Path:

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from jaxtyping import Float64
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface.geotiff import GDAL_ERRORS, gdal
+from splatpipe.pipeline.surface.geotiff import GDAL_ERRORS, gdal, open_raster
 from splatpipe.pipeline.surface.height_field import HeightField
 from splatpipe.pipeline.surface.lattice import Lattice
 from splatpipe.pipeline.surface.tiles import Tile
@@ -86,10 +85,10 @@ def open_surface(path: Path, confidence: Path | None = None) -> SurfaceFile:
         SplatpipeError: if it is not such a raster, or the two do not share a grid.
     """
     try:
-        with gdal(path.parent), rasterio.open(path) as raster:
+        with gdal(path.parent), open_raster(path) as raster:
             at, shape = raster.transform, raster.shape
         if confidence is not None:
-            with gdal(path.parent), rasterio.open(confidence) as raster:
+            with gdal(path.parent), open_raster(confidence) as raster:
                 same = raster.shape == shape and raster.transform == at and raster.count >= SIGMA_BAND
             if not same:
                 raise SplatpipeError(f"{confidence.name} is not on the grid of {path.name}.", "Make both again.")
@@ -115,7 +114,7 @@ def _runs(cells: Float64[np.ndarray, "n 2"]) -> Iterator[slice]:
 def _read(path: Path, band: int, part: Tile) -> Float64[np.ndarray, "h w"]:
     """Values of cells, NaN where there are none, and outside of the raster."""
     found = np.full((part.height, part.width), np.nan)
-    with gdal(path.parent), rasterio.open(path) as raster:
+    with gdal(path.parent), open_raster(path) as raster:
         top, bottom = np.clip([part.row, part.row + part.height], 0, raster.height)
         left, right = np.clip([part.column, part.column + part.width], 0, raster.width)
         if top < bottom and left < right:

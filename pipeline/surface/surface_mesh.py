@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
+from splatpipe.pipeline.splat.archives import open_archive
 from splatpipe.pipeline.surface.blocks import surface_blocks
 from splatpipe.pipeline.surface.mesh_files import write_mesh
 from splatpipe.pipeline.surface.photo_set import PhotoSet, SurfacePieces
@@ -90,7 +91,7 @@ def _save_fine(path: Path, mesh: TriangleMesh, voxel_m: float) -> None:
 
 
 def _load_fine(path: Path) -> tuple[TriangleMesh, float]:
-    with np.load(path, allow_pickle=False) as kept:
+    with open_archive(path) as kept:
         return TriangleMesh(kept["vertices"], kept["triangles"]), float(kept["voxel_m"])
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.survey.crs import Crs, parse_crs, utm_of
 from splatpipe.pipeline.survey.geodesy import ecef_from_geodetic
-from splatpipe.pipeline.survey.readings import TIMES_LESS, Evidence, Reading, plausible
+from splatpipe.pipeline.survey.readings import MIN_WITNESSES, TIMES_LESS, Evidence, Reading, plausible
 
 FAR_M = 2000.0  # from the photos; control that they show must be nearer
 ZONE = 1e6  # what a zone number in front of an easting counts
@@ -148,11 +148,15 @@ SHAPES: tuple[tuple[Reading, Callable[[Places], Places]], ...] = (
 def shape_reading(found: Places, surveyed: Places, heights: Bool[np.ndarray, " n"]) -> tuple[Reading, Evidence] | None:
     """The convention by which surveyed points have the shape of the model, where they do not as stated; else None.
 
+    Fewer than ``MIN_WITNESSES`` points, or none, have no shape.
+
     Args:
         found: Their places in the model, upright, with its north, and in metres to a few percent.
         surveyed: East, north, up as stated.
         heights: Where up is known.
     """
+    if len(found) < MIN_WITNESSES:
+        return None
     stated = _alike(found, surveyed, heights)
     return plausible(stated, ((reading, _alike(found, rewrite(surveyed), heights)) for reading, rewrite in SHAPES))
 

@@ -18,27 +18,32 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.control import ControlResult
+from splatpipe.pipeline.survey.barometer import altitude_climbs, climb_ratio, climb_sentence
+from splatpipe.pipeline.survey.blunders import EXACT_M
+from splatpipe.pipeline.survey.control import MISTAKEN, ControlResult
 from splatpipe.pipeline.survey.crs import Crs, outside_area_km, parse_crs
-from splatpipe.pipeline.survey.flight_steps import FlightSteps, steps_of
+from splatpipe.pipeline.survey.flight_steps import MIN_STEP_M, FlightSteps, steps_of
 from splatpipe.pipeline.survey.foot_readings import other_foot
 from splatpipe.pipeline.survey.frames import Frame
 from splatpipe.pipeline.survey.level import Positions, gimbal_rotation
 from splatpipe.pipeline.survey.model import SparseModel
 from splatpipe.pipeline.survey.position_lag import position_lag
+from splatpipe.pipeline.survey.position_repeats import repeats, ways_m
 from splatpipe.pipeline.survey.position_sources import ALTITUDE_BOUNDS_M, MOST_DATUMS_M
 from splatpipe.pipeline.survey.up_witnesses import FLYING, check_up, values_of
 
 TURNED_RAD = math.radians(45.0)  # from the gimbal's north: compasses, declinations and conventions differ by less
+LAG_TURN_RAD = math.radians(15.0)  # a turn that a lag on a loop may explain, and a compass hardly
 HALF_TURN_RAD = math.radians(150.0)
 LEANING_RAD = math.radians(30.0)  # from the gimbal's up; what is more is told by the witnesses of up, too
 MIN_WITNESSES = 6
-CLIMB_M = 5.0  # spread of the heights above take-off that tells a scale: five times the barometer's error
-CLIMB_RATIO = 2.0  # of climbs in the model and by the drone, either way
+OTHERS_SHARE = 0.4  # of the positions: so many that the others may be the wrong ones
 CLOCK_S = 1.0  # EXIF's times are whole seconds
 DRONE_M_S, AIRCRAFT_M_S = 50.0, 150.0  # no survey is flown faster: drones, and manned aircraft (or unknown)
 OUTSIDE_KM = 100.0  # from the CRS's area of use: surveyors stay in their zone across a border
 DATUM_M, DATUM_SIGMAS = 20.0, 5.0  # control off the positions: more is another datum or CRS
+MISSHAPEN = 0.05  # of the control's width: tape and hand-held receivers do better, or are stated to be worse
+BASE_M = 3.0  # likewise, of positions stated to EXACT_M: modern datums differ by less, wrong bases and points by more
 SCALE_APART, SCALE_SIGMAS = 0.2, 5.0  # likewise, of the scale
 HEADING_APART_RAD = math.radians(20.0)  # likewise, of north
 
@@ -130,16 +135,19 @@ def _up(placed: Placed) -> Iterator[Contradiction]:
         )
 
 
-def _north(placed: Placed) -> Iterator[Contradiction]:
-    """North by the gimbal, where up is not in question."""
+def _turn(placed: Placed) -> float | None:
+    """Angle, radians counter-clockwise, of north in the result against the gimbal's, where up is not in question."""
     gimbal = gimbal_rotation(placed.model, placed.positions)
     if gimbal is None:
-        return
+        return None
     turn = placed.world_from_model.rotation @ gimbal.T  # from the gimbal's world to the placed one
-    if turn[2, 2] < math.cos(LEANING_RAD):
-        return
-    angle = math.atan2(turn[1, 0], turn[0, 0])
-    if abs(angle) > TURNED_RAD:
+    return None if turn[2, 2] < math.cos(LEANING_RAD) else math.atan2(turn[1, 0], turn[0, 0])
+
+
+def _north(placed: Placed) -> Iterator[Contradiction]:
+    """North by the gimbal."""
+    angle = _turn(placed)
+    if angle is not None and abs(angle) > TURNED_RAD:
         cause = (
             "Missing signs of both latitude and longitude (S and W) do that: check them."
             if abs(angle) > HALF_TURN_RAD
@@ -152,23 +160,17 @@ def _north(placed: Placed) -> Iterator[Contradiction]:
 
 def _climbs(placed: Placed) -> Iterator[Contradiction]:
     """How far the drone climbed by its barometer; the ground's height does not matter."""
-    above, up = placed.stated("relative_altitude_m"), placed.centres()[:, 2]
-    flights = np.nan_to_num(placed.stated("flight"))
-    known = np.isfinite(above)
-    ours, theirs = up.copy(), above.copy()
-    for flight in np.unique(flights[known]):
-        own = known & (flights == flight)
-        ours[own] -= ours[own].mean()
-        theirs[own] -= theirs[own].mean()
-    if known.sum() < MIN_WITNESSES or float(theirs[known].std()) < CLIMB_M:
-        return
-    ratio = float(ours[known] @ theirs[known] / (theirs[known] @ theirs[known]))
-    if not 1.0 / CLIMB_RATIO <= ratio <= CLIMB_RATIO:
+    above, flights = placed.stated("relative_altitude_m"), np.nan_to_num(placed.stated("flight"))
+    ratio = climb_ratio(placed.centres()[:, 2], above, flights)
+    if ratio is not None:
         yield Contradiction(
-            f"Where the drone climbs by 10 m according to its heights above take-off, the result climbs by "
-            f"{10.0 * ratio:.1f} m.",
+            f"{climb_sentence(ratio, 'the result')}.",
             "Check the scale of the result on a known length, and the positions' altitudes.",
         )
+    if placed.controlled is None:  # else heights are the control's
+        told = altitude_climbs([placed.positions.by_name.get(name, {}) for name in placed.model.names])
+        if told is not None:
+            yield Contradiction(*told)
 
 
 def _speed(placed: Placed) -> Iterator[Contradiction]:
@@ -192,16 +194,50 @@ def _lag(placed: Placed) -> Iterator[Contradiction]:
     if not residuals or not placed.positions.by_name:
         return
     unknown = [np.nan, np.nan]
-    off = np.array([residuals[name][:2] if name in residuals else unknown for name in placed.model.names])
+    used = residuals.keys() - set(placed.frame.left_out)
+    off = np.array([residuals[name][:2] if name in used else unknown for name in placed.model.names])
     way = placed.centres()[:, :2]
     sigma = float(np.nanmedian(placed.stated("sigma_horizontal_m")))
     found = position_lag(way, way - off, placed.steps, sigma)
+    turn, turned = _turn(placed), ""
+    if found is None and turn is not None and abs(turn) > LAG_TURN_RAD:
+        found = position_lag(way, way - off, placed.steps, sigma, turn)
+        turned = f"North in the result is {abs(math.degrees(turn)):.0f}° off the headings of the gimbal. "
     if found is not None:
         reading, evidence, near = found
         yield Contradiction(
-            f"The positions do not keep the order and times of the flight: if {reading.cause}, {evidence.share:.0%} of"
-            f" them fit to {near:.1f} m.",
+            f"{turned}The positions do not keep the order and times of the flight: if {reading.cause}, "
+            f"{evidence.share:.0%} of them fit to {near:.1f} m.",
             reading.remedy,
+        )
+
+
+def _repeats(placed: Placed) -> Iterator[Contradiction]:
+    """Photos that state the position of the one before, and were taken elsewhere."""
+    records = [placed.positions.by_name.get(name) for name in placed.model.names]
+    places = [None if record is None else (record["latitude"], record["longitude"]) for record in records]
+    again = repeats(places, placed.steps)
+    if len(again) < MIN_WITNESSES:
+        return
+    way = float(np.median(ways_m(placed.centres(), placed.steps)[again]))
+    if way > max(MIN_STEP_M, float(np.nanmedian(placed.stated("sigma_horizontal_m")))):
+        yield Contradiction(
+            f"{len(again)} of {len(places)} photos state the position of the photo before, and lie {way:.1f} m off it.",
+            "The receiver was slower than the camera, or stood still: scale and north may be wrong. Give each photo "
+            "its own position in geo.txt, or control points.",
+        )
+
+
+def _left_out(placed: Placed) -> Iterator[Contradiction]:
+    """Positions that contradict those that were used, where they are nearly as many."""
+    if placed.controlled is not None:
+        return
+    stated = placed.positions.by_name.keys() & set(placed.model.names)
+    odd = len(stated & set(placed.frame.left_out))
+    if odd >= MIN_WITNESSES and odd >= OTHERS_SHARE * len(stated):
+        yield Contradiction(
+            f"{odd} of {len(stated)} stated positions do not fit the others, and are left out.",
+            "Check which of them are right: if it is those, the result is in the wrong place.",
         )
 
 
@@ -253,10 +289,12 @@ def _control(placed: Placed) -> Iterator[Contradiction]:
             f"{reading.remedy} {follows}",
         )
     shift = np.hypot(offsets[:, 0], offsets[:, 1])
-    if float(shift.min()) > max(DATUM_M, DATUM_SIGMAS * float(np.median(stations.sigmas[:, 0]))):
+    sigma = float(np.median(stations.sigmas[:, 0]))
+    if float(shift.min()) > max(BASE_M if sigma <= EXACT_M else DATUM_M, DATUM_SIGMAS * sigma):
         yield Contradiction(
             f"The control of {survey.name} lies {shift.min():.0f} m horizontally off the photos' positions.",
-            f"Check that {survey.crs.text} is its CRS and datum. {follows}",
+            f"Check that {survey.crs.text} is its CRS and datum"
+            f"{', and the coordinates of the base station' if sigma <= EXACT_M else ''}. {follows}",
         )
     lift = offsets[:, 2]
     has_heights = any(point.surveyed.z is not None for point in survey.of_role("control"))
@@ -269,6 +307,24 @@ def _control(placed: Placed) -> Iterator[Contradiction]:
     alone = placed.by_positions
     if alone is not None and "sigma_scale_percent" in alone.residuals:
         yield from _shape(placed.world_from_model, alone, survey.name)
+
+
+def _agreement(placed: Placed) -> Iterator[Contradiction]:
+    """Control whose points lie off each other by a good part of the site: they do not have the model's shape."""
+    controlled = placed.controlled
+    if controlled is None or controlled.sigma_factor <= MISTAKEN:
+        return
+    chosen = [k for k, point in enumerate(controlled.survey.points) if point.role == "control"]
+    targets = controlled.site.targets
+    apart = controlled.sigma_factor * float(np.median(targets.sigmas[chosen, 0]))
+    extent = float(np.linalg.norm(np.ptp(targets.enu[chosen, :2], axis=0)))
+    if apart > MISSHAPEN * extent:
+        yield Contradiction(
+            f"The control points of {controlled.survey.name} agree with the photos to {apart:.1f} m only,"
+            f" {apart / extent:.0%} of the width of their area.",
+            "Check the order and signs of the coordinates (latitude and longitude swapped mirror them), the names and "
+            "the marks.",
+        )
 
 
 def _shape(ours: Similarity, alone: Frame, name: str) -> Iterator[Contradiction]:
@@ -295,7 +351,10 @@ LOOKS: tuple[Callable[[Placed], Iterator[Contradiction]], ...] = (
     _up,
     _north,
     _control,
+    _agreement,
     _other_sources,
+    _left_out,
+    _repeats,
     _lag,
     _areas,
     _climbs,

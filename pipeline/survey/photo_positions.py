@@ -111,6 +111,7 @@ class PositionList:
         doubts: Where EXIF was not read as it stands.
         elsewhere: Median distance in metres between the positions and those of a source (``exif``, ``xmp``) that is not
             used, where it is too large for a correction.
+        file_step_m: Median of the file's altitudes less the photos' own, of EXIF or else XMP, where both are given.
     """
 
     positions: tuple[Position, ...]
@@ -119,6 +120,7 @@ class PositionList:
     orientations: Mapping[str, int]
     doubts: SourceDoubts = field(default_factory=SourceDoubts)
     elsewhere: Mapping[str, float] = field(default_factory=dict)
+    file_step_m: float | None = None
 
     @property
     def impossible(self) -> tuple[str, ...]:
@@ -137,6 +139,7 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
     stamps: list[Stamp] = []
     wrong: dict[str, str] = {}
     steps: list[float] = []
+    file_steps: list[float] = []
     others: dict[str, list[tuple[Gps, Gps]]] = {"exif": [], "xmp": []}
     conventions = _conventions(photos)
     photos, doubts = settle_sources(photos)
@@ -160,6 +163,9 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
         ours, theirs = exif_altitude(photo.exif.gps), xmp_altitude(photo.xmp)
         if ours is not None and theirs is not None:
             steps.append(ours - theirs)
+        own = theirs if ours is None else ours
+        if position.altitude_source == "file" and position.altitude_m is not None and own is not None:
+            file_steps.append(position.altitude_m - own)
     found = _above_takeoff(found)
     wrong |= _repeated(found, photos)
     wrong |= find_misplaced({each.name: (each.latitude, each.longitude) for each in found})
@@ -172,6 +178,7 @@ def read_positions(photos: Sequence[CheckedPhoto], places: Mapping[str, FilePlac
         {photo.name: photo.exif.orientation for photo in photos if photo.exif.orientation != 1},
         doubts,
         _elsewhere(others),
+        float(np.median(file_steps)) if file_steps else None,
     )
 
 

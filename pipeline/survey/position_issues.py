@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float64
 
 from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.photo_list import Photo
 from splatpipe.pipeline.photos.position_outliers import median_distance_m
+from splatpipe.pipeline.survey.altitude_issues import find_altitude_issues, who_states
 from splatpipe.pipeline.survey.fitting import MIN_POSITIONS
-from splatpipe.pipeline.survey.flight_steps import flying_relation, steps_of
+from splatpipe.pipeline.survey.flight_steps import FlightSteps, flying_relation, steps_of
 from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.photo_positions import DATUM_STEP_M, NOWHERE, Position, PositionList
-from splatpipe.pipeline.survey.position_sources import MOST_DATUMS_M, is_on_earth, xmp_place
+from splatpipe.pipeline.survey.photo_positions import NOWHERE, Position, PositionList
+from splatpipe.pipeline.survey.position_repeats import copied_coordinate, repeats, two_places
+from splatpipe.pipeline.survey.position_sources import is_on_earth, xmp_place
 from splatpipe.pipeline.survey.position_spread import spread_of
 from splatpipe.pipeline.survey.stated_positions import FilePlaces
 
@@ -26,14 +26,7 @@ CONTRADICTION_TIMES = 6.0  # times the difference in most photos, whose EXIF may
 ANOTHER_PLACE_M = 10.0  # in most photos: too large for a correction
 WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
 RTK_SHARE = 0.5  # of the photos with a fix: above, the others have lost it
-ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
-MIN_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
-ORIGINS = {
-    "file": "from the file of positions",
-    "exif": "from EXIF",
-    "xmp": "from XMP",
-    "takeoff": "above take-off",
-}  # of altitudes
+MIN_REPEATS = 6  # photos
 
 
 def find_position_issues(
@@ -50,12 +43,12 @@ def find_position_issues(
         *_none_on_earth(positions),
         *_missing(photos, positions),
         *_degenerate(positions.positions),
+        *_repeating(photos, positions),
         *_doubted(positions),
         *_elsewhere(positions, file),
         *_contradicting(photos, positions),
         *_headings(photos, positions),
-        *_altitudes(positions),
-        *_datums(positions),
+        *find_altitude_issues(positions),
         *_lost_fix(positions.positions),
     ]
 
@@ -69,7 +62,8 @@ def _none_on_earth(positions: PositionList) -> list[CaptureIssue]:
                 f"Impossible positions: {list_names(positions.impossible)}."
                 if positions.positions
                 else "All stated positions are impossible: the result will have neither scale nor georeference.",
-                "They are none on Earth, 0, 0, or of no known hemisphere. These photos are used without them.",
+                "They are none on Earth, 0, 0, of no known hemisphere, or not in degrees, minutes and seconds. "
+                "These photos are used without them.",
                 positions.impossible,
             )
         )
@@ -132,6 +126,38 @@ def _degenerate(positions: Sequence[Position]) -> list[CaptureIssue]:
     return []
 
 
+def _repeating(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
+    """Positions that repeat: a copied coordinate, two places, a receiver slower than the camera."""
+    places = [(each.latitude, each.longitude) for each in positions.positions]
+    issues = []
+    copied = copied_coordinate(places)
+    if copied:
+        text = f"All {len(places)} photos state one and the same {copied}, as no receiver does: it looks copied."
+        hint = "The scale would be wrong: correct it, or give positions in geo.txt."
+        issues.append(CaptureIssue("position-copied", text, hint))
+    split = two_places(places)
+    if split is not None:
+        text = f"The positions are at two places, {split[2] / 1000.0:,.1f} km apart ({split[0]} and {split[1]} photos)."
+        hint = (
+            "If it is one site, those of one place are wrong (an earlier fix?): leave them out. If not, run each alone."
+        )
+        issues.append(CaptureIssue("position-two-places", text, hint))
+    names = [each.name for each in positions.positions]
+    again = repeats(places, _steps(photos, positions))
+    if len(again) >= MIN_REPEATS and len(set(places)) >= MIN_POSITIONS:
+        text = f"{len(again)} of {len(names)} photos state the position of the photo before."
+        hint = "In flight, the receiver is then slower than the camera; the run tells whether they moved."
+        issues.append(CaptureIssue("position-repeated", text, hint, severity="note"))
+    return issues
+
+
+def _steps(photos: Sequence[CheckedPhoto], positions: PositionList) -> FlightSteps:
+    """From photo to photo, in order of time."""
+    times = {photo.name: Photo(photo.name, photo.sha256, 0, 0, 0, photo.exif.time) for photo in photos}
+    stated = positions.positions
+    return steps_of([each.name for each in stated], {each.name: {"flight": each.flight} for each in stated}, times)
+
+
 def _doubted(positions: PositionList) -> list[CaptureIssue]:
     """Photos whose EXIF is not read as it stands."""
     doubts = positions.doubts
@@ -169,18 +195,16 @@ def _doubted(positions: PositionList) -> list[CaptureIssue]:
         ),
         ("altitude-zero", doubts.zero, "state an altitude of exactly 0 m.", "It is read as no altitude."),
     ]
+    for datum in sorted(set(doubts.datum.values())):
+        names = frozenset(name for name, stated in doubts.datum.items() if stated == datum)
+        text = f"state the datum {printable(datum)} in EXIF: their positions are read as WGS 84, which may be hundreds"
+        hint = "Convert them to WGS 84, or give positions with their CRS in geo.txt."
+        texts.append(("position-datum", names, f"{text} of metres off.", hint))
     return [
-        CaptureIssue(code, f"{_who(names, positions)} {text}", hint, tuple(sorted(names)))
+        CaptureIssue(code, f"{who_states(names, positions)} {text}", hint, tuple(sorted(names)))
         for code, names, text, hint in texts
         if names
     ]
-
-
-def _who(names: Collection[str], positions: PositionList) -> str:
-    """All photos, or their number and names."""
-    if len(names) >= len(positions.positions):
-        return f"All {len(names)} photos"
-    return f"{len(names)} of {len(positions.positions)} photos ({list_names(sorted(names))})"
 
 
 def _elsewhere(positions: PositionList, file: FilePlaces | None) -> list[CaptureIssue]:
@@ -200,9 +224,7 @@ def _headings(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[C
     stated = positions.positions
     if not stated:
         return []
-    names = [each.name for each in stated]
-    times = {photo.name: Photo(photo.name, photo.sha256, 0, 0, 0, photo.exif.time) for photo in photos}
-    steps = steps_of(names, {each.name: {"flight": each.flight} for each in stated}, times)
+    steps = _steps(photos, positions)
     yaw = [each.yaw_deg if each.flight_yaw_deg is None else each.flight_yaw_deg for each in stated]
     headings = np.array([np.nan if value is None else value for value in yaw], dtype=np.float64)
     geodetic = np.array([[each.latitude, each.longitude, 0.0] for each in stated], dtype=np.float64)
@@ -241,96 +263,6 @@ def _contradicting(photos: Sequence[CheckedPhoto], positions: PositionList) -> l
     return [
         CaptureIssue("position-contradiction", text, "EXIF's are used: correct them, or restore the originals.", names)
     ]
-
-
-def _altitudes(of: PositionList) -> list[CaptureIssue]:
-    """Altitudes that are missing, impossible, or far off the others'."""
-    positions = of.positions
-    stated = {each.name: each.altitude_m for each in positions if each.altitude_m is not None}
-    takeoff = any(each.altitude_source == "takeoff" for each in positions)
-    lacking = frozenset(each.name for each in positions if takeoff or each.altitude_m is None)
-    issues = []
-    impossible = {name: metres for name, metres in of.doubts.impossible_m.items() if name in lacking}
-    if impossible:
-        least, most = min(impossible.values()), max(impossible.values())
-        values = f"{least:,.0f} m" if round(least) == round(most) else f"{least:,.0f} to {most:,.0f} m"
-        text = f"{_who(impossible, of)} state an impossible altitude ({values})."
-        issues.append(CaptureIssue("altitude-impossible", text, "It is not used.", tuple(sorted(impossible))))
-    if takeoff:
-        text = "No photo states a usable altitude: heights will count from the take-off point, not from the sea."
-        hint = "Scale, horizontal place and up are not affected. Control points or geo.txt would give heights."
-        issues.append(CaptureIssue("altitude-missing", text, hint))
-    elif lacking:
-        issues.append(_without_altitude(sorted(lacking), len(stated)))
-    return [*issues, *_far_altitudes(stated)]
-
-
-def _without_altitude(names: Sequence[str], others: int) -> CaptureIssue:
-    """Photos without an altitude.
-
-    Args:
-        names: The photos.
-        others: How many have one.
-    """
-    if others < MIN_POSITIONS:
-        who = f"Only {others} of {len(names) + others} photos state" if others else "No photo states"
-        text = f"{who} a usable altitude: only horizontal positions are used, and heights are arbitrary."
-        hint = "Up will be from how the cameras were held. Control points, or altitudes in geo.txt, would give heights."
-        return CaptureIssue("altitude-missing", text, hint)
-    who = list_names(names) if len(names) <= others else f"{len(names)} of {len(names) + others} photos"
-    return CaptureIssue("altitude-missing", f"Without an altitude: {who}.", "Others place the model.", tuple(names))
-
-
-def _far_altitudes(stated: Mapping[str, float]) -> list[CaptureIssue]:
-    """Altitudes far off the others'."""
-    if len(stated) < MIN_POSITIONS:
-        return []
-    values: Float64[np.ndarray, " n"] = np.array(list(stated.values()), dtype=np.float64)
-    off = np.abs(values - np.median(values))
-    limit = max(MIN_ALTITUDE_M, ALTITUDE_SPREADS * float(np.median(off)))
-    odd = tuple(name for name, metres in zip(stated, off.tolist(), strict=True) if metres > limit)
-    if not odd:
-        return []
-    text = f"Altitudes far from the others' ({np.median(values):.0f} m): {list_names(odd)}."
-    return [CaptureIssue("altitude-far", text, "Correct them, or leave the photos out.", odd)]
-
-
-def _datums(positions: PositionList) -> list[CaptureIssue]:
-    kinds = Counter((each.vertical, each.altitude_source) for each in positions.positions if each.altitude_source)
-    issues = []
-    if len(kinds) > 1:
-        references = ", ".join(f"{count} {_datum(*kind)}" for kind, count in kinds.most_common())
-        issues.append(
-            CaptureIssue(
-                "altitude-datums",
-                f"Altitudes have different references: {references}.",
-                "Heights of different datums differ by up to a hundred metres: give positions in one datum in geo.txt.",
-            )
-        )
-    step = positions.altitude_step_m
-    if step is not None and abs(step) > MOST_DATUMS_M:
-        text = f"The altitudes in EXIF and in the drone's XMP differ by {step:.1f} m, more than any two datums do."
-        hint = "Usually one of them is the height above take-off. EXIF's are used: correct them if they are wrong."
-        issues.append(CaptureIssue("altitude-contradiction", text, hint))
-    elif step is not None and abs(step) > DATUM_STEP_M:
-        issues.append(
-            CaptureIssue(
-                "altitude-datums",
-                f"The altitudes in EXIF and in the drone's XMP differ by {step:.1f} m: they have different datums.",
-                "EXIF's are used.",
-            )
-        )
-    return issues
-
-
-def _datum(vertical: str, source: str | None) -> str:
-    where = {
-        "file": "from the file of positions",
-        "exif": "from EXIF",
-        "xmp": "from XMP",
-        "takeoff": "above take-off",
-    }.get(source or "", "")
-    return f"{where} ({vertical if vertical != 'unknown' else 'datum not stated'})"
 
 
 def _lost_fix(positions: Sequence[Position]) -> list[CaptureIssue]:

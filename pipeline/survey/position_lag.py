@@ -1,7 +1,7 @@
 """Positions that belong to an earlier or later photo: rows shifted by one, or a clock that is off.
 
 The flight as stated then has the right shape, but the photos sit elsewhere on it. A turn and a scale absorb that on a
-loop; on strips to and fro nothing does.
+loop, where only the gimbal's headings contradict; on strips to and fro nothing does.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ MIN_WEIGHT_M = 0.01
 
 
 def position_lag(
-    placed: Float64[np.ndarray, "n 2"], stated: Float64[np.ndarray, "n 2"], steps: FlightSteps, sigma_m: float
+    placed: Float64[np.ndarray, "n 2"],
+    stated: Float64[np.ndarray, "n 2"],
+    steps: FlightSteps,
+    sigma_m: float,
+    turn_rad: float | None = None,
 ) -> tuple[Reading, Evidence, float] | None:
     """The lag of positions that explains them where as stated they do not fit; else None.
 
@@ -32,6 +36,8 @@ def position_lag(
         stated: The same, as stated; NaN where unknown.
         steps: From photo to photo.
         sigma_m: Standard deviation of the positions.
+        turn_rad: Angle, counter-clockwise, by which the result is turned against headings that are to be believed; None
+            if it may turn.
 
     Returns:
         The cause, its evidence, and how well (metres) these photos then fit.
@@ -40,12 +46,15 @@ def position_lag(
     if not runs:
         return None
     photos = np.concatenate(runs)
-    ours = placed[photos] @ np.array([1.0, 1.0j])
+    north = 1.0 if turn_rad is None else np.exp(-1.0j * turn_rad)
+    ours = north * (placed[photos] @ np.array([1.0, 1.0j]))
     misfits = {}
     for lag in LAGS.tolist():
         theirs = np.concatenate([_along(stated[run], lag) for run in runs]) @ np.array([1.0, 1.0j])
         known = np.isfinite(theirs)
-        misfits[lag] = _misfits(ours[known], theirs[known]) if known.sum() > MIN_STEPS else np.full(1, np.inf)
+        misfits[lag] = (
+            _misfits(ours[known], theirs[known], turn_rad is None) if known.sum() > MIN_STEPS else np.full(1, np.inf)
+        )
     best = min(misfits, key=lambda lag: (float(np.median(misfits[lag])), abs(lag)))
     step = float(np.median(np.abs(np.concatenate([np.diff(placed[run] @ np.array([1.0, 1.0j])) for run in runs]))))
     reach = NEAR * abs(best) * step
@@ -87,14 +96,16 @@ def _along(places: Float64[np.ndarray, "k 2"], lag: float) -> Float64[np.ndarray
     return np.where(((at >= 0.0) & (at <= len(places) - 1.0))[:, None], found, np.nan)
 
 
-def _misfits(ours: Complex128[np.ndarray, " n"], theirs: Complex128[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Distances that remain after a plane similarity, fitted so that their sum is least."""
+def _misfits(
+    ours: Complex128[np.ndarray, " n"], theirs: Complex128[np.ndarray, " n"], turning: bool
+) -> Float64[np.ndarray, " n"]:
+    """Distances that remain after a plane similarity, which may turn or not, fitted so that their sum is least."""
     weights = np.ones(len(ours))
     off = np.zeros(len(ours), dtype=np.complex128)
     for _ in range(ROUNDS):
         share = weights / weights.sum()
         a, b = ours - share @ ours, theirs - share @ theirs
         factor = np.vdot(a, share * b) / max(float((share * np.abs(a) ** 2).sum()), 1e-300)
-        off = b - factor * a
+        off = b - (factor if turning else max(factor.real, 0.0)) * a
         weights = 1.0 / np.maximum(np.abs(off), MIN_WEIGHT_M)
     return np.asarray(np.abs(off))

@@ -42,6 +42,7 @@ class SourceDoubts:
         sign: EXIF states an altitude below sea level, and XMP the same above it: read as above.
         above_takeoff: EXIF's altitude is the height above take-off, by XMP, whose altitude is used.
         zero: All photos state an altitude of exactly 0, which is none.
+        datum: EXIF names a datum that is far from WGS84, by photo; what it states is read as WGS84.
         impossible_m: Altitudes that are none on Earth, metres, of photos without another one.
     """
 
@@ -51,6 +52,7 @@ class SourceDoubts:
     sign: frozenset[str] = frozenset()
     above_takeoff: frozenset[str] = frozenset()
     zero: frozenset[str] = frozenset()
+    datum: Mapping[str, str] = field(default_factory=dict)
     impossible_m: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -85,6 +87,7 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
         frozenset(sign),
         frozenset(above_takeoff),
         frozenset(zero),
+        {each.name: _of(each).datum for each in settled if _is_usable(each.exif.gps) and _of(each).datum},
         _impossible(settled),
     )
     return settled, doubts

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import csv
-import tomllib
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatpipe.pipeline.engine.config import Table, load_file, merge, parse_set
+from splatpipe.pipeline.engine.config import Table, load_file, merge, parse_set, parse_toml
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.small_file import read_small
@@ -109,7 +108,7 @@ def _of_toml(path: Path) -> list[Mapping[str, JSON]]:
     """The captures' tables, each overlaid on the defaults for all."""
     name = f"The list of captures {path.name}"
     try:
-        table = tomllib.loads(read_small(path, MAX_LIST_BYTES).decode("utf-8-sig"))
+        table = parse_toml(read_small(path, MAX_LIST_BYTES))
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a number with thousands of digits
         raise UsageError(f"{name} is not valid TOML: {error}.", hint=TOML_HINT) from error
     except OSError as error:

@@ -115,13 +115,24 @@ def _own_folder(out: Path) -> Path:
 def with_unlisted(plan: BatchPlan) -> BatchPlan:
     """Add to the plan the captures of earlier calls that are no longer listed, and save this call's names."""
     path = Path(plan.out) / BATCH_FOLDER / NAMES_FILE
-    known: list[JSON] = []
+    known: JSON = []
     with suppress(OSError, ValueError):
         known = read_json(path)
     names = [capture.name for capture in plan.captures]
-    unlisted = [str(name) for name in known if name not in names and (Path(plan.out) / str(name) / "stages").is_dir()]
+    unlisted = (
+        [name for name in known if name not in names and _is_capture(Path(plan.out), name)]
+        if isinstance(known, list)
+        else []
+    )
     write_durably(path, json.dumps([*names, *unlisted]))
     return replace(plan, unlisted=tuple(unlisted))
+
+
+def _is_capture(out: Path, name: JSON) -> bool:
+    """Whether a name in the batch's own list is that of a run's folder in it; the list may be somebody else's."""
+    if not isinstance(name, str) or "\0" in name or name in (".", "..") or Path(name).name != name:
+        return False
+    return not (out / name).is_symlink() and (out / name / "stages").is_dir()
 
 
 @dataclass(frozen=True)

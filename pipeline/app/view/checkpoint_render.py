@@ -23,6 +23,7 @@ from splatpipe.pipeline.raster.device import Device, choose_device, cpu
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.render.rendering import as_trained, placed, render_pixels
+from splatpipe.pipeline.splat.archives import open_archive
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.panorama import Panorama, read_panorama
 from splatpipe.pipeline.splat.ply import read_splat
@@ -273,7 +274,7 @@ def viewer(shown: LoadedModel, source: ModelSource, contents: Contents, name: st
 def _from_checkpoint(path: Path, contents: Contents) -> tuple[Gaussians, Panorama | None]:
     """The Gaussians as rendered, and the sky; only the arrays needed for that are read from the file."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open_archive(path) as archive:
             tensors = {name: torch.from_numpy(archive[name]) for name in PARAMETERS}
             colours = torch.from_numpy(archive[SKY]) if SKY in archive.files else None
         gaussians = Gaussians.from_tensors(tensors)
@@ -292,7 +293,7 @@ def _from_checkpoint(path: Path, contents: Contents) -> tuple[Gaussians, Panoram
 
 
 def _facts(checkpoint: Path) -> Mapping[str, int]:
-    with np.load(checkpoint, allow_pickle=False) as archive:
+    with open_archive(checkpoint) as archive:
         facts: Mapping[str, int] = json.loads(archive["facts"].tobytes())["facts"]
     return facts
 

@@ -49,6 +49,16 @@ def test_the_page_says_what_cannot_be_marked(gps_run: Path, tmp_path: Path) -> N
     assert "km from the photos" in message(points)
 
 
+def test_the_page_opens_before_anything_is_marked(gps_run: Path, tmp_path: Path) -> None:
+    (gps_run.parent / "photos of a house" / "gcp_list.txt").unlink(missing_ok=True)
+    points = tmp_path / "points.csv"
+    points.write_text(POINTS)
+    marking = Marking(open_job(open_run_folder(gps_run, LINE), points))
+    overview = marking.overview()
+    assert [point["marks"] for point in overview["points"]] == [0] * len(TRUTH)
+    assert marking.detail(overview["points"][0]["name"])["photos"]
+
+
 def test_three_points_determine_a_frame_if_photos_have_no_positions(gps_run: Path, tmp_path: Path) -> None:
     """Before that no positions are predicted; then all others are, to a few pixels. Wrong marks are reported."""
     job = open_job(open_run_folder(gps_run, LINE), gps_run.parent / "points.csv")

@@ -16,6 +16,7 @@ signal.signal(signal.SIGTERM, stop)
 def load():
     import pycolmap, pyceres
     pycolmap.logging.info("said to the log")
+    pycolmap.logging.logtostderr = False  # as its bundle adjustment does
     pycolmap.logging.error("an error")
 {how}
 try:

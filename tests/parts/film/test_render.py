@@ -128,6 +128,17 @@ WRONG = [
 ]
 
 
+@pytest.mark.parametrize("name", ["renders", "renders/orbit-colour"])
+def test_stills_below_out_are_not_written_through_a_link(tmp_path: Path, name: str) -> None:
+    link = tmp_path / "out" / name
+    link.parent.mkdir(parents=True)
+    (tmp_path / "secret").mkdir()
+    link.symlink_to(tmp_path / "secret")
+    with pytest.raises(UsageError, match=f"{name} is a link"):
+        RenderRequest("orbit", stills=True).target(tmp_path / "out")
+    assert list((tmp_path / "secret").iterdir()) == []
+
+
 @pytest.mark.parametrize(("wanted", "code", "message"), WRONG, ids=range(len(WRONG)))
 def test_invalid_requests_are_refused_before_anything_is_rendered(
     demo_run: Path, tmp_path: Path, wanted: RenderRequest, code: int, message: str

@@ -173,6 +173,7 @@ def test_points_in_another_shape_are_read_as_what_gives_them_the_models(k: int) 
     found = 1.03 * enu @ turn.T + [0.0, 0.0, 1.0] * (enu[:, :1] / 20.0) ** 2
     known = np.ones(len(enu), dtype=bool)
     assert shape_reading(found, enu, known) is None
+    assert shape_reading(found[:0], enu[:0], known[:0]) is None  # nothing is marked yet
     cause = shape_reading(found, WRITTEN[k](enu), known)
     assert cause is not None
     assert cause[0] == SHAPES[k][0]

@@ -200,7 +200,7 @@ def test_a_folder_of_any_name_is_one_word_of_the_workflows_command(tmp_path: Pat
     command = ast.literal_eval(line.strip()).format(
         wildcards=SimpleNamespace(capture=Plain("x")), threads=1, output=Plain("y")
     )
-    assert shlex.split(command)[4] == str(call.folder)
+    assert shlex.split(command)[5] == str(call.folder)
 
 
 class Plain(str):

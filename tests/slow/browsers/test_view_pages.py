@@ -175,6 +175,7 @@ def test_report_film_files_and_web_viewer_work_in_their_sandbox(
             page.goto(server.file(name))
             page.evaluate("splatpipe.ready")
             assert page.evaluate("origin") == "null"
+            page.wait_for_load_state("networkidle")  # its photos follow; leaving would abort them
         with page.expect_download() as saved:
             page.keyboard.press("x")  # the picture of the view
         assert saved.value.suggested_filename.endswith(".png")

@@ -11,8 +11,9 @@ from batch_captures import call_of, demo, link, planned
 
 from splatpipe.pipeline.app.batch.attempts import AttemptLog, AttemptResult
 from splatpipe.pipeline.app.batch.capture_list import read_captures
-from splatpipe.pipeline.app.batch.driver import fresh_call, lock_folder
+from splatpipe.pipeline.app.batch.driver import fresh_call, lock_folder, with_unlisted
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
+from splatpipe.pipeline.app.batch.plan import BatchPlan
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
@@ -130,3 +131,19 @@ def test_the_folder_of_a_batch_may_be_a_link_and_that_of_a_capture_not(tmp_path:
     (disk / "house").symlink_to(link_photos.parent)
     (planned,) = make_plan(read_captures(tmp_path / "captures", call.out), call, Settings("preview")).captures
     assert "house is a link" in planned.message and planned.jobs == ()
+
+
+@pytest.mark.parametrize(
+    "listed", ['["../elsewhere", "/ABSOLUTE", "linked", "..", "\\u0000", 7, [1], null]', "7", "{}", "["]
+)
+def test_only_runs_in_the_batchs_folder_are_named_as_unlisted(tmp_path: Path, listed: str) -> None:
+    out = tmp_path / "out"
+    for folder in (out / ".batch", out / "earlier/stages", tmp_path / "elsewhere/stages"):
+        folder.mkdir(parents=True)
+    (out / "linked").symlink_to(tmp_path / "elsewhere")
+    plan = BatchPlan(str(out), 0.0, ())
+    names = out / ".batch/captures.json"
+    names.write_text(listed.replace("/ABSOLUTE", str(tmp_path / "elsewhere")))
+    assert with_unlisted(plan).unlisted == ()
+    names.write_text('["earlier"]')
+    assert with_unlisted(plan).unlisted == ("earlier",)

@@ -14,7 +14,7 @@ from repository import ROOT
 from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.events import Event, EventLog
-from splatpipe.pipeline.engine.output_file import appended_file, is_inside, new_file, own_folder, write_file
+from splatpipe.pipeline.engine.output_file import appended_file, is_inside, new_file, open_own, own_folder, write_file
 
 MINE = "alias ll='ls -l'\n"
 
@@ -245,3 +245,21 @@ def test_a_new_file_has_the_usual_permissions(tmp_path: Path) -> None:
     with new_file(tmp_path / "new"):
         pass
     assert (tmp_path / "new").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_file_that_has_a_second_name_elsewhere_is_copied_before_it_is_changed(tmp_path: Path) -> None:
+    mine, log = tmp_path / "mine", tmp_path / "out.log"
+    mine.write_bytes(b"mine\n")
+    mine.chmod(0o600)
+    os.link(mine, log)
+    with appended_file(log) as file:
+        file.write(b"ours\n")
+    assert (mine.read_bytes(), log.read_bytes()) == (b"mine\n", b"mine\nours\n")
+    assert mine.stat().st_nlink == 1 and log.stat().st_mode & 0o777 == 0o600
+    log.unlink()
+    os.link(mine, log)
+    descriptor = open_own(log, os.O_RDWR)
+    os.ftruncate(descriptor, 0)
+    os.close(descriptor)
+    assert (mine.read_bytes(), log.read_bytes()) == (b"mine\n", b"")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out.log"]

@@ -50,7 +50,9 @@ def test_too_large_a_configuration_is_refused_by_name(tmp_path: Path) -> None:
         load_file(path)
 
 
-@pytest.mark.parametrize("text", ["9" * 400, f'{{"psnr": -{"9" * 400}}}', "[" * 100_000, "", "{", "\udcff"])
+@pytest.mark.parametrize(
+    "text", ["9" * 400, "1," * 9 + "7" * 300, f'{{"psnr": -{"9" * 400}}}', "[" * 100_000, "", "{", "\udcff"]
+)
 def test_what_no_number_can_hold_and_no_stack_can_nest_is_no_json(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         parse_json(text.encode("utf-8", "surrogateescape"))
@@ -76,3 +78,18 @@ def test_the_device_of_a_mount_is_parsed() -> None:
     line = "36 35 98:5 / /mnt rw,noatime master:1 - ext3 /dev/root rw\n"
     broken = line.replace("98:5", "x:")
     assert [mount.device for mount in parse_mounts(line + broken)] == [os.makedev(98, 5), 0]
+
+
+@pytest.mark.parametrize(
+    "many", ["[" + "{}," * 5_000_001 + "0]", "[" + "[]," * 5_000_001 + "0]", f"[{'1,' * 10_000_001}1]"]
+)
+def test_more_values_than_memory_has_room_for_are_no_json(many: str) -> None:
+    with pytest.raises(ValueError, match="it has more than 10,000,000 values"):
+        parse_json(many.encode())
+
+
+def test_a_configuration_with_a_line_of_dots_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text("a" + ".a" * 400_000 + " = 1\n")
+    with pytest.raises(UsageError, match=r"is not valid TOML: it has lines with thousands of dots"):
+        load_file(path)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.run_folder import RunFolder
 from splatpipe.pipeline.engine.stage import Stage, StageConfig
 from splatpipe.pipeline.engine.store import Artifact, StageInputs, Store, open_store
 
@@ -148,3 +150,40 @@ def test_the_out_itself_may_be_a_link(out: Path) -> None:
     out.symlink_to(out.parent / "disk")
     store, artifact = finished(out)
     assert store.find(STAGE, artifact.key) is not None and (out.parent / "disk/stages").is_dir()
+
+
+@pytest.mark.parametrize("name", ["finished_s", "key", "stage", "summary", "inputs"])
+@pytest.mark.parametrize("value", [None, [1], "x"])
+def test_a_manifest_that_lacks_something_is_of_no_artifact(out: Path, name: str, value: object) -> None:
+    store, artifact = finished(out)
+    path = artifact.folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    if (name, value) in [("key", "x"), ("stage", "x")]:
+        value = 7
+    path.write_text(json.dumps({**manifest, name: value}))
+    assert store.artifacts("export") == []
+    path.write_text(json.dumps({key: entry for key, entry in manifest.items() if key != name}))
+    assert store.artifacts("export") == []
+
+
+def test_working_folders_that_events_name_are_looked_for_in_their_folder_only(out: Path) -> None:
+    store = open_store(out, create=True)
+    for name in (".partial/export-k", ".partial/export-", ".partial/x", "elsewhere"):
+        (store.stages / name).mkdir()
+    (store.partials / "export-link").symlink_to(out.parent / "secret")
+    run = RunFolder(out, [STAGE])
+    assert run.contents(None, {"export": "k"}).working == {"export": store.partials / "export-k"}
+    for key in ("/../x", "/../../elsewhere", "link"):
+        assert run.contents(None, {"export": key}).working == {}
+
+
+def test_folders_too_deep_are_refused_by_name(out: Path) -> None:
+    store = open_store(out, create=True)
+    store.partials.joinpath(*["d"] * 400).mkdir(parents=True)
+    most = sys.getrecursionlimit()
+    sys.setrecursionlimit(350)  # so that what is removed after the tests is not as deep as an attacker's
+    try:
+        with pytest.raises(UsageError, match=r"\.partial has folders a thousand deep"):
+            open_store(out, create=True)
+    finally:
+        sys.setrecursionlimit(most)

@@ -1,4 +1,4 @@
-"""EXIF's hemispheres: letters, words, either case; what is none gives no position, and a missing one is told."""
+"""EXIF's degrees and hemispheres: notations that are read, and those that give no position; a missing one is told."""
 
 import io
 import math
@@ -6,7 +6,7 @@ import math
 import pytest
 from PIL import Image
 
-from splatpipe.pipeline.photos.exif import Gps, read_exif
+from splatpipe.pipeline.photos.exif import LATITUDE_SIGNS, Gps, _degrees, read_exif
 
 
 def gps_of(tags: dict[int, object]) -> Gps:
@@ -49,3 +49,32 @@ def test_another_word_gives_no_position(north: str, east: str) -> None:
 @pytest.mark.parametrize("tags", [{}, {1: "N"}, {3: "W"}, {1: "\0", 3: " "}])
 def test_a_missing_hemisphere_is_told(tags: dict[int, object]) -> None:
     assert not gps_of(PLACE | tags).hemispheres
+
+
+@pytest.mark.parametrize(
+    "latitude",
+    [(46.5, 0.0, 0.0), (46.0, 30.0, 0.0), (46.0, 29.0, 60.0), (46.5,), (46.0, 30.0)],
+)
+def test_notations_of_one_angle(latitude: tuple[float, ...]) -> None:
+    assert gps_of(PLACE | {1: "N", 2: latitude, 3: "E"}).latitude == pytest.approx(46.5, abs=0.01)
+
+
+@pytest.mark.parametrize("latitude", [(46.0, 84.12, 0.0), (46.0, 30.0, 2848.0), (46.5, 30.0, 0.0), (46.0, 30.5, 28.0)])
+def test_numbers_that_are_no_degrees_minutes_and_seconds_give_no_position(latitude: tuple[float, ...]) -> None:
+    """Decimals written as minutes, or a decimal left in front of its minutes, would be kilometres off."""
+    assert math.isnan(gps_of(PLACE | {1: "N", 2: latitude, 3: "E"}).latitude)
+
+
+@pytest.mark.parametrize(("south", "told"), [("S", True), ("", True)])
+def test_a_sign_of_the_degrees_is_that_of_the_angle(south: str, told: bool) -> None:
+    """Pillow has no signed rationals in GPS tags: other writers do."""
+    latitude, stated = _degrees((-33.0, 51.0, 36.0), south, LATITUDE_SIGNS)
+    assert (latitude, stated) == (pytest.approx(-33.86), told)
+
+
+@pytest.mark.parametrize(
+    ("stated", "far"),
+    [("TOKYO", "TOKYO"), ("Tokyo97", "Tokyo97"), ("NAD-27", "NAD-27"), ("WGS-84", ""), ("", ""), ("JGD2011", "")],
+)
+def test_a_datum_far_from_wgs84_is_kept(stated: str, far: str) -> None:
+    assert gps_of(PLACE | {1: "N", 3: "E", 18: stated}).datum == far

@@ -34,3 +34,16 @@ def test_pictures_of_users_are_opened_in_one_place() -> None:
 def test_files_of_users_are_split_at_line_feeds() -> None:
     split = {path for path, call in calls("text.splitlines")}
     assert split <= {"pipeline/engine/machine.py", "pipeline/app/batch/snakemake_process.py"}  # the kernel's; a log
+
+
+def test_numpy_archives_are_opened_in_one_place() -> None:
+    assert {path for path, _ in calls("np.load")} == {
+        "pipeline/splat/archives.py",
+        "pipeline/mvs/rendered_depths.py",  # single arrays, which are not compressed
+        "stages/sparse.py",
+    }
+
+
+def test_rasters_are_read_as_geotiffs_only() -> None:
+    read = {path for path, call in calls("rasterio.open") if len(call.args) == 1}
+    assert read == {"pipeline/surface/geotiff.py"}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.splat.formats import sog
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.levels import LevelNode, build_levels
@@ -126,3 +127,12 @@ def test_a_model_of_one_node_has_one_level(wall: Scene, tmp_path: Path) -> None:
     meta = read_meta(tmp_path)
     assert (meta["lodLevels"], meta["counts"], meta["filenames"]) == (1, [20], ["0_0/meta.json"])
     assert meta["tree"]["lods"] == {"0": {"file": 0, "offset": 0, "count": 20}}
+
+
+def test_a_level_that_is_a_link_is_not_written_through(wall: Scene, root: LevelNode, tmp_path: Path) -> None:
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "web").mkdir()
+    (tmp_path / "web/0_0").symlink_to(tmp_path / "secret")
+    with pytest.raises(UsageError, match="0_0 is a link"):
+        write_streamed_sog(tmp_path / "web", wall, root)
+    assert list((tmp_path / "secret").iterdir()) == []

@@ -12,6 +12,7 @@ from PIL import Image
 from rasterio.enums import ColorInterp, MaskFlags
 from rio_cogeo.cogeo import cog_info, cog_validate
 
+from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.surface.geotiff import (
     COLOURS,
     COLOURS_AS_JPEG,
@@ -22,6 +23,7 @@ from splatpipe.pipeline.surface.geotiff import (
     raster_file,
 )
 from splatpipe.pipeline.surface.grid import Grid, make_grid
+from splatpipe.pipeline.surface.surface_file import open_surface
 from splatpipe.pipeline.survey.frames import Frame
 
 STEP_M = 0.5 / 1024.0  # half of a height's step
@@ -220,3 +222,17 @@ def test_gdal_leaves_pyproj_and_the_environment_alone(tmp_path: Path) -> None:
     assert state() == before
     with pytest.raises(rasterio.errors.EnvError):
         rasterio.env.getenv()  # none of our settings remains after writing
+
+
+def test_a_virtual_raster_under_the_name_of_a_geotiff_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "secret.txt").write_text("SECRET KEY BYTES")
+    (tmp_path / "dsm.tif").write_text(
+        '<VRTDataset rasterXSize="4" rasterYSize="4"><GeoTransform>0,1,0,4,0,-1</GeoTransform>'
+        '<VRTRasterBand dataType="Byte" band="1" subClass="VRTRawRasterBand"><SourceFilename relativetoVRT="0">'
+        f"{tmp_path}/secret.txt</SourceFilename><PixelOffset>1</PixelOffset><LineOffset>4</LineOffset>"
+        "</VRTRasterBand></VRTDataset>"
+    )
+    with rasterio.open(tmp_path / "dsm.tif") as raster:
+        assert raster.read(1).tobytes() == b"SECRET KEY BYTES"  # GDAL alone does
+    with pytest.raises(SplatpipeError, match=r"dsm.tif cannot be read"):
+        open_surface(tmp_path / "dsm.tif")

@@ -10,7 +10,7 @@ from odd_sites import ALPS, Outcome, Site, Warnings, joined, orbit, place, strip
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.last_look import report_contradictions
+from splatpipe.pipeline.survey.last_look import _agreement, report_contradictions
 
 MINNESOTA = Origin(46.84, -91.99, 199.0)
 BARE = ("place",)
@@ -116,3 +116,76 @@ def test_climbs_that_the_barometer_does_not_know_are_told() -> None:
         for k, each in enumerate(site.photos())
     ]
     assert "heights above take-off" in place(site, flat).says
+
+
+def test_altitudes_that_sink_where_the_drone_climbs_are_told() -> None:
+    """AltitudeRef 1 above the sea: a fit whose scale comes from the horizontal positions takes them for noise."""
+    ring = orbit()
+    site = replace(
+        ring,
+        place=replace(ring.place, height_m=90.0),
+        centres=ring.centres + [[0.0, 0.0, 12.0 * (k % 2)] for k in range(len(ring.centres))],
+    )
+    assert place(site).says == ""
+    placed = place(site).placed
+    assert placed is not None
+    records = placed.positions.by_name
+    below = {name: {**record, "altitude_m": -record["altitude_m"]} for name, record in records.items()}
+    sunk = replace(placed, positions=replace(placed.positions, by_name=below))
+    found = " ".join(each.text for each in report_contradictions(sunk, Warnings()))
+    assert "above the sea instead of below it, 100% of the altitudes agree" in found
+
+
+def test_positions_of_the_photo_before_on_a_loop_turn_the_result_and_the_gimbal_tells() -> None:
+    """A loop takes the lag for a turn: by shape alone it fits."""
+    site = replace(orbit(16), tags=("angles", "height"))
+    compass = replace(site, compass_deg=5.0)
+    assert place(site).says == place(compass).says == ""
+    found = place(site, site.photos(np.roll(site.geodetic(), 1, axis=0)))
+    assert "each position is that of 1 photo earlier" in found.says
+    assert "off the headings of the gimbal" in found.says
+
+
+def test_a_receiver_slower_than_the_camera_is_told_and_a_hover_is_not() -> None:
+    site = replace(orbit(32), tags=("angles", "height"))
+    slow = place(site, site.photos(np.repeat(site.geodetic()[::4], 4, axis=0)))
+    assert "24 of 32 photos state the position of the photo before" in slow.says
+    assert "position-repeated" in slow.issues
+    hover = replace(site, centres=np.repeat(site.centres[::4], 4, axis=0), noise_m=0.0)
+    assert "photo before" not in place(hover).says
+
+
+def test_half_of_the_positions_at_another_place_is_told() -> None:
+    site = replace(orbit(32), tags=("angles", "height"))
+    away = site.geodetic() + [[0.0455 * (k % 2), 0.0, 0.0] for k in range(32)]
+    found = place(site, site.photos(away))
+    assert "two places, 5.0 km apart (16 and 16 photos)" in found.issues["position-two-places"]
+    assert found.stopped or "do not fit the others" in found.says
+
+
+def test_a_copied_coordinate_is_told() -> None:
+    site = replace(orbit(), tags=("angles", "height"))
+    copied = site.geodetic()
+    copied[:, 1] = copied[0, 1]
+    assert "one and the same longitude" in place(site, site.photos(copied)).issues["position-copied"]
+
+
+@pytest.mark.parametrize(("factor", "told"), [(157.0, True), (40.0, False)])
+def test_control_that_has_not_the_shape_of_the_model_is_told(factor: float, told: bool) -> None:
+    placed = place(orbit()).placed
+    assert placed is not None
+    points = [SimpleNamespace(role="control", surveyed=SimpleNamespace(z=1.0)) for _ in range(6)]
+    targets = SimpleNamespace(enu=np.arange(18.0).reshape(6, 3), sigmas=np.full((6, 3), 0.02))
+    control = SimpleNamespace(
+        survey=SimpleNamespace(name="gcp_list.txt", points=points),
+        site=SimpleNamespace(targets=targets),
+        sigma_factor=factor,
+    )
+    bent = replace(placed)
+    object.__setattr__(bent, "controlled", control)  # past the types that tests check
+    found = [each.text for each in _agreement(bent)]
+    assert found == (
+        ["The control points of gcp_list.txt agree with the photos to 3.1 m only, 15% of the width of their area."]
+        if told
+        else []
+    )

@@ -1,6 +1,6 @@
 """EXIF's position against XMP's, and what is told of positions that are none, before anything is computed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.exif import Exif, Gps
 from splatpipe.pipeline.survey.photo_positions import PositionList, read_positions
 from splatpipe.pipeline.survey.position_issues import find_position_issues
+from splatpipe.pipeline.survey.stated_positions import FilePlace
 
 ONE = Gps(47.8412, 13.5127, 520.0)
 
@@ -154,3 +155,62 @@ def test_altitudes_too_far_apart_for_datums_are_named_heights_above_takeoff() ->
     positions, issues = told(tested)
     assert {(each.altitude_m, each.altitude_source) for each in positions.positions} == {(560.0, "xmp")}
     assert "height above take-off" in issues["altitude-takeoff"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "cause"),
+    [
+        (lambda rise: 90.0 + rise, None),
+        (lambda rise: -90.0 - rise, "if they are above the sea instead of below it, 100% of the altitudes agree"),
+        (lambda rise: (90.0 + rise) / 0.3048, "if they are in feet, 100% of the altitudes agree"),
+        (lambda rise: 0.3048 * (90.0 + rise), "if they are in metres and read as feet, 100% of the altitudes agree"),
+        (lambda rise: 590.0 - rise, "the stated altitude falls by 10.0 m."),  # no place lies at -590 m
+        (lambda rise: 90.0 + 6.0 * rise, "the stated altitude climbs by 60.0 m."),
+    ],
+)
+def test_altitudes_climb_as_the_barometer_does(stated: Callable[[float], float], cause: str | None) -> None:
+    rises = [10.0 if k % 3 else 27.0 for k in range(12)]
+    photos = [photo(k, at(k, stated(rise)), {"RelativeAltitude": rise}) for k, rise in enumerate(rises)]
+    _, issues = told(photos)
+    assert cause in issues["altitude-climbs"] if cause else "altitude-climbs" not in issues
+
+
+def test_altitudes_of_a_poor_receiver_or_a_level_flight_say_nothing_against_the_barometer() -> None:
+    noise = np.random.default_rng(0).normal(0.0, 15.0, 12)
+    poor = [photo(k, at(k, 520.0 + noise[k]), {"RelativeAltitude": 40.0 + 12.0 * (k % 2)}) for k in range(12)]
+    climbing = [photo(k, at(k, 520.0 + 9.0 * k), {"RelativeAltitude": 40.0}) for k in range(12)]
+    for photos in (poor, climbing):
+        assert "altitude-climbs" not in told(photos)[1]
+
+
+def test_a_datum_far_from_wgs84_is_told() -> None:
+    _, issues = told([photo(k, replace(at(k), datum="TOKYO")) for k in range(8)])
+    assert "All 8 photos state the datum TOKYO in EXIF" in issues["position-datum"]
+
+
+@pytest.mark.parametrize(
+    ("height", "says"),
+    [(522.0, None), (473.0, "lie 47 m below the photos' own."), (8.0, "more than any two datums do")],
+)
+def test_altitudes_of_a_file_against_the_photos_own(height: float, says: str | None) -> None:
+    photos = [photo(k, at(k)) for k in range(8)]
+    places = {
+        each.name: FilePlace(at(k).latitude, at(k).longitude, height, "unknown", None, (None, None))
+        for k, each in enumerate(photos)
+    }
+    positions = read_positions(photos, places)
+    told = [each.message for each in find_position_issues(photos, positions) if each.code.startswith("altitude")]
+    assert (says is None and told == []) or (says is not None and says in told[0])
+
+
+def test_level_flights_whose_altitudes_have_the_wrong_sign_are_told() -> None:
+    """The climbs are between the flights; two that start at other heights would say nothing."""
+    for rises, says in (((10.0, 21.0, 27.0), True), ((10.0, 27.0), False)):
+        photos = []
+        for flight, rise in enumerate(rises):
+            for k in range(6):
+                each = photo(6 * flight + k, at(k, -60.0 - rise), {"RelativeAltitude": rise})
+                photos.append(replace(each, exif=replace(each.exif, time=f"2026-05-01T{10 + 2 * flight}:{k:02d}:00")))
+        positions, issues = told(photos)
+        assert len({each.flight for each in positions.positions}) == len(rises)
+        assert ("altitude-climbs" in issues) == says
