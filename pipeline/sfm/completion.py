@@ -86,6 +86,21 @@ def _adjust(
     rough: bool,
 ) -> None:
     """Run a global bundle adjustment through COLMAP's function, since the mapper's method holds the GIL throughout."""
+    adjustment = adjustment_options(options, coarseness(mapper.reconstruction.cameras.values()), rough=rough)
+    mapper.observation_manager.filter_observations_with_negative_depth()
+    pycolmap.bundle_adjustment(mapper.reconstruction, adjustment, stop)
+
+
+def adjustment_options(
+    options: pycolmap.IncrementalPipelineOptions, coarse: float, *, rough: bool
+) -> pycolmap.BundleAdjustmentOptions:
+    """Return options of an adjustment on one thread: to convergence with a robust loss, or a rough one without.
+
+    Args:
+        options: The mapper's.
+        coarse: The cameras' ``coarseness``.
+        rough: Before wrong observations are filtered.
+    """
     adjustment = options.get_global_bundle_adjustment()
     solver = adjustment.ceres.solver_options
     solver.num_threads = 1
@@ -94,6 +109,5 @@ def _adjust(
     solver.max_num_iterations = ROUGH_ITERATIONS if rough else FINE_ITERATIONS
     if not rough:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        adjustment.ceres.loss_function_scale = ROBUST_PX * coarseness(mapper.reconstruction.cameras.values())
-    mapper.observation_manager.filter_observations_with_negative_depth()
-    pycolmap.bundle_adjustment(mapper.reconstruction, adjustment, stop)
+        adjustment.ceres.loss_function_scale = ROBUST_PX * coarse
+    return adjustment

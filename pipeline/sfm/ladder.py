@@ -87,6 +87,7 @@ def run_ladder(capture: MappingInput, found: MappingResult, config: SparseConfig
         ("more pairs", with_more_pairs),
         ("stronger keypoints", with_stronger_keypoints),
     ]
+    mapped = found
     for name, rung in rungs:
         left = unplaced(found)
         if not left:
@@ -98,7 +99,18 @@ def run_ladder(capture: MappingInput, found: MappingResult, config: SparseConfig
         gained = len(left) - len(unplaced(found))
         report.note(f"Ladder, {name}: {gained} of {len(left)} remaining photos placed.")
         found = replace(found, rungs=(*before.rungs, {**_row(name, before, found), "cpu_s": round(cpu_s, 2)}))
-    return found
+    return _completed(work, mapped, found)
+
+
+def _completed(work: LadderContext, mapped: MappingResult, found: MappingResult) -> MappingResult:
+    """Adjust everything once to the photos that the rungs placed; the model as mapped if that would be worse."""
+    added = set(found.model.reg_image_ids()).difference(mapped.model.reg_image_ids())
+    if not added:
+        return found
+    work.report_progress(len(added), len(added), "adjusting everything")
+    before = _on(mapped, found)
+    grown = _adjusted(work, before, found.model, added, everything=True)
+    return mapped if grown is before else grown
 
 
 def unplaced(found: MappingResult) -> list[int]:
@@ -194,8 +206,12 @@ def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
     model, added = found.model, set[int]()
     for _ in range(ROUNDS):
         left = [number for number in unplaced(found) if number not in added]
-        placements = _placements(work, found.verified, model, left)
-        model = _extended(model, found.verified, placements) if placements else pycolmap.Reconstruction(model)
+        structure = read_structure(model)
+        placements = _placements(work, found.verified, model, structure, left)
+        if placements:
+            model = _extended(model, found.verified, structure, placements)
+        else:
+            model = pycolmap.Reconstruction(model)
         growth = ModelMapper(found.database, model, work.options)
         growth.triangulate(sorted(placements))
         fresh = sorted(placements) or growth.place_by_pairs(left)
@@ -210,9 +226,8 @@ def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
 
 
 def _placements(
-    work: LadderContext, verified: ViewGraph, model: Model, left: Collection[int]
+    work: LadderContext, verified: ViewGraph, model: Model, structure: Structure, left: Collection[int]
 ) -> dict[int, PoseEstimate]:
-    structure = read_structure(model)
     counts = {number: len(verified.keypoints[number]) for number in model.reg_image_ids()}
     rows = structure.rows(counts)
     cameras = cameras_of(model)
@@ -233,9 +248,8 @@ def _placements(
     return placements
 
 
-def _extended(model: Model, verified: ViewGraph, placements: Mapping[int, PoseEstimate]) -> Model:
+def _extended(model: Model, verified: ViewGraph, structure: Structure, placements: Mapping[int, PoseEstimate]) -> Model:
     """Return the model with more photos and their observations of its points."""
-    structure = read_structure(model)
     tracks = [list(track) for track in structure.tracks]
     cameras = cameras_of(model)
     poses = poses_of(model)
@@ -270,7 +284,9 @@ def _joined(work: LadderContext, found: MappingResult) -> MappingResult:
     return replace(found, others=tuple(remaining))
 
 
-def _adjusted(work: LadderContext, found: MappingResult, model: Model, added: Collection[int]) -> MappingResult:
+def _adjusted(
+    work: LadderContext, found: MappingResult, model: Model, added: Collection[int], everything: bool = False
+) -> MappingResult:
     """Adjust a model with new photos and drop those whose pose does not hold.
 
     Args:
@@ -278,6 +294,7 @@ def _adjusted(work: LadderContext, found: MappingResult, model: Model, added: Co
         found: The result before.
         model: The model with the new photos; changed in place.
         added: The new photos.
+        everything: Adjust the other photos too, with all of their matches.
 
     Returns:
         The result with the new model, or ``found`` itself if no new photo holds or the model got worse.
@@ -286,7 +303,12 @@ def _adjusted(work: LadderContext, found: MappingResult, model: Model, added: Co
     before, error = sum(observations(found.model, old).values()), mean_error_px(found.model)
     kept = sorted(added)
     while kept:
-        complete(model, found.database, incremental_options(work.options), pycolmap.CancellationToken(), False)
+        if everything:
+            complete(model, found.database, incremental_options(work.options), pycolmap.CancellationToken(), False)
+        else:
+            growth = ModelMapper(found.database, model, work.options)
+            growth.adjust(kept)
+            growth.end()
         bad = _not_held(found.verified, model, kept)
         if not bad:
             break

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from splatpipe.pipeline.sfm.completion import MIN_MATCHES
+from splatpipe.pipeline.sfm.coarseness import coarseness
+from splatpipe.pipeline.sfm.completion import MIN_MATCHES, adjustment_options
 from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options
 
 MIN_OBSERVATIONS = 15  # of an added photo, after the adjustment
@@ -53,9 +54,35 @@ class ModelMapper:
         self._mapper.complete_and_merge_tracks(self._triangulation)
         return placed
 
+    def adjust(self, photos: Collection[int]) -> None:
+        """Adjust some photos and the points that they observe to the other photos, which stay; then filter points.
+
+        The camera of a photo is adjusted too if no other photo has it.
+        """
+        moved = sorted(photos)
+        for rough in (True, False):
+            options = adjustment_options(self._options, coarseness(self._model.cameras.values()), rough=rough)
+            problem = _only(self._model, moved)
+            pycolmap.create_default_bundle_adjuster(options, problem, self._model).solve()
+            self._mapper.filter_points(self._options.get_mapper())
+        self._mapper.complete_and_merge_tracks(self._triangulation)
+
     def end(self) -> None:
         """Detach the mapper from the model, keeping all of it."""
         self._mapper.end_reconstruction(False)
+
+
+def _only(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.BundleAdjustmentConfig:
+    """The parameters of some photos: their poses, points, and the cameras that no other photo has."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in photos:
+        config.add_image(number)
+        for keypoint in model.images[number].get_observation_points2D():
+            config.add_variable_point(keypoint.point3D_id)
+    others = set(model.reg_image_ids()).difference(photos)
+    for camera in sorted({model.images[number].camera_id for number in others}):
+        config.set_constant_cam_intrinsics(camera)
+    return config
 
 
 def observations(model: pycolmap.Reconstruction, photos: Collection[int]) -> dict[int, int]:
