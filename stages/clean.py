@@ -21,6 +21,7 @@ from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduc
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import as_trained
+from splatpipe.pipeline.splat.archives import open_archive
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat_parts
@@ -76,7 +77,7 @@ def _clean(gaussians: Gaussians, inputs: Inputs, folder: Path, report: Reporter)
             _, photo, mask = reduced_view(views[index], SEEN_MEGAPIXELS)
             np.savez(path, photo=photo, masks=np.zeros((0, *photo.shape[:2]), np.bool_) if mask is None else mask[None])
             return photo, mask
-        with np.load(path) as arrays:
+        with open_archive(path) as arrays:
             masks = arrays["masks"]
             return arrays["photo"], masks[0] if len(masks) else None
 
