@@ -169,20 +169,18 @@ def test_report_film_files_and_web_viewer_work_in_their_sandbox(
     out = linked_copy(demo_run, tmp_path / "out")
     answered("export", out, "--format", "web")
     with serving(out) as server:
-        watched = open_page(server.page(), 390, 400)  # drawn in software
-        page = watched.page
-        for name in ("web/index.html", "viewer.html"):
-            page.goto(server.file(name))
-            page.evaluate("splatpipe.ready")
-            assert page.evaluate("origin") == "null"
-            page.wait_for_load_state("networkidle")  # its photos follow; leaving would abort them
-        with page.expect_download() as saved:
-            page.keyboard.press("x")  # the picture of the view
+        shown = [open_page(server.file(name), 390, 400) for name in ("web/index.html", "viewer.html")]  # in software
+        for watched in shown:
+            watched.page.evaluate("splatpipe.ready")
+            assert watched.page.evaluate("origin") == "null"
+        with shown[1].page.expect_download() as saved:
+            shown[1].page.keyboard.press("x")  # the picture of the view
         assert saved.value.suggested_filename.endswith(".png")
-        page.goto(server.file("report.html"))
+        report = open_page(server.file("report.html"))
+        page = report.page
         assert page.locator("h1").count() == 1
         assert page.evaluate("[...document.images].every(image => image.naturalWidth > 0)")
-        assert watched.errors == []
+        assert [watched.errors for watched in (*shown, report)] == [[], [], []]
         with page.expect_download() as saved:
             page.locator("a[href='splat.ply']").first.click()
         assert Path(saved.value.path()).read_bytes() == (out / "splat.ply").read_bytes()
