@@ -18,10 +18,8 @@ MM_PER_FOCAL_PLANE_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF 2.32, Foc
 BELOW_SEA_LEVEL = (1, 3)  # GPSAltitudeRef: below sea level; EXIF 3.0 adds 3, below the ellipsoid
 NO_FIX = "V"  # GPSStatus of a receiver without a fix
 # Names of datums that are 50 m or more off WGS84; EXIF 2.32 itself names TOKYO. Others are metres off, or no datum.
-FAR_DATUMS = tuple(
-    "TOKYO NAD27 NAD1927 ED50 OSGB PULKOVO AGD66 AGD84 DHDN POTSDAM CH1903".split()
-    + "NTF GCJ02 BD09 BEIJING XIAN INDIAN ARC19 CAPE".split()
-)
+FAR_DATUMS: tuple[str, ...] = ("TOKYO", "NAD27", "NAD1927", "ED50", "OSGB", "PULKOVO", "AGD66", "AGD84", "DHDN")
+FAR_DATUMS += ("POTSDAM", "CH1903", "NTF", "GCJ02", "BD09", "BEIJING", "XIAN", "INDIAN", "ARC19", "CAPE")
 SIXTY = 60.0  # minutes in a degree; 60 itself is what 59.9999 is rounded to
 WHOLE = 1e-6  # by which a whole number may be off: fractions of large terms
 LATITUDE_SIGNS = {"N": 1.0, "S": -1.0}  # first letters of GPSLatitudeRef; some programs write whole words
