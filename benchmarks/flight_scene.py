@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
+from splatpipe.pipeline.photos.camera_groups import DEFAULT_FOCAL
 from splatpipe.pipeline.sfm.footprints import StatedPoses
 from splatpipe.pipeline.sfm.pairs import Layout, Pair, select_pairs
 
@@ -224,31 +225,76 @@ def _wrong(
     return np.column_stack([tried[near], free[1][pick[near]]])
 
 
-def write_database(flight: SyntheticFlight, path: Path, seed: int) -> int:
-    """Write what matching would produce; return the number of pairs with matches."""
+def anonymous(flight: SyntheticFlight, seed: int) -> SyntheticFlight:
+    """Return the flight with its photos in a random order, as if their names said nothing."""
+    order = np.random.default_rng(seed).permutation(len(flight.centres_m))
+    rows = [np.arange(len(flight.photo))[flight.rows(number)] for number in order.tolist()]
+    photo = np.repeat(np.arange(len(order)), [len(mine) for mine in rows])
+    taken = np.concatenate(rows)
+    turned = flight.centres_m[order], flight.cam_from_enu[order]
+    return SyntheticFlight(*turned, flight.points_m, photo, flight.point[taken], flight.places[taken])
+
+
+def write_features(flight: SyntheticFlight, path: Path, seed: int) -> None:
+    """Write keypoints with descriptors: those of one point differ by noise, those of two points by all."""
+    rng = np.random.default_rng(seed)
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        _write_photos(flight, database, guessed())
+        for number in range(1, len(flight.centres_m) + 1):
+            drawn = [
+                np.random.default_rng(point).random(128) for point in flight.point[flight.rows(number - 1)].tolist()
+            ]
+            values = np.sqrt(np.array(drawn).reshape(-1, 128) + 0.1 * rng.random((len(drawn), 128)))
+            values *= 512.0 / np.linalg.norm(values, axis=1, keepdims=True)
+            stored = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, np.rint(values).astype(np.uint8))
+            database.write_descriptors(number, stored)
+
+
+def guessed() -> pycolmap.Camera:
+    """Return the camera of photos that do not state a focal length, as `ingest` guesses it."""
+    parameters = [DEFAULT_FOCAL * WIDTH, WIDTH / 2, HEIGHT / 2, 0.0]
+    return pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=parameters)
+
+
+def stated() -> pycolmap.Camera:
+    """Return the camera of photos whose metadata state a focal length that is a little wrong."""
     prior = lens(FOCAL_OFF)
     prior.has_prior_focal_length = True
+    return prior
+
+
+def write_database(flight: SyntheticFlight, path: Path, seed: int, camera: pycolmap.Camera | None = None) -> int:
+    """Write what matching would produce, with the stated camera or another; return the number of pairs with matches."""
+    prior = camera or stated()
+    known = prior.has_prior_focal_length
     pinhole = prior.calibration_matrix()
     written = 0
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        database.write_camera(prior, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(prior.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
-        for number in range(1, len(flight.centres_m) + 1):
-            image = pycolmap.Image(name=f"{number - 1:05d}.jpg", camera_id=1, image_id=number)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=number, rig_id=1)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            places = flight.places[flight.rows(number - 1)]
-            affine = np.tile([1.0, 0.0, 0.0, 1.0], (len(places), 1))
-            database.write_keypoints(number, np.hstack([places, affine]).astype(np.float32))
+        _write_photos(flight, database, prior)
         for (i, j), found, fundamental in matches(flight, choose_pairs(flight, seed), seed):
             geometry = pycolmap.TwoViewGeometry()
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-            geometry.F, geometry.E = fundamental, pinhole.T @ fundamental @ pinhole
+            configurations = pycolmap.TwoViewGeometryConfiguration
+            geometry.config = configurations.CALIBRATED if known else configurations.UNCALIBRATED
+            geometry.F = fundamental
+            if known:
+                geometry.E = pinhole.T @ fundamental @ pinhole
             geometry.inlier_matches = found.astype(np.uint32)
             database.write_two_view_geometry(i + 1, j + 1, geometry)
             written += 1
     return written
+
+
+def _write_photos(flight: SyntheticFlight, database: pycolmap.Database, camera: pycolmap.Camera) -> None:
+    database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=1)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+    for number in range(1, len(flight.centres_m) + 1):
+        image = pycolmap.Image(name=f"{number - 1:05d}.jpg", camera_id=1, image_id=number)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame(frame_id=number, rig_id=1)
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)
+        places = flight.places[flight.rows(number - 1)]
+        affine = np.tile([1.0, 0.0, 0.0, 1.0], (len(places), 1))
+        database.write_keypoints(number, np.hstack([places, affine]).astype(np.float32))

@@ -3,8 +3,9 @@
 ``before`` is the pipeline's former incremental mapping, ``plain`` COLMAP's with its own options, ``ours`` and
 ``global`` the pipeline's mappers, and ``oracle`` the adjustment of a synthetic flight from its true cameras and tracks:
 the error that noise alone causes. All run on one thread. ``pairs`` chooses the pairs of a synthetic flight as the
-pipeline does, by position and by appearance. Figures are written to ``FOLDER/HOW.json``, the largest model to
-``FOLDER/HOW``.
+pipeline does, by position and by appearance. ``whole`` is all of `reconstruct`, with its judging and further mappings;
+descriptors lie beside the database, in ``features.db``. Figures are written to ``FOLDER/HOW.json``, the largest model
+to ``FOLDER/HOW``.
 """
 
 from __future__ import annotations
@@ -24,8 +25,13 @@ from flight_scene import SyntheticFlight, choose_pairs, lens, make_flight
 from jaxtyping import Float64
 from tables import Row
 
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.photos.photo_list import PhotoList
+from splatpipe.pipeline.sfm.capture import MappingInput
 from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
+from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.pairs import connect, nearest
+from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
 NEIGHBOURS = 20  # the pipeline's default
@@ -72,6 +78,8 @@ def _map(how: str, database: Path, made: list[int]) -> list[pycolmap.Reconstruct
     with tempfile.TemporaryDirectory() as scratch:
         if how == "oracle":
             return [oracle(make_flight(*made))]
+        if how == "whole":
+            return [reconstruct(_capture(database, Path(scratch)), SparseConfig(), Silent()).model]
         if how in ("ours", "global"):
             mapper = map_global if how == "global" else map_incremental
             return mapper(database, Path(scratch), MappingOptions(), lambda *_: None)
@@ -83,6 +91,30 @@ def _map(how: str, database: Path, made: list[int]) -> list[pycolmap.Reconstruct
             options.min_model_size = 3
         found = pycolmap.incremental_mapping(database, scratch, scratch, options)
         return sorted(found.values(), key=lambda model: -model.num_reg_images())
+
+
+def _capture(database: Path, scratch: Path) -> MappingInput:
+    """Return the input of a capture whose photos state nothing: names, positions and focal lengths are not used."""
+    features = database.with_name("features.db")
+    guess: JSON = {"has_prior": False, "focal_source": "guess"}
+    none = np.zeros((0, 3), np.uint8)
+    return MappingInput(database, features, none, PhotoList(()), scratch, scratch, (), (guess,), scratch)
+
+
+class Silent:
+    """A reporter to nobody."""
+
+    def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
+        """Ignore progress."""
+
+    def metric(self, name: str, value: int | float, step: int | None = None) -> None:
+        """Ignore a metric."""
+
+    def note(self, message: str) -> None:
+        """Ignore a note."""
+
+    def warning(self, message: str, hint: str = "") -> None:
+        """Ignore a warning."""
 
 
 def oracle(flight: SyntheticFlight) -> pycolmap.Reconstruction:

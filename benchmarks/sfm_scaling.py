@@ -6,7 +6,8 @@ the true tracks from the true cameras leaves for the same noise. Plain COLMAP ru
 photos. Pair selection is measured separately, with descriptors generated on demand.
 
 ``--captures DATABASE …`` maps real captures instead: databases of the stage `matches`, or folders of runs. The exponent
-is the slope of a line through log CPU seconds over log photos.
+is the slope of a line through log CPU seconds over log photos. ``--nameless 290`` shuffles a flight's photos, takes
+their positions and focal length away, and times all of `reconstruct`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from flight_scene import GSD_M, make_flight, write_database
+from flight_scene import GSD_M, anonymous, guessed, make_flight, write_database, write_features
 from mapped_apart import COLUMNS, centre_errors, centres, run_apart
 from sfm_speed import measure
 from tables import Row, print_table
@@ -39,22 +40,26 @@ PAIRS = {
 }
 
 
-def fly(count: int, seed: int, hows: Sequence[str], folder: Path) -> list[Row]:
+def fly(count: int, seed: int, hows: Sequence[str], folder: Path, nameless: bool) -> list[Row]:
     """Generate a flight and map it in each of the ways, with the noise's own error for comparison."""
     flight = make_flight(count, seed)
     database = folder / "database.db"
-    write_database(flight, database, seed)
+    if nameless:
+        flight = anonymous(flight, seed)
+        write_features(flight, folder / "features.db", seed)
+    write_database(flight, database, seed, guessed() if nameless else None)
     true = flight.centres_m
     del flight
     rows = []
-    for how in ("oracle", *hows):
+    for how in hows if nameless else ("oracle", *hows):
         row = run_apart(how, database, folder, count, seed)
         row |= {"capture": "flight", "photos": count}
         if row["placed"] > 2:
             numbers, found = centres(pycolmap.Reconstruction(folder / how))
             errors, _ = centre_errors(found, true[np.array(numbers) - 1])
             row["centres_gsd"] = float(np.sqrt(np.mean(errors**2))) / GSD_M
-            row["over_noise"] = row["centres_gsd"] / (rows[0]["centres_gsd"] if rows else row["centres_gsd"])
+            if not nameless:
+                row["over_noise"] = row["centres_gsd"] / (rows[0]["centres_gsd"] if rows else row["centres_gsd"])
         rows.append(row)
         print(json.dumps(row), flush=True)
     return rows
@@ -72,6 +77,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--photos", nargs="*", type=int, default=[250, 500, 1000, 2000])
     parser.add_argument("--captures", nargs="+", type=Path)
+    parser.add_argument("--nameless", nargs="+", type=int, default=[])
     parser.add_argument("--mappers", nargs="+", choices=["ours", "global"], default=["ours"])
     parser.add_argument("--plain-up-to", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
@@ -81,11 +87,15 @@ def main() -> None:
     if wanted.captures:
         rows = [measure(path, how, {}) for path in wanted.captures for how in wanted.mappers]
         rows.sort(key=lambda row: row["photos"])
+    elif wanted.nameless:
+        for count in wanted.nameless:
+            with tempfile.TemporaryDirectory() as folder:
+                rows += fly(count, wanted.seed, ["whole"], Path(folder), nameless=True)
     else:
         for count in wanted.photos:
             hows = [*wanted.mappers, *(["plain"] if count <= wanted.plain_up_to else [])]
             with tempfile.TemporaryDirectory() as folder:
-                rows += fly(count, wanted.seed, hows, Path(folder))
+                rows += fly(count, wanted.seed, hows, Path(folder), nameless=False)
                 rows.append({**run_apart("pairs", Path(folder), Path(folder), count, wanted.seed), "photos": count})
     print_table("Mapping, one thread", [row for row in rows if row["how"] != "pairs"], FLOWN)
     chosen = [row for row in rows if row["how"] == "pairs"]

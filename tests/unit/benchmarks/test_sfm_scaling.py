@@ -60,6 +60,23 @@ def test_a_fifth_of_the_verified_matches_is_wrong_and_near_the_epipolar_line(
     assert np.percentile(off, 95) < 2.0 * scene.EPIPOLAR_PX  # the lens bends the true ones off a pinhole's lines
 
 
+def test_a_nameless_flight_is_the_same_flight_in_another_order(flight: scene.SyntheticFlight, tmp_path: Path) -> None:
+    other = scene.anonymous(flight, 3)
+    assert not np.array_equal(other.centres_m, flight.centres_m)
+    assert np.array_equal(np.sort(other.centres_m[:, 0]), np.sort(flight.centres_m[:, 0]))
+    for number in (0, 7):
+        twin = int(np.flatnonzero((flight.centres_m == other.centres_m[number]).all(axis=1))[0])
+        assert np.array_equal(other.places[other.rows(number)], flight.places[flight.rows(twin)])
+    few = scene.anonymous(scene.make_flight(4, 0, 60), 0)
+    scene.write_database(few, tmp_path / "database.db", 0, scene.guessed())
+    scene.write_features(few, tmp_path / "features.db", 0)
+    assert not read_verified(tmp_path / "database.db").cameras[1].has_prior_focal_length
+    with pycolmap.Database.open(tmp_path / "features.db") as database:
+        first, second = (np.asarray(database.read_descriptors(number).data, float) for number in (1, 2))
+    _, ours, theirs = np.intersect1d(few.point[few.rows(0)], few.point[few.rows(1)], return_indices=True)
+    assert len(ours) > 10 and np.array_equal((first[ours] @ second.T).argmax(axis=1), theirs)
+
+
 def test_pairs_per_photo_are_bounded_for_any_number_of_photos(flight: scene.SyntheticFlight) -> None:
     small = 2 * len(scene.choose_pairs(flight, 0)) / COUNT
     large = 2 * len(scene.choose_pairs(scene.make_flight(90, 0, 10), 0)) / 90
