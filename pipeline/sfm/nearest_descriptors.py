@@ -5,8 +5,8 @@ the cells of their words; what looks like a match there is compared with everyth
 is one that comparing everything with everything would give; a descriptor whose neighbour is in none of its cells has
 none (1 % of the matches).
 
-Descriptors and words are whole numbers of length 512 at most a few more: their products stay below 2**24, exact in
-float32 whatever the order of summation. So matches are the same for any linear algebra library and instruction set.
+Descriptors and words are whole numbers of 8 bits: their products stay below 2**23, exact in float32 whatever the order
+of summation. So matches are the same for any linear algebra library and instruction set.
 Of equal neighbours the first is taken; the ratio test then rejects it.
 """
 
