@@ -17,8 +17,7 @@ from splatpipe.pipeline.sfm.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.reduction import copy_photos
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
-TILE = 16  # photos; pairs are matched tile by tile, so that a block needs the descriptors of few photos
-PAIRS_A_PROCESS = 12  # at least: a process takes half a second to start and rebuilds its photos' search trees
+PAIRS_A_PROCESS = 12  # at least: a process takes half a second to start
 MATCHER = "splatpipe.pipeline.sfm.matching_process"
 
 
@@ -46,9 +45,9 @@ def look_alike(features: Path, seed: int) -> Costs:
 
 
 def match_pairs(features: Path, work: Path, pairs: Sequence[Pair], seed: int, threads: int, report: Reporter) -> None:
-    """Match and verify pairs in up to ``threads`` single-threaded processes.
+    """Match and verify pairs in up to ``threads`` single-threaded processes, which hold two photos' descriptors each.
 
-    Threads of one process must not match concurrently: the linear algebra in pycolmap's wheels (OpenBLAS built for
+    Threads of one process must not verify concurrently: the linear algebra in pycolmap's wheels (OpenBLAS built for
     one thread, without locks) occasionally gives two of them the same buffer, and both pairs lose many matches.
 
     Args:
@@ -59,9 +58,9 @@ def match_pairs(features: Path, work: Path, pairs: Sequence[Pair], seed: int, th
         threads: Maximum number of concurrent processes.
         report: Receives progress.
     """
-    tiled = sorted(pairs, key=lambda pair: (pair[0] // TILE, pair[1] // TILE, pair))
-    count = max(1, min(threads, len(tiled) // PAIRS_A_PROCESS))
-    shares = [tiled[len(tiled) * k // count : len(tiled) * (k + 1) // count] for k in range(count)]
+    ordered = sorted(pairs, key=lambda pair: (pair[1], pair[0]))  # a process prepares each second photo once
+    count = max(1, min(threads, len(ordered) // PAIRS_A_PROCESS))
+    shares = [ordered[len(ordered) * k // count : len(ordered) * (k + 1) // count] for k in range(count)]
     places = [work.with_name(f"{work.stem}-{k}.db") for k in range(count)]
     try:
         for place, share in zip(places, shares, strict=True):
@@ -87,15 +86,12 @@ def _list_of(place: Path) -> Path:
 
 
 def _write_share(features: Path, place: Path, share: Sequence[Pair]) -> None:
-    """Write the database of one process: the photos of its pairs, named by number so that lists need no quoting."""
+    """Write the database of one process: the photos of its pairs."""
     wanted = sorted({number + 1 for pair in share for number in pair})
     with pycolmap.Database.open(features) as source, pycolmap.Database.open(place) as database:
         copy_photos(source, database, set(wanted))
         for number in wanted:
             database.write_descriptors(number, source.read_descriptors(number))
-        for image in database.read_all_images():
-            image.name = str(image.image_id)
-            database.update_image(image)
     write_file(_list_of(place), "".join(f"{i + 1} {j + 1}\n" for i, j in share))
 
 

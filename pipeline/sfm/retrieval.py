@@ -45,10 +45,17 @@ def codebook(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Fl
     if len(sample) == 0:
         return np.zeros((1, 128), np.float32)
     choice = np.random.default_rng(seed).permutation(len(sample))[:WORDS]
-    words = sample[np.sort(choice)]
-    for _ in range(ROUNDS):
-        labels = assign(sample, words)
-        sums, counts = _sums(sample.astype(np.int64), labels, len(words))
+    return refine_words(sample, sample[np.sort(choice)], ROUNDS)
+
+
+def refine_words(
+    sample: Float32[np.ndarray, "n 128"], words: Float32[np.ndarray, "words 128"], rounds: int
+) -> Float32[np.ndarray, "words 128"]:
+    """Move words to the rounded means of the descriptors that are nearest to them: rounds of k-means."""
+    words = words.copy()
+    whole = sample.astype(np.int64)
+    for _ in range(rounds):
+        sums, counts = _sums(whole, assign(sample, words), len(words))
         filled = counts > 0
         words[filled] = np.rint(sums[filled] / counts[filled, None]).astype(np.float32)
     return words
