@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from splatpipe.pipeline.photos.dataset import MASKS, SKY_MASKS, image_path, mask
 from splatpipe.pipeline.photos.jpeg_strips import write_jpeg
 from splatpipe.pipeline.photos.names import list_names, match_names
 from splatpipe.pipeline.photos.photo_list import Photo, decode_mask, decode_sky_mask, open_decoded
-from splatpipe.pipeline.photos.resampling import resample, resampled_strips
+from splatpipe.pipeline.photos.resampling import Places, kept_places, resample, resampled_strips
 
 SHAPE_TOLERANCE = 0.01  # between the aspect ratios of a photo and of its camera in the model
 WHITE = 254.5  # of 255: a pixel counts only if no part of it is masked, and is sky only if all of it is sky
@@ -123,15 +124,37 @@ def pinhole_camera(source: pycolmap.Camera, max_megapixels: float, number: int) 
     return camera
 
 
-def write_view(view: RegisteredPhoto, inputs: Inputs, dataset: Path) -> None:
+def with_places(placed: Sequence[RegisteredPhoto]) -> Iterator[tuple[RegisteredPhoto, Places | None]]:
+    """Yield the photos by camera, each with its camera's places, which are computed once if several photos share them.
+
+    Only the places of the photos that are being worked on are held.
+    """
+    photos = Counter(view.target.camera_id for view in placed)
+    of, places = 0, None
+    for view in sorted(placed, key=lambda view: view.target.camera_id):
+        if view.target.camera_id != of:
+            of = view.target.camera_id
+            places = kept_places(view.source, view.target) if photos[of] > 1 else None
+        yield view, places
+
+
+def write_view(view: RegisteredPhoto, places: Places | None, inputs: Inputs, dataset: Path) -> None:
+    """Write a photo and its masks, undistorted.
+
+    Args:
+        view: The photo.
+        places: Those of its cameras, or None.
+        inputs: Of the stage.
+        dataset: The folder of the dataset.
+    """
     part = inputs["ingest.photos"]
     photo = open_decoded(view.photo, part, inputs.photos_dir)
-    strips = resampled_strips(photo.rows, view.source, view.target)
+    strips = resampled_strips(photo.rows, view.source, view.target, places)
     _write(image_path(dataset, view.photo.name), (strip[:, :, ::-1] for strip in strips), view.target.height)
     for folder, decoded in ((MASKS, decode_mask), (SKY_MASKS, decode_sky_mask)):
         mask = decoded(view.photo, part)
         if mask is not None:
-            white = resample(mask, view.source, view.target) > WHITE
+            white = resample(mask, view.source, view.target, places) > WHITE
             _write(mask_path(dataset, view.photo.name, folder), [white.astype(np.uint8) * 255], len(white))
 
 
