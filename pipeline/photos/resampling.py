@@ -174,7 +174,7 @@ def _places(source: pycolmap.Camera, target: pycolmap.Camera, top: int, bottom: 
 
 
 def _sample_places(places: Places, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """OpenCV's maps of the samples of target rows: (rows*samples, width*samples) each.
+    """OpenCV's maps of the samples of target rows, the caller's own: (rows*samples, width*samples) each.
 
     The distortion is evaluated at the pixels' centres, plus one pixel on every side, and interpolated linearly between
     them, where it is practically linear.
@@ -183,6 +183,8 @@ def _sample_places(places: Places, samples: int) -> tuple[np.ndarray, np.ndarray
     for grid in places:
         if samples > 1:
             size = grid.shape[1] * samples, grid.shape[0] * samples
-            grid = cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)
-        maps.append(grid[samples:-samples, samples:-samples].copy())
+            finer = np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR))
+        else:
+            finer = grid.copy()  # the caller moves the maps, and these places may be kept
+        maps.append(finer[samples:-samples, samples:-samples])
     return maps[0], maps[1]
