@@ -27,6 +27,8 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat_parts
 
+FEW_PHOTOS = 12  # up to this many, floaters are compared with all, of more, with some: most photos show a floater
+
 
 def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
     """Write `model.ply` (a copy of the trained model if cleaning is switched off) and `cleaned.json`.
@@ -85,7 +87,7 @@ def _clean(config: CleanConfig, gaussians: Gaussians, inputs: Inputs, folder: Pa
     compared = None
     if config.photos == "covering":
         points, seen = load_points_and_tracks(inputs["undistort.dataset"])
-        compared = covering_photos([seen[view.camera.name] for view in views], len(points.xyz))
+        compared = covering_photos([seen[view.camera.name] for view in views], len(points.xyz), FEW_PHOTOS)
     photos = TrainingPhotos(
         [reduced_camera(view.camera, SEEN_MEGAPIXELS) for view in views],
         options,

@@ -9,12 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int64
 
-ALL_UP_TO = 12  # photos; of n, the geometric mean of this and n suffices: each shows more of what others show, too
 COVERED = 0.9  # least share of the points that the chosen photos show; the rest, only one or two photos show at all
 
 
-def covering_photos(seen: Sequence[Int64[np.ndarray, " _"]], points: int) -> list[int]:
-    """Choose photos that show the scene: √(12 n) of n, and more until they show nine tenths of its points.
+def covering_photos(seen: Sequence[Int64[np.ndarray, " _"]], points: int, few: int) -> list[int]:
+    """Choose photos that show the scene: √(few n) of n, and more until they show nine tenths of its points.
+
+    The more photos there are, the more of what one shows others show, too.
 
     One after the other, the photo is chosen whose points the chosen ones show least: a point that k of them show counts
     1 / (1 + k)², so that most points are shown by several. Among equals, the first is chosen.
@@ -22,13 +23,14 @@ def covering_photos(seen: Sequence[Int64[np.ndarray, " _"]], points: int) -> lis
     Args:
         seen: For each photo the rows of the points that it shows, ascending.
         points: Number of points.
+        few: Number of photos up to which all are chosen.
 
     Returns:
         Indices of the chosen photos, ascending.
     """
     shown = np.zeros(points, np.int64)
     needed = COVERED * np.unique(np.concatenate([*seen, np.zeros(0, np.int64)])).size
-    least = math.ceil(math.sqrt(min(len(seen), ALL_UP_TO) * len(seen)))
+    least = math.ceil(math.sqrt(min(len(seen), few) * len(seen)))
 
     def gain(photo: int) -> float:
         return float((1.0 / np.square(1.0 + shown[seen[photo]])).sum())
