@@ -23,7 +23,7 @@ from splatpipe.pipeline.photos.dataset import View
 WIDER = 1.25  # search this many times nearer than the sparse points: thin places have no points yet
 NEIGHBOURS = 8  # photos that a photo is matched with, and whose depths may confirm its own
 CELLS = 64  # across a photo's width; a cell with a sparse point gets no dense one
-FEW_PHOTOS = 24  # up to this many, all are used, of more, some: depths that three photos confirm need overlap
+FEW_PHOTOS = 48  # up to this many, all are used, of more, some: depths that three photos confirm need overlap
 GROWTH = 2.0 ** (1.0 / 3.0)  # factor by which voxels grow until the points are few enough
 
 

@@ -28,7 +28,7 @@ class InitializeConfig(StageConfig):
     max_megapixels: PositiveFloat = DENSE_MEGAPIXELS
     """Photos are reduced to this size before dense points are estimated from them; the time is proportional to it."""
     photos: Literal["all", "covering"] = "all"
-    """Photos that dense points are estimated from: all training photos, or √(24 n) of n (`covering`), or a few more,
+    """Photos that dense points are estimated from: all training photos, or √(48 n) of n (`covering`), or a few more,
     which show the scene."""
 
 
