@@ -16,7 +16,8 @@ from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS, CleanConfig
 from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.dataset import load_split, load_views
+from splatpipe.pipeline.photos.covering import covering_photos
+from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_split, load_views
 from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
@@ -25,6 +26,8 @@ from splatpipe.pipeline.splat.archives import open_archive
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.panorama import read_panorama
 from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat_parts
+
+FEW_PHOTOS = 12  # up to this many, floaters are compared with all, of more, with some: most photos show a floater
 
 
 def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -43,7 +46,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     gaussians = read_splat(trained)
     device = choose_device(inputs.machine.device)
     with same_bits(inputs.machine.threads), tempfile.TemporaryDirectory(prefix="photos-", dir=out) as folder:
-        cleaned = _clean(gaussians.to(device.tensors), inputs, Path(folder), report)
+        cleaned = _clean(config, gaussians.to(device.tensors), inputs, Path(folder), report)
     removed = sum(cleaned.removed.values())
     if removed:
         kept = (piece.select(keep) for piece, keep in _pieces(gaussians, cleaned.keep))
@@ -61,7 +64,7 @@ def run(config: CleanConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
     }
 
 
-def _clean(gaussians: Gaussians, inputs: Inputs, folder: Path, report: Reporter) -> CleaningResult:
+def _clean(config: CleanConfig, gaussians: Gaussians, inputs: Inputs, folder: Path, report: Reporter) -> CleaningResult:
     """Clean by the training photos only: the held-out ones must stay independent for evaluation.
 
     Every photo is looked at several times; it is decoded once, and reduced it is kept in the folder.
@@ -81,11 +84,16 @@ def _clean(gaussians: Gaussians, inputs: Inputs, folder: Path, report: Reporter)
             masks = arrays["masks"]
             return arrays["photo"], masks[0] if len(masks) else None
 
+    compared = None
+    if config.photos == "covering":
+        points, seen = load_points_and_tracks(inputs["undistort.dataset"])
+        compared = covering_photos([seen[view.camera.name] for view in views], len(points.xyz), FEW_PHOTOS)
     photos = TrainingPhotos(
         [reduced_camera(view.camera, SEEN_MEGAPIXELS) for view in views],
         options,
         picture,
         None if sky is None else sky.to(gaussians.means.device),
+        compared,
     )
 
     def progress(done: int, total: int) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area
-from splatpipe.pipeline.mvs.dense import DensePoints, PointBudget, dense_points
+from splatpipe.pipeline.mvs.dense import DensePoints, PointBudget, covering_views, dense_points
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_split, load_views
 from splatpipe.pipeline.splat.backdrop import coarse_start
@@ -58,7 +58,7 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     area = read_model_area(inputs.parts.get("georef.boundary"))
     sparse, summary = int(chosen.size), {}
     if config.dense:
-        more = _dense(views, inputs, area, out, report)
+        more = _dense(config, views, inputs, area, out, report)
         xyz, rgb = np.concatenate([xyz, more.xyz]), np.concatenate([rgb, more.rgb])
     if area is not None:
         rows = coarse_start(inside := area.contains(xyz))
@@ -72,12 +72,16 @@ def run(config: InitializeConfig, inputs: Inputs, out: Path, report: Reporter) -
     return {"gaussians": len(xyz), "median_size": float(np.median(sizes)), **summary}
 
 
-def _dense(views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter) -> DensePoints:
+def _dense(
+    config: InitializeConfig, views: list[View], inputs: Inputs, area: PlanArea | None, out: Path, report: Reporter
+) -> DensePoints:
     """Return dense points from the training photos only: held-out views must not influence what they evaluate."""
-    cover = PointBudget(MAX_DENSE, None if area is None else area.contains)
+    cover = PointBudget(MAX_DENSE, None if area is None else area.contains, config.max_megapixels)
     kept = set(load_split(inputs["split.views"]).train)
     used = [view for view in views if view.camera.name in kept]
     dataset, threads = inputs["undistort.dataset"], inputs.machine.threads
+    if config.photos == "covering":
+        used = covering_views(dataset, used)
     return dense_points(dataset, used, cover, out, threads, report)
 
 

@@ -12,10 +12,12 @@ from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.dataset import MODEL
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.photo_list import load_photo_list
+from splatpipe.pipeline.photos.resampling import Places
 from splatpipe.pipeline.photos.undistortion import (
     RegisteredPhoto,
     pinhole_model,
     plan_views,
+    with_places,
     write_view,
 )
 from splatpipe.pipeline.sfm.sparse_model import write_model
@@ -34,13 +36,13 @@ def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) ->
     placed = plan_views(model, photos, config.max_megapixels, report)
     dataset = out / "dataset"
 
-    def work(view: RegisteredPhoto) -> None:
-        write_view(view, inputs, dataset)
+    def work(item: tuple[RegisteredPhoto, Places | None]) -> None:
+        write_view(*item, inputs, dataset)
 
     threads_before = cv2.getNumThreads()
     cv2.setNumThreads(1)  # parallelism is over photos
     try:
-        for done, _ in enumerate(ordered_map(work, placed, inputs.machine.threads), start=1):
+        for done, _ in enumerate(ordered_map(work, with_places(placed), inputs.machine.threads), start=1):
             report.progress(done, len(placed), "undistorting", "photos")
     finally:
         cv2.setNumThreads(threads_before)

@@ -101,7 +101,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
         yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
         return
     looks = len(photos.cameras)
-    steps = looks * (1 if photos.picture is None else 1 + LOOKS)
+    steps = looks + (0 if photos.picture is None else LOOKS * len(photos.looked_at))
     found = measure_visibility(gaussians, photos, lambda done: on_progress(done, steps))
     seen = found.weight >= SEEN_PIXELS
     floats = seen & (found.floating > FLOATING)
@@ -115,7 +115,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
     if photos.picture is None:
         yield "floating", loose & solid & ~large  # large ones may be all that represents the far background
         return
-    suspected = seen & (found.floating > SUSPECTED)
+    suspected = seen & (found.floating > SUSPECTED) & (found.compared >= SEEN_PIXELS)
     suspects = Suspects(gaussians, shapes, suspected, seen & ~suspected & solid, found)
     floaters = likely_floaters(suspects, photos, lambda done: on_progress(looks + done, steps))
     yield "oversized", floaters & large

@@ -32,7 +32,7 @@ HALFWAY = 0.5
 
 @dataclass(frozen=True, eq=False)
 class PhotoErrorChange:
-    """Changes of the squared error with each Gaussian (pixels 0..1, three channels), summed over the photos.
+    """Changes of the squared error with each Gaussian (pixels 0..1, three channels), summed over the photos compared.
 
     Attributes:
         better: Total decrease, over the photos in which the error decreases.
@@ -68,14 +68,14 @@ def error_change_in_photos(
     halfway = replace(gaussians.detach(), opacity_logits=logits)
     per_logit = torch.where(wanted, opacity / (shown * (1.0 - shown)), torch.zeros(()).to(opacity)).numpy(force=True)
     better, worse = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), np.float32)
-    for index, camera in enumerate(photos.cameras):
-        colour = _rendered(halfway, camera, photos, options)
+    for done, index in enumerate(photos.looked_at, start=1):
+        colour = _rendered(halfway, photos.cameras[index], photos, options)
         downhill = _error_slope(colour, *photos.picture(index))
         (slope,) = torch.autograd.grad(colour, logits, downhill)
         paid = slope.numpy(force=True) * per_logit
         better -= np.minimum(paid, 0.0)
         worse += np.maximum(paid, 0.0)
-        on_progress(index + 1)
+        on_progress(done)
     return PhotoErrorChange(better, worse)
 
 

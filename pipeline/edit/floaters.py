@@ -86,7 +86,7 @@ def likely_floaters(suspects: Suspects, photos: TrainingPhotos, on_progress: Cal
     Args:
         suspects: The suspects and what is known of them.
         photos: The training photos, with images.
-        on_progress: Called with the number of images processed, at most ``LOOKS`` times the number of photos.
+        on_progress: Called with the number of images processed, at most ``LOOKS`` times that of photos compared.
     """
     if suspects.ground.sum() <= NEIGHBOURS:
         return np.zeros(len(suspects.ground), np.bool_)  # not enough of a scene for anything to float in front of
@@ -95,15 +95,15 @@ def likely_floaters(suspects: Suspects, photos: TrainingPhotos, on_progress: Cal
     likely = np.asarray(suspects.suspected & (odds > 0.0))
     if not likely.any():
         return likely
-    looks = len(LIMITS) * len(photos.cameras)
+    looks = len(LIMITS) * len(photos.looked_at)
     worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, on_progress, looks))
     missed = (worth.better - worth.worse) / _pixels(suspects) > LIMITS[-1][1]
     return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # a loose one may hide other floaters
 
 
 def _pixels(suspects: Suspects) -> Figures:
-    """Effective number of pixels that show each Gaussian, at least 1."""
-    return np.asarray(np.maximum(suspects.sightings.weight, np.float32(1.0)))
+    """Effective number of pixels that show each Gaussian in the photos compared, at least 1."""
+    return np.asarray(np.maximum(suspects.sightings.compared, np.float32(1.0)))
 
 
 def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
@@ -135,7 +135,7 @@ def verdicts_of(suspects: Suspects, photos: TrainingPhotos, on_progress: Callabl
             break
         rows = np.flatnonzero(shown)
         model = gaussians if len(rows) == n else gaussians.select(torch.from_numpy(rows).to(gaussians.means.device))
-        looks = number * len(photos.cameras)
+        looks = number * len(photos.looked_at)
         worth = error_change_in_photos(model, asked[rows], photos, partial(_after, on_progress, looks))
         of_pixel = np.full(n, np.inf, np.float32)
         of_pixel[rows] = (worth.better - worth.worse) / pixels[rows]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from splatpipe.pipeline.engine.stage import StageConfig
 
 SEEN_MEGAPIXELS = 0.3
@@ -14,6 +16,10 @@ class CleanConfig(StageConfig):
 
     enabled: bool = True
     """Remove floaters, haze and Gaussians that no photo supports before the splat is evaluated and exported."""
+
+    photos: Literal["all", "covering"] = "all"
+    """Training photos with which likely floaters are compared; covering: √(12 n) of n or a few more, which show the
+    scene. What none of them shows is kept."""
 
     @property
     def is_off(self) -> bool:

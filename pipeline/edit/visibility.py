@@ -41,12 +41,19 @@ class TrainingPhotos:
         options: How the splat is rendered.
         picture: Returns a photo, (h, w, 3) RGB, and its mask at its camera's size; None if only cameras are known.
         sky: The panorama behind the splat, or None.
+        compared: Indices of the photos that suspects are compared with, if there are pictures; None: all.
     """
 
     cameras: Sequence[Camera]
     options: rasterizer.RenderOptions
     picture: Callable[[int], tuple[Pixels, Mask | None]] | None = None
     sky: Panorama | None = field(default=None, repr=False)
+    compared: Sequence[int] | None = None
+
+    @property
+    def looked_at(self) -> Sequence[int]:
+        """Indices of the photos that suspects are compared with."""
+        return range(len(self.cameras)) if self.compared is None else self.compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +67,7 @@ class GaussianVisibility:
         border: Share of its weight that lies at the images' borders.
         floating: Share of its visible area in photos where it lies in front of everything around it.
         gap: How far in front of its surroundings it lies as a share of their depth, weighted mean, -1..1.
+        compared: Its weight in the photos that suspects are compared with.
     """
 
     weight: Float32[np.ndarray, " n"]
@@ -68,13 +76,14 @@ class GaussianVisibility:
     border: Float32[np.ndarray, " n"]
     floating: Float32[np.ndarray, " n"]
     gap: Float32[np.ndarray, " n"]
+    compared: Float32[np.ndarray, " n"]
 
 
 class _VisibilitySums:
     """Sums over the photos from which ``GaussianVisibility`` is computed."""
 
     def __init__(self, n: int) -> None:
-        self.weight, self.square, self.border = (np.zeros(n, np.float32) for _ in range(3))
+        self.weight, self.square, self.border, self.compared = (np.zeros(n, np.float32) for _ in range(4))
         self.area, self.before, self.gap = (np.zeros(n, np.float32) for _ in range(3))
         self.towards = np.zeros((n, 3), np.float32)
 
@@ -87,7 +96,7 @@ class _VisibilitySums:
         angle[self.weight == 0.0] = 0.0
         photos = part(self.weight * self.weight, self.square)
         border, before, gap = part(self.border, self.weight), part(self.before, self.area), part(self.gap, self.weight)
-        return GaussianVisibility(self.weight, photos, angle, border, before, gap)
+        return GaussianVisibility(self.weight, photos, angle, border, before, gap, self.compared)
 
 
 def measure_visibility(
@@ -103,15 +112,17 @@ def measure_visibility(
     grey = grey_of(gaussians)
     plain = replace(photos.options, sh_degree=0, depth=True, magnitudes=False)
     centres, axes = gaussians.means.detach().numpy(force=True), half_axes(gaussians)
-    sums = _VisibilitySums(len(gaussians))
-    for done, camera in enumerate(photos.cameras, start=1):
+    sums, looked_at = _VisibilitySums(len(gaussians)), set(photos.looked_at)
+    for index, camera in enumerate(photos.cameras):
         rendered = rasterizer.render(grey, camera, plain)
         behind = without_islands(rendered.median_depth.numpy(force=True))
         picture = np.stack([np.ones_like(behind), _border(camera), behind], axis=2)
         found = weights_of(rendered, grey, picture)
         rows = np.flatnonzero(found[:, 0] > MIN_SEEN)
         _add(sums, rows, found[rows], camera, (centres[rows], axes[rows]))
-        on_progress(done)
+        if index in looked_at:
+            sums.compared[rows] += found[rows, 0]
+        on_progress(index + 1)
     return sums.sightings()
 
 

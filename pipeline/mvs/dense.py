@@ -15,13 +15,15 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch, SearchPlan
+from splatpipe.pipeline.mvs.neighbours import load_tracks
+from splatpipe.pipeline.mvs.options import DENSE_MEGAPIXELS
+from splatpipe.pipeline.photos.covering import covering_photos
 from splatpipe.pipeline.photos.dataset import View
 
-MEGAPIXELS = 0.05  # per photo: most depths are accurate to 0.5 %
 WIDER = 1.25  # search this many times nearer than the sparse points: thin places have no points yet
 NEIGHBOURS = 8  # photos that a photo is matched with, and whose depths may confirm its own
-PLAN = SearchPlan(MEGAPIXELS, WIDER, False, NEIGHBOURS, NEIGHBOURS)
 CELLS = 64  # across a photo's width; a cell with a sparse point gets no dense one
+FEW_PHOTOS = 48  # up to this many, all are used, of more, some: depths that three photos confirm need overlap
 GROWTH = 2.0 ** (1.0 / 3.0)  # factor by which voxels grow until the points are few enough
 
 
@@ -51,15 +53,27 @@ class DensePoints:
 
 @dataclass(frozen=True)
 class PointBudget:
-    """How many points to keep, and where.
+    """How many points to keep, where, and from photos of what size.
 
     Attributes:
         most: Maximum number of points, spread evenly.
         inside: Returns which points lie in the area of interest; up to ``most`` more are kept outside. None: no area.
+        megapixels: Size of the photos that they are estimated from.
     """
 
     most: int
     inside: Callable[[Float64[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]] | None = None
+    megapixels: float = DENSE_MEGAPIXELS
+
+
+def covering_views(dataset: Path, views: Sequence[View]) -> list[View]:
+    """The views that suffice to show the scene (``covering_photos``), in the order given.
+
+    Raises:
+        StageError: if the model cannot be read.
+    """
+    tracks = load_tracks(dataset, [view.camera.name for view in views])
+    return [views[number] for number in covering_photos(tracks.seen, len(tracks.xyz), FEW_PHOTOS)]
 
 
 def dense_points(
@@ -70,7 +84,7 @@ def dense_points(
     Args:
         dataset: The folder that `undistort` wrote.
         views: Photos to use, in name order; no held-out views.
-        cover: How many points to keep, and where.
+        cover: How many points to keep, where, and from photos of what size.
         folder: Folder for temporary files, with room for a megabyte per photo.
         threads: Photos compared in parallel, and threads of the kernel.
         report: Receives progress.
@@ -79,7 +93,8 @@ def dense_points(
         StageError: if the model or a photo cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="depths-", dir=folder) as kept:
-        search = DepthSearch.begin(dataset, views, Path(kept), PLAN)
+        plan = SearchPlan(cover.megapixels, WIDER, False, NEIGHBOURS, NEIGHBOURS)
+        search = DepthSearch.begin(dataset, views, Path(kept), plan)
         search.run(threads, report)
         found = []
         for done, points in enumerate(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from splatpipe.pipeline.engine.ranges import PositiveFloat, PositiveInt
 from splatpipe.pipeline.engine.stage import StageConfig
+
+DENSE_MEGAPIXELS = 0.05  # per photo: most depths are accurate to 0.5 %
 
 
 class InitializeConfig(StageConfig):
@@ -23,6 +25,11 @@ class InitializeConfig(StageConfig):
     """Add points by PatchMatch between neighbouring photos where the sparse points are thin: 0.6 CPU seconds per photo.
     At most 50,000 are added; together with the sparse points they fill at most half of the cap on Gaussians, which
     leaves room for densification."""
+    max_megapixels: PositiveFloat = DENSE_MEGAPIXELS
+    """Photos are reduced to this size before dense points are estimated from them; the time is proportional to it."""
+    photos: Literal["all", "covering"] = "all"
+    """Photos that dense points are estimated from: all training photos, or √(48 n) of n (`covering`), or a few more,
+    which show the scene."""
 
 
 class DepthsConfig(StageConfig):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 MAX_SAMPLES = 16  # per side of a pixel; for larger reductions, the photo is reduced first
 STRIP_PIXELS = 1 << 21  # samples held at a time
@@ -16,12 +16,30 @@ SINGLE_PIXELS = 1 << 18  # with one sample per pixel: strips are then independen
 PROJECTED = 1 << 16  # places projected at a time, in double precision
 MARGIN = 3  # rows around those that samples lie in: a cubic uses one before and two after
 ONE_TO_ONE = 1.1  # up to this reduction, one cubic sample per pixel is sharper than several
+KEPT_PIXELS = 1 << 23  # of a target whose places are kept for all photos of a camera: 64 MB
 
 Rows = UInt8[np.ndarray, "rows w *channels"]
+Places = Float32[np.ndarray, "2 rows columns"]
+"""x and y in the photo, as OpenCV counts them, of the centres of a target's pixels and of one more on every side."""
+
+
+def kept_places(source: pycolmap.Camera, target: pycolmap.Camera) -> Places | None:
+    """What ``resample`` needs of two cameras, for all photos that share them; None if too large, or if it needs none.
+
+    Args:
+        source: Of any model.
+        target: Pinhole.
+    """
+    if _is_filtered_whole(source, target) or target.width * target.height > KEPT_PIXELS:
+        return None
+    return _places(source, target, 0, target.height)
 
 
 def resample(
-    photo: UInt8[np.ndarray, "h w *channels"], source: pycolmap.Camera, target: pycolmap.Camera
+    photo: UInt8[np.ndarray, "h w *channels"],
+    source: pycolmap.Camera,
+    target: pycolmap.Camera,
+    places: Places | None = None,
 ) -> UInt8[np.ndarray, "th tw *channels"]:
     """Resample a photo to what the target camera would have seen from the same pose.
 
@@ -32,8 +50,9 @@ def resample(
         photo: In the source camera's grid.
         source: Of any model.
         target: Pinhole.
+        places: ``kept_places`` of the two cameras, which saves time and changes nothing.
     """
-    if source.is_undistorted() and _same_view(source, target):
+    if _is_plain(source, target):
         if (source.width, source.height) == (target.width, target.height):
             return photo
         return np.asarray(cv2.resize(photo, (target.width, target.height), interpolation=cv2.INTER_AREA))
@@ -45,14 +64,17 @@ def resample(
         source.rescale(*size)
     result = np.empty((target.height, target.width, *photo.shape[2:]), np.uint8)
     top = 0
-    for strip in _strips(lambda first, last: photo[first:last], source, target):
+    for strip in _strips(lambda first, last: photo[first:last], source, target, places):
         result[top : top + len(strip)] = strip
         top += len(strip)
     return result
 
 
 def resampled_strips(
-    rows_of: Callable[[int, int], Rows], source: pycolmap.Camera, target: pycolmap.Camera
+    rows_of: Callable[[int, int], Rows],
+    source: pycolmap.Camera,
+    target: pycolmap.Camera,
+    places: Places | None = None,
 ) -> Iterator[UInt8[np.ndarray, "rows tw 3"]]:
     """Yield the result of ``resample`` strip by strip, from the top, without an array of the photo or the result.
 
@@ -62,16 +84,26 @@ def resampled_strips(
         rows_of: Returns the photo's rows from the first up to the second argument, in the source camera's grid.
         source: Of any model.
         target: Pinhole.
+        places: As for ``resample``.
     """
-    plain = source.is_undistorted() and _same_view(source, target)
-    if plain or _reduction(source, target) > MAX_SAMPLES:
+    if _is_filtered_whole(source, target):
         yield resample(rows_of(0, source.height), source, target)
     else:
-        yield from _strips(rows_of, source, target)
+        yield from _strips(rows_of, source, target, places)
+
+
+def _is_plain(source: pycolmap.Camera, target: pycolmap.Camera) -> bool:
+    """Whether a photo is only reduced."""
+    return source.is_undistorted() and _same_view(source, target)
+
+
+def _is_filtered_whole(source: pycolmap.Camera, target: pycolmap.Camera) -> bool:
+    """Whether one filter reduces the whole photo at first."""
+    return _is_plain(source, target) or _reduction(source, target) > MAX_SAMPLES
 
 
 def _strips(
-    rows_of: Callable[[int, int], Rows], source: pycolmap.Camera, target: pycolmap.Camera
+    rows_of: Callable[[int, int], Rows], source: pycolmap.Camera, target: pycolmap.Camera, places: Places | None
 ) -> Iterator[UInt8[np.ndarray, "rows tw *channels"]]:
     reduction = _reduction(source, target)
     samples = 1 if reduction <= ONE_TO_ONE else min(MAX_SAMPLES, math.ceil(reduction))
@@ -80,7 +112,8 @@ def _strips(
     rows = max(1, held // (target.width * samples * samples))
     for top in range(0, target.height, rows):
         bottom = min(target.height, top + rows)
-        x, y = _sample_places(source, target, top, bottom, samples)
+        here = _places(source, target, top, bottom) if places is None else places[:, top : bottom + 2]
+        x, y = _sample_places(here, samples)
         first, last = _reach(y, source.height)
         y -= np.float32(first)  # exact: a whole number is subtracted from a larger one, or zero
         strip = cv2.remap(rows_of(first, last), x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
@@ -125,14 +158,8 @@ def _project(
     return np.asarray(source.img_from_cam(rays))
 
 
-def _sample_places(
-    source: pycolmap.Camera, target: pycolmap.Camera, top: int, bottom: int, samples: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """OpenCV's maps of the samples of target rows ``top`` to ``bottom``: ((bottom-top)*samples, width*samples) each.
-
-    The distortion is evaluated at the pixels' centres, plus one pixel on every side, and interpolated linearly between
-    them, where it is practically linear.
-    """
+def _places(source: pycolmap.Camera, target: pycolmap.Camera, top: int, bottom: int) -> Places:
+    """Places of target rows ``top`` to ``bottom``; a pixel's do not depend on the rows asked for."""
     wide, high = target.width + 2, bottom - top + 2
     grids = np.empty((2, high, wide), np.float32)
     at_once = max(1, PROJECTED // wide)
@@ -143,9 +170,21 @@ def _sample_places(
             _project(source, target, np.column_stack([x.ravel(), y.ravel()])) - 0.5
         )  # OpenCV's first centre is 0, 0
         grids[:, here] = places.T.reshape(2, len(here), wide)
+    return grids
+
+
+def _sample_places(places: Places, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV's maps of the samples of target rows, the caller's own: (rows*samples, width*samples) each.
+
+    The distortion is evaluated at the pixels' centres, plus one pixel on every side, and interpolated linearly between
+    them, where it is practically linear.
+    """
     maps = []
-    for grid in grids:
+    for grid in places:
         if samples > 1:
-            grid = cv2.resize(grid, (wide * samples, high * samples), interpolation=cv2.INTER_LINEAR)
-        maps.append(np.ascontiguousarray(grid[samples:-samples, samples:-samples]))
+            size = grid.shape[1] * samples, grid.shape[0] * samples
+            finer = np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR))
+        else:
+            finer = grid.copy()  # the caller moves the maps, and these places may be kept
+        maps.append(finer[samples:-samples, samples:-samples])
     return maps[0], maps[1]

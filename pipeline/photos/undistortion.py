@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from splatpipe.pipeline.photos.dataset import MASKS, SKY_MASKS, image_path, mask
 from splatpipe.pipeline.photos.jpeg_strips import write_jpeg
 from splatpipe.pipeline.photos.names import list_names, match_names
 from splatpipe.pipeline.photos.photo_list import Photo, decode_mask, decode_sky_mask, open_decoded
-from splatpipe.pipeline.photos.resampling import resample, resampled_strips
+from splatpipe.pipeline.photos.resampling import Places, kept_places, resample, resampled_strips
 
 SHAPE_TOLERANCE = 0.01  # between the aspect ratios of a photo and of its camera in the model
 WHITE = 254.5  # of 255: a pixel counts only if no part of it is masked, and is sky only if all of it is sky
@@ -123,15 +125,37 @@ def pinhole_camera(source: pycolmap.Camera, max_megapixels: float, number: int) 
     return camera
 
 
-def write_view(view: RegisteredPhoto, inputs: Inputs, dataset: Path) -> None:
+def with_places(placed: Sequence[RegisteredPhoto]) -> Iterator[tuple[RegisteredPhoto, Places | None]]:
+    """Yield the photos by camera, each with its camera's places, which are computed once if several photos share them.
+
+    Only the places of the photos that are being worked on are held.
+    """
+    photos = Counter(view.target.camera_id for view in placed)
+    of, places = 0, None
+    for view in sorted(placed, key=lambda view: view.target.camera_id):
+        if view.target.camera_id != of:
+            of = view.target.camera_id
+            places = kept_places(view.source, view.target) if photos[of] > 1 else None
+        yield view, places
+
+
+def write_view(view: RegisteredPhoto, places: Places | None, inputs: Inputs, dataset: Path) -> None:
+    """Write a photo and its masks, undistorted.
+
+    Args:
+        view: The photo.
+        places: Those of its cameras, or None.
+        inputs: Of the stage.
+        dataset: The folder of the dataset.
+    """
     part = inputs["ingest.photos"]
     photo = open_decoded(view.photo, part, inputs.photos_dir)
-    strips = resampled_strips(photo.rows, view.source, view.target)
+    strips = resampled_strips(photo.rows, view.source, view.target, places)
     _write(image_path(dataset, view.photo.name), (strip[:, :, ::-1] for strip in strips), view.target.height)
     for folder, decoded in ((MASKS, decode_mask), (SKY_MASKS, decode_sky_mask)):
         mask = decoded(view.photo, part)
         if mask is not None:
-            white = resample(mask, view.source, view.target) > WHITE
+            white = resample(mask, view.source, view.target, places) > WHITE
             _write(mask_path(dataset, view.photo.name, folder), [white.astype(np.uint8) * 255], len(white))
 
 
@@ -161,18 +185,18 @@ def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[RegisteredPho
     observed: dict[int, list[tuple[int, int]]] = {}
     for camera in {view.target.camera_id: view.target for view in placed}.values():
         result.add_camera_with_trivial_rig(camera)
+    known = set(model.points3D)
     for view in placed:
-        points, places = _observations(model, view)
+        points, places = _observations(known, view)
         number = view.image.image_id
         image = pycolmap.Image(view.photo.name, places, view.target.camera_id, number)
         result.add_image_with_trivial_frame(image, view.image.cam_from_world())
         for index, point in enumerate(points):
             observed.setdefault(point, []).append((number, index))
-    for number in sorted(model.points3D):
-        old = model.points3D[number]
+    for number, old in sorted(model.points3D.items()):
         seen = observed.get(number, [])
         unobserved = old.track.length() < MIN_VIEWS
-        if (len(seen) < MIN_VIEWS and not unobserved) or not np.isfinite(old.xyz).all():
+        if (len(seen) < MIN_VIEWS and not unobserved) or not all(map(math.isfinite, old.xyz)):
             continue
         track = pycolmap.Track([pycolmap.TrackElement(*element) for element in seen])
         result.add_point3D(old.xyz, track, old.color)
@@ -183,19 +207,19 @@ def pinhole_model(model: pycolmap.Reconstruction, placed: Sequence[RegisteredPho
     return result
 
 
-def _observations(model: pycolmap.Reconstruction, view: RegisteredPhoto) -> tuple[list[int], npt.NDArray[np.float64]]:
-    """Points that a photo observes, and their positions (n, 2) in the pinhole image, if inside it."""
-    indices = view.image.get_observation_point2D_idxs()
-    points = [view.image.points2D[index].point3D_id for index in indices]
+def _observations(known: Set[int], view: RegisteredPhoto) -> tuple[list[int], npt.NDArray[np.float64]]:
+    """Which of the known points a photo observes, and their positions (n, 2) in the pinhole image, if inside it."""
+    keypoints = view.image.points2D
+    observations = [keypoints[index] for index in view.image.get_observation_point2D_idxs()]
+    points = [observation.point3D_id for observation in observations]
     if not points:
         return [], np.zeros((0, 2))
-    distorted = np.array([view.image.points2D[index].xy for index in indices], np.float64)
+    distorted = np.array([observation.xy for observation in observations], np.float64)
     target = view.target
     in_camera = view.image.camera.cam_from_img(distorted)
     focal = [target.focal_length_x, target.focal_length_y]
     places = in_camera * focal + [target.principal_point_x, target.principal_point_y]
     inside = np.isfinite(places).all(axis=1) & (places >= 0).all(axis=1)
     inside &= (places <= [target.width, target.height]).all(axis=1)
-    known = np.array([point in model.points3D for point in points])
-    keep = np.flatnonzero(inside & known)
+    keep = np.flatnonzero(inside & [point in known for point in points])
     return [points[index] for index in keep], places[keep]

@@ -152,6 +152,25 @@ def test_real_floating_objects_are_kept_because_of_the_photos() -> None:
     assert not clean_scene(real, photos(pictures=True)).keep[-2:].any()  # on photos without them
 
 
+def test_some_photos_suffice_to_find_floaters_and_what_they_do_not_show_is_kept() -> None:
+    both = Gaussians.concat([scene(), planted("clusters")])
+    every, all_photos = clean_scene(both, photos(pictures=True)), range(len(cameras()))
+    assert torch.equal(clean_scene(both, replace(photos(pictures=True), compared=all_photos)).keep, every.keep)
+    asked: list[int] = []
+
+    def picture(index: int) -> tuple[Pixels, Mask | None]:
+        asked.append(index)
+        taken = photos(pictures=True).picture
+        assert taken is not None
+        return taken(index)
+
+    found, lost = shares(clean_scene(both, TrainingPhotos(cameras(), OPTIONS, picture, compared=[0, 3, 6, 9])))
+    assert found >= 0.95 and lost <= 0.005
+    assert set(asked) == {0, 3, 6, 9}
+    blind = clean_scene(both, replace(photos(pictures=True), compared=[]))
+    assert blind.removed["floating"] == blind.removed["oversized"] == 0
+
+
 def test_cleaning_twice_equals_cleaning_once_bit_for_bit() -> None:
     both = Gaussians.concat([scene(), planted("single"), planted("clusters")])
     first = clean_scene(both, photos(pictures=True))

@@ -22,6 +22,7 @@ from splatpipe.pipeline.mvs.picture import Picture
 from splatpipe.pipeline.photos.dataset import load_points, load_views
 from splatpipe.pipeline.splat.ply import read_splat
 from splatpipe.pipeline.train.start import read_start
+from splatpipe.stages import initialize as stages_initialize
 from splatpipe.stages.initialize import run
 
 PHOTOS = 6
@@ -175,6 +176,15 @@ def test_sparse_gaussians_are_kept_and_the_summary_counts_both(
     assert summary["gaussians"] == len(after) == 300 + summary["dense_points"]
     assert (after.means[:300] == before.means).all()
     assert [read_start(path).sparse for path in (tmp_path / "off/init.ply", tmp_path / "dense.ply")] == [300, 300]
+
+
+def test_only_photos_that_cover_the_scene_are_read(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages_initialize, "covering_views", lambda _, views: views[1:])
+    dataset = tmp_path / "dataset"
+    shutil.copytree(room, dataset)
+    (dataset / "images/0.png").write_bytes(b"not a photo")
+    summary, _ = initialized(dataset, tmp_path / "out", photos="covering", max_megapixels=0.02)
+    assert summary["dense_points"] > 0
 
 
 def test_off_reads_no_photo_and_no_setting(room: Path, started: tuple[dict, bytes], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import corner_photos
 import cv2
@@ -13,11 +14,11 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos import resampling
+from splatpipe.pipeline.photos import resampling, undistortion
 from splatpipe.pipeline.photos.dataset import load_points, load_views
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list, save_photo_list
-from splatpipe.pipeline.photos.undistortion import pinhole_camera
+from splatpipe.pipeline.photos.undistortion import pinhole_camera, with_places
 from splatpipe.stages import undistort
 
 WIDTH, HEIGHT = 960, 720
@@ -145,6 +146,40 @@ def test_strips_join_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = resampling.resample(photo, source, target)
     monkeypatch.setattr(resampling, "STRIP_PIXELS", 40_000)
     assert (resampling.resample(photo, source, target) == whole).all()
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("megapixels", [0.05, 2.0])
+def test_places_kept_for_a_camera_do_not_change_a_bit(
+    model: str, megapixels: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = make_camera(model)
+    target = pinhole_camera(source, megapixels, 1)
+    photo = blobs(source)
+    monkeypatch.setattr(resampling, "PROJECTED", 64 * target.width)
+    monkeypatch.setattr(resampling, "STRIP_PIXELS", 200_000)
+    places = resampling.kept_places(source, target)
+    if places is None:
+        assert model.endswith("PINHOLE")  # only reduced
+        return
+    before = places.copy()
+    whole = resampling.resample(photo, source, target)
+    np.testing.assert_array_equal(resampling.resample(photo, source, target, places), whole)
+    np.testing.assert_array_equal(places, before)
+    monkeypatch.setattr(resampling, "KEPT_PIXELS", target.width * target.height - 1)
+    assert resampling.kept_places(source, target) is None
+
+
+def test_places_are_computed_once_for_all_photos_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    computed: list[int] = []
+    monkeypatch.setattr(undistortion, "kept_places", lambda _, target: computed.append(target.camera_id))
+    targets = {}
+    for number in (1, 2, 3):
+        targets[number] = pinhole_camera(make_camera("OPENCV"), 0.1, number)
+    placed = [Mock(target=targets[number]) for number in (2, 1, 2, 3, 1, 2)]
+    given = [view for view, _ in with_places(placed)]
+    assert [placed.index(view) for view in given] == [1, 4, 0, 2, 5, 3]  # by camera, then as they were
+    assert computed == [1, 2]  # a single photo's are computed strip by strip
 
 
 def test_a_pinhole_photo_of_the_right_size_is_unchanged() -> None:
