@@ -98,7 +98,13 @@ def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similar
             f"Only one of {name} and the splat is in metres.",
             hint="Scale the other first: splatpipe edit IN OUT --scale-from A B 12.40m.",
         )
-    return Similarity.identity()
+    apart = np.array(other.offset) - np.array(ours.offset)
+    if float(np.linalg.norm(apart)) > MAX_DISTANCE_M:
+        raise SplatpipeError(
+            f"By its coordinates, {name} lies {np.linalg.norm(apart):,.0f} from the splat: one file cannot hold both.",
+            hint="Export both in the same coordinates.",
+        )
+    return Similarity(1.0, np.eye(3), turn_of("z up", ours.axes).numpy() @ apart)
 
 
 def _on_earth(ours: SplatOrigin, other: SplatOrigin, name: str) -> Similarity:
