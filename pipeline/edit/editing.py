@@ -199,7 +199,8 @@ def _require_finite(scene: Scene) -> None:
     bad = len(scene.gaussians) - int(scene.gaussians.finite().sum())
     if bad:
         raise SplatpipeError(
-            f"{bad} Gaussians are out of the range that a file can hold.", hint="Scale or move it by less."
+            f"A file cannot hold the values of {bad} of {len(scene.gaussians)} Gaussians.",
+            hint="Scale or move it by less.",
         )
 
 

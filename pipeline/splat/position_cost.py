@@ -13,7 +13,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.scene import NO_OFFSET, SceneFacts
 
 WORTH_TELLING = 0.05  # share of Gaussians smaller than a step: fewer are not seen
-LOST_STEPS = 4.0  # of a Gaussian's size in a step that displaces it by more than its own size (a step / √12)
+LOST_STEPS = 4.0  # of a Gaussian's largest size in a step that displaces it by more than that (a step / √12)
 FEW = 10  # Gaussians that may well lie nearer to each other than a step
 SAMPLE, EXTENT = 200_000, (0.05, 0.95)  # Gaussians and quantiles that bound a splat's main extent
 DESTROYED = 0.2  # share of such Gaussians beyond which the splat falls apart
@@ -29,7 +29,7 @@ class PositionCost:
         step: Median step of a coordinate.
         size: Median size of a Gaussian: the middle one of its standard deviations, as one of many is zero.
         smaller: Number of Gaussians smaller than their step.
-        lost: Number of Gaussians displaced by more than their size.
+        lost: Number of Gaussians displaced by more than their largest standard deviation.
         rounded: Whether the format rounds; false for float32, which a splat had before.
         notes: What else the format does to some Gaussians, a sentence each.
     """
@@ -45,15 +45,15 @@ class PositionCost:
     @staticmethod
     def of(
         steps: Float64[np.ndarray, " n"] | float,
-        sizes: Float64[np.ndarray, " n"],
+        sizes: Float64[np.ndarray, "n 2"],
         rounded: bool = True,
         notes: tuple[str, ...] = (),
     ) -> PositionCost:
-        """The cost of each Gaussian's step, or of one for all, with their sizes."""
+        """The cost of each Gaussian's step, or of one for all, with the sizes of ``sizes_of``."""
         if not len(sizes):
             return PositionCost(0, 0.0, 0.0, 0, 0, rounded, notes)
-        smaller, lost = (int((times * sizes < steps).sum()) for times in (1.0, LOST_STEPS))
-        step, size = float(np.median(steps)), float(np.median(sizes))
+        smaller, lost = int((sizes[:, 0] < steps).sum()), int((LOST_STEPS * sizes[:, 1] < steps).sum())
+        step, size = float(np.median(steps)), float(np.median(sizes[:, 0]))
         return PositionCost(len(sizes), step, size, smaller, lost, rounded, notes)
 
     @property
@@ -90,12 +90,12 @@ def two_digits(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100.0 else f"{value:,.0f}"
 
 
-def sizes_of(log_scales: Float[Tensor, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """The middle one of each Gaussian's standard deviations."""
-    found = np.empty(len(log_scales))
+def sizes_of(log_scales: Float[Tensor, "n 3"]) -> Float64[np.ndarray, "n 2"]:
+    """The middle one and the largest of each Gaussian's standard deviations."""
+    found = np.empty((len(log_scales), 2))
     for start in range(0, len(log_scales), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
-        found[rows] = log_scales[rows].double().median(1).values.exp().numpy()
+        found[rows] = log_scales[rows].double().sort(1).values[:, 1:].exp().numpy()
     return found
 
 

@@ -124,7 +124,7 @@ def position_cost(gaussians: Gaussians) -> PositionCost:
     largest = gaussians.log_scales.numpy().max(axis=1, initial=-math.inf) + np.log(shrink)
     for count, what, limit in (
         (int((largest > MAX_LOG_SCALE).sum()), "largest", MAX_LOG_SCALE),
-        (int((np.log(np.maximum(sizes, 1e-300)) < MIN_LOG_SCALE).sum()), "smallest", MIN_LOG_SCALE),
+        (int((np.log(np.maximum(sizes[:, 0], 1e-300)) < MIN_LOG_SCALE).sum()), "smallest", MIN_LOG_SCALE),
     ):
         if count > TOLD_SHARE * len(gaussians):
             notes.append(

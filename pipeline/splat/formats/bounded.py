@@ -103,7 +103,7 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
     if not all_finite(gaussians):
         bad = torch.nonzero(~gaussians.finite())
         raise SplatpipeError(
-            f"{path}: {len(bad)} of {len(gaussians)} Gaussians have values that are not numbers "
+            f"{path} has values that are not numbers in {len(bad)} of {len(gaussians)} Gaussians "
             f"(the first is number {int(bad[0])}).",
             hint=f"Remove them: splatpipe edit {path} cleaned.ply --clean",
         )
@@ -118,7 +118,7 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
     if max(float(gaussians.means.max()), -float(gaussians.means.min())) > MAX_COORDINATE:
         far = int((gaussians.means.abs().amax(1) > MAX_COORDINATE).sum())
         raise SplatpipeError(
-            f"{path}: {far} of {len(gaussians)} Gaussians have coordinates beyond {MAX_COORDINATE:g}.",
+            f"{path} has coordinates beyond {MAX_COORDINATE:g} in {far} of {len(gaussians)} Gaussians.",
             hint=f"Remove them: splatpipe edit {path} cleaned.ply --clean",
         )
 

@@ -72,7 +72,7 @@ def write(path: Path, scene: Scene) -> PositionCost:
     order = in_neighbourhoods((gaussians.means.double() @ turn.T).float(), CHUNK, _COARSE_AXIS)
     sizes = [element.count * np.dtype(list(element.fields)).itemsize for element in elements]
     offsets = list(accumulate(sizes[:-1], initial=len(header)))
-    steps, of_gaussians = [np.zeros(0)], [np.zeros(0)]
+    steps, of_gaussians = [np.zeros(0)], [np.zeros((0, 2))]
     with new_file(path) as file:
         file.write(header)
         for piece in reordered(gaussians, order, _ROWS, None if scene.facts.axes == "y down" else turn):

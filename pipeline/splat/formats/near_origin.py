@@ -18,7 +18,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats.bounded import usable
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.position_cost import sizes_of, two_digits
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts
+from splatpipe.pipeline.splat.scene import MAX_OFFSET, Scene, SceneFacts
 
 STEPS_PER_SIZE = 16.0  # of float32 in a Gaussian: finer ones are not seen
 STEPS_ACROSS = 4096.0  # of float32 in the extent of a splat whose Gaussians' sizes are in another unit
@@ -26,7 +26,7 @@ ROUNDED_STEPS = 0.5  # Gaussians' sizes in a step that has visibly displaced the
 EXTENT = (0.05, 0.95)  # quantiles that bound a splat's main extent
 SAMPLE = 200_000  # Gaussians that this is estimated from
 MIXED_UNITS = 2.0  # extents of the splat along two axes in its median Gaussian: its scales are in another unit
-TORN = 0.05  # share of Gaussians that float32 displaces by more than their size: parts of the splat are lost
+TORN = 0.05  # share of Gaussians that float32 displaces by more than their largest size: parts of the splat are lost
 FEW = 10  # Gaussians that may well be larger than the distances between them
 MAX_LOG = 700.0  # of what float64 holds
 
@@ -48,6 +48,8 @@ def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Sc
     stored_as_float32 = gaussians.means.dtype == torch.float32
     lying = _Lying.of(gaussians)
     notes = () if lying is None else lying.notes(path)
+    if stored_as_float32 and lying is not None and lying.too_far:
+        notes += lying.rounding(path)
     if lying is None or not lying.too_far:
         _to_float32(path, gaussians)
         return Scene(gaussians, facts, notes)
@@ -65,11 +67,6 @@ def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Sc
     _to_float32(path, gaussians)
     x, y, z = (before + taken for before, taken in zip(facts.offset, origin, strict=True))
     axes = "z up" if facts.axes == "y down" else facts.axes
-    if stored_as_float32 and lying.step > ROUNDED_STEPS * lying.size:
-        notes += (
-            f"{path}: its positions had been rounded to {two_digits(lying.step)} before, and half of its Gaussians are "
-            f"smaller than {two_digits(lying.size)}: export it again with 64-bit coordinates, or about a near origin.",
-        )
     return Scene(gaussians, replace(facts, axes=axes, offset=(x, y, z)), notes)
 
 
@@ -99,7 +96,8 @@ class _Lying:
     def too_far(self) -> bool:
         """Whether float32 is too coarse, and an origin in the splat's middle would help."""
         coarse = self.step * STEPS_PER_SIZE > self.size or (self.mixed and self.step * STEPS_ACROSS > self.across)
-        return coarse and float(np.abs(self.middle).max()) > float(np.linalg.norm(self.extents)) + self.largest
+        distance = float(np.abs(self.middle).max())
+        return coarse and float(np.linalg.norm(self.extents)) + self.largest < distance < MAX_OFFSET
 
     def origin(self) -> tuple[float, float, float]:
         """The middle, in digits as few as the splat's extent along each axis allows."""
@@ -107,6 +105,15 @@ class _Lying:
         digits = [-math.floor(math.log10(reach)) for reach in reaches.tolist()]
         x, y, z = (round(number, count) for number, count in zip(self.middle.tolist(), digits, strict=True))
         return x, y, z
+
+    def rounding(self, path: Path) -> tuple[str, ...]:
+        """What has been lost before, if positions were float32."""
+        if self.step <= ROUNDED_STEPS * self.size:
+            return ()
+        return (
+            f"{path}: its positions had been rounded to {two_digits(self.step)} before, and half of its Gaussians are "
+            f"smaller than {two_digits(self.size)}: export it again with 64-bit coordinates, or about a near origin.",
+        )
 
     def notes(self, path: Path) -> tuple[str, ...]:
         """What is odd about it."""
@@ -130,7 +137,7 @@ def _to_float32(path: Path, gaussians: Gaussians) -> None:
     lost, count = 0, len(gaussians)
     for piece in gaussians.pieces():
         moved = (piece.means - piece.means.float()).abs().amax(1).numpy()
-        lost += int((moved > sizes_of(piece.log_scales)).sum())
+        lost += int((moved > sizes_of(piece.log_scales)[:, 1]).sum())
     if lost > TORN * count:
         raise SplatpipeError(
             f"{path}: it extends so far that 32-bit coordinates would displace {lost:,} of {count:,} Gaussians by more "

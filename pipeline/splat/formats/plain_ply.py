@@ -125,6 +125,6 @@ def _others_offsets(path: Path, comments: Sequence[str]) -> tuple[str, ...]:
         return ()
     stated = [text for text in comments if _OFFSET.search(text) and len(_NUMBER.findall(text)) >= _MIN_NUMBERS]
     return tuple(
-        f'{path}: its header says "{text[:_MAX_SHOWN]}", which is neither applied nor copied to another file.'
+        f"{path}: its header says {text[:_MAX_SHOWN]!r}, which is neither applied nor copied to another file."
         for text in stated[:_MAX_NOTES]
     )

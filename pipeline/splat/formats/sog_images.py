@@ -148,7 +148,7 @@ def position_cost(gaussians: Gaussians) -> PositionCost:
     """What the steps of the positions cost the Gaussians; the same for any axes."""
     means = gaussians.means.numpy().astype(np.float64)
     if not len(means):
-        return PositionCost.of(0.0, np.zeros(0))
+        return PositionCost.of(0.0, np.zeros((0, 2)))
     logs = _signed_log(means)
     steps = (logs.max(0) - logs.min(0)) / LEVELS * (1.0 + np.abs(means))
     return PositionCost.of(steps.max(axis=1), sizes_of(gaussians.log_scales))

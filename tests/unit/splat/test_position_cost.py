@@ -43,7 +43,7 @@ def test_a_format_that_would_destroy_the_splat_is_refused(tmp_path: Path, kind):
 
 
 def test_steps_are_told_from_a_share_of_the_gaussians_on():
-    sizes = np.full(1000, 0.1)
+    sizes = np.full((1000, 2), 0.1)
     sizes[:40] = 0.01
     assert PositionCost.of(0.02, sizes).warnings() == ()
     sizes[:60] = 0.01
