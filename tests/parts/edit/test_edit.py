@@ -417,6 +417,9 @@ def test_splats_with_origins_taken_off_are_merged_by_their_coordinates(tmp_path:
     ours = Scene(model.clone(), SceneFacts("z up", offset=(388714.0, 5299720.0, 515.0)))
     merged = edited(ours, ("merge", tmp_path / "other.ply")).gaussians.means[300:]
     torch.testing.assert_close(merged, model.means + torch.tensor([-10.0, -20.0, 0.0]), atol=1e-5, rtol=0.0)
+    for axes in ("y up", "y down"):
+        turned = edited(ours.turned(axes), ("merge", tmp_path / "other.ply"))
+        torch.testing.assert_close(turned.turned("z up").gaussians.means[300:], merged, atol=1e-5, rtol=0.0)
     with pytest.raises(SplatpipeError, match="one file cannot hold both"):
         edited(Scene(model.clone(), SceneFacts("z up")), ("merge", tmp_path / "other.ply"))
 
