@@ -357,6 +357,7 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the current configuration no longer uses."""
     from splatpipe.pipeline.app.console import print_line
+    from splatpipe.pipeline.app.report.wording import plural, size
     from splatpipe.pipeline.engine.line import line_status
     from splatpipe.pipeline.engine.lock import locked
     from splatpipe.pipeline.engine.session import status_of
@@ -367,7 +368,7 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
             keep = [entry for status in line_status(line, store) for entry in status.to_keep]
             removed, freed = store.remove_stale(keep)
         done.details = {"removed": removed, "freed_bytes": freed}
-        print_line(f"Removed {removed} stale artifacts, {freed / 1e6:.1f} MB.")
+        print_line(f"Removed {plural(removed, 'stale artifact')}, {size(freed)}.")
 
 
 @with_help(app)

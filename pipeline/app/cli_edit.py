@@ -193,10 +193,14 @@ def _edit(
 
 def _show(facts: Mapping[str, Any]) -> None:
     from splatpipe.pipeline.app.console import print_line
+    from splatpipe.pipeline.app.formats import show_precision
+    from splatpipe.pipeline.app.report.wording import plural
 
     for step in facts["steps"]:
         before, after = step["gaussians"]
-        change = f"{before:,} Gaussians" if before == after else f"{before:,} → {after:,} Gaussians"
+        arrow = "" if before == after else f"{before:,} → "
+        change = f"{arrow}{plural(after, 'Gaussian')}"
         print_line(f"{step['step']}: {change}")
+    show_precision({**facts, "warnings": []})  # told while they were found
     for path in facts["outputs"]:
         print_line(path)

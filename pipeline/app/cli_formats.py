@@ -71,7 +71,8 @@ def convert(
     """Convert a splat file to another format; its georeference is kept."""
     with CommandSummary(target, as_json) as done:
         from splatpipe.pipeline.app.console import print_line
-        from splatpipe.pipeline.app.formats import convert_file
+        from splatpipe.pipeline.app.formats import convert_file, show_precision
+        from splatpipe.pipeline.app.report.wording import plural, size
         from splatpipe.pipeline.splat.formats.files import format_of_name
 
         kind = format_of_name(target, format_name)
@@ -79,4 +80,5 @@ def convert(
             raise UsageError(f"{target} is the input file.", hint="Choose another output file.")
         facts: dict[str, Any] = convert_file(source, target, kind)
         done.details = {"convert": facts}
-        print_line(f"{facts['gaussians']:,} Gaussians, {facts['bytes'] / 1e6:.1f} MB: {target}")
+        print_line(f"{plural(facts['gaussians'], 'Gaussian')}, {size(facts['bytes'])}: {target}")
+        show_precision(facts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +62,8 @@ def convert_file(source: Path, target: Path, kind: SplatFormat) -> dict[str, Any
     """Convert a splat file.
 
     Returns:
-        Number of Gaussians, bytes, and the format's name.
+        Number of Gaussians, bytes, the format's name, the origin taken off the coordinates (None if none was), steps
+        and sizes in the file's units, and warnings.
 
     Raises:
         SplatpipeError: if it cannot be read, or the format cannot hold it.
@@ -72,7 +74,32 @@ def convert_file(source: Path, target: Path, kind: SplatFormat) -> dict[str, Any
     scene = read_scene(source)
     if not len(scene.gaussians):
         raise SplatpipeError(f"{source} has no Gaussians.", hint="There is nothing to export.")
-    write_scene(target, scene, kind)
+    cost = write_scene(target, scene, kind)
     files = [target] if target.is_file() else [path for path in target.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files)
-    return {"format": kind.name, "gaussians": len(scene.gaussians), "bytes": size, "file": str(target)}
+    return {
+        "format": kind.name,
+        "gaussians": len(scene.gaussians),
+        "bytes": size,
+        "file": str(target),
+        **cost.summary(scene.facts),
+        "warnings": [*scene.notes, *cost.warnings()],
+    }
+
+
+def show_precision(facts: Mapping[str, Any]) -> None:
+    """Print the origin taken off a splat's coordinates, the steps of its positions, and warnings, from a summary."""
+    from splatpipe.pipeline.app.console import print_line
+    from splatpipe.pipeline.splat.position_cost import two_digits
+
+    unit = " m" if facts["metres"] else ""
+    if facts["origin"] is not None:
+        x, y, z = (f"{number:.15g}" for number in facts["origin"])
+        whole = "x, y, z as 64-bit numbers; for programs that read only 32-bit ones, write .viewer.ply"
+        print_line(
+            f"Origin {x} {y} {z}: {whole if facts['format'] == 'ply' else 'taken off, and recorded in the file'}"
+        )
+    steps = f"in steps of {two_digits(facts['position_step'])}{unit}" if facts["position_step"] else "exact"
+    print_line(f"Positions {steps}, Gaussians of {two_digits(facts['gaussian_size'])}{unit}")
+    for text in facts["warnings"]:
+        print_line(f"! {text}")

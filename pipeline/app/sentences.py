@@ -123,7 +123,7 @@ def _split(facts: Figures) -> str:
 
 
 def _initialize(facts: Figures) -> str:
-    text = f"{count(facts['gaussians'])} Gaussians from {count(facts['points'])} tie points"
+    text = f"{plural(facts['gaussians'], 'Gaussian')} from {count(facts['points'])} tie points"
     return text + (f" and {count(facts['dense_points'])} dense points" if facts.get("dense_points") else "")
 
 
@@ -133,7 +133,7 @@ def _blocks(facts: Figures) -> str:
 
 def _train(facts: Figures) -> str:
     done, planned = facts["iterations"], facts.get("planned_iterations")
-    text = f"{count(facts['gaussians'])} Gaussians after {count(done)}"
+    text = f"{plural(facts['gaussians'], 'Gaussian')} after {count(done)}"
     text += f" of {count(planned)} iterations" if planned and planned != done else " iterations"
     text += " (stopped when the loss was flat)" if facts.get("flat_at") else ""
     return text + (f", on {facts['device']}" if facts.get("device") not in (None, "cpu") else "")
@@ -154,7 +154,7 @@ def _evaluate(facts: Figures) -> str:
 
 
 def _export(facts: Figures) -> str:
-    return f"{count(facts['gaussians'])} Gaussians and their files"
+    return f"{plural(facts['gaussians'], 'Gaussian')} and their files"
 
 
 def _flythrough(facts: Figures) -> str:

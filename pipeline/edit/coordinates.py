@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.splat.scene import SceneFacts, turn_of
+from splatpipe.pipeline.splat.scene import NO_OFFSET, SceneFacts, turn_of
 from splatpipe.pipeline.survey.handover import frame_of
 from splatpipe.pipeline.survey.world import World, open_world
 
@@ -24,14 +24,17 @@ class Coordinates:
     """The meaning of coordinates that a user gives. Steps work in the splat's frame, rotated to z up.
 
     Attributes:
-        name: ``own`` (the file's axes), ``local`` (metres east, north, up of the origin), or the CRS.
+        name: ``own`` (the file's axes, with an origin that was taken off), ``local`` (metres east, north, up of the
+            origin), or the CRS.
         world: Converts between the CRS and the frame; None if the coordinates are not in a CRS.
         frame_from_stated: Rotation of directions, and of positions without a CRS, into the frame.
+        offset: What is added to positions of the file, without a CRS.
     """
 
     name: str
     world: World | None
     frame_from_stated: Float64[np.ndarray, "3 3"]
+    offset: tuple[float, float, float] = NO_OFFSET
 
     @staticmethod
     def of(facts: SceneFacts, local: bool) -> Coordinates:
@@ -45,7 +48,8 @@ class Coordinates:
             SplatpipeError: if its CRS cannot be used there.
         """
         if facts.place is None:
-            return Coordinates(OWN, None, turn_of("z up", facts.axes).numpy())
+            offset = NO_OFFSET if local else facts.offset
+            return Coordinates(OWN, None, turn_of("z up", facts.axes).numpy(), offset)
         if local:
             return Coordinates(LOCAL, None, np.eye(3))
         world = open_world(frame_of(facts.place))
@@ -55,7 +59,13 @@ class Coordinates:
         """Convert points from the frame to the coordinates the user gives."""
         if self.world is not None:
             return self.world.crs_from_local(points)
-        return np.asarray(points @ self.frame_from_stated)
+        return np.asarray(points @ self.frame_from_stated + self.offset)
+
+    def heights(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """The heights of points in the frame, along the up direction, whichever of the file's axes that is."""
+        if self.world is not None:
+            return np.asarray(self.stated(points)[:, 2])
+        return np.asarray(points[:, 2] + (self.frame_from_stated @ self.offset)[2])
 
     def in_frame(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """Convert points from the coordinates the user gives to the frame.
@@ -64,7 +74,7 @@ class Coordinates:
             UsageError: if the CRS has no such place.
         """
         if self.world is None:
-            return np.asarray(points @ self.frame_from_stated.T)
+            return np.asarray((points - self.offset) @ self.frame_from_stated.T)
         found = self.world.local_from_crs(points)
         if not (np.isfinite(found).all() and (np.abs(found) <= LARGEST).all()):
             raise UsageError(

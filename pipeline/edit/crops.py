@@ -118,8 +118,7 @@ class CropHeights:
         coordinates = Coordinates.of(piece.facts, self.local)
 
         def within(places: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-            # Heights are along the up direction, whichever of the file's axes that is.
-            heights = places[:, 2] if coordinates.world is None else coordinates.stated(places)[:, 2]
+            heights = coordinates.heights(places)
             return np.asarray((heights >= self.low) & (heights <= self.high))
 
         _crop(piece, within, True, lambda: _nothing("heights", piece, coordinates))

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from splatpipe.pipeline.edit.clean import Clean
 from splatpipe.pipeline.edit.merge import Merge, origin_of
 from splatpipe.pipeline.edit.pictures import PictureCameras, Points, choose_views, picture, write_side_by_side
 from splatpipe.pipeline.edit.record import Edit, with_edits, write_record
@@ -21,7 +22,9 @@ from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, Usage
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.splat.formats.bounded import keep_unusable, usable
 from splatpipe.pipeline.splat.formats.files import write_scene
+from splatpipe.pipeline.splat.position_cost import PositionCost
 from splatpipe.pipeline.splat.scene import Scene, SplatOrigin
 
 RECORD, PICTURE = ".edits.json", ".edit.png"
@@ -85,17 +88,21 @@ def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
     total = len(task.steps) + 1 + task.pictures
     report.progress(0, total, "reading", "steps")
     digest = task.source.digest()
-    piece = Workpiece(task.source.read())
-    if not len(piece):
-        raise SplatpipeError(f"{task.source.name} has no Gaussians.", hint="Name another splat.")
+    whole, unusable = _read(task)
+    for note in whole.notes:
+        report.warning(note)
+    piece = Workpiece(whole)
+    del whole  # changed in place
     before = _SplatExtent(piece.sample(), piece.facts.place, len(piece))
-    edits = _take_steps(task, piece, total, report)
+    edits = [*unusable, *_take_steps(task, piece, total, report)]
     scene = piece.scene()
     _require_finite(scene)
     scene = Scene(scene.gaussians, with_edits(scene.facts, edits))
     after = _SplatExtent(piece.sample(), scene.facts.place, len(piece))
     del piece
-    _write(task, scene)
+    cost = _write(task, scene)
+    for warning in cost.warnings():
+        report.warning(warning)
     write_record(task.beside(RECORD), task.source, digest, edits, _made(task, after.count))
     outputs = [task.output.path, task.beside(RECORD)]
     facts = scene.facts
@@ -115,9 +122,32 @@ def edit_splat(task: EditTask, report: Reporter) -> dict[str, Any]:
         "steps": edits,
         "gaussians": after.count,
         "place": placed,
-        "metres": facts.metres,
+        "format": task.output.kind.name,
+        **cost.summary(facts),
         "outputs": [str(path) for path in outputs],
     }
+
+
+def _read(task: EditTask) -> tuple[Scene, list[Edit]]:
+    """The splat; if it is to be cleaned, without Gaussians that have unusable values, and the record of these.
+
+    Raises:
+        SplatpipeError: if it is broken, or nothing is left.
+    """
+    if not any(isinstance(step, Clean) for step in task.steps):
+        scene = task.source.read()
+        if not len(scene.gaussians):
+            raise SplatpipeError(f"{task.source.name} has no Gaussians.", hint="Name another splat.")
+        return scene, []
+    scene = task.source.read(keep_unusable)
+    count, good = len(scene.gaussians), usable(scene.gaussians)
+    left = int(good.sum())
+    if not left:
+        raise SplatpipeError(f"{task.source.name} has no Gaussians with usable values.", hint="Name another splat.")
+    if left == count:
+        return scene, []
+    kept = replace(scene, gaussians=scene.gaussians.select(good))
+    return kept, [{"step": "drop unusable values", "gaussians": [count, left]}]
 
 
 def _take_steps(task: EditTask, piece: Workpiece, total: int, report: Reporter) -> list[Edit]:
@@ -169,16 +199,17 @@ def _require_finite(scene: Scene) -> None:
     bad = len(scene.gaussians) - int(scene.gaussians.finite().sum())
     if bad:
         raise SplatpipeError(
-            f"{bad} Gaussians are out of the range that a file can hold.", hint="Scale or move it by less."
+            f"A file cannot hold the values of {bad} of {len(scene.gaussians)} Gaussians.",
+            hint="Scale or move it by less.",
         )
 
 
-def _write(task: EditTask, scene: Scene) -> None:
-    """Write the output atomically."""
+def _write(task: EditTask, scene: Scene) -> PositionCost:
+    """Write the output atomically; returns what its positions have lost."""
     path = task.output.path
     try:
         with beside(path) as aside:
-            write_scene(aside, scene, task.output.kind)
+            return write_scene(aside, scene, task.output.kind)
     except OSError as error:
         raise MachineError(f"Cannot write {path}: {error.strerror}.", hint="Check the free space.") from error
 
@@ -195,7 +226,7 @@ def _views(task: EditTask, before: _SplatExtent, after: _SplatExtent) -> Picture
 
 def _write_picture(task: EditTask, views: PictureCameras, before: _SplatExtent, right: Pixels) -> None:
     """Read the original again, and write its image beside that of the result."""
-    left = picture(task.source.read(), views.before, before.points, f"before: {before.count:,} Gaussians")
+    left = picture(_read(task)[0], views.before, before.points, f"before: {before.count:,} Gaussians")
     try:
         write_side_by_side(task.beside(PICTURE), left, right)
     except OSError as error:

@@ -15,7 +15,7 @@ from splatpipe.pipeline.edit.workpiece import Workpiece, between
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, turn_of
+from splatpipe.pipeline.splat.scene import NO_OFFSET, Scene, SceneFacts, SplatOrigin, turn_of
 from splatpipe.pipeline.survey.crs import UNKNOWN, describe_vertical, parse_vertical, same_datum
 from splatpipe.pipeline.survey.frames import Origin
 
@@ -88,7 +88,8 @@ def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similar
         )
     if ours.place is not None and other.place is not None:
         return _on_earth(ours.place, other.place, name)
-    if ours.axes != other.axes:
+    surveyed = ours.offset != NO_OFFSET and other.offset != NO_OFFSET  # z up, whatever the files' axes
+    if ours.axes != other.axes and not surveyed:
         raise SplatpipeError(
             f"{name} has its {other.axes.replace(' ', ' axis ')}, the splat its {ours.axes.replace(' ', ' axis ')}.",
             hint="Splats that are not georeferenced can be merged only in the same frame.",
@@ -98,7 +99,13 @@ def _frame_from_other(ours: SceneFacts, other: SceneFacts, name: str) -> Similar
             f"Only one of {name} and the splat is in metres.",
             hint="Scale the other first: splatpipe edit IN OUT --scale-from A B 12.40m.",
         )
-    return Similarity.identity()
+    apart = np.array(other.turned("z up").offset) - np.array(ours.turned("z up").offset)
+    if float(np.linalg.norm(apart)) > MAX_DISTANCE_M:
+        raise SplatpipeError(
+            f"By its coordinates, {name} lies {np.linalg.norm(apart):,.0f} from the splat: one file cannot hold both.",
+            hint="Export both in the same coordinates.",
+        )
+    return Similarity(1.0, np.eye(3), apart)
 
 
 def _on_earth(ours: SplatOrigin, other: SplatOrigin, name: str) -> Similarity:

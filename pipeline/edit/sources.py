@@ -13,6 +13,7 @@ from splatpipe.pipeline.engine.digests import part_digest, tree_entries
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.scene import Scene
 
@@ -38,13 +39,16 @@ class SplatSource:
         """The splat's display name."""
         return self.path.name if self.run is None else self.run.name
 
-    def read(self) -> Scene:
+    def read(self, check: CheckValues = check_values) -> Scene:
         """Read the splat.
+
+        Args:
+            check: What to do about unusable values.
 
         Raises:
             SplatpipeError: if it is broken.
         """
-        return read_scene(self.path)
+        return read_scene(self.path, check)
 
     def digest(self) -> str:
         """sha256 of its content, which identifies it."""

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, turn_of
+from splatpipe.pipeline.splat.scene import NO_OFFSET, Scene, SceneFacts, turn_of
 from splatpipe.pipeline.survey.frames import Frame, Origin
 from splatpipe.pipeline.survey.handover import frame_of
 from splatpipe.pipeline.survey.world import open_world
@@ -126,7 +126,7 @@ class Workpiece:
         return Scene(gaussians, self.facts)
 
     def _near_zero(self) -> None:
-        """Make sure that float32 can hold the coordinates; a georeferenced splat gets a nearer origin if needed.
+        """Make sure that float32 can hold the coordinates; a splat that knows its origin gets a nearer one if needed.
 
         Raises:
             SplatpipeError: if float32 would be too coarse.
@@ -137,6 +137,9 @@ class Workpiece:
         if self.facts.place is not None and float(np.linalg.norm(middle)) > FAR_M:
             self._take_zero(middle)
             sample = self.sample()
+        elif self.facts.offset != NO_OFFSET and float(np.linalg.norm(middle)) > FAR_M:
+            self._take_off(np.rint(middle))
+            sample = self.sample()
         size = float(np.linalg.norm(high - low)) + self._moved.scale * _sigma(self._gaussians)
         before = self._moved.scale * _step(_largest(self._gaussians.means))  # the file was no finer before
         if not _step(float(np.abs(sample).max())) <= max(COARSEST * size, before):
@@ -144,6 +147,12 @@ class Workpiece:
                 "The splat would be too far from the origin for a file, whose coordinates are 32-bit numbers.",
                 hint="Keep coordinates small; a georeferenced splat can be moved anywhere with --move-to.",
             )
+
+    def _take_off(self, origin: Float64[np.ndarray, " 3"]) -> None:
+        """Take an origin off the coordinates, beyond what is taken off already."""
+        self.move(Similarity(1.0, np.eye(3), -origin))
+        x, y, z = (turn_of(self.facts.axes, "z up").numpy() @ origin + self.facts.offset).tolist()
+        self.facts = replace(self.facts, offset=(x, y, z))
 
     def _take_zero(self, middle: Float64[np.ndarray, " 3"]) -> None:
         place = self.facts.place

@@ -20,11 +20,11 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
-from splatpipe.pipeline.splat.formats.bounded import read_exactly
+from splatpipe.pipeline.splat.formats.bounded import CheckValues, read_exactly
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import Accessor, Container
 from splatpipe.pipeline.splat.glb_nodes import drawn_primitives
-from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count, rgb_to_dc
+from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count, multiply_rows, rgb_to_dc
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
@@ -56,7 +56,7 @@ def harmonics_names(sh_degree: int) -> list[str]:
     return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
 
 
-def read_splats(container: Container) -> Gaussians:
+def read_splats(container: Container, check: CheckValues) -> Gaussians:
     """Read all Gaussians that the scene draws, in the scene's frame.
 
     Args:
@@ -76,7 +76,7 @@ def read_splats(container: Container) -> Gaussians:
     if sum(splat.least_bytes for splat in splats) > container.length:
         container.refuse("it draws more Gaussians than it contains")
     matrices = [matrix for _, matrix in drawn]
-    parts = [_placed(container, one.read(container), at) for one, at in zip(splats, matrices, strict=True)]
+    parts = [_placed(container, one.read(container, check), at) for one, at in zip(splats, matrices, strict=True)]
     degree = max(part.sh_degree for part in parts)
     return parts[0] if len(parts) == 1 else Gaussians.concat([_of_degree(part, degree) for part in parts])
 
@@ -104,7 +104,7 @@ class _SpzSplat:
     def least_bytes(self) -> int:
         return self.length
 
-    def read(self, container: Container) -> Gaussians:
+    def read(self, container: Container, check: CheckValues) -> Gaussians:
         """Read its Gaussians through the SPZ reader, which needs a file."""
         reader = next((each for each in SPLAT_FORMATS if each.name == "spz" and each.reads), None)
         if reader is None:
@@ -115,10 +115,10 @@ class _SpzSplat:
             path = Path(folder) / "inside.spz"
             write_file(path, data)
             try:
-                return reader.read(path).turned("y up").gaussians
+                return reader.read(path, check).turned("y up").gaussians
             except SplatpipeError as error:
                 message = error.message.replace(str(path), f"The SPZ file in {container.path}")
-                raise SplatpipeError(message, hint=error.hint) from error
+                raise SplatpipeError(message, hint=error.hint.replace(str(path), str(container.path))) from error
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,8 @@ class _Splat:
     def least_bytes(self) -> int:
         return _MIN_ROW_BYTES * self.columns["position"].count
 
-    def read(self, container: Container) -> Gaussians:
-        """Read its Gaussians, in its own frame."""
+    def read(self, container: Container, _: CheckValues) -> Gaussians:
+        """Read its Gaussians, in its own frame; the caller checks their values."""
         count = self.columns["position"].count
         gaussians = Gaussians.empty(count, max(math.isqrt(len(self.harmonics)) - 1, 0))
         for start in range(0, count, ROWS_AT_ONCE):
@@ -239,4 +239,5 @@ def _placed(container: Container, gaussians: Gaussians, matrix: Float64[np.ndarr
         )
     turn, move = torch.from_numpy(rotation.copy()), torch.from_numpy(matrix[:3, 3].copy())
     pieces = (piece.transformed(scale, turn, move) for piece in gaussians.pieces())
-    return Gaussians.gathered(pieces, gaussians)
+    placed = Gaussians.gathered(pieces, gaussians)
+    return replace(placed, means=multiply_rows(scale * turn, gaussians.means.double()) + move)  # not rounded to float32

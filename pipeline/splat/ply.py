@@ -19,6 +19,7 @@ from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.splat.formats.bounded import check_values, open_file
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.ply_header import PLY_HINT, PlyElement, ply_header_bytes, read_ply_header
+from splatpipe.pipeline.splat.scene import NO_OFFSET
 from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count
 
 MIP_COMMENT = "SplatRenderMode: mip"
@@ -58,13 +59,16 @@ class SplatHeader:
     offset_bytes: int
 
 
-def write_splat(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> None:
+def write_splat(
+    path: Path, gaussians: Gaussians, comments: Sequence[str] = (), offset: tuple[float, float, float] = NO_OFFSET
+) -> None:
     """Write the exact 3DGS layout: binary little-endian float32, normals of zero, f_rest channel-major.
 
     Args:
         path: The file; replaced if it exists.
         gaussians: Gaussians to write, as raw parameters (logits, logarithms, (w, x, y, z)).
         comments: Header comments, one line each; non-ASCII characters are escaped.
+        offset: Added to the positions, which are then float64; zero for float32.
 
     Raises:
         ValueError: if a value is not finite, or a comment has a line break.
@@ -73,8 +77,8 @@ def write_splat(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) 
     gaussians = gaussians.detach().to("cpu", torch.float32)
     _check_finite(gaussians)
     with new_file(path) as file:
-        file.write(_header(len(gaussians), gaussians.sh_degree, comments))
-        _write_rows(file, gaussians)
+        file.write(_header(len(gaussians), gaussians.sh_degree, comments, "f4" if offset == NO_OFFSET else "f8"))
+        _write_rows(file, gaussians, offset)
 
 
 def write_splat_parts(
@@ -107,8 +111,8 @@ def write_splat_parts(
         raise ValueError(f"parts of {count - left} Gaussians were to be of {count}")
 
 
-def _header(count: int, sh_degree: int, comments: Sequence[str]) -> bytes:
-    fields = tuple((name, "f4") for name in property_names(sh_degree))
+def _header(count: int, sh_degree: int, comments: Sequence[str], position: str = "f4") -> bytes:
+    fields = tuple((name, position if name in _POSITION else "f4") for name in property_names(sh_degree))
     return ply_header_bytes([PlyElement("vertex", count, fields)], comments)
 
 
@@ -118,7 +122,8 @@ def _check_finite(gaussians: Gaussians) -> None:
         raise ValueError(f"{bad} Gaussians have values that are not finite: never to be written")
 
 
-def _write_rows(file: BinaryIO, gaussians: Gaussians) -> None:
+def _write_rows(file: BinaryIO, gaussians: Gaussians, offset: tuple[float, float, float] = NO_OFFSET) -> None:
+    far = torch.tensor(offset, dtype=torch.float64)
     for piece in gaussians.pieces(_CHUNK_ROWS):
         columns = [
             piece.means,
@@ -129,7 +134,13 @@ def _write_rows(file: BinaryIO, gaussians: Gaussians) -> None:
             piece.log_scales,
             piece.quats,
         ]
-        file.write(torch.cat(columns, dim=1).numpy().astype("<f4", copy=False).tobytes())
+        if offset == NO_OFFSET:
+            file.write(torch.cat(columns, dim=1).numpy().astype("<f4", copy=False).tobytes())
+            continue
+        rest = torch.cat(columns[1:], dim=1).numpy()
+        rows = np.empty(len(piece), [("position", "<f8", 3), ("rest", "<f4", rest.shape[1])])
+        rows["position"], rows["rest"] = (piece.means.double() + far).numpy(), rest
+        file.write(rows.tobytes())
 
 
 def property_names(sh_degree: int) -> list[str]:
@@ -152,15 +163,28 @@ def read_splat(path: Path) -> Gaussians:
     Raises:
         SplatpipeError: if the file is missing, truncated, not a splat, or has values that are not numbers.
     """
+    gaussians, _ = read_stored_splat(path)
+    check_values(path, gaussians)
+    gaussians.means = gaussians.means.float()
+    return gaussians
+
+
+def read_stored_splat(path: Path) -> tuple[Gaussians, SplatHeader]:
+    """As ``read_splat``, with positions of float64 if the file has any, and values that nobody has checked.
+
+    Raises:
+        SplatpipeError: as ``read_splat``, except for the values.
+    """
     with open_file(path) as file:
         header = _read_header(path, file)
         gaussians = Gaussians.empty(header.count, header.sh_degree)
+        if any(header.row[name].itemsize == 8 for name in _POSITION):
+            gaussians.means = torch.zeros(header.count, 3, dtype=torch.float64)
         start = 0
         for rows in _chunks(path, file, header):
             _fill(gaussians, start, rows)
             start += len(rows)
-    check_values(path, gaussians)
-    return gaussians
+    return gaussians, header
 
 
 def read_splat_header(path: Path) -> SplatHeader:
@@ -224,8 +248,8 @@ def _fill(gaussians: Gaussians, start: int, rows: np.ndarray) -> None:
     """Convert rows into the Gaussians from ``start`` on."""
     part = slice(start, start + len(rows))
 
-    def columns(names: Sequence[str]) -> torch.Tensor:
-        out = np.empty((len(rows), len(names)), dtype=np.float32)
+    def columns(names: Sequence[str], kind: str = "f4") -> torch.Tensor:
+        out = np.empty((len(rows), len(names)), dtype=kind)
         with np.errstate(over="ignore", invalid="ignore"):  # a double beyond float32 becomes an infinity: reported
             for i, name in enumerate(names):
                 out[:, i] = rows[name]
@@ -233,7 +257,7 @@ def _fill(gaussians: Gaussians, start: int, rows: np.ndarray) -> None:
 
     k = gaussians.sh.shape[1]
     rest = columns([f"f_rest_{i}" for i in range(3 * (k - 1))])
-    gaussians.means[part] = columns(_POSITION)
+    gaussians.means[part] = columns(_POSITION, "f4" if gaussians.means.dtype == torch.float32 else "f8")
     gaussians.sh[part, 0] = columns(_DC)
     gaussians.sh[part, 1:] = rest.reshape(len(rows), 3, k - 1).transpose(1, 2)
     logits = columns(["opacity"])[:, 0]

@@ -36,7 +36,7 @@ _TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
-_NAMES = {"u1": "uchar", "u4": "uint", "f4": "float"}  # the types that we write
+_NAMES = {"u1": "uchar", "u4": "uint", "f4": "float", "f8": "double"}  # the types that we write
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -109,7 +109,7 @@ def ply_header_bytes(elements: Sequence[PlyElement], comments: Sequence[str]) ->
     """The header of a binary little-endian file.
 
     Args:
-        elements: In order, with uint8, uint32 and float32 properties.
+        elements: In order, with uint8, uint32, float32 and float64 properties.
         comments: One line each; non-ASCII characters are escaped.
 
     Raises:

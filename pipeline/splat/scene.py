@@ -21,7 +21,9 @@ viewers assume for a 3DGS PLY (a COLMAP camera's axes)."""
 FORMAT = 1
 MAX_RECORD_BYTES = 60_000  # of the record in a file: gzip's extra field holds 65,535
 MAX_EDITS = 200
+MAX_OFFSET = 1e12  # of a coordinate, in any unit a place on the earth has
 _MAX_TEXT_LENGTH = 4000  # characters of a CRS in WKT, the longest text
+NO_OFFSET = (0.0, 0.0, 0.0)
 _Z_UP_FROM: Mapping[Axes, tuple[tuple[float, ...], ...]] = {
     "z up": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "y up": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
@@ -60,6 +62,8 @@ class SceneFacts:
         metres: Whether a unit is a metre.
         place: Position on the earth; None if unknown.
         edits: Edits since training, in order, each as JSON.
+        offset: What was taken off the coordinates of another program, along ``axes``, so that float32 can hold them:
+            its coordinates are the file's plus this. Zero if the splat has a place.
     """
 
     axes: Axes = "z up"
@@ -67,6 +71,13 @@ class SceneFacts:
     metres: bool = False
     place: SplatOrigin | None = None
     edits: tuple[Mapping[str, Any], ...] = ()
+    offset: tuple[float, float, float] = NO_OFFSET
+
+    def turned(self, axes: Axes) -> SceneFacts:
+        """The facts of the same splat turned to other axes."""
+        offset = turn_of(axes, self.axes) @ torch.tensor(self.offset, dtype=torch.float64)
+        x, y, z = (offset + 0.0).tolist()  # no negative zeros
+        return replace(self, axes=axes, offset=(x, y, z))
 
     def record(self) -> str:
         """One line of ASCII JSON, stored in files under the name ``splatpipe``; ``facts_of_record`` reads it.
@@ -74,7 +85,10 @@ class SceneFacts:
         Raises:
             ValueError: if it is longer than ``MAX_RECORD_BYTES``.
         """
-        text = json.dumps({"format": FORMAT, **asdict(self)}, separators=(",", ":"), allow_nan=False)
+        facts = {"format": FORMAT, **asdict(self)}
+        if self.offset == NO_OFFSET:
+            del facts["offset"]
+        text = json.dumps(facts, separators=(",", ":"), allow_nan=False)
         if len(text) > MAX_RECORD_BYTES:
             raise ValueError(f"a record of {len(text)} bytes is larger than {MAX_RECORD_BYTES}")
         return text
@@ -102,7 +116,12 @@ def _facts(value: Mapping[str, Any]) -> SceneFacts:
     if not isinstance(edits, list) or len(edits) > MAX_EDITS or not all(isinstance(edit, dict) for edit in edits):
         raise ValueError("edits")
     place = None if value["place"] is None else _place(value["place"])
-    facts = SceneFacts(value["axes"], value["antialias"] is True, value["metres"] is True, place, tuple(edits))
+    x, y, z = (float(number) for number in value.get("offset", NO_OFFSET))
+    if not all(abs(number) <= MAX_OFFSET for number in (x, y, z)) or (place is not None and any((x, y, z))):
+        raise ValueError("offset")
+    facts = SceneFacts(
+        value["axes"], value["antialias"] is True, value["metres"] is True, place, tuple(edits), (x, y, z)
+    )
     facts.record()  # raises if it could not be written again: JSON reads 1e400 as infinity
     return facts
 
@@ -122,10 +141,12 @@ class Scene:
     Attributes:
         gaussians: On the CPU, float32, in the frame given by ``facts.axes``.
         facts: Metadata.
+        notes: What its reader has to tell the user about it.
     """
 
     gaussians: Gaussians
     facts: SceneFacts = field(default_factory=SceneFacts)
+    notes: tuple[str, ...] = ()
 
     def turned(self, axes: Axes) -> Scene:
         """The scene turned to other axes; the scene itself if it has these already."""
@@ -133,7 +154,7 @@ class Scene:
             return self
         turn, nowhere = turn_of(axes, self.facts.axes), torch.zeros(3, dtype=torch.float64)
         pieces = (piece.transformed(1.0, turn, nowhere) for piece in self.gaussians.pieces())
-        return Scene(Gaussians.gathered(pieces, self.gaussians), replace(self.facts, axes=axes))
+        return Scene(Gaussians.gathered(pieces, self.gaussians), self.facts.turned(axes), self.notes)
 
 
 def turn_of(axes: Axes, from_axes: Axes) -> Float64[Tensor, "3 3"]:

@@ -20,6 +20,7 @@ from jaxtyping import Float, Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.splat.formats.bounded import all_finite
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.position_cost import PositionCost, sizes_of, two_digits
 
 MAGIC = 0x5053474E  # "NGSP"
 VERSION = 3
@@ -34,10 +35,12 @@ RECORD_FIELD = b"sp"
 POSITION_STEPS = 2**23 - 1
 MIN_FRACTIONAL_BITS, MAX_FRACTIONAL_BITS = 12, 20  # the reference's: a quarter of a millimetre in metres
 FINEST_QUANTILE, STEPS_PER_SIZE = 0.05, 16.0  # nearly all Gaussians are as many steps large: finer ones are noise
-RANGE_PER_SCENE = 16.0  # of the distances of nearly all Gaussians: what is beyond is brought in
+RANGE_PER_SCENE = 16.0  # of the distances of nearly all Gaussians: kept even if steps become coarser
 SCENE_QUANTILE = 0.99
 COLOUR_SCALE = 0.15
 MIN_LOG_SCALE, LOG_SCALE_STEPS = -10.0, 16.0
+MAX_LOG_SCALE = MIN_LOG_SCALE + 255.0 / LOG_SCALE_STEPS
+TOLD_SHARE = 0.001  # of Gaussians whose scales are cut: single huge ones are haze
 ROTATION_STEPS = 511
 SH_STEPS = 128.0
 SH_STEP = 10.0
@@ -59,8 +62,9 @@ def spz_bytes(
 ) -> bytes:
     """Encode Gaussians, reordered for compression; deterministic.
 
-    A Gaussian far beyond all others is moved in along its ray from the origin and scaled down by the same factor, so
-    that it looks the same from the scene and the 24 bits of positions are left to the scene. SH coefficients are
+    A Gaussian so far beyond all others that the 24 bits of positions would no longer do for the scene is moved in along
+    its ray from the origin and scaled down by the same factor, so that it looks the same from there; ``position_cost``
+    counts them. SH coefficients are
     rounded to power-of-two steps according to a Gaussian's contribution to images, and Gaussians with the same step are
     stored together.
 
@@ -84,7 +88,8 @@ def spz_bytes(
         raise ValueError("an SPZ file holds finite numbers only")
     gaussians = gaussians.detach()
     means = [np.zeros((0, 3)), *(_turned(piece, turn).means.numpy() for piece in gaussians.pieces())]
-    bits, shrink = _range(np.concatenate(means, dtype=np.float64), _fine_bits(gaussians.log_scales))
+    distances = np.linalg.norm(np.concatenate(means, dtype=np.float64), axis=1)
+    bits, shrink = _range(distances, _finest_size(gaussians.log_scales))
     doublings = _sh_doublings(gaussians, sh_step)
     header = struct.pack(
         "<IIIBBBB", MAGIC, version, len(gaussians), gaussians.sh_degree, bits, ANTIALIASED if antialias else 0, 0
@@ -100,6 +105,32 @@ def spz_bytes(
     whole = [np.concatenate(kept) for kept in coded if kept]
     order = _order(whole[1], whole[5], doublings) if whole else np.zeros(0, np.int64)
     return _gzip(chain([header], (array[order].tobytes() for array in whole)), record)
+
+
+def position_cost(gaussians: Gaussians) -> PositionCost:
+    """What the steps of the positions and the ranges of positions and scales cost the Gaussians; in any axes."""
+    gaussians = gaussians.detach()
+    sizes = sizes_of(gaussians.log_scales)
+    distances = np.linalg.norm(gaussians.means.numpy().astype(np.float64), axis=1)
+    bits, shrink = _range(distances, _finest_size(gaussians.log_scales))
+    notes, moved = [], shrink < 1.0
+    if moved.any():
+        reach = float((distances * shrink).max())
+        notes.append(
+            f"Moved in to a distance of {reach:,.0f} from the origin and made smaller, as SPZ has no room for them "
+            f"beside such small Gaussians: {int(moved.sum()):,} of {len(gaussians):,} Gaussians, up to "
+            f"{distances.max():,.0f} away. A PLY or GLB keeps them; splatpipe edit --crop-box removes them."
+        )
+    largest = gaussians.log_scales.numpy().max(axis=1, initial=-math.inf) + np.log(shrink)
+    for count, what, limit in (
+        (int((largest > MAX_LOG_SCALE).sum()), "largest", MAX_LOG_SCALE),
+        (int((np.log(np.maximum(sizes[:, 0], 1e-300)) < MIN_LOG_SCALE).sum()), "smallest", MIN_LOG_SCALE),
+    ):
+        if count > TOLD_SHARE * len(gaussians):
+            notes.append(
+                f"Given SPZ's {what} size, {two_digits(math.exp(limit))}: {count:,} of {len(gaussians):,} Gaussians."
+            )
+    return PositionCost.of(2.0**-bits, sizes, notes=tuple(notes))
 
 
 def _gzip(parts: Iterable[bytes], record: str) -> bytes:
@@ -119,14 +150,12 @@ def _gzip(parts: Iterable[bytes], record: str) -> bytes:
     return b"".join([*made, deflate.flush(), struct.pack("<II", check, size & 0xFFFFFFFF)])
 
 
-def _fine_bits(log_scales: Float[torch.Tensor, "n 3"]) -> int:
-    """Fractional bits beyond which positions are finer than visible."""
+def _finest_size(log_scales: Float[torch.Tensor, "n 3"]) -> float:
+    """The logarithm of the size that nearly all Gaussians exceed."""
     if not len(log_scales):
-        return MIN_FRACTIONAL_BITS
+        return math.log(STEPS_PER_SIZE / 2.0**MIN_FRACTIONAL_BITS)
     middling = np.sort(log_scales.numpy(), axis=1)[:, 1]
-    size = float(np.quantile(middling, FINEST_QUANTILE, method="lower"))
-    bits = math.ceil((math.log(STEPS_PER_SIZE) - size) / math.log(2.0))
-    return min(max(bits, MIN_FRACTIONAL_BITS), MAX_FRACTIONAL_BITS)
+    return float(np.quantile(middling, FINEST_QUANTILE, method="lower"))
 
 
 def _sh_doublings(gaussians: Gaussians, sh_step: float | None) -> UInt8[np.ndarray, " n"]:
@@ -177,13 +206,20 @@ def _coded(
     )
 
 
-def _range(means: Float64[np.ndarray, "n 3"], most_bits: int) -> tuple[int, Float64[np.ndarray, " n"]]:
-    """Fractional bits of the positions, and the factor by which each Gaussian is moved in, 0..1."""
-    distance = np.linalg.norm(means, axis=1)
+def _range(distance: Float64[np.ndarray, " n"], finest: float) -> tuple[int, Float64[np.ndarray, " n"]]:
+    """Fractional bits of the positions, and the factor by which each Gaussian is moved in, 0..1.
+
+    Args:
+        distance: Distances from the origin.
+        finest: The logarithm of the size that nearly all Gaussians exceed: bits beyond ``STEPS_PER_SIZE`` are noise.
+    """
+    fine_bits = math.ceil((math.log(STEPS_PER_SIZE) - finest) / math.log(2.0))
+    most_bits = min(max(fine_bits, MIN_FRACTIONAL_BITS), MAX_FRACTIONAL_BITS)
     if not len(distance) or not distance.max() > 0.0:
-        return most_bits, np.ones(len(means))
+        return most_bits, np.ones(len(distance))
     nearly_all = float(np.quantile(distance, SCENE_QUANTILE, method="lower"))
-    reach = min(float(distance.max()), RANGE_PER_SCENE * nearly_all or math.inf)
+    for_nothing = POSITION_STEPS / 2.0 ** min(max(fine_bits, 0), MAX_FRACTIONAL_BITS)  # beyond it, steps become coarser
+    reach = min(float(distance.max()), max(RANGE_PER_SCENE * nearly_all, for_nothing))
     bits = min(max(math.floor(math.log2(POSITION_STEPS / reach)), 0), most_bits)
     reach = min(reach, POSITION_STEPS / 2.0**bits)
     return bits, np.asarray(reach / np.maximum(distance, reach))

@@ -93,7 +93,8 @@ def write_deliverables(names: Sequence[str], run: RunSplat, out: Path, report: R
             elif name == "streamed-sog":
                 write_streamed_sog(folder / name, run.scene, run.levels)
             else:
-                _write(name, run, folder)
+                for warning in _write(name, run, folder):
+                    report.warning(f"{name}: {warning}")
         except SplatpipeError as error:
             if error.exit_code != SplatpipeError.exit_code:
                 raise
@@ -109,10 +110,12 @@ def _write_tiles(run: RunSplat, folder: Path, report: Reporter) -> None:
         report.note(f"3D Tiles: {placement.note}")
 
 
-def _write(name: str, run: RunSplat, folder: Path) -> None:
+def _write(name: str, run: RunSplat, folder: Path) -> tuple[str, ...]:
+    """Write a format; returns what the user has to know about it."""
+    warnings: tuple[str, ...] = ()
     kind = next((each for each in SPLAT_FORMATS if each.name == name), None)
     if kind is not None:
-        write_scene(folder / kind.file, run.scene, kind)
+        warnings = write_scene(folder / kind.file, run.scene, kind).warnings()
     if name == "model":
         _complete_model_folder(run, folder / "model")
     elif name == "colmap":
@@ -123,6 +126,7 @@ def _write(name: str, run: RunSplat, folder: Path) -> None:
         _write_clouds(run, folder)
     if name in ("model", "colmap", "transforms"):  # these formats cannot store it themselves
         write_json(folder / ("model" if name == "model" else DATASET) / "georef.json", dict(run.georeference))
+    return warnings
 
 
 def _complete_model_folder(run: RunSplat, folder: Path) -> None:

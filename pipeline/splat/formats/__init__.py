@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from splatpipe.pipeline.engine.errors import UsageError
 
 if TYPE_CHECKING:
+    from splatpipe.pipeline.splat.formats.bounded import CheckValues
+    from splatpipe.pipeline.splat.position_cost import PositionCost
     from splatpipe.pipeline.splat.scene import Scene
 
 
@@ -41,13 +43,15 @@ class SplatFormat:
         """File name suffix, from the first dot; empty for a folder."""
         return "".join(self.file.partition(".")[1:])
 
-    def write(self, path: Path, scene: Scene) -> None:
-        """Write a scene; see the module."""
-        getattr(importlib.import_module(f"{__name__}.{self.module}"), self.writer)(path, scene)
+    def write(self, path: Path, scene: Scene) -> PositionCost:
+        """Write a scene, and return what its positions have lost; see the module."""
+        cost: PositionCost = getattr(importlib.import_module(f"{__name__}.{self.module}"), self.writer)(path, scene)
+        return cost
 
-    def read(self, path: Path) -> Scene:
-        """Read a scene; see the module."""
-        scene: Scene = importlib.import_module(f"{__name__}.{self.module}").read(path)
+    def read(self, path: Path, check: CheckValues | None = None) -> Scene:
+        """Read a scene, refusing unusable values unless ``check`` accepts them; see the module."""
+        reader = importlib.import_module(f"{__name__}.{self.module}").read
+        scene: Scene = reader(path) if check is None else reader(path, check)
         return scene
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections.abc import Callable
 from io import BufferedIOBase, BufferedReader
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.small_file import open_regular
@@ -18,6 +21,8 @@ MAX_EXPANSION = 10.0
 FREE_BYTES = 1 << 25
 """Expansion allowed for files of any size: with little or uniform content, they may be very small."""
 MAX_LOG_SCALE, MAX_COORDINATE = 40.0, 1e18  # float32 holds the squares of what is smaller
+CheckValues = Callable[[Path, Gaussians], None]
+"""What a reader does about unusable values: ``check_values``, or ``keep_unusable``."""
 _READ_BYTES = 1 << 16
 _AGAIN = "Copy or export it again."
 
@@ -98,19 +103,36 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
     if not all_finite(gaussians):
         bad = torch.nonzero(~gaussians.finite())
         raise SplatpipeError(
-            f"{path}: {len(bad)} of {len(gaussians)} Gaussians have values that are not numbers "
+            f"{path} has values that are not numbers in {len(bad)} of {len(gaussians)} Gaussians "
             f"(the first is number {int(bad[0])}).",
-            hint="Export it again, or remove them in a splat editor.",
+            hint=f"Remove them: splatpipe edit {path} cleaned.ply --clean",
         )
     if not len(gaussians):
         return
     if float(gaussians.log_scales.max()) > MAX_LOG_SCALE:
         raise SplatpipeError(
             f"{path}: scales as large as exp({float(gaussians.log_scales.max()):.6g}) are not valid for a splat.",
-            hint="A splat file holds the scales' logarithms; this file appears to hold something else.",
+            hint="A splat file holds the scales' logarithms; this file appears to hold something else. If it is only a "
+            f"few Gaussians, remove them: splatpipe edit {path} cleaned.ply --clean",
         )
     if max(float(gaussians.means.max()), -float(gaussians.means.min())) > MAX_COORDINATE:
-        raise SplatpipeError(f"{path}: coordinates beyond {MAX_COORDINATE:g} are not valid for a splat.", hint=_AGAIN)
+        far = int((gaussians.means.abs().amax(1) > MAX_COORDINATE).sum())
+        raise SplatpipeError(
+            f"{path} has coordinates beyond {MAX_COORDINATE:g} in {far} of {len(gaussians)} Gaussians.",
+            hint=f"Remove them: splatpipe edit {path} cleaned.ply --clean",
+        )
+
+
+def keep_unusable(path: Path, gaussians: Gaussians) -> None:
+    """Accept any values: in place of ``check_values`` where they are removed afterwards."""
+
+
+def usable(gaussians: Gaussians) -> Bool[Tensor, " n"]:
+    """Which Gaussians ``check_values`` would not refuse."""
+    if not len(gaussians):
+        return torch.ones(0, dtype=torch.bool)
+    small = (gaussians.log_scales.amax(1) <= MAX_LOG_SCALE) & (gaussians.means.abs().amax(1) <= MAX_COORDINATE)
+    return gaussians.finite() & small
 
 
 def all_finite(gaussians: Gaussians) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 
@@ -20,11 +20,13 @@ from jaxtyping import Float32, Float64, UInt8, UInt32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
-from splatpipe.pipeline.splat.formats.bounded import all_finite, check_values, open_file, read_exactly
+from splatpipe.pipeline.splat.formats.bounded import CheckValues, all_finite, check_values, open_file, read_exactly
+from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.formats.plain_ply import facts_of_comments, header_comments
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.neighbourhoods import in_neighbourhoods, reordered
 from splatpipe.pipeline.splat.ply_header import PLY_HINT, PlyElement, PlyHeader, ply_header_bytes, read_ply_header
+from splatpipe.pipeline.splat.position_cost import PositionCost, sizes_of
 from splatpipe.pipeline.splat.scene import Scene, turn_of
 from splatpipe.pipeline.splat.sh import C0, MAX_DEGREE, coefficient_count
 
@@ -50,7 +52,7 @@ _ALPHA_END = 0.25 / 255.0
 """Stands for an opacity coded as 0, and this below 1 for one coded as 1, of which there are no logits."""
 
 
-def write(path: Path, scene: Scene) -> None:
+def write(path: Path, scene: Scene) -> PositionCost:
     """Write a scene y down, as viewers assume, reordered for precision.
 
     Args:
@@ -65,21 +67,25 @@ def write(path: Path, scene: Scene) -> None:
         raise ValueError("Gaussians have values that are not finite: never to be written")
     gaussians = scene.gaussians.detach()
     elements = _elements(len(gaussians), gaussians.sh_degree)
-    header = ply_header_bytes(elements, header_comments(replace(scene.facts, axes="y down")))
+    header = ply_header_bytes(elements, header_comments(scene.facts.turned("y down")))
     turn = turn_of("y down", scene.facts.axes)
     order = in_neighbourhoods((gaussians.means.double() @ turn.T).float(), CHUNK, _COARSE_AXIS)
     sizes = [element.count * np.dtype(list(element.fields)).itemsize for element in elements]
     offsets = list(accumulate(sizes[:-1], initial=len(header)))
+    steps, of_gaussians = [np.zeros(0)], [np.zeros((0, 2))]
     with new_file(path) as file:
         file.write(header)
         for piece in reordered(gaussians, order, _ROWS, None if scene.facts.axes == "y down" else turn):
+            steps.append(_position_steps(piece.means.numpy()))
+            of_gaussians.append(sizes_of(piece.log_scales))
             for i, data in enumerate(_coded(piece)):
                 file.seek(offsets[i])
                 file.write(data)
                 offsets[i] += len(data)
+    return PositionCost.of(np.concatenate(steps), np.concatenate(of_gaussians))
 
 
-def read(path: Path) -> Scene:
+def read(path: Path, check: CheckValues = check_values) -> Scene:
     """Read a file; without a record of ours it is assumed to be y down and not georeferenced.
 
     Raises:
@@ -88,6 +94,7 @@ def read(path: Path) -> Scene:
     with open_file(path) as file:
         layout = _layout(path, read_ply_header(path, file))
         gaussians = Gaussians.empty(layout.count, layout.degree)
+        gaussians.means = torch.zeros(layout.count, 3, dtype=torch.float64)  # between two float32
         for start in range(0, layout.count, _ROWS):
             count = min(_ROWS, layout.count - start)
             rows = []
@@ -96,8 +103,8 @@ def read(path: Path) -> Scene:
                 data = read_exactly(path, file, part_count * part.row.itemsize)
                 rows.append(np.frombuffer(data, part.row))
             _fill(gaussians, start, rows)
-    check_values(path, gaussians)
-    return Scene(gaussians, facts_of_comments(layout.comments))
+    check(path, gaussians)
+    return scene_near_origin(path, gaussians, facts_of_comments(layout.comments))
 
 
 def _elements(count: int, degree: int) -> list[PlyElement]:
@@ -218,6 +225,14 @@ def _within_chunks(
     extent = most.astype(np.float64) - least
     scaled = (columns - least[..., None].astype(np.float64)) / np.where(extent > 0.0, extent, 1.0)[..., None]
     return least.T, most.T, scaled.reshape(3, -1)[:, :count].T
+
+
+def _position_steps(means: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+    """Each Gaussian's coarsest step of a coordinate; the first starts a chunk."""
+    least, most, _ = _within_chunks(means)
+    levels = [(1 << count) - 1 for count in _VECTOR_BITS]
+    steps = ((most.astype(np.float64) - least) / levels).max(axis=1)
+    return np.asarray(np.repeat(steps, CHUNK)[: len(means)])
 
 
 def _packed(unit: Float64[np.ndarray, "n c"], bits: tuple[int, ...]) -> UInt32[np.ndarray, " n"]:

@@ -9,6 +9,8 @@ from splatpipe.pipeline.engine.durable import beside
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
+from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values
+from splatpipe.pipeline.splat.position_cost import PositionCost, two_digits
 from splatpipe.pipeline.splat.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 16
@@ -17,11 +19,12 @@ _MAGIC = ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK", "sog"), (b"glTF", "glb
 _HINT = "Give a splat as PLY, compressed PLY, SPZ, SOG or GLB, or the folder of a 3DGS model."
 
 
-def read_scene(path: Path) -> Scene:
+def read_scene(path: Path, check: CheckValues = check_values) -> Scene:
     """Read a splat of any format that can be read.
 
     Args:
         path: A file, or the folder of a 3DGS model.
+        check: What to do about unusable values; ``keep_unusable`` returns them.
 
     Returns:
         The splat, in the file's axes, with unchanged quaternions.
@@ -31,7 +34,7 @@ def read_scene(path: Path) -> Scene:
     """
     found = format_of_content(path)
     try:
-        return found.read(path)
+        return found.read(path, check)
     except OSError as error:
         raise SplatpipeError(f"Cannot read {path}: {error.strerror or error}.", hint="Check the path.") from error
     except MemoryError as error:
@@ -90,7 +93,7 @@ def format_of_name(path: Path, asked: str | None = None) -> SplatFormat:
     return max(fits, key=lambda each: len(each.ending))
 
 
-def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> None:
+def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> PositionCost:
     """Write a splat in the axes that the format's readers expect, with unit quaternions unless the format is exact.
 
     Args:
@@ -98,9 +101,12 @@ def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> No
         scene: The scene; finite.
         kind: The format; None to choose it by suffix.
 
+    Returns:
+        What the file's positions have lost.
+
     Raises:
         UsageError: if the name has no known suffix, or a folder is not empty.
-        SplatpipeError: if the format cannot store the scene.
+        SplatpipeError: if the format cannot store the scene, or only so coarsely that it would be destroyed.
         MachineError: if it cannot be written.
     """
     kind = format_of_name(path) if kind is None else kind
@@ -109,9 +115,32 @@ def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> No
         if path.is_dir() and (kind.ending or any(path.iterdir())):
             raise UsageError(f"{path} is an existing folder.", hint="Name a new file or folder.")
         with beside(path) as aside:
-            kind.write(aside, scene if kind.exact else in_unit_quats(scene))
+            cost = kind.write(aside, scene if kind.exact else in_unit_quats(scene))
+            _refuse_ruin(path, scene, cost)
+            return cost
     except OSError as error:
         raise MachineError(f"Cannot write {path}: {error.strerror or error}.", hint="Check the free space.") from error
+
+
+def _refuse_ruin(path: Path, scene: Scene, cost: PositionCost) -> None:
+    """Refuse a file that would not show the splat.
+
+    Raises:
+        SplatpipeError: if its positions have too coarse steps.
+    """
+    would = f"{path.name} would destroy the splat: its positions would have steps of {two_digits(cost.step)}, and"
+    if cost.collapses(scene.gaussians):
+        raise SplatpipeError(
+            f"{would} it extends less along two axes.",
+            hint="Its coordinates appear to be in another unit than its scales, such as degrees and metres: export it "
+            "in projected coordinates.",
+        )
+    if cost.destroys:
+        raise SplatpipeError(
+            f"{would} half of its Gaussians are smaller than {two_digits(cost.size)}.",
+            hint="Write a PLY or GLB, which keep positions, or remove what lies far away first: splatpipe edit IN OUT "
+            "--crop-box X1,Y1,X2,Y2.",
+        )
 
 
 def in_unit_quats(scene: Scene) -> Scene:

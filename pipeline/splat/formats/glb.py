@@ -18,17 +18,19 @@ from jaxtyping import Float32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
-from splatpipe.pipeline.splat.formats.bounded import check_values, open_file
+from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values, open_file
+from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.glb_container import FLOAT, UNSIGNED_BYTE, open_container, write_head
 from splatpipe.pipeline.splat.glb_splats import EXTENSION, KERNEL, RECORD, ROWS_AT_ONCE, harmonics_names, read_splats
+from splatpipe.pipeline.splat.position_cost import PositionCost, float32_cost
 from splatpipe.pipeline.splat.scene import Scene, SceneFacts, facts_of_record, turn_of
 from splatpipe.pipeline.splat.sh import C0, multiply_rows
 
 _ARRAY_BUFFER, _POINTS = 34962, 0
 
 
-def write(path: Path, scene: Scene) -> None:
+def write(path: Path, scene: Scene) -> PositionCost:
     """Write a scene y up, in bounded memory.
 
     Args:
@@ -46,7 +48,7 @@ def write(path: Path, scene: Scene) -> None:
         raise SplatpipeError("A GLB needs at least one Gaussian.", hint="Crop less.")
     if not bool(gaussians.finite().all()):
         raise ValueError("a GLB holds finite numbers only")
-    facts = replace(scene.facts, axes="y up")
+    facts = scene.facts.turned("y up")
     turn = turn_of("y up", scene.facts.axes)
     columns = _columns(gaussians.sh_degree)
     starts = np.cumsum([0, *(count * column.row_bytes for column in columns)]).tolist()
@@ -58,9 +60,10 @@ def write(path: Path, scene: Scene) -> None:
                 file.seek(first + start + done * column.row_bytes)
                 file.write(rows.tobytes())
             done += len(piece)
+    return float32_cost(gaussians)
 
 
-def read(path: Path) -> Scene:
+def read(path: Path, check: CheckValues = check_values) -> Scene:
     """Read a file, y up; without a record of ours it is not georeferenced.
 
     Raises:
@@ -68,10 +71,10 @@ def read(path: Path) -> Scene:
     """
     with open_file(path) as file:
         container = open_container(path, file)
-        gaussians = read_splats(container)
-    check_values(path, gaussians)
+        gaussians = read_splats(container, check)
+    check(path, gaussians)
     facts = facts_of_record(_record(container.document), SceneFacts("y up"))
-    return Scene(gaussians, replace(facts, axes="y up"))
+    return scene_near_origin(path, gaussians, replace(facts, axes="y up"))
 
 
 def _record(document: Mapping[str, Any]) -> str | None:

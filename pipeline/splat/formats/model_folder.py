@@ -12,6 +12,8 @@ from pathlib import Path
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.formats import plain_ply
+from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values
+from splatpipe.pipeline.splat.position_cost import PositionCost
 from splatpipe.pipeline.splat.scene import Scene
 
 POINT_CLOUD, PLY = "point_cloud", "point_cloud.ply"
@@ -23,8 +25,8 @@ _SETTINGS = (
 )
 
 
-def write(path: Path, scene: Scene) -> None:
-    """Write the folder: the splat as in ``plain_ply``, and `cfg_args`.
+def write(path: Path, scene: Scene) -> PositionCost:
+    """Write the folder: the splat as in ``plain_ply``, about its origin, and `cfg_args`.
 
     Args:
         path: The folder; created if missing.
@@ -36,12 +38,13 @@ def write(path: Path, scene: Scene) -> None:
     """
     folder = path / POINT_CLOUD / f"iteration_{ITERATION}"
     folder.mkdir(parents=True, exist_ok=True)
-    plain_ply.write(folder / PLY, scene)
+    cost = plain_ply.write_about_origin(folder / PLY, scene)
     settings = _SETTINGS.format(degree=scene.gaussians.sh_degree, white=False)
     write_file(path / "cfg_args", settings)
+    return cost
 
 
-def read(path: Path) -> Scene:
+def read(path: Path, check: CheckValues = check_values) -> Scene:
     """Read the newest iteration's splat.
 
     Raises:
@@ -51,7 +54,7 @@ def read(path: Path) -> Scene:
     whole = [(number, entry / PLY) for number, entry in sorted(found) if (entry / PLY).is_file()]
     if not whole:
         raise SplatpipeError(f"{path} has no {POINT_CLOUD}/iteration_N/{PLY}.", hint="Name the folder of a 3DGS model.")
-    return plain_ply.read(whole[-1][1])
+    return plain_ply.read(whole[-1][1], check)
 
 
 def _entries(path: Path) -> list[Path]:

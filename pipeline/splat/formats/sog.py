@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import json
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.splat.formats.bounded import open_file
+from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values, open_file
+from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.formats.sog_decoder import SogDecoder
-from splatpipe.pipeline.splat.formats.sog_images import META, RECORD, SogImages, encode_sog
+from splatpipe.pipeline.splat.formats.sog_images import META, RECORD, SogImages, encode_sog, position_cost
+from splatpipe.pipeline.splat.position_cost import PositionCost
 from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record, turn_of
 
 __all__ = ["AXES", "SogImages", "encode_sog", "read", "write"]
@@ -36,7 +37,7 @@ _HINT = "Give a .sog file, or the meta.json beside its pictures."
 _AGAIN = "Copy or export it again."
 
 
-def write(path: Path, scene: Scene) -> None:
+def write(path: Path, scene: Scene) -> PositionCost:
     """Write a scene as a bundle, turned to y down.
 
     Args:
@@ -47,15 +48,16 @@ def write(path: Path, scene: Scene) -> None:
         ValueError: if a value is not finite.
         OSError: if the file cannot be written.
     """
-    facts = replace(scene.facts, axes=AXES)
+    facts = scene.facts.turned(AXES)
     turn = None if scene.facts.axes == AXES else turn_of(AXES, scene.facts.axes)
     files = encode_sog(scene.gaussians, facts.antialias, facts.record(), turn=turn).files()
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in files.items():
             archive.writestr(zipfile.ZipInfo(name, _FIRST_DAY), data)
+    return position_cost(scene.gaussians)
 
 
-def read(path: Path) -> Scene:
+def read(path: Path, check: CheckValues = check_values) -> Scene:
     """Read a file; without a record of ours it is assumed to be y down, as in viewers, and not georeferenced.
 
     Args:
@@ -67,7 +69,9 @@ def read(path: Path) -> Scene:
     source = path / META if path.is_dir() else path
     with open_file(source) as file:
         bundled = file.read(2) == b"PK"
-    return _read_bundle(source) if bundled else _read_folder(source)
+    scene = _read_bundle(source) if bundled else _read_folder(source)
+    check(source, scene.gaussians)
+    return scene_near_origin(source, scene.gaussians, scene.facts)
 
 
 def _read_bundle(path: Path) -> Scene:
@@ -136,7 +140,7 @@ def _files(part: dict[str, Any]) -> list[str]:
 
 
 def _scene(decoder: SogDecoder) -> Scene:
-    """The scene with our record, which may be an object or a string."""
+    """The scene as stored, with our record, which may be an object or a string."""
     found = decoder.meta.get(RECORD)
     record = found if isinstance(found, str | None) else json.dumps(found)
     otherwise = SceneFacts(AXES, antialias=decoder.meta.get("antialias") is True)

@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.codebooks import CODEBOOK_SIZE
-from splatpipe.pipeline.splat.formats.bounded import check_expansion, check_values
+from splatpipe.pipeline.splat.formats.bounded import check_expansion
 from splatpipe.pipeline.splat.formats.lossless_pictures import pixels_of_picture
 from splatpipe.pipeline.splat.formats.sog_images import ENTRIES_A_ROW, FIRST_MODE, LEVELS, MAX_ENTRIES, VERSION
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -48,7 +48,7 @@ class SogDecoder:
     stored_bytes: int
 
     def gaussians(self) -> Gaussians:
-        """Decode all Gaussians.
+        """Decode all Gaussians, with positions of float64; their values are not checked.
 
         Raises:
             SplatpipeError: if it has another version, is damaged, or is a decompression bomb.
@@ -60,7 +60,7 @@ class SogDecoder:
             bands = self._whole(harmonics, "bands", 1, MAX_DEGREE)
         check_expansion(self.path, count * (11 + 3 * coefficient_count(bands)) * 4, self.stored_bytes, MAX_EXPANSION)
         gaussians = Gaussians.empty(count, bands)
-        gaussians.means[:] = torch.from_numpy(self._means(count))
+        gaussians.means = torch.from_numpy(self._means(count))
         gaussians.quats[:] = torch.from_numpy(self._quats(count))
         gaussians.log_scales[:] = torch.from_numpy(self._coded("scales", self._pixels("scales", count)[:, :3]))
         colours = self._pixels("sh0", count)
@@ -69,7 +69,6 @@ class SogDecoder:
         gaussians.opacity_logits[:] = torch.logit(opacities).float()
         if harmonics is not None:
             self._fill_harmonics(gaussians, harmonics)
-        check_values(self.path, gaussians)
         return gaussians
 
     def _check_version(self) -> None:
@@ -87,7 +86,7 @@ class SogDecoder:
             )
         raise self._wrong("it does not say that it is of version 2")
 
-    def _means(self, count: int) -> Float32[np.ndarray, "n 3"]:
+    def _means(self, count: int) -> Float64[np.ndarray, "n 3"]:
         part = self._part("means")
         low, high = (self._numbers("means", part.get(name), 3) for name in ("mins", "maxs"))
         if max(np.abs(low).max(), np.abs(high).max()) > _MAX_LOG:
@@ -96,8 +95,7 @@ class SogDecoder:
         levels += self._pixels("means", count, 0, 2)[:, :3]
         logs = low + (high - low) * (levels / LEVELS)
         with np.errstate(over="ignore"):  # an infinity is caught among the values
-            means: Float32[np.ndarray, "n 3"] = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
-        return means
+            return np.asarray(np.sign(logs) * np.expm1(np.abs(logs)))
 
     def _quats(self, count: int) -> Float32[np.ndarray, "n 4"]:
         pixels = self._pixels("quats", count)

@@ -18,6 +18,7 @@ from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.splat.morton import morton_keys
 from splatpipe.pipeline.splat.neighbourhoods import reordered
 from splatpipe.pipeline.splat.palettes import fit_palette, nearest_entries
+from splatpipe.pipeline.splat.position_cost import PositionCost, sizes_of
 from splatpipe.pipeline.splat.sh import multiply_rows
 
 VERSION = 2
@@ -141,6 +142,16 @@ def _means(means: Float[Tensor, "n 3"]) -> _Part:
         "means_u": _picture((levels >> 8).astype(np.uint8)),
     }
     return {"mins": low.tolist(), "maxs": high.tolist()}, pictures
+
+
+def position_cost(gaussians: Gaussians) -> PositionCost:
+    """What the steps of the positions cost the Gaussians; the same for any axes."""
+    means = gaussians.means.numpy().astype(np.float64)
+    if not len(means):
+        return PositionCost.of(0.0, np.zeros((0, 2)))
+    logs = _signed_log(means)
+    steps = (logs.max(0) - logs.min(0)) / LEVELS * (1.0 + np.abs(means))
+    return PositionCost.of(steps.max(axis=1), sizes_of(gaussians.log_scales))
 
 
 def _signed_log(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

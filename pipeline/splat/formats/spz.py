@@ -20,6 +20,7 @@ from jaxtyping import Float32, UInt8
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.splat.formats.bounded import (
+    CheckValues,
     InflatedFile,
     check_expansion,
     check_values,
@@ -27,7 +28,9 @@ from splatpipe.pipeline.splat.formats.bounded import (
     open_file,
     read_exactly,
 )
+from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.position_cost import PositionCost
 from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record, turn_of
 from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count
 from splatpipe.pipeline.splat.spz import (
@@ -42,6 +45,7 @@ from splatpipe.pipeline.splat.spz import (
     ROTATION_STEPS,
     SH_STEPS,
     VERSION,
+    position_cost,
     spz_bytes,
 )
 
@@ -64,7 +68,7 @@ _ALPHA_END = 0.25 / 255.0
 _AGAIN = "Copy or export it again."
 
 
-def write(path: Path, scene: Scene) -> None:
+def write(path: Path, scene: Scene) -> PositionCost:
     """Write version 3, y up.
 
     Args:
@@ -75,26 +79,27 @@ def write(path: Path, scene: Scene) -> None:
         ValueError: if a value is not finite.
         OSError: if the file cannot be written.
     """
-    _write(path, scene, VERSION)
+    return _write(path, scene, VERSION)
 
 
-def write_version_2(path: Path, scene: Scene) -> None:
+def write_version_2(path: Path, scene: Scene) -> PositionCost:
     """Write version 2, which older readers and CesiumJS need; its rotations are coarse.
 
     Raises:
         ValueError: if a value is not finite.
         OSError: if the file cannot be written.
     """
-    _write(path, scene, FIRST_THREE_VERSION)
+    return _write(path, scene, FIRST_THREE_VERSION)
 
 
-def _write(path: Path, scene: Scene, version: int) -> None:
-    facts = replace(scene.facts, axes=AXES)
+def _write(path: Path, scene: Scene, version: int) -> PositionCost:
+    facts = scene.facts.turned(AXES)
     turn = None if scene.facts.axes == AXES else turn_of(AXES, scene.facts.axes)
     write_file(path, spz_bytes(scene.gaussians, facts.antialias, turn=turn, version=version, record=facts.record()))
+    return position_cost(scene.gaussians)
 
 
-def read(path: Path) -> Scene:
+def read(path: Path, check: CheckValues = check_values) -> Scene:
     """Read a file; without a record of ours it is assumed to be y up, as specified, and not georeferenced.
 
     Raises:
@@ -111,8 +116,9 @@ def read(path: Path) -> Scene:
             raise SplatpipeError(f"{path} is not an SPZ file.", hint=_AGAIN)
         gaussians = _decoded(packed)
         _check_end(path, packed)
-    check_values(path, gaussians)
-    return Scene(gaussians, facts_of_record(record, SceneFacts(AXES, antialias=bool(packed.flags & ANTIALIASED))))
+    check(path, gaussians)
+    facts = facts_of_record(record, SceneFacts(AXES, antialias=bool(packed.flags & ANTIALIASED)))
+    return scene_near_origin(path, gaussians, facts)
 
 
 class _ZstdStream:

@@ -8,10 +8,13 @@ import command
 import laspy
 import numpy as np
 import pytest
+from some_splats import some_gaussians
 
 from splatpipe.pipeline.app.formats import check_possible, with_formats
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.formats.files import read_scene
+from splatpipe.pipeline.splat.scene import Scene, SceneFacts
 
 
 def splatpipe(*arguments: str) -> tuple[int, dict[str, Any]]:
@@ -53,6 +56,27 @@ def test_a_file_is_converted_and_the_result_is_reported(demo_run: Path, tmp_path
     assert output["convert"]["gaussians"] == len(read.gaussians)
     assert output["convert"]["bytes"] == (tmp_path / "made.viewer.ply").stat().st_size
     assert read.facts.axes == "y down" and read.facts.place == read_scene(demo_run / "splat.ply").facts.place
+
+
+def test_far_coordinates_and_steps_are_printed(tmp_path: Path) -> None:
+    facts = SceneFacts("z up", offset=(388714.0, 5299720.0, 515.0))
+    plain_ply.write(tmp_path / "utm.ply", Scene(some_gaussians(1), facts))
+    done = command.splatpipe("convert", str(tmp_path / "utm.ply"), str(tmp_path / "a.spz"))
+    assert done.returncode == 0
+    first, origin, steps = done.stderr.strip().splitlines()
+    assert first.startswith("1 Gaussian, ") and first.endswith(f" B: {tmp_path / 'a.spz'}")
+    assert origin.startswith("Origin 3887") and "recorded in the file" in origin
+    assert steps.startswith("Positions in steps of 0.0002")
+
+
+def test_a_splat_with_values_that_are_not_numbers_is_refused_with_the_command_that_drops_them(tmp_path: Path) -> None:
+    plain_ply.write(tmp_path / "a.ply", Scene(some_gaussians(20)))
+    data = bytearray((tmp_path / "a.ply").read_bytes())
+    data[-4:] = np.float32("nan").tobytes()
+    (tmp_path / "a.ply").write_bytes(data)
+    code, output = splatpipe("convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz"))
+    assert code == 1 and "1 of 20 Gaussians" in output["error"]["message"]
+    assert f"splatpipe edit {tmp_path / 'a.ply'} cleaned.ply --clean" in output["error"]["hint"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.formats import format_named, plain_ply
 from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.ply import property_names
 from splatpipe.pipeline.splat.scene import MAX_EDITS, Scene, SceneFacts, SplatOrigin, turn_of
 from splatpipe.pipeline.survey.frames import Origin
 from splatpipe.pipeline.survey.handover import frame_of
@@ -371,6 +373,55 @@ def test_held_out_photos_are_not_used_for_cleaning(run_folder: Path):
     assert next(camera.name for camera in open_source(run_folder).trained_on()) == "flight 1/photo_1.png"
     (run_folder / "metrics.json").write_text("[")
     assert len(open_source(run_folder / "splat.ply").trained_on()) == 9
+
+
+def test_cleaning_drops_unusable_values_and_says_how_many(tmp_path: Path):
+    plain_ply.write(tmp_path / "a.ply", Scene(true_model(600)))
+    data = bytearray((tmp_path / "a.ply").read_bytes())
+    row = 4 * len(property_names(true_model(600).sh_degree))
+    start, last = len(data) - 600 * row, row // 4 - 1
+    for number, column, value in ((5, 0, math.nan), (7, 2, math.inf), (11, last, math.nan), (12, last - 5, 50.0)):
+        struct.pack_into("<f", data, start + number * row + 4 * column, value)
+    (tmp_path / "a.ply").write_bytes(data)
+    source, output = open_source(tmp_path / "a.ply"), OutputFile(tmp_path / "b.ply", format_named("ply"))
+    with pytest.raises(SplatpipeError, match="3 of 600") as refused:
+        edit_splat(EditTask(source, output, parse_steps([("rotate", "1")], output, False)), Recorder())
+    assert "splatpipe edit" in refused.value.hint and "--clean" in refused.value.hint
+    facts = edit_splat(EditTask(source, output, parse_steps([("clean", True)], output, False)), Recorder())
+    assert facts["steps"][0] == {"step": "drop unusable values", "gaussians": [600, 596]}
+    assert facts["steps"][1]["gaussians"][0] == 596
+    assert bool(plain_ply.read(output.path).gaussians.finite().all())
+    assert (tmp_path / "b.edit.png").is_file()
+
+
+def test_coordinates_of_a_splat_with_an_origin_taken_off_are_its_original_ones():
+    offset = (388714.0, 5299720.0, 515.0)
+    scene = Scene(true_model(600), SceneFacts("z up", offset=offset))
+    inside = scene.gaussians.means[:, 0] > 0.0
+    for given, local in (("388714,5299000,389000,5300000", False), ("0,-99,99,99", True)):
+        kept = edited(scene, ("crop_box", given), local=local)
+        assert len(kept.gaussians) == int(inside.sum())
+        assert kept.facts.offset == offset
+    high = int((scene.gaussians.means[:, 2] >= 0.1).sum())
+    assert len(edited(scene, ("crop_heights", "515.1,")).gaussians) == high
+    far = edited(scene, ("about", "388714,5299720,515"), ("move_to", "500000,5400000,100"))
+    moved_by = np.array([500000.0, 5400000.0, 100.0]) - offset
+    whole = far.gaussians.means.double().numpy() + far.facts.offset
+    np.testing.assert_allclose(whole, scene.gaussians.means.double().numpy() + offset + moved_by, atol=1e-5)
+
+
+def test_splats_with_origins_taken_off_are_merged_by_their_coordinates(tmp_path: Path):
+    model = true_model(300)
+    other = SceneFacts("z up", offset=(388704.0, 5299700.0, 515.0))
+    plain_ply.write_about_origin(tmp_path / "other.ply", Scene(model, other))
+    ours = Scene(model.clone(), SceneFacts("z up", offset=(388714.0, 5299720.0, 515.0)))
+    merged = edited(ours, ("merge", tmp_path / "other.ply")).gaussians.means[300:]
+    torch.testing.assert_close(merged, model.means + torch.tensor([-10.0, -20.0, 0.0]), atol=1e-5, rtol=0.0)
+    for axes in ("y up", "y down"):
+        turned = edited(ours.turned(axes), ("merge", tmp_path / "other.ply"))
+        torch.testing.assert_close(turned.turned("z up").gaussians.means[300:], merged, atol=1e-5, rtol=0.0)
+    with pytest.raises(SplatpipeError, match="one file cannot hold both"):
+        edited(Scene(model.clone(), SceneFacts("z up")), ("merge", tmp_path / "other.ply"))
 
 
 def test_it_is_reduced_to_a_count_or_a_size_in_bytes(tmp_path: Path):

@@ -214,8 +214,21 @@ def test_splats_that_are_drawn_twice_are_read_twice(tmp_path: Path):
     assert found.means[2:].tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
 
 
+def test_a_node_far_away_is_an_origin_and_not_rounded(tmp_path: Path):
+    def far(document: dict[str, Any]) -> None:
+        document["nodes"][0]["translation"] = [388714.001, 515.002, -5299720.003]
+
+    (tmp_path / "a").write_bytes(foreign(far))
+    scene = glb.read(tmp_path / "a")
+    whole = scene.gaussians.means.double().numpy() + scene.facts.offset
+    np.testing.assert_allclose(
+        whole, [[388714.001, 517.002, -5299720.003], [388710.001, 515.002, -5299720.003]], atol=1e-6
+    )
+
+
 def test_harmonics_of_the_lower_degree_are_filled_up(tmp_path: Path):
-    _, binary = parts((lambda path: glb.write(path, Scene(some_gaussians(4, 2))) or path.read_bytes())(tmp_path / "a"))
+    glb.write(tmp_path / "a", Scene(some_gaussians(4, 2)))
+    _, binary = parts((tmp_path / "a").read_bytes())
     document, _ = parts((tmp_path / "a").read_bytes())
     primitive = document["meshes"][0]["primitives"][0]
     few = {name: index for name, index in primitive["attributes"].items() if "DEGREE_2" not in name}

@@ -1,5 +1,6 @@
 """SPZ: the file, parsed strictly by its specification, contains what was written."""
 
+import base64
 import gzip
 import math
 import struct
@@ -217,6 +218,26 @@ def test_the_reader_agrees_with_a_literal_decoder(tmp_path: Path, monkeypatch, v
     np.testing.assert_allclose(made.sh[:, 1:], found["sh"], atol=1e-6)
     np.testing.assert_allclose(made.log_scales, found["log_scales"], atol=1e-6)
     assert apart_deg(found["quats"] / np.linalg.norm(found["quats"], axis=1, keepdims=True), made.quats).max() < 0.05
+
+
+SPLAT_TRANSFORM = (  # 2.7.1, --spz-version 4, of four Gaussians of degree 1
+    "TkdTUAQAAAAEAAAAAQwABiAAAAAAAAAAAAAAAAAAAAAtAAAAAAAAACQAAAAAAAAADQAAAAAAAAAEAAAAAAAAABUAAAAAAAAADAAAAAAAAAAVAAAA"
+    "AAAAAAwAAAAAAAAAGQAAAAAAAAAQAAAAAAAAAC0AAAAAAAAAJAAAAAAAAAAotS/9ICQhAQAqFQB19/8H/v/iEwB2DgBRBQBFz//J8//iIAD77f+O"
+    "HADdAQAotS/9IAQhAACOA8VuKLUv/SAMYQAAi4pvb5KBdXWQjoWKKLUv/SAMYQAAbWF3dGloV26pU4pcKLUv/SAQgQAAEKcw9d1KBahVREYHITUy"
+    "aii1L/0gJCEBALBwcHhYUKB4mLCQuJCQUFCIeHCQYJigaIggoFCIcKiguFCowA=="
+)
+
+
+def test_a_file_of_splat_transform_in_version_4_reads_as_its_original(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(base64.b64decode(SPLAT_TRANSFORM))
+    found = spz.read(tmp_path / "a.spz").turned("y down").gaussians
+    generator = torch.Generator().manual_seed(1)
+    means = 2.0 * torch.randn(4, 3, generator=generator)
+    log_scales = -3.0 + torch.randn(4, 3, generator=generator)
+    order = torch.cdist(found.means, means).argmin(dim=1)
+    torch.testing.assert_close(found.means, means[order], atol=1.3e-4, rtol=0.0)
+    torch.testing.assert_close(found.log_scales, log_scales[order], atol=0.5 / 16 + 1e-5, rtol=0.0)
+    assert found.sh_degree == 1
 
 
 def test_version_1_has_half_floats(tmp_path: Path) -> None:
