@@ -21,7 +21,6 @@ from splatpipe.pipeline.photos.camera_groups import (
     report_cameras,
 )
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.duplicates import split_duplicates
 from splatpipe.pipeline.photos.names import NAMES_SHOWN, list_names, printable
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
@@ -36,13 +35,14 @@ from splatpipe.pipeline.photos.preparation import (
     MASKS,
     SKIES,
     Preparation,
-    check_photos,
+    Selection,
     convert_unusual,
     converted_path,
     mask_path,
     prepare_masks,
+    select_photos,
 )
-from splatpipe.pipeline.photos.scan import ExcludedPhoto, Scan, scan_folder
+from splatpipe.pipeline.photos.scan import by_reason, with_reason
 from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
@@ -66,18 +66,15 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     # Libraries print their own warnings about odd metadata tags. Filters are process-wide, so they are set only here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scan = scan_folder(root)
-        checked, broken = check_photos(scan, work)
-        photos, duplicates = split_duplicates(checked)
-        left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
-        _require_photos(inputs.photos_dir, scan, photos, left_out)
-        _warn_of_excluded(left_out, report)
+        chosen = select_photos(root, work)
+        photos, left_out = chosen.photos, chosen.left_out
+        _require_photos(inputs.photos_dir, chosen)
+        _report_excluded(chosen, config, report)
         groups, camera_of = group_cameras(photos)
         groups, lenses = _lenses(inputs, groups, camera_of, photos, report)
         opacity = convert_unusual(photos, camera_of, work)
-        others = [entry.name for entry in left_out]
-        masked = prepare_masks(MASKS, root, photos, others, opacity, work)
-        skies = prepare_masks(SKIES, root, photos, others, {}, work)
+        masked = prepare_masks(MASKS, root, chosen, opacity, work)
+        skies = prepare_masks(SKIES, root, chosen, {}, work)
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places.by_name)
     for issue in find_position_issues(photos, positions, places):
@@ -120,9 +117,8 @@ def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]
     )
 
 
-def _require_photos(
-    folder: Path, scan: Scan, photos: Sequence[CheckedPhoto], left_out: Sequence[ExcludedPhoto]
-) -> None:
+def _require_photos(folder: Path, chosen: Selection) -> None:
+    photos, left_out, scan = chosen.photos, chosen.left_out, chosen.scan
     if len(photos) >= MIN_PHOTOS:
         return
     listing = "".join(f"\n  {printable(entry.name)} {entry.reason}" for entry in left_out[:NAMES_SHOWN])
@@ -142,13 +138,17 @@ def _require_photos(
     raise SplatpipeError(message + (f" Left out:{listing}{more}" if left_out else ""), hint=hint)
 
 
-def _warn_of_excluded(left_out: Sequence[ExcludedPhoto], report: Reporter) -> None:
-    """Issue one warning per reason, naming the photos."""
-    by_reason: dict[str, list[str]] = {}
-    for entry in left_out:
-        by_reason.setdefault(entry.reason, []).append(entry.name)
-    for reason, names in by_reason.items():
-        report.warning(f"Left out: {list_names(names)} {reason}.")
+def _report_excluded(chosen: Selection, config: IngestConfig, report: Reporter) -> None:
+    """Issue one warning, or for files that belong to photos one note, per reason, naming the files."""
+    for kind, say in (("unusable", report.warning), ("duplicate", report.warning), ("companion", report.note)):
+        for reason, names in by_reason(entry for entry in chosen.left_out if entry.kind == kind).items():
+            say(f"Left out: {with_reason(names, reason)}.")
+    if chosen.note:
+        report.note(chosen.note)
+    if chosen.masks:
+        names = list_names(mask.name for mask in chosen.masks)
+        use = "used as masks" if config.masks else "not used, by ingest.masks=false"
+        report.note(f"Masks beside their photos, {use}: {names}.")
 
 
 def _lenses(
