@@ -125,7 +125,7 @@ def _require_photos(folder: Path, chosen: Selection) -> None:
     more = f"\n  … and {len(left_out) - NAMES_SHOWN} more" if len(left_out) > NAMES_SHOWN else ""
     if photos:
         message = f"There is only one usable photo in {folder}: {printable(photos[0].name)}."
-        hint = "A reconstruction needs many overlapping photos of the same scene, at least two."
+        hint = "A reconstruction needs many overlapping photos of the same scene, at least three."
     elif left_out:
         message = f"None of the {len(left_out)} pictures in {folder} can be used."
         hint = "Give JPEG, PNG or TIFF photos."

@@ -41,6 +41,7 @@ from splatpipe.pipeline.survey.survey_text import (
 Role = Literal["control", "check"]
 MAX_POINTS = 10_000
 MAX_NAME = 255
+UNNAMED = "point "  # before the number of a point without a name
 TABS = 5  # a line of ODM's list with at least as many is tab-separated
 SAME_PLACE_M = 1e-3  # lines of one point must repeat its coordinates to within a millimetre
 SEA_LEVEL_M = 20.0  # a height of exactly 0 counts as measured if another point is this close to 0, else as unknown
@@ -176,9 +177,15 @@ class Table:
             groups.setdefault(row.name or row.place, []).append(row)
         named: dict[str, list[Row]] = {}
         for number, group in enumerate(groups.values(), 1):
-            name = group[0].name or f"point {number}"
+            name = group[0].name or f"{UNNAMED}{number}"
             named[name if name not in named else f"{name} (line {group[0].line})"] = group
         return named
+
+
+def titled(kind: str, name: str) -> str:
+    """A point in a message: ``Control point P1``, and without a kind ``Point P1``; ``Point 12`` if it has no name."""
+    bare = name.removeprefix(UNNAMED) if name.removeprefix(UNNAMED).isdigit() else name
+    return f"{kind} point {bare}" if kind else f"Point {bare}"
 
 
 def read_control_file(path: Path) -> ControlFile:
@@ -294,8 +301,8 @@ def _require_no_points(written: Sequence[tuple[int, str]]) -> None:
         looked = [list_fields(line, separator, TABS) for _, line in written[:LOOKED_AT]]
         points = [each for each in looked if len(each) >= 4 and all(map(is_numeral, each[1:4]))]
         if points and 2 * len(points) >= len(looked) and not any(is_photo(PurePosixPath(cell)) for cell in points[0]):
-            what = f"points separated by {SEPARATORS[separator]} without titles: their order (x, y or north, east) is not known"
-            raise LineError(written[0][0], what, _TITLES)
+            what = f"points separated by {SEPARATORS[separator]} without titles"
+            raise LineError(written[0][0], f"{what}: their order (x, y or north, east) is not known", _TITLES)
 
 
 def _is_header(line: str, needed: Sequence[str]) -> bool:

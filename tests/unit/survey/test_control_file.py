@@ -6,7 +6,7 @@ import pytest
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.survey.control_file import ControlFile, Mark, read_control_file, read_points_file
+from splatpipe.pipeline.survey.control_file import ControlFile, Mark, read_control_file, read_points_file, titled
 
 
 def read(folder: Path, text: str | bytes, name: str = "gcp_list.txt") -> ControlFile:
@@ -174,9 +174,7 @@ def test_points_of_a_receiver_without_marks_are_read_by_their_titles(tmp_path: P
     "text", ["P1,5299705.2,388710.5,512,GCP\nP2,5299705.3,388711.5,513,GCP\n", "EPSG:32633\nP1;1;2;3\n"]
 )
 def test_points_without_titles_are_refused_with_what_is_wanted(tmp_path: Path, text: str) -> None:
-    with pytest.raises(
-        SplatpipeError, match="without titles: their order .x, y or north, east. is not known"
-    ) as caught:
+    with pytest.raises(SplatpipeError, match=r"by .* without titles: their order") as caught:
         read(tmp_path, text)
     assert "name,north,east,height,code" in caught.value.hint
 
@@ -185,3 +183,16 @@ def test_a_line_that_cannot_be_read_names_the_separator_and_the_columns(tmp_path
     with pytest.raises(SplatpipeError, match="separated by blanks, but at least 6 are needed: x y z pixel_x") as caught:
         read(tmp_path, "EPSG:32633\n1|2|3|4|5|A.JPG\n")
     assert "112.1 514.1 DJI_0005.JPG P01" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "said"),
+    [
+        ("", "point 12", "Point 12"),
+        ("Control", "point 12", "Control point 12"),
+        ("Check", "P1", "Check point P1"),
+        ("", "point A", "Point point A"),  # its own name
+    ],
+)
+def test_points_without_names_are_called_by_their_number(kind: str, name: str, said: str) -> None:
+    assert titled(kind, name) == said
