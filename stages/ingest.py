@@ -12,6 +12,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.source import find_model
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.bands import ALL, AUTO
 from splatpipe.pipeline.photos.camera_groups import (
     CameraGroup,
     cameras_json,
@@ -62,6 +63,8 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     root = photo_root(inputs.photos_dir)
     part = out / "photos"
     part.mkdir(parents=True, exist_ok=True)
+    if config.bands == AUTO and find_model(inputs.photos_dir) is not None:
+        config = config.model_copy(update={"bands": ALL})  # a given model says which photos it is of
     work = Preparation(config, inputs.machine.threads, part, report)
     # Libraries print their own warnings about odd metadata tags. Filters are process-wide, so they are set only here.
     with warnings.catch_warnings():
@@ -146,9 +149,9 @@ def _report_excluded(chosen: Selection, config: IngestConfig, report: Reporter) 
     if chosen.note:
         report.note(chosen.note)
     if chosen.masks:
-        names = list_names(mask.name for mask in chosen.masks)
+        listed = list_names(mask.name for mask in chosen.masks)
         use = "used as masks" if config.masks else "not used, by ingest.masks=false"
-        report.note(f"Masks beside their photos, {use}: {names}.")
+        report.note(f"Masks beside their photos, {use}: {listed}.")
 
 
 def _lenses(

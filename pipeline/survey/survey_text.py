@@ -280,7 +280,7 @@ def csv_rows(
     places, crs = _with_degrees(titles, places, crs)
     if not crs:
         raise LineError(0, "it states no CRS", "Put it in the first line, e.g. EPSG:32633, or in a column crs.")
-    named = [
+    named: list[tuple[int, Mapping[str, str]]] = [
         (number, {name: cells[at].strip() if at < len(cells) else "" for name, at in places.items()})
         for number, cells in rows
     ]
