@@ -18,6 +18,7 @@ from splatpipe.pipeline.survey.survey_text import (
     ELLIPSOIDAL_Z,
     GEOGRAPHIC,
     GEOGRAPHIC_Y,
+    MOST_WORDS,
     SEPARATORS,
     UNKNOWN,
     LineError,
@@ -73,7 +74,6 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 NUMBERS = ("x", "y", "z", "yaw", "pitch", "roll", "sigma_horizontal", "sigma_vertical")
 ODM_ORDER = ("name", *NUMBERS)
 ANGLES_FROM = 7  # fields of a line of geo.txt
-MOST_WORDS = 20  # of a photo's name without a suffix, in a list whose fields blanks separate
 EXPECTED = (
     "First a line with the CRS, e.g. EPSG:4326, then lines of `photo x y z`, east (or longitude) first, such as"
     " `DJI_0001.JPG 13.5127 47.8412 512.3`, separated by blanks, tabs, semicolons or commas; or a CSV with a header"

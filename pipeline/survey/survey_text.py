@@ -30,6 +30,7 @@ GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "gps_longitude"
 GEOGRAPHIC_Y = ("lat", "latitude", "gpslatitude", "gps_latitude", "y/latitude", "latitude_deg")
 ELLIPSOIDAL_Z = ("ellipsoidal_height", "ellipsoid_height")
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "": "blanks"}
+MOST_WORDS = 20  # of a photo's name in a list whose fields blanks separate
 LOOKED_AT = 20  # lines of a list without a header, by which its separator is found
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 CODE = re.compile(r"EPSG\s*:|\+|WGS\s?84\s*/?\s*UTM", re.IGNORECASE)  # how a CRS begins that splatpipe knows by itself
@@ -192,7 +193,7 @@ def list_fields(line: str, separator: str, tabs: int) -> list[str]:
 
 def with_whole_name(fields: Sequence[str], at: int) -> list[str]:
     """Fields that blanks separate, with those of a photo's name joined: up to the first that ends in its suffix."""
-    ends = (end for end in range(at, len(fields)) if is_photo(PurePosixPath(fields[end])))
+    ends = (end for end in range(at, min(len(fields), at + MOST_WORDS)) if is_photo(PurePosixPath(fields[end])))
     end = next(ends, at)
     return [*fields[:at], " ".join(fields[at : end + 1]), *fields[end + 1 :]] if at < len(fields) else list(fields)
 

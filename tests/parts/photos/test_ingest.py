@@ -996,7 +996,9 @@ def test_the_bands_of_a_shot_are_no_photos_of_their_own(folder: Path) -> None:
         tags = ImageFileDirectory_v2()
         tags[700] = packet.encode()
         for stem in "ab":
-            Image.fromarray(deep(number + ord(stem), 257.0)[..., 2]).save(folder / f"{stem}{number}.tif", tiffinfo=tags)
+            Image.fromarray(deep(9 * number + ord(stem), 257.0)[..., 2]).save(
+                folder / f"{stem}{number}.tif", tiffinfo=tags
+            )
     result = ingest(folder)
     assert list(result.photos) == ["a.jpg", "b.jpg"]
     assert result.left_out["a2.tif"] == "shows the band near infrared, and colour is used"
