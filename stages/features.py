@@ -79,9 +79,11 @@ def _check(photo_list: PhotoList, counts: list[int], report: Reporter) -> None:
             hint=texture_hint((photo.width, photo.height) for photo in photo_list.photos),
         )
     if poor:
+        verb, what = ("has", "It is") if len(poor) == 1 else ("have", "They are")
         report.warning(
-            f"{len(poor)} of {len(counts)} photos have hardly any keypoints and cannot be placed: {list_names(poor)}.",
-            hint="They are probably blurred, blank or masked.",
+            f"{len(poor)} of {len(counts)} photos {verb} hardly any keypoints and cannot be placed:"
+            f" {list_names(poor)}.",
+            hint=f"{what} probably blurred, blank or masked.",
         )
 
 

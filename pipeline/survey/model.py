@@ -146,17 +146,21 @@ def report_unmatched(names: Iterable[str], photos: Collection[str], report: Repo
     missing = sorted(set(placed) - set(photos))
     if missing:
         report.warning(
-            f"{len(missing)} of {len(placed)} photos of the model in sparse/ are missing in images/:"
+            f"{len(missing)} of {len(placed)} photos of the model in sparse/ {_are(missing)} missing in images/:"
             f" {list_names(missing)}.",
             "The others are used. Copy these into images/ under their names in the model.",
         )
     unplaced = sorted(set(photos) - set(placed))
     if unplaced:
         report.warning(
-            f"{len(unplaced)} of {len(photos)} photos in images/ are not in the model in sparse/: "
+            f"{len(unplaced)} of {len(photos)} photos in images/ {_are(unplaced)} not in the model in sparse/: "
             f"{list_names(unplaced)}.",
-            "They are not used. To place them, run on the photos alone.",
+            "Those are not used: to place them, run on the photos alone.",
         )
+
+
+def _are(names: Collection[str]) -> str:
+    return "is" if len(names) == 1 else "are"
 
 
 def copy_model(source: Path, target: Path, may_link: bool) -> None:

@@ -329,7 +329,7 @@ def test_photos_that_a_model_of_the_user_has_and_its_folder_lacks_are_named(tmp_
     lost, new = (text for text in notes.warnings if "sparse/" in text)
     assert lost.startswith("5 of 30 photos of the model in sparse/ are missing in images/: ")
     assert all(name in lost for name in scene.names[:5])
-    assert new == "1 of 26 photos in images/ are not in the model in sparse/: new.jpg."
+    assert new == "1 of 26 photos in images/ is not in the model in sparse/: new.jpg."
 
 
 TARGETS = {1: np.array([5.0, 5.0, 0.0]), 2: np.array([35.0, 5.0, 0.4]), 7: np.array([5.0, 40.0, 0.1])}
