@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from functools import partial
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import pycolmap
@@ -14,9 +15,11 @@ from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
 from splatpipe.pipeline.sfm.keypoints import Bytes, extract, single_threaded_opencv
 from splatpipe.pipeline.sfm.options import FeaturesConfig
+from splatpipe.pipeline.sfm.refusal import little_texture, texture_hint
 
 MIN_KEYPOINTS = 16  # COLMAP needs 15 inliers per pair; a photo with fewer keypoints can never be placed
 
@@ -68,13 +71,19 @@ def _check(photo_list: PhotoList, counts: list[int], report: Reporter) -> None:
     if len(counts) - len(poor) < 2:
         raise SplatpipeError(
             "The photos have too little texture: they have hardly any keypoints.",
-            hint="Check that they are sharp and well exposed, and that masks leave enough of each photo.",
+            hint=texture_hint((photo.width, photo.height) for photo in photo_list.photos),
+        )
+    if little_texture(counts):
+        report.warning(
+            f"The photos have little texture: {median(counts):.0f} keypoints a photo (median); few will match.",
+            hint=texture_hint((photo.width, photo.height) for photo in photo_list.photos),
         )
     if poor:
+        verb, what = ("has", "It is") if len(poor) == 1 else ("have", "They are")
         report.warning(
-            f"{len(poor)} of {len(counts)} photos have hardly any keypoints and cannot be placed: {', '.join(poor[:5])}"
-            + ("…" if len(poor) > 5 else ""),
-            hint="They are probably blurred, blank or masked.",
+            f"{len(poor)} of {len(counts)} photos {verb} hardly any keypoints and cannot be placed:"
+            f" {list_names(poor)}.",
+            hint=f"{what} probably blurred, blank or masked.",
         )
 
 

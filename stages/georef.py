@@ -36,7 +36,7 @@ from splatpipe.pipeline.survey.gps import georeference, read_positions, report_f
 from splatpipe.pipeline.survey.last_look import Placed, report_contradictions
 from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of
-from splatpipe.pipeline.survey.model import SparseModel, copy_model, model_of, read_model
+from splatpipe.pipeline.survey.model import SparseModel, copy_model, model_of, read_model, report_unmatched
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE, LensKnowledge
 from splatpipe.pipeline.survey.scale_bars import ModelScale, scale_by
@@ -76,6 +76,8 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     report.progress(0, 3, "reading the model", "steps")
     photos = load_photo_list(inputs["ingest.photos"]).by_name()
     model = read_model(source, photos)
+    if inputs.photos_dir in source.parents:
+        report_unmatched(model.names, photos, report)
     positions = with_assumed_heights(model, read_positions(inputs["ingest.positions"]))
     report.progress(1, 3, "fitting the positions", "steps")
     lenses = _lens_knowledge(inputs["ingest.cameras"], inputs["ingest.lenses"], model, photos)

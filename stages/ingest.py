@@ -12,6 +12,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.source import find_model
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
+from splatpipe.pipeline.photos.bands import ALL, AUTO
 from splatpipe.pipeline.photos.camera_groups import (
     CameraGroup,
     cameras_json,
@@ -21,7 +22,6 @@ from splatpipe.pipeline.photos.camera_groups import (
     report_cameras,
 )
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.duplicates import split_duplicates
 from splatpipe.pipeline.photos.names import NAMES_SHOWN, list_names, printable
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
@@ -36,13 +36,14 @@ from splatpipe.pipeline.photos.preparation import (
     MASKS,
     SKIES,
     Preparation,
-    check_photos,
+    Selection,
     convert_unusual,
     converted_path,
     mask_path,
     prepare_masks,
+    select_photos,
 )
-from splatpipe.pipeline.photos.scan import ExcludedPhoto, Scan, scan_folder
+from splatpipe.pipeline.photos.scan import by_reason, with_reason
 from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
@@ -62,22 +63,21 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     root = photo_root(inputs.photos_dir)
     part = out / "photos"
     part.mkdir(parents=True, exist_ok=True)
+    if config.bands == AUTO and find_model(inputs.photos_dir) is not None:
+        config = config.model_copy(update={"bands": ALL})  # a given model says which photos it is of
     work = Preparation(config, inputs.machine.threads, part, report)
     # Libraries print their own warnings about odd metadata tags. Filters are process-wide, so they are set only here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scan = scan_folder(root)
-        checked, broken = check_photos(scan, work)
-        photos, duplicates = split_duplicates(checked)
-        left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
-        _require_photos(inputs.photos_dir, scan, photos, left_out)
-        _warn_of_excluded(left_out, report)
+        chosen = select_photos(root, work)
+        photos, left_out = chosen.photos, chosen.left_out
+        _require_photos(inputs.photos_dir, chosen)
+        _report_excluded(chosen, config, report)
         groups, camera_of = group_cameras(photos)
         groups, lenses = _lenses(inputs, groups, camera_of, photos, report)
         opacity = convert_unusual(photos, camera_of, work)
-        others = [entry.name for entry in left_out]
-        masked = prepare_masks(MASKS, root, photos, others, opacity, work)
-        skies = prepare_masks(SKIES, root, photos, others, {}, work)
+        masked = prepare_masks(MASKS, root, chosen, opacity, work)
+        skies = prepare_masks(SKIES, root, chosen, {}, work)
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places.by_name)
     for issue in find_position_issues(photos, positions, places):
@@ -120,16 +120,15 @@ def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]
     )
 
 
-def _require_photos(
-    folder: Path, scan: Scan, photos: Sequence[CheckedPhoto], left_out: Sequence[ExcludedPhoto]
-) -> None:
+def _require_photos(folder: Path, chosen: Selection) -> None:
+    photos, left_out, scan = chosen.photos, chosen.left_out, chosen.scan
     if len(photos) >= MIN_PHOTOS:
         return
     listing = "".join(f"\n  {printable(entry.name)} {entry.reason}" for entry in left_out[:NAMES_SHOWN])
     more = f"\n  … and {len(left_out) - NAMES_SHOWN} more" if len(left_out) > NAMES_SHOWN else ""
     if photos:
         message = f"There is only one usable photo in {folder}: {printable(photos[0].name)}."
-        hint = "A reconstruction needs many overlapping photos of the same scene, at least two."
+        hint = "A reconstruction needs many overlapping photos of the same scene, at least three."
     elif left_out:
         message = f"None of the {len(left_out)} pictures in {folder} can be used."
         hint = "Give JPEG, PNG or TIFF photos."
@@ -142,13 +141,17 @@ def _require_photos(
     raise SplatpipeError(message + (f" Left out:{listing}{more}" if left_out else ""), hint=hint)
 
 
-def _warn_of_excluded(left_out: Sequence[ExcludedPhoto], report: Reporter) -> None:
-    """Issue one warning per reason, naming the photos."""
-    by_reason: dict[str, list[str]] = {}
-    for entry in left_out:
-        by_reason.setdefault(entry.reason, []).append(entry.name)
-    for reason, names in by_reason.items():
-        report.warning(f"Left out: {list_names(names)} {reason}.")
+def _report_excluded(chosen: Selection, config: IngestConfig, report: Reporter) -> None:
+    """Issue one warning, or for files that belong to photos one note, per reason, naming the files."""
+    for kind, say in (("unusable", report.warning), ("duplicate", report.warning), ("companion", report.note)):
+        for reason, names in by_reason(entry for entry in chosen.left_out if entry.kind == kind).items():
+            say(f"Left out: {with_reason(names, reason)}.")
+    if chosen.note:
+        report.note(chosen.note)
+    if chosen.masks:
+        listed = list_names(mask.name for mask in chosen.masks)
+        use = "used as masks" if config.masks else "not used, by ingest.masks=false"
+        report.note(f"Masks beside their photos, {use}: {listed}.")
 
 
 def _lenses(

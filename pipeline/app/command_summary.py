@@ -186,11 +186,22 @@ def print_json(value: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
+def _is_undecoded(error: UnicodeEncodeError) -> bool:
+    """Whether a text has bytes of a file's name that are not of the encoding of names."""
+    return any("\udc80" <= sign <= "\udcff" for sign in error.object[error.start : error.end])
+
+
 def for_the_user(error: Exception) -> SplatpipeError:
     if isinstance(error, SplatpipeError):
         return error
     if isinstance(error, OSError):
         return MachineError(str(error), "Check the free space and the permissions.")
+    if isinstance(error, UnicodeEncodeError) and (sys.getfilesystemencoding() != "utf-8" or _is_undecoded(error)):
+        return MachineError(
+            "A name of a file or folder has letters that this environment cannot write: its encoding is "
+            f"{sys.getfilesystemencoding()}.",
+            "Unset PYTHONUTF8, or set LC_ALL=C.UTF-8; or rename the file or folder.",
+        )
     if (fault := card_fault(error)) is not None:
         return fault
     hint = "Please report it."

@@ -107,9 +107,15 @@ def own_folder(root: Path, *below: str | PurePath) -> Path:
         below: The folder, relative to it.
 
     Raises:
-        UsageError: if one of them is a link, or not a folder; ``root`` itself may be a link.
+        UsageError: if one of them is a link, or not a folder; ``root`` itself may be a link, but not to nothing.
         OSError: if it cannot be made.
     """
+    for place in (root, *root.parents):
+        if place.is_symlink() and not place.exists():
+            raise UsageError(
+                f"{place} is a link to {place.readlink()}, which does not exist.",
+                hint="Make that folder, or remove the link.",
+            )
     root.mkdir(parents=True, exist_ok=True)
     folder = root
     for name in PurePath(*below).parts:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -33,7 +34,11 @@ FINGERPRINT_STEP = 8
 TAG_ORIENTATION = 274
 TAG_BITS_PER_SAMPLE = 258
 TAG_DNG_VERSION = 50706
+TAGS_GEOTIFF = (33550, 34735)  # ModelPixelScale, GeoKeyDirectory: the size of a map's pixels on the ground, its CRS
+PANORAMA = re.compile(r"(?:^|[ ._-])pano(?:rama)?(?:[ ._-]|\d|$)")  # in the names of stitched ones
+PANORAMA_ASPECT = 1.9  # a sphere's is 2; of the pictures of other cameras, 1.78 is the widest
 DEEP_GREY_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
+GREY_MODES = ("1", "L", "LA", "La", *DEEP_GREY_MODES)
 COLOUR_MODES = ("RGB", "RGBA")
 READ_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *DEEP_GREY_MODES)
 RANGE_QUANTILES = (0.001, 0.999)  # of a deep image's values: excludes hot and dead pixels
@@ -63,6 +68,7 @@ class CheckedPhoto:
         deep_range: Lowest and highest value of an image with more than 8 bits per channel, else None.
         exif: Its EXIF.
         xmp: Its XMP properties.
+        grey: Whether it has no colours.
     """
 
     name: str
@@ -76,6 +82,7 @@ class CheckedPhoto:
     deep_range: tuple[float, float] | None
     exif: Exif
     xmp: Mapping[str, str]
+    grey: bool = False
 
 
 def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | ExcludedPhoto:
@@ -156,6 +163,8 @@ def _refusal_reason(picture: Image.Image, limits: PictureLimits) -> str:
         return f"is only {width} × {height} pixels, less than ingest.min_size={limits.min_side}"
     if picture.format == "TIFF" and _tiff_tag(picture, TAG_DNG_VERSION, None) is not None:
         return "is a camera's raw file (DNG): develop it to JPEG or TIFF"
+    if picture.format == "TIFF" and None not in (_tiff_tag(picture, tag, None) for tag in TAGS_GEOTIFF):
+        return "is a map (GeoTIFF), made from photos: give the photos themselves"
     if picture.mode not in READ_MODES:
         return f"has an unsupported colour mode ({picture.mode}): convert it to 8-bit RGB"
     return ""
@@ -164,7 +173,7 @@ def _refusal_reason(picture: Image.Image, limits: PictureLimits) -> str:
 def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image) -> CheckedPhoto | ExcludedPhoto:
     exif = read_exif(picture)
     xmp = parse_xmp(find_packet(_xmp_bytes(picture)) or find_packet(data))
-    if xmp.get("GPano:ProjectionType"):
+    if xmp.get("GPano:ProjectionType") or _is_named_panorama(candidate.name, picture):
         return ExcludedPhoto(candidate.name, "is a stitched panorama: give the original photos")
     orientation = stored_orientation(exif, picture)
     width, height = picture.size
@@ -193,6 +202,7 @@ def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image
         deep_range=pixels.deep_range,
         exif=exif,
         xmp=xmp,
+        grey=picture.mode in GREY_MODES,
     )
 
 
@@ -201,6 +211,12 @@ class _Facts:
     fingerprint: str
     transparent: bool
     deep_range: tuple[float, float] | None
+
+
+def _is_named_panorama(name: str, picture: Image.Image) -> bool:
+    """Whether a wide picture is called a panorama, as those whose XMP was lost; its tiles are not wide."""
+    stem = PurePosixPath(name).stem.casefold()
+    return picture.width >= PANORAMA_ASPECT * picture.height and PANORAMA.search(stem) is not None
 
 
 def _load(data: bytes, picture: Image.Image, orientation: int) -> np.ndarray | Image.Image:

@@ -23,13 +23,14 @@ from splatpipe.pipeline.photos.picture_file import (
     turn_to_decode,
     undo_orientation,
 )
-from splatpipe.pipeline.photos.scan import MASK_FOLDER, PHOTO_SUFFIXES
+from splatpipe.pipeline.photos.scan import MASK_FOLDER, PHOTO_SUFFIXES, PhotoMask
 
 ASPECT_TOLERANCE = 0.01
 IMAGE_FOLDER = "images"
 FEW_LABELS = 128  # a lossless mask with only lower values contains labels (0 and 1, or classes): all but 0 count
 HALF = 128
 MANY_TIMES = 2  # a mask has its photo's size; a larger one may be of photos that were reduced later
+MASK_TAGS = ("_mask", ".mask")  # as other programs end a mask's name
 QUARTER_TURNS = (5, 6, 7, 8)
 
 
@@ -39,7 +40,7 @@ class MaskError(Exception):
 
 @dataclass(frozen=True)
 class MaskFile:
-    """A file below a ``masks/`` or ``sky_masks/`` folder.
+    """A mask: a file below a ``masks/`` or ``sky_masks/`` folder, or beside its photo.
 
     Attributes:
         label: Its name in messages.
@@ -74,6 +75,11 @@ def find_masks(root: Path, called: str = MASK_FOLDER) -> list[MaskFile]:
     return found
 
 
+def with_masks_beside(matched: Mapping[str, MaskFile], masks: Sequence[PhotoMask]) -> dict[str, MaskFile]:
+    """Masks by photo name, with those that lie among the photos where a photo has no other."""
+    return {**{mask.owner: MaskFile(mask.name, mask.owner, mask.path) for mask in masks}, **matched}
+
+
 def match_masks(masks: Sequence[MaskFile], names: Sequence[str]) -> tuple[dict[str, MaskFile], list[MaskFile]]:
     """Match masks with photos.
 
@@ -82,7 +88,8 @@ def match_masks(masks: Sequence[MaskFile], names: Sequence[str]) -> tuple[dict[s
         names: Of all photos, including those left out.
 
     Returns:
-        The masks by photo name, and the masks without a photo. ``NAME.ext.png`` takes precedence over ``NAME.png``.
+        The masks by photo name, and the masks without a photo. ``NAME.ext.png`` takes precedence over ``NAME.png``,
+        and this over ``NAME_mask.png``.
         A mask that matches no photo this way is matched with ``images/NAME``, as in COLMAP's folders.
     """
     by_key: dict[str, MaskFile] = {}
@@ -100,7 +107,8 @@ def match_masks(masks: Sequence[MaskFile], names: Sequence[str]) -> tuple[dict[s
 
 
 def _key(name: str, by_key: Mapping[str, MaskFile]) -> str | None:
-    return next((key for key in (name, str(PurePosixPath(name).with_suffix(""))) if key in by_key), None)
+    keys = (name, str(PurePosixPath(name).with_suffix("")))
+    return next((key for key in (*keys, *(key + tag for key in keys for tag in MASK_TAGS)) if key in by_key), None)
 
 
 def _name_beside_images(name: str) -> str | None:

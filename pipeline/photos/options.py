@@ -13,11 +13,14 @@ from splatpipe.pipeline.engine.stage import StageConfig
 class IngestConfig(StageConfig):
     masks: bool = True
     """Apply the masks in `masks/` (black is ignored) and `sky_masks/` (white is sky, for `train.sky`), beside or inside
-    the photo folder. Masks have the file names of their photos."""
+    the photo folder. Masks have the file names of their photos. `NAME_mask.JPG` beside `NAME.JPG` is a mask, too."""
     min_size: PositiveInt = 320
     """Images whose longer side is shorter than this, in pixels, are left out: thumbnails and icons."""
     max_megapixels: Annotated[float, Field(gt=0.0, le=4000.0)] = 500.0
     """Larger images are left out without being decoded, because a small file can claim any size."""
+    bands: str = "auto"
+    """Of photos of several spectral bands, those that are used: `auto` takes the colour photos, or else the sharpest
+    band; a band, such as `green` or `near infrared`; `all`: every photo, each band as a camera of its own."""
     positions: str = "auto"
     """File of camera positions, which take precedence over those in the photos: `geo.txt` (ODM) or a CSV with a header.
     `auto`: `geo.txt` or `positions.csv` in the photo folder or beside it; `none`: only the photos' metadata."""

@@ -12,9 +12,18 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.stage import Reporter
+from splatpipe.pipeline.photos.bands import choose_band
 from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.photos.convert import convert_photo, save_png, scale_of
-from splatpipe.pipeline.photos.masks import MaskError, MaskFile, find_masks, match_masks, read_mask
+from splatpipe.pipeline.photos.duplicates import split_duplicates, split_maps
+from splatpipe.pipeline.photos.masks import (
+    MaskError,
+    MaskFile,
+    find_masks,
+    match_masks,
+    read_mask,
+    with_masks_beside,
+)
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.photo_list import (
@@ -22,7 +31,7 @@ from splatpipe.pipeline.photos.photo_list import (
     MASK_DIR,
     SKY_DIR,
 )
-from splatpipe.pipeline.photos.scan import MASK_FOLDER, SKY_FOLDER, ExcludedPhoto, Scan
+from splatpipe.pipeline.photos.scan import MASK_FOLDER, SKY_FOLDER, ExcludedPhoto, PhotoMask, Scan, scan_folder
 
 MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly intended
 T = TypeVar("T")
@@ -62,14 +71,42 @@ class Preparation:
         return int(self.config.max_megapixels * 1e6)
 
 
-def check_photos(scan: Scan, work: Preparation) -> tuple[list[CheckedPhoto], list[ExcludedPhoto]]:
-    """Check the scan's candidates; return the usable photos, and those excluded with the reason."""
+@dataclass(frozen=True)
+class Selection:
+    """The photos of a folder.
+
+    Attributes:
+        scan: What lies in the folder.
+        photos: The photos in use, sorted by name.
+        left_out: All other pictures, sorted by name, each with the reason.
+        masks: Masks that lie beside their photos, sorted by name.
+        note: Which band was chosen; empty where the photos are of one.
+    """
+
+    scan: Scan
+    photos: list[CheckedPhoto]
+    left_out: list[ExcludedPhoto]
+    masks: list[PhotoMask]
+    note: str
+
+
+def select_photos(root: Path, work: Preparation) -> Selection:
+    """Check the pictures of a folder, and choose those that are used.
+
+    Raises:
+        SplatpipeError: if there are no photos of the band that `ingest.bands` names.
+    """
+    scan = scan_folder(root)
     limits = PictureLimits(work.config.min_size, work.max_pixels)
     results = _in_threads(
         lambda candidate: check_photo(candidate, limits), scan.candidates, work, "checking photos", "photos"
     )
-    checked = [result for result in results if isinstance(result, CheckedPhoto)]
-    return checked, [result for result in results if isinstance(result, ExcludedPhoto)]
+    broken = [result for result in results if isinstance(result, ExcludedPhoto)]
+    photos, duplicates = split_duplicates([result for result in results if isinstance(result, CheckedPhoto)])
+    chosen = choose_band(photos, work.config.bands)
+    photos, maps, masks = split_maps(chosen.photos)
+    left_out = sorted([*scan.left_out, *broken, *duplicates, *chosen.left_out, *maps], key=lambda entry: entry.name)
+    return Selection(scan, photos, left_out, sorted([*scan.masks, *masks], key=lambda mask: mask.name), chosen.note)
 
 
 def convert_unusual(
@@ -94,16 +131,14 @@ def convert_unusual(
 
 
 def prepare_masks(
-    kind: MaskKind,
-    root: Path,
-    photos: Sequence[CheckedPhoto],
-    left_out: Sequence[str],
-    opacity: Mapping[str, UInt8[np.ndarray, "h w"]],
-    work: Preparation,
+    kind: MaskKind, root: Path, chosen: Selection, opacity: Mapping[str, UInt8[np.ndarray, "h w"]], work: Preparation
 ) -> set[str]:
-    """Write the masks of a kind, from its folder and from transparency; return the names of masked photos."""
+    """Write the masks of a kind: from its folder, beside the photos, from transparency; return the masked photos."""
+    photos = chosen.photos
     files = find_masks(root, kind.folder) if work.config.masks else []
-    matched, unused = match_masks(files, [*(photo.name for photo in photos), *left_out])
+    matched, unused = match_masks(files, [photo.name for photo in photos] + [entry.name for entry in chosen.left_out])
+    if kind is MASKS and work.config.masks:
+        matched = with_masks_beside(matched, chosen.masks)
     if unused:
         names = list_names([mask.label for mask in unused])
         work.report.warning(f"There is no photo for the mask {names}.", "A mask must have its photo's name: NAME.png.")

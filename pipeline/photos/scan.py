@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Container
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from splatpipe.pipeline.engine.machine import pseudo_devices
 from splatpipe.pipeline.engine.small_file import open_regular
-from splatpipe.pipeline.photos.names import is_plain
+from splatpipe.pipeline.photos.companions import MASK, find_companions, other_formats, reason_of
+from splatpipe.pipeline.photos.names import is_plain, list_names
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"}
 OTHER_PICTURES = {
@@ -28,6 +30,14 @@ MASK_FOLDER = "masks"
 SKY_FOLDER = "sky_masks"
 HEAD_BYTES = 16
 MAX_NAME_BYTES = 250
+MAGICS = {  # first bytes of pictures whose names claim to be some
+    "BMP": (b"BM",),
+    "JPEG XL": (b"\xff\x0a", b"\0\0\0\x0cJXL \r\n"),
+    "JPEG 2000": (b"\0\0\0\x0cjP  \r\n", b"\xff\x4f\xff\x51"),
+    "OpenEXR": (b"\x76\x2f\x31\x01",),
+}
+RAW_REASON = "is a camera's raw file: develop it to JPEG or TIFF"
+TWIN_REASON = "is another format of a photo that is used"
 TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
@@ -41,10 +51,39 @@ class Candidate:
 
 @dataclass(frozen=True)
 class ExcludedPhoto:
-    """An excluded photo, and why: ``reason`` ends a sentence that starts with the name."""
+    """An excluded photo.
+
+    Attributes:
+        name: Its name.
+        reason: Why: the end of a sentence that starts with the name.
+        kind: ``companion`` for a file that belongs to a photo, so that nothing is lost without it.
+    """
 
     name: str
     reason: str
+    kind: Literal["unusable", "duplicate", "companion"] = "unusable"
+
+
+def by_reason(entries: Iterable[ExcludedPhoto]) -> dict[str, list[str]]:
+    """The names of excluded photos by their reasons."""
+    names: dict[str, list[str]] = {}
+    for entry in entries:
+        names.setdefault(entry.reason, []).append(entry.name)
+    return names
+
+
+def with_reason(names: Sequence[str], reason: str) -> str:
+    """A sentence, without its full stop, about photos that are excluded for the same reason."""
+    return f"{list_names(names)} {reason}" if len(names) == 1 else f"{list_names(names)}; each {reason}"
+
+
+@dataclass(frozen=True)
+class PhotoMask:
+    """A mask that lies beside its photo: its name, the photo's, and its path."""
+
+    name: str
+    owner: str
+    path: Path
 
 
 @dataclass(frozen=True)
@@ -53,13 +92,15 @@ class Scan:
 
     Attributes:
         candidates: Files to be checked, sorted by name.
-        left_out: Files that claim to be photos but cannot be used, sorted by name.
+        left_out: Files that claim to be photos but cannot be used, or belong to photos, sorted by name.
         others: Number of other files, which are ignored.
+        masks: Masks of photos that lie among them, sorted by name.
     """
 
     candidates: tuple[Candidate, ...]
     left_out: tuple[ExcludedPhoto, ...]
     others: int
+    masks: tuple[PhotoMask, ...] = ()
 
 
 def scan_folder(root: Path) -> Scan:
@@ -100,11 +141,28 @@ def scan_folder(root: Path) -> Scan:
                 candidates.append(Candidate(_name(path, root), path))
             else:
                 left_out.append(ExcludedPhoto(_name(path, root), reason))
-    return Scan(
-        tuple(sorted(candidates, key=lambda candidate: candidate.name)),
-        tuple(sorted(left_out, key=lambda entry: entry.name)),
-        others,
-    )
+    return _without_companions(sorted(candidates, key=lambda candidate: candidate.name), left_out, others)
+
+
+def _without_companions(candidates: Sequence[Candidate], left_out: Sequence[ExcludedPhoto], others: int) -> Scan:
+    """The scan, with the files that belong to photos told apart from these."""
+    companions = find_companions(candidate.name for candidate in candidates)
+    photos = [candidate for candidate in candidates if candidate.name not in companions]
+    raws = {
+        entry.name for entry in left_out if entry.reason in (RAW_REASON, *map(_unsupported, OTHER_PICTURES.values()))
+    }
+    twins = other_formats(raws, [photo.name for photo in photos])
+    masks, excluded = [], []
+    for candidate in candidates:
+        companion = companions.get(candidate.name)
+        if companion is not None and companion.kind == MASK:
+            masks.append(PhotoMask(candidate.name, companion.owner, candidate.path))
+        elif companion is not None:
+            excluded.append(ExcludedPhoto(candidate.name, reason_of(companion), "companion"))
+    for entry in left_out:
+        known = entry.name in twins
+        excluded.append(ExcludedPhoto(entry.name, TWIN_REASON, "companion") if known else entry)
+    return Scan(tuple(photos), tuple(sorted(excluded, key=lambda entry: entry.name)), others, tuple(masks))
 
 
 def _name(path: Path, root: Path) -> str:
@@ -125,15 +183,18 @@ def _exclusion_reason(path: Path, pseudo: Container[int]) -> str | None:
     except OSError as error:
         return f"cannot be read ({error.strerror})" if claims else ""
     if suffix in RAW_SUFFIXES:  # most raw formats are TIFF files with a thumbnail in front
-        return "is a camera's raw file: develop it to JPEG or TIFF"
+        return RAW_REASON
     kind = _kind(head)
     if kind == "photo":
         return None
     if kind:
-        return f"is a {kind} picture, which is not supported: convert it to JPEG or PNG"
+        return _unsupported(kind)
     if not claims:
         return ""
-    return "is empty" if not head else f"is no {_claimed_format(suffix)} picture, whatever its name says"
+    if not head:
+        return "is empty"
+    other = next((name for name, magics in MAGICS.items() if head.startswith(magics)), "")
+    return _unsupported(other) if other else f"is no {_claimed_format(suffix)} picture, whatever its name says"
 
 
 def _name_problem(relative: Path) -> str | None:
@@ -151,6 +212,10 @@ def _claimed_format(suffix: str) -> str:
     if suffix in OTHER_PICTURES:
         return OTHER_PICTURES[suffix]
     return {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}.get(suffix, "JPEG")
+
+
+def _unsupported(kind: str) -> str:
+    return f"is a {kind} picture, which is not supported: convert it to JPEG or PNG"
 
 
 def _kind(head: bytes) -> str:

@@ -56,14 +56,12 @@ def plan_views(
     by_name = {photo.name: photo for photo in photos}
     targets: dict[tuple[int, int, int], pycolmap.Camera] = {}
     placed: dict[str, RegisteredPhoto] = {}
-    missing: list[str] = []
     unusable: list[str] = []
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     matched = match_names((image.name for image in images), by_name)
     for image in images:
         name = matched.get(image.name)
-        if name is None or name in placed:
-            missing.append(image.name)
+        if name is None or name in placed:  # georef has told it
             continue
         photo = by_name[name]
         source = _camera_for(image, photo)
@@ -78,10 +76,6 @@ def plan_views(
         raise SplatpipeError(
             f"Of the {len(images)} photos in the sparse model, {len(placed)} can be used.",
             hint="images/ must contain them, with the names and aspect ratios of the model.",
-        )
-    if missing:
-        report.warning(
-            f"{len(missing)} photos of the sparse model are missing and are left out: {list_names(missing)}."
         )
     if unusable:
         names = list_names(unusable)

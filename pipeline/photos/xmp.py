@@ -17,6 +17,7 @@ MAX_PROPERTIES = 2000
 MAX_DEPTH = 32
 MAX_VALUE_CHARS = 1000
 MAX_NAME_CHARS = 200
+SEPARATOR = ", "  # of a list's items
 PREFIX_OF_NAMESPACE = {
     "http://www.dji.com/drone-dji/1.0/": "drone-dji",
     "http://pix4d.com/camera/1.0": "Camera",
@@ -36,7 +37,7 @@ class _Properties:
     def __init__(self) -> None:
         self.values: dict[str, str] = {}
         self._prefixes: dict[str, str] = {}
-        self._open: list[tuple[str, list[str]]] = []
+        self._open: list[tuple[str, list[str], list[str]]] = []  # element, its text, the items of a list in it
 
     def start(self, name: str, attributes: dict[str, str]) -> None:
         for key, value in attributes.items():
@@ -47,17 +48,21 @@ class _Properties:
                 self._add(key, value)
         if len(self._open) >= MAX_DEPTH:
             raise _RefusedError
-        self._open.append((name, []))
+        self._open.append((name, [], []))
 
     def text(self, data: str) -> None:
         if self._open:
             self._open[-1][1].append(data)
 
     def end(self, name: str) -> None:
-        opened, texts = self._open.pop()
-        text = "".join(texts).strip()
-        if text and opened == name:
-            self._add(name, text)
+        opened, texts, items = self._open.pop()
+        text = "".join(texts).strip() or SEPARATOR.join(items)
+        if not text or opened != name:
+            return
+        self._add(name, text)
+        if name == "rdf:li":
+            around = (items for element, _, items in reversed(self._open) if not element.startswith("rdf:"))
+            next(around, []).append(text)
 
     def refuse(self, *_: object) -> None:
         raise _RefusedError
@@ -87,7 +92,8 @@ def parse_xmp(packet: bytes) -> Mapping[str, str]:
 
     Returns:
         ``{"drone-dji:RelativeAltitude": "+39.80", …}``: known namespaces under the prefix used here, others under the
-        file's own. Empty if the packet is broken, declares a document type or exceeds a limit.
+        file's own; the items of a list are joined by commas. Empty if the packet is broken, declares a document type or
+        exceeds a limit.
     """
     if not packet or len(packet) > MAX_PACKET_BYTES:
         return {}

@@ -42,7 +42,9 @@ STEPS = {
     WIDE_FISHEYE: (("k2",), ("cx", "cy"), ("k3",), ("k4",)),
 }
 PASSES = 2  # a group rejected with a wrong lens may be justified with a better one
-WIDE_ANGLE = 1.2  # tangent of half the field of view, at the corner, above which a lens may be a fisheye
+WIDE_ANGLE = (
+    1.2  # tangent of the widest angle off the axis at which photos have points, above which it may be a fisheye
+)
 
 
 @dataclass(frozen=True)
@@ -138,13 +140,18 @@ class LensTrial:
                 self._free_group({n: names for n in sorted(hopeful) if (names := self._open(n, step))})
 
     def try_fisheye(self) -> None:
-        """Switch wide-angle cameras to the fisheye model if it predicts the held-out tracks better."""
-        wanted = {}
+        """Switch cameras whose photos show a wide angle to the fisheye model if it predicts the held-out tracks better.
+
+        It must be better than the best lens so far, and than a pinhole lens with everything free: more free parameters
+        alone are no reason.
+        """
+        wanted, full = {}, {}
         model = pycolmap.Reconstruction(self.model)
         for number, state in sorted(self.states.items()):
             camera = model.cameras[number]
-            if state.stated or not state.freedom.free or camera.model_name != WIDE or not _is_wide(camera):
+            if state.stated or not state.freedom.free or camera.model_name != WIDE or not self._is_wide(number, camera):
                 continue
+            full[number] = self._with(number, tuple(sorted(set(sum(STEPS[WIDE], ())) - set(state.freedom.free))))
             _as_fisheye(camera)
             free = (*BASE, *sum(STEPS[WIDE_FISHEYE], ()))
             freedom = replace(state.freedom, free=free, prior=weak_prior(camera))
@@ -152,14 +159,31 @@ class LensTrial:
         if not wanted:
             return
         solved, errors = self._solve(model, wanted)
+        _, pinhole = self._solve(pycolmap.Reconstruction(self.model), full)
         kept = {}
         for number in wanted:
             gain, sure = self._gain(number, errors)
-            row = {"freed": "fisheye", "held_out_gain": round(gain, 4), "kept": sure}
-            kept[number] = sure
-            chosen = wanted[number] if sure else self.states[number]
+            over, clear = self._gain(number, errors, pinhole)
+            wide = self._is_wide(number, solved.model.cameras[number])
+            row = {
+                "freed": "fisheye",
+                "held_out_gain": round(gain, 4),
+                "over_pinhole": round(over, 4),
+                "kept": sure and clear and wide,
+            }
+            kept[number] = sure and clear and wide
+            chosen = wanted[number] if kept[number] else self.states[number]
             wanted[number] = replace(chosen, tried=(*self.states[number].tried, row))
         self._keep(solved, errors, wanted, kept)
+
+    def _is_wide(self, number: int, camera: pycolmap.Camera) -> bool:
+        """Whether a camera's lens shows a wide angle where its photos have points.
+
+        Beyond them, as around an object that was cut out, a polynomial may run anywhere.
+        """
+        pixels = self._tracks.pixels[self._rows.get(number, np.zeros(0, np.int64))]
+        tangent = np.linalg.norm(np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2), axis=1)
+        return len(tangent) > 0 and float(np.where(np.isfinite(tangent), tangent, np.inf).max()) > WIDE_ANGLE
 
     def _free_group(self, groups: Mapping[int, tuple[str, ...]]) -> None:
         if not groups:
@@ -231,9 +255,15 @@ class LensTrial:
         solved = adjust_lenses(model, freedoms, with_covariances)
         return solved, predicted_errors(solved.model, self._tracks)
 
-    def _gain(self, number: int, errors: Float64[np.ndarray, " n"]) -> tuple[float, bool]:
+    def _gain(
+        self, number: int, errors: Float64[np.ndarray, " n"], before: Float64[np.ndarray, " n"] | None = None
+    ) -> tuple[float, bool]:
+        """How much a camera's held-out errors are less than those of another solution, or of the best so far."""
         rows = self._rows.get(number, np.zeros(0, np.int64))
-        return improves(self._errors[rows], errors[rows], self._tracks.image[rows], MIN_GAIN, self._seed)
+        was = (self._errors if before is None else before)[rows]
+        if before is not None and not math.isfinite(float(np.median(was))):
+            return math.inf, True  # a solution that predicts nothing
+        return improves(was, errors[rows], self._tracks.image[rows], MIN_GAIN, self._seed)
 
     def _typical(self, number: int) -> float:
         """Return the typical held-out error along one axis, pixels."""
@@ -257,12 +287,6 @@ class LensTrial:
                     camera = self.model.cameras[number]
                     set_lens(model.cameras[number], camera.model_name, named_params(camera))
             self._best, self._errors = self._solve(model, {})
-
-
-def _is_wide(camera: pycolmap.Camera) -> bool:
-    rays = picture_rays(camera.width, camera.height, camera)
-    tangent = np.linalg.norm(rays, axis=1)
-    return not np.isfinite(tangent).all() or float(tangent.max()) > WIDE_ANGLE
 
 
 def _as_fisheye(camera: pycolmap.Camera) -> None:

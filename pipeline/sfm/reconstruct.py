@@ -11,7 +11,6 @@ from typing import Literal, TypeAlias
 import numpy as np
 import pycolmap
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.coarseness import coarseness
@@ -21,6 +20,7 @@ from splatpipe.pipeline.sfm.judging import Judgement, judge
 from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options, map_global, map_incremental
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.probing import FILL, PROBES, THIN, pairs_a_photo, probe
+from splatpipe.pipeline.sfm.refusal import refusal
 from splatpipe.pipeline.sfm.structure import Structure, cameras_of, make_model, poses_of
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
@@ -153,7 +153,8 @@ def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -
     """
     work = Reconstructor(capture, config, report)
     answer = _first(work)
-    _check_enough(answer.placed, config, len(work.verified.names))
+    if answer.placed < max(config.min_model_size, math.ceil(MIN_SHARE * len(work.verified.names))):
+        raise refusal(answer.placed, config.min_model_size, work.verified, len(capture.tried))
     if config.mapper == "auto":
         answer = _settled(work, _with_new_pairs(work, answer))
     return MappingResult(
@@ -299,15 +300,6 @@ def _row(answer: MappingAttempt) -> dict[str, JSON]:
 def _has_points(model: Model) -> bool:
     """Whether a model's photos observe enough points; photos taken from one spot are placed without any."""
     return bool(model.compute_num_observations() >= MIN_SEEN * model.num_reg_images())
-
-
-def _check_enough(count: int, config: SparseConfig, total: int) -> None:
-    if count < max(config.min_model_size, math.ceil(MIN_SHARE * total)):
-        raise SplatpipeError(
-            f"Only {count} of {total} photos could be placed." if count else f"None of {total} photos could be placed.",
-            hint="Photos must overlap by two thirds and be taken from different positions."
-            " Add overlap, or try --set matches.pairing=exhaustive.",
-        )
 
 
 def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bool:

@@ -21,6 +21,7 @@ from splatpipe.pipeline.geometry.joint_fit import (
     studentised,
 )
 from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.survey.control_file import titled
 from splatpipe.pipeline.survey.coordinate_readings import FAR_M, nearer_reading, shape_reading
 from splatpipe.pipeline.survey.geodesy import ecef_from_geodetic
 from splatpipe.pipeline.survey.local_survey import LocalSurvey, Stations, locate_survey, observed_in
@@ -235,12 +236,12 @@ def gsd_m(survey: Survey, model: SparseModel, scale: float) -> float:
 def _left_out_blunder(point: SurveyPoint, off: _Offset, report: Reporter) -> SurveyPoint:
     if point.role == "check":
         report.warning(
-            f"Check point {point.name} lies {off.length:.2f} m from its surveyed position ({off}).",
+            f"{titled('Check', point.name)} lies {off.length:.2f} m from its surveyed position ({off}).",
             "Check its coordinates and marks against the field book. It stays in the accuracy table.",
         )
         return point
     report.warning(
-        f"Control point {point.name} is left out: the other points and the photos place it {off.length:.2f} m"
+        f"{titled('Control', point.name)} is left out: the other points and the photos place it {off.length:.2f} m"
         f" from where it is surveyed ({off}).",
         "Check its coordinates and marks against the field book, correct the file, and run again.",
     )

@@ -32,6 +32,7 @@ from splatpipe.pipeline.survey.blunders import (
     tell_heights_apart,
     warn_of_weak_control,
 )
+from splatpipe.pipeline.survey.control_file import titled
 from splatpipe.pipeline.survey.control_fit import fit_control
 from splatpipe.pipeline.survey.crs import UNKNOWN, parse_vertical
 from splatpipe.pipeline.survey.frames import Frame
@@ -196,7 +197,7 @@ def _settle(case: _Case, report: Reporter) -> _TrustedAdjustment:
         index, off, best = better
         point = best.survey.points[index]
         report.warning(
-            f"Control point {point.name} is left out: after adjustment to the others, the photos place it "
+            f"{titled('Control', point.name)} is left out: after adjustment to the others, the photos place it "
             f"{off:.2f} m from"
             " its surveyed position.",
             "Check its coordinates and marks against the field book, correct the file, and run again.",

@@ -14,15 +14,22 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.survey.control_file import COLUMNS, SurveyedPoint, Table, parse_table, read_table
-from splatpipe.pipeline.survey.survey_text import delimiter_of, find_columns, is_number
+from splatpipe.pipeline.survey.control_file import (
+    COLUMNS,
+    TABS,
+    SurveyedPoint,
+    Table,
+    fields_of,
+    parse_table,
+    read_table,
+)
+from splatpipe.pipeline.survey.survey_text import cells_of, find_columns, is_number, titles_of
 
 HIDDEN, UNMARKED = "# not visible:", "# unmarked:"
 CSV_TITLES = ("name", "x", "y", "z", "photo", "pixel_x", "pixel_y", "role", "sigma_h", "sigma_v")
 CSV_KEYS = ("name", "x", "y", "z", "photo", "px", "py", "role", "sigma_horizontal", "sigma_vertical")
 MARKED = ("photo", "px", "py")
 BOM = "\ufeff"
-TABS = 5  # a line of ODM's list with at least as many is tab-separated
 
 FindPhoto = Callable[[str], str | None]
 
@@ -118,7 +125,7 @@ class ControlText:
             return self._named().without_mark(point, photo)
         if len(group) > 1:
             return self._put(here.line, None)
-        fields = _split(self._line(here.line))[:3]
+        fields = fields_of(self._line(here.line), self.table.separator)[:3]
         return self._put(here.line, f"{UNMARKED}\t" + "\t".join([*fields, point.name]))
 
     def with_hidden(self, point: str, photo: str, hidden: bool) -> ControlText:
@@ -149,9 +156,9 @@ class ControlText:
         for name, group in self.table.groups.items():
             for row in group:
                 if not row.name:
-                    fields = _split(lines[row.line - 1])
+                    fields = fields_of(lines[row.line - 1], self.table.separator)
                     fields[6:7] = [name]
-                    lines[row.line - 1] = _joined(fields, tabs=True)
+                    lines[row.line - 1] = _joined(fields, self.table.separator, tabs=True)
         return self._with_lines(lines)
 
     def _line(self, number: int) -> str:
@@ -161,12 +168,12 @@ class ControlText:
         """Return an observation's line with a new pixel and, unless ``keep``, a new photo name."""
         shown = ("", "") if pixel is None else (f"{pixel[0]:.2f}", f"{pixel[1]:.2f}")
         if self.table.header is None:
-            fields = _split(line)
+            fields = fields_of(line, self.table.separator)
             fields[3:5] = shown
             fields[5] = fields[5] if keep else photo
-            return _joined(fields, tabs=line.count("\t") >= TABS)
+            return _joined(fields, self.table.separator, tabs=line.count("\t") >= TABS)
         delimiter, columns = self._columns()
-        cells = next(csv.reader([line], delimiter=delimiter))
+        cells = cells_of(line, delimiter)
         cells += [""] * (max(columns.values()) + 1 - len(cells))
         cells[columns["px"]], cells[columns["py"]] = shown
         cells[columns["photo"]] = cells[columns["photo"]] if keep else photo
@@ -176,7 +183,7 @@ class ControlText:
         """Return an observation's line for a point that is not in the file yet, without its pixel."""
         height = "NaN" if point.z is None else repr(point.z)
         if self.table.header is None:
-            return _joined([repr(point.x), repr(point.y), height, "0", "0", photo, point.name])
+            return _joined([repr(point.x), repr(point.y), height, "0", "0", photo, point.name], self.table.separator)
         delimiter, columns = self._columns()
         stated = [point.name, repr(point.x), repr(point.y), height, photo, "", "", point.role or ""]
         stated += ["" if sigma is None else repr(sigma) for sigma in point.sigma_m]
@@ -190,9 +197,8 @@ class ControlText:
 
     def _columns(self) -> tuple[str, Mapping[str, int]]:
         assert self.table.header is not None
-        titles = self._line(self.table.header)
-        delimiter = delimiter_of(titles)
-        return delimiter, find_columns(next(csv.reader([titles], delimiter=delimiter)), COLUMNS)
+        titles, delimiter = titles_of(self._line(self.table.header))
+        return delimiter, find_columns(titles, COLUMNS)
 
     def _without_comment(self, wanted: Callable[[str], bool]) -> ControlText:
         text = self
@@ -222,8 +228,8 @@ def _with_columns(table: Table, path: Path) -> Table:
         return table
     lines = [text for _, text in table.lines]
     titles = lines[table.header - 1]
-    delimiter = delimiter_of(titles)
-    columns = find_columns(next(csv.reader([titles], delimiter=delimiter)), COLUMNS)
+    cells, delimiter = titles_of(titles)
+    columns = find_columns(cells, COLUMNS)
     missing = [title for title, key in zip(CSV_TITLES, CSV_KEYS, strict=True) if key in MARKED and key not in columns]
     if not missing:
         return table
@@ -231,12 +237,9 @@ def _with_columns(table: Table, path: Path) -> Table:
     return parse_table(tuple(enumerate(lines, 1)), path)
 
 
-def _split(line: str) -> list[str]:
-    """Return the fields of a line of ODM's list, split as by its reader."""
-    return [field.strip() for field in line.split("\t")] if line.count("\t") >= TABS else line.split()
-
-
-def _joined(fields: Sequence[str], tabs: bool = False) -> str:
+def _joined(fields: Sequence[str], separator: str, tabs: bool = False) -> str:
+    if separator:
+        return _csv_line(fields, separator)
     return ("\t" if tabs or any(" " in text for text in fields) else " ").join(fields)
 
 

@@ -7,41 +7,59 @@ text is untrusted: everything has a limit, and every error names the line.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
+from splatpipe.pipeline.photos.names import is_photo
 from splatpipe.pipeline.survey.survey_text import (
+    ELLIPSOIDAL_Z,
+    GEOGRAPHIC,
+    GEOGRAPHIC_Y,
+    LOOKED_AT,
     MAX_LINE_CHARS,
+    SEPARATORS,
     UNKNOWN,
     LineError,
     TableKind,
+    crs_text,
     csv_rows,
-    delimiter_of,
     find_columns,
-    is_number,
+    find_header,
+    is_numeral,
     line_errors,
+    list_fields,
+    list_separator,
     number_in,
     read_lines,
+    titles_of,
+    with_whole_name,
     written_lines,
 )
 
 Role = Literal["control", "check"]
 MAX_POINTS = 10_000
 MAX_NAME = 255
+UNNAMED = "point "  # before the number of a point without a name
+TABS = 5  # a line of ODM's list with at least as many is tab-separated
 SAME_PLACE_M = 1e-3  # lines of one point must repeat its coordinates to within a millimetre
 SEA_LEVEL_M = 20.0  # a height of exactly 0 counts as measured if another point is this close to 0, else as unknown
 SIGMA_BOUNDS_M = (1e-4, 1e3)
 COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "name": ("name", "label", "point", "point_name", "gcp", "gcp_name", "id"),
-    "x": ("x", "geo_x", "east", "easting", "e", "lon", "longitude", "x/east", "x/longitude"),
-    "y": ("y", "geo_y", "north", "northing", "n", "lat", "latitude", "y/north", "y/latitude"),
-    "z": ("z", "geo_z", "height", "h", "up", "alt", "altitude", "elevation", "z/altitude"),
-    "photo": ("photo", "image", "image_name", "photo_name", "filename", "file", "camera"),
-    "px": ("px", "pixel_x", "im_x", "image_x", "u", "column", "x_px"),
-    "py": ("py", "pixel_y", "im_y", "image_y", "v", "row", "y_px"),
+    "name": (
+        *("name", "label", "point", "point_name", "gcp", "gcp_name", "gcp_label", "marker", "marker_name", "station"),
+        *("point_id", "pointid", "point_number", "point_no", "pt", "id"),
+    ),
+    "x": ("x", "geo_x", "east", "easting", "e", "x/east", "x/easting", *GEOGRAPHIC),
+    "y": ("y", "geo_y", "north", "northing", "n", "y/north", "y/northing", *GEOGRAPHIC_Y),
+    "z": (
+        *("z", "geo_z", "height", "h", "up", "alt", "altitude", "elevation", "elev", "z/altitude", "z/height"),
+        *ELLIPSOIDAL_Z,
+    ),
+    "photo": ("photo", "image", "image_name", "imagename", "photo_name", "filename", "file_name", "file", "camera"),
+    "px": ("px", "pixel_x", "im_x", "image_x", "u", "column", "x_px", "x_pixel"),
+    "py": ("py", "pixel_y", "im_y", "image_y", "v", "row", "y_px", "y_pixel"),
     "role": ("role", "type", "kind"),
     "sigma_horizontal": (
         "sigma_horizontal",
@@ -50,9 +68,14 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         "accuracy_xy",
         "horz_accuracy",
         "sigma_horizontal_m",
+        "accuracy_horizontal",
+        "horizontal_accuracy",
     ),
-    "sigma_vertical": ("sigma_vertical", "sigma_v", "sigma_z", "accuracy_z", "vert_accuracy", "sigma_vertical_m"),
-    "crs": ("crs", "epsg", "srs"),
+    "sigma_vertical": (
+        *("sigma_vertical", "sigma_v", "sigma_z", "accuracy_z", "vert_accuracy", "sigma_vertical_m"),
+        *("accuracy_vertical", "vertical_accuracy"),
+    ),
+    "crs": ("crs", "epsg", "srs", "cs_name", "coordinate_system"),
 }
 _NEEDED = ("x", "y", "photo", "px", "py")  # columns of a table
 _OF_MARKS = ("photo", "px", "py")
@@ -63,6 +86,9 @@ ROLES: Mapping[str, Role] = {
     "check": "check",
     "checkpoint": "check",
     "cp": "check",
+    "check point": "check",
+    "control point": "control",
+    "3d gcp": "control",  # of Pix4D
 }
 
 
@@ -134,12 +160,14 @@ class Table:
         header: Line number of the header; None in ODM's list.
         crs: As written.
         rows: The observations.
+        separator: Between the fields of a line; empty for blanks, or tabs by the line, in ODM's list.
     """
 
     lines: tuple[tuple[int, str], ...]
     header: int | None
     crs: str
     rows: tuple[Row, ...]
+    separator: str = ""
 
     @property
     def groups(self) -> dict[str, list[Row]]:
@@ -149,9 +177,15 @@ class Table:
             groups.setdefault(row.name or row.place, []).append(row)
         named: dict[str, list[Row]] = {}
         for number, group in enumerate(groups.values(), 1):
-            name = group[0].name or f"point {number}"
+            name = group[0].name or f"{UNNAMED}{number}"
             named[name if name not in named else f"{name} (line {group[0].line})"] = group
         return named
+
+
+def titled(kind: str, name: str) -> str:
+    """A point in a message: ``Control point P1``, and without a kind ``Point P1``; ``Point 12`` if it has no name."""
+    bare = name.removeprefix(UNNAMED) if name.removeprefix(UNNAMED).isdigit() else name
+    return f"{kind} point {bare}" if kind else f"Point {bare}"
 
 
 def read_control_file(path: Path) -> ControlFile:
@@ -197,19 +231,25 @@ def parse_table(lines: Sequence[tuple[int, str]], path: Path, needed: Sequence[s
     """
     kind = _KIND if needed == _NEEDED else _POINTS
     written = written_lines(lines, path, kind)
-    header = next((i for i, (_, line) in enumerate(written[:2]) if _is_header(line, needed)), None)
+    header = find_header(lines, written, lambda line: _is_header(line, needed))
     with line_errors(path, kind):
         if header is None:
-            crs, rows = _odm_rows(written)
+            crs, rows, separator = _odm_rows(written)
         else:
             crs, cells = csv_rows(lines, written, header, COLUMNS)
             rows = [_csv_row(number, row) for number, row in cells]
-    return Table(tuple(lines), None if header is None else written[header][0], crs, tuple(rows))
+            separator = titles_of(lines[header - 1][1])[1]
+    return Table(tuple(lines), header, crs, tuple(rows), separator)
 
 
 _EXPECTED = (
-    "First a line with the CRS, e.g. EPSG:32633, then lines of `x y z pixel_x pixel_y photo point`;"
+    "First a line with the CRS, e.g. EPSG:32633, then lines of `x y z pixel_x pixel_y photo point`, such as"
+    " `388710.51 5299705.21 512.01 112.1 514.1 DJI_0005.JPG P01`, separated by blanks, tabs, semicolons or commas;"
     " or a CSV with a header name,x,y,z,pixel_x,pixel_y,photo; omit the last three if targets are to be detected."
+)
+_TITLES = (
+    "Put the CRS and the titles of the columns into two lines above them, in the order of the file, such as EPSG:32633"
+    " and then name,north,east,height,code."
 )
 _KIND = TableKind("control file", _EXPECTED, max_bytes=32 << 20, max_lines=200_000)
 _POINTS = TableKind(
@@ -220,30 +260,53 @@ _POINTS = TableKind(
 )
 
 
-def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row]]:
-    first, crs = written[0][0], written[0][1].strip()
-    fields = crs.split()
-    if len(fields) >= 6 and all(is_number(field) for field in fields[:5]):
+def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row], str]:
+    """The CRS, the observations and the separator of ODM's list."""
+    first, crs = written[0]
+    separator = list_separator(written[1:] or written, range(5))
+    fields = fields_of(crs, separator)
+    if len(fields) >= 6 and all(is_numeral(field) for field in fields[:5]):
         raise LineError(first, "the first line must state the CRS, but it is an observation", _EXPECTED)
     for number, line in written[:2]:
         _require_no_header(number, line)
+    _require_no_points(written)
     rows = []
     for number, line in written[1:]:
-        fields = [field.strip() for field in line.split("\t")] if line.count("\t") >= 5 else line.split()
+        fields = fields_of(line, separator)
         if len(fields) < 6:
-            raise LineError(number, f"{len(fields)} fields, but at least 6 are needed")
+            counted = f"{len(fields)} field{'' if len(fields) == 1 else 's'} separated by {SEPARATORS[separator]}"
+            raise LineError(number, f"{counted}, but at least 6 are needed: x y z pixel_x pixel_y photo")
         place = (number_in(number, "x", fields[0]), number_in(number, "y", fields[1]), _height(number, fields[2]))
         mark = Mark(
             _name(number, fields[5]), number_in(number, "pixel x", fields[3]), number_in(number, "pixel y", fields[4])
         )
         name = _name(number, fields[6]) if len(fields) > 6 and fields[6] else ""
         rows.append(Row(number, name, place, mark, None, (None, None)))
-    return crs, rows
+    return crs_text(crs), rows, separator
+
+
+def fields_of(line: str, separator: str) -> list[str]:
+    """The fields of a line of ODM's list; a photo's name with blanks is one of them, up to its suffix."""
+    fields = list_fields(line, separator, TABS)
+    return fields if separator or line.count("\t") >= TABS else with_whole_name(fields, 5)
+
+
+def _require_no_points(written: Sequence[tuple[int, str]]) -> None:
+    """Reject points without titles, of name and coordinates as receivers write them: their order is not known.
+
+    Raises:
+        LineError: if the lines are such points.
+    """
+    for separator in filter(None, SEPARATORS):
+        looked = [list_fields(line, separator, TABS) for _, line in written[:LOOKED_AT]]
+        points = [each for each in looked if len(each) >= 4 and all(map(is_numeral, each[1:4]))]
+        if points and 2 * len(points) >= len(looked) and not any(is_photo(PurePosixPath(cell)) for cell in points[0]):
+            what = f"points separated by {SEPARATORS[separator]} without titles"
+            raise LineError(written[0][0], f"{what}: their order (x, y or north, east) is not known", _TITLES)
 
 
 def _is_header(line: str, needed: Sequence[str]) -> bool:
-    delimiter = delimiter_of(line)
-    columns = find_columns(next(csv.reader([line], delimiter=delimiter)), COLUMNS)
+    columns = find_columns(titles_of(line)[0], COLUMNS)
     if set(needed) <= set(columns) or set(_NEEDED) <= set(columns):
         return True
     # Points only: targets are to be detected in the photos, or marks made by hand.
@@ -252,7 +315,7 @@ def _is_header(line: str, needed: Sequence[str]) -> bool:
 
 def _require_no_header(number: int, line: str) -> None:
     """Reject a CSV header that lacks columns: it would pass for a line of ODM's list."""
-    columns = find_columns(next(csv.reader([line], delimiter=delimiter_of(line))), COLUMNS)
+    columns = find_columns(titles_of(line)[0], COLUMNS)
     missing = [name for name in _NEEDED if name not in columns]
     if missing and len(columns) >= len(_NEEDED) - 2:
         titles = ", ".join(COLUMNS[name][1] for name in missing)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +14,10 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
-from splatpipe.pipeline.photos.names import match_names
+from splatpipe.pipeline.photos.names import list_names, match_names
 
 RAY_STEP = 1e-5  # step in x/z for finite differences: about a hundredth of a pixel
 
@@ -131,6 +132,35 @@ def model_of(reconstruction: pycolmap.Reconstruction, photos: Iterable[str]) -> 
     ids = tuple(image.image_id for image, good in zip(images, finite, strict=True) if good)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     return SparseModel(names, centres[finite], rotations[finite], cloud, ids, reconstruction)
+
+
+def report_unmatched(names: Iterable[str], photos: Collection[str], report: Reporter) -> None:
+    """Warn of cameras of a user's model without photos, and of photos without cameras.
+
+    Args:
+        names: The model's photos.
+        photos: The photos that ingest found.
+        report: Receives the warnings.
+    """
+    placed = list(names)
+    missing = sorted(set(placed) - set(photos))
+    if missing:
+        report.warning(
+            f"{len(missing)} of {len(placed)} photos of the model in sparse/ {_are(missing)} missing in images/:"
+            f" {list_names(missing)}.",
+            "The others are used. Copy these into images/ under their names in the model.",
+        )
+    unplaced = sorted(set(photos) - set(placed))
+    if unplaced:
+        report.warning(
+            f"{len(unplaced)} of {len(photos)} photos in images/ {_are(unplaced)} not in the model in sparse/: "
+            f"{list_names(unplaced)}.",
+            "Those are not used: to place them, run on the photos alone.",
+        )
+
+
+def _are(names: Collection[str]) -> str:
+    return "is" if len(names) == 1 else "are"
 
 
 def copy_model(source: Path, target: Path, may_link: bool) -> None:

@@ -74,8 +74,9 @@ def read_places(
     Raises:
         SplatpipeError: if it is not such a file, names none of the photos, or its CRS cannot be used.
     """
-    file = read_position_file(path)
-    find = NameFinder(photos)
+    names = list(photos)
+    file = read_position_file(path, names)
+    find = NameFinder(names)
     matched: dict[str, PhotoPlace] = {}
     unknown: list[str] = []
     for photo in file.photos:

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+import codecs
+import contextlib
 import csv
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.engine.text_lines import text_lines
+from splatpipe.pipeline.photos.names import is_photo
 
 MAX_LINE_CHARS = 2000
 LARGEST = 1e9  # of a coordinate, metres or pixels: larger ones are neither on the earth nor in a photo
 UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
-CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg)\s*[:=]\s*(\S.*)", re.IGNORECASE)
-GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "x/longitude")  # titles of x that name no other CRS
+CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg|coordinate[ _]?system)\s*[:=]\s*(\S.*)", re.IGNORECASE)
+AUTHORITY = re.compile(
+    r'\bEPSG(?:::?\s*|"\s*,\s*")(\d{4,6})\b', re.IGNORECASE
+)  # EPSG:1, EPSG::1, AUTHORITY["EPSG","1"]
+SEPARATOR_LINE = re.compile(r'"?sep=.?"?', re.IGNORECASE)  # the first line that a spreadsheet writes
+UNITS = re.compile(r"[ _]*[(\[][^)\]]*[)\]]$")  # after a title
+GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "gps_longitude", "x/longitude", "longitude_deg")
+GEOGRAPHIC_Y = ("lat", "latitude", "gpslatitude", "gps_latitude", "y/latitude", "latitude_deg")
+ELLIPSOIDAL_Z = ("ellipsoidal_height", "ellipsoid_height")
+SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "": "blanks"}
+MOST_WORDS = 20  # of a photo's name in a list whose fields blanks separate
+LOOKED_AT = 20  # lines of a list without a header, by which its separator is found
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+CODE = re.compile(r"EPSG\s*:|\+|WGS\s?84\s*/?\s*UTM", re.IGNORECASE)  # how a CRS begins that splatpipe knows by itself
 CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 
 
@@ -56,7 +70,8 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
     """
     name = f"The {kind.what} {path.name}"
     try:
-        text = read_small(path, kind.max_bytes).decode("utf-8-sig")
+        data = read_small(path, kind.max_bytes)
+        text = data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise SplatpipeError(f"{name} is not UTF-8 text.", "Save it as plain text in UTF-8.") from error
     except OSError as error:
@@ -78,6 +93,8 @@ def written_lines(lines: Sequence[tuple[int, str]], path: Path, kind: TableKind)
         SplatpipeError: if there is none.
     """
     written = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if written and SEPARATOR_LINE.fullmatch(written[0][1].strip()):
+        del written[0]
     if not written:
         raise SplatpipeError(f"The {kind.what} {path.name} is empty.", kind.expected)
     return written
@@ -98,6 +115,89 @@ def delimiter_of(line: str) -> str:
     return max(",;\t", key=line.count)
 
 
+def cells_of(line: str, delimiter: str) -> list[str]:
+    """The cells of a table's line; of several blanks between them, one counts.
+
+    Raises:
+        csv.Error: if it has no such cells.
+    """
+    line = line.replace("\t", " ").strip() if delimiter == " " else line
+    return next(csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter == " "), [])
+
+
+def titles_of(line: str) -> tuple[list[str], str]:
+    """The titles of a header, which may be a comment as in Metashape's files, and its delimiter; none if it is none."""
+    line = line.strip().lstrip("#").strip() if line.lstrip().startswith("#") else line
+    delimiter = delimiter_of(line)
+    if delimiter not in line and " " in line:
+        delimiter = " "
+    try:
+        return cells_of(line, delimiter), delimiter
+    except csv.Error:
+        return [], delimiter
+
+
+def find_header(
+    lines: Sequence[tuple[int, str]], written: Sequence[tuple[int, str]], is_header: Callable[[str], bool]
+) -> int | None:
+    """The line number of a table's header: one of the first two written lines, or a comment before the first row."""
+    header = next((number for number, line in written[:2] if is_header(line)), None)
+    if header is not None:
+        return header
+    last = written[0][0] if len(written) == 1 else written[1][0]
+    comments = [(number, line) for number, line in lines if number < last and line.lstrip().startswith("#")]
+    # Not by blanks: such a comment may explain the fields of ODM's list.
+    return next((at for at, line in comments if titles_of(line)[1] != " " and is_header(line)), None)
+
+
+def crs_text(text: str) -> str:
+    """The CRS that a file states: its EPSG code wherever one is named, without a spreadsheet's empty cells."""
+    text = text.strip().rstrip(",;\t ").strip('"').strip()
+    if text.isdigit():
+        return f"EPSG:{text}"
+    codes = AUTHORITY.findall(text)
+    return f"EPSG:{codes[-1]}" if codes and not re.match(r"EPSG\s*:\s*\d", text, re.IGNORECASE) else text
+
+
+def list_separator(rows: Sequence[tuple[int, str]], numbers: Sequence[int]) -> str:
+    """The separator of a list without a header: a semicolon or a comma; empty where blanks or tabs separate the fields.
+
+    Args:
+        rows: Its lines.
+        numbers: The fields that are numbers in most lines, if the separator is the right one.
+    """
+    looked = [line for _, line in rows[:LOOKED_AT]]
+
+    def fits(line: str, separator: str) -> bool:
+        fields = line.split(separator)
+        return len(fields) > max(numbers) and all(is_numeral(fields[at].strip()) for at in numbers)
+
+    good = {sign: sum(fits(line, sign) for line in looked) for sign in ";,"}
+    best = max(good, key=lambda sign: good[sign])
+    return best if good[best] > len(looked) / 2 else ""
+
+
+def list_fields(line: str, separator: str, tabs: int) -> list[str]:
+    """The fields of a list's line; a name with blanks is one field where something else separates the fields.
+
+    Args:
+        line: The line.
+        separator: Of the list.
+        tabs: With so many tabs, they separate the fields of this line.
+    """
+    if separator:
+        with contextlib.suppress(csv.Error):
+            return [cell.strip() for cell in cells_of(line, separator)]
+    return [field.strip() for field in line.split("\t")] if line.count("\t") >= tabs else line.split()
+
+
+def with_whole_name(fields: Sequence[str], at: int) -> list[str]:
+    """Fields that blanks separate, with those of a photo's name joined: up to the first that ends in its suffix."""
+    ends = (end for end in range(at, min(len(fields), at + MOST_WORDS)) if is_photo(PurePosixPath(fields[end])))
+    end = next(ends, at)
+    return [*fields[:at], " ".join(fields[at : end + 1]), *fields[end + 1 :]] if at < len(fields) else list(fields)
+
+
 def find_columns(titles: Sequence[str], spellings: Mapping[str, Sequence[str]]) -> dict[str, int]:
     """The index of each known column, by our name for it; the first of several."""
     spelled = {spelling: key for key, each in spellings.items() for spelling in each}
@@ -110,8 +210,13 @@ def find_columns(titles: Sequence[str], spellings: Mapping[str, Sequence[str]]) 
 
 
 def title_of(text: str) -> str:
-    """Normalize a column's title for comparison with known spellings."""
-    return text.strip().casefold().replace(" ", "_")
+    """Normalize a column's title for comparison with known spellings: without units in brackets."""
+    return UNITS.sub("", text.strip().strip('"').lstrip("#").strip().casefold()).replace(" ", "_").replace("-", "_")
+
+
+def is_numeral(text: str) -> bool:
+    """Whether a text is a finite number, perhaps with a decimal comma."""
+    return is_number(text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text)
 
 
 def is_number(text: str) -> bool:
@@ -142,37 +247,62 @@ def csv_rows(
 ) -> tuple[str, list[tuple[int, Mapping[str, str]]]]:
     """The CRS of a table with a header, and its rows by the columns' names, numbered by their lines.
 
-    The CRS is in the line before the header, in a comment, or in a column; without it, degrees are taken as WGS 84.
+    The CRS is in the line before the header, in a comment, or in a column. Without it, degrees are taken as WGS 84:
+    those of their own columns, if the table has other coordinates, too.
 
     Args:
         lines: All lines of the file.
         written: Those that are neither blank nor comments.
-        header: Index of the header among them, 0 or 1.
+        header: Line number of the header.
         columns: Titles of each column, in lower case.
 
     Raises:
         LineError: if a line is broken, or the table names no CRS or two.
     """
-    _, line = written[header]
-    delimiter = delimiter_of(line)
-    titles = next(csv.reader([line], delimiter=delimiter))
+    titles, delimiter = titles_of(lines[header - 1][1])
     places = find_columns(titles, columns)
     comments = (CRS_COMMENT.match(text.strip()) for _, text in lines)
-    crs = written[0][1].strip() if header == 1 else next((found[1].strip() for found in comments if found), "")
-    rows: list[tuple[int, Mapping[str, str]]] = []
-    for number, text in written[header + 1 :]:
+    above = next((text for number, text in written if number < header), "")
+    crs = crs_text(above or next((found[1] for found in comments if found), ""))
+    rows: list[tuple[int, list[str]]] = []
+    for number, text in written:
+        if number <= header:
+            continue
         try:
-            cells = next(csv.reader([text], delimiter=delimiter))
+            cells = cells_of(text, delimiter)
         except csv.Error as error:
             raise LineError(number, str(error)) from error
-        row = {name: cells[place].strip() if place < len(cells) else "" for name, place in places.items()}
-        stated = f"EPSG:{row['crs']}" if row.get("crs", "").isdigit() else row.get("crs", "")
+        place = places.get("crs", len(cells))
+        stated = crs_text(cells[place]) if place < len(cells) else ""
         if stated and crs and crs.casefold() != stated.casefold():
             raise LineError(number, f"another CRS ({stated[:40]}) than before ({crs[:40]})", "Use one CRS a file.")
         crs = stated or crs
-        rows.append((number, row))
-    if not crs and title_of(titles[places["x"]]) in GEOGRAPHIC:
-        crs = "EPSG:4326"
+        rows.append((number, _whole(cells, titles, places) if delimiter == " " else cells))
+    places, crs = _with_degrees(titles, places, crs)
     if not crs:
         raise LineError(0, "it states no CRS", "Put it in the first line, e.g. EPSG:32633, or in a column crs.")
-    return crs, rows
+    named: list[tuple[int, Mapping[str, str]]] = [
+        (number, {name: cells[at].strip() if at < len(cells) else "" for name, at in places.items()})
+        for number, cells in rows
+    ]
+    return crs, named
+
+
+def _whole(cells: Sequence[str], titles: Sequence[str], places: Mapping[str, int]) -> list[str]:
+    """Cells that blanks separate, with those of a photo's name joined if there are more than titles."""
+    at = places.get("photo", places.get("name", 0))
+    return with_whole_name(cells, at) if len(cells) > len(titles) else list(cells)
+
+
+def _with_degrees(titles: Sequence[str], places: Mapping[str, int], crs: str) -> tuple[dict[str, int], str]:
+    """The columns and the CRS of a table: without a CRS, or with one by a name alone, degrees count if it has any."""
+    known = [title_of(title) for title in titles]
+    x, y, z = (
+        next((at for at, title in enumerate(known) if title in each), None)
+        for each in (GEOGRAPHIC, GEOGRAPHIC_Y, ELLIPSOIDAL_Z)
+    )
+    if x is None or y is None or (crs and (known[places["x"]] in GEOGRAPHIC or CODE.match(crs))):
+        return dict(places), crs or ("EPSG:4326" if known[places["x"]] in GEOGRAPHIC else "")
+    if z is not None:
+        return {**places, "x": x, "y": y, "z": z}, "EPSG:4979"
+    return {**places, "x": x, "y": y}, "EPSG:4326"

@@ -12,7 +12,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.names import NameFinder, list_names, without_zeros
 from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
+from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file, titled
 from splatpipe.pipeline.survey.crs import Crs, parse_crs
 from splatpipe.pipeline.survey.located_points import Sighting, SurveyPoint, locate, residual_px
 from splatpipe.pipeline.survey.mark_readings import Marks, named_reading, require_agreement, sentence_of
@@ -248,7 +248,7 @@ def _warn_of_unusable(
     for point in points:
         if point.found is None:
             report.warning(
-                f"Point {point.name} of {name} is left out: {point.why}.",
+                f"{titled('', point.name)} of {name} is left out: {point.why}.",
                 "Mark it in at least two photos taken from different positions; four are better.",
             )
             continue

@@ -14,6 +14,7 @@ import re
 import runpy
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -83,7 +84,7 @@ def require_snakemake() -> None:
     """
     if importlib.util.find_spec("snakemake") is None:
         raise MachineError(
-            "Snakemake is not installed.", hint="Install it: pip install 'FILE.whl[batch]', with splatpipe's wheel."
+            "Snakemake is not installed.", hint=f"Install it: {sys.executable} -m pip install 'splatpipe[batch]'"
         )
 
 

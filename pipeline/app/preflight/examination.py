@@ -34,7 +34,13 @@ from splatpipe.pipeline.app.preflight.overlap import (
     overlap_findings,
     swap_findings,
 )
-from splatpipe.pipeline.app.preflight.photo_quality import find_blurred, find_copies, find_exposures, sharpness
+from splatpipe.pipeline.app.preflight.photo_quality import (
+    find_blurred,
+    find_copies,
+    find_exposures,
+    find_little_texture,
+    sharpness,
+)
 from splatpipe.pipeline.app.preflight.places import (
     control_findings,
     footprint,
@@ -146,6 +152,7 @@ def examine_photos(intake: Intake, threads: int, report: Reporter) -> PhotoExami
     missing, gaps = gap_findings(names, flight)
     findings = [
         *find_blurred(intake.photos, dull),
+        *find_little_texture(glimpses),
         *find_exposures(intake.photos, glimpses, steps),
         *find_copies(intake.photos, glimpses),
         *overlap_findings(names, overlap),

@@ -14,15 +14,15 @@ from splatpipe.pipeline.app.preflight.findings import Finding, LeftOutPhoto
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.source import RunSource
 from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.photos.bands import ALL
 from splatpipe.pipeline.photos.camera_groups import CameraGroup, group_cameras
 from splatpipe.pipeline.photos.camera_issues import find_camera_issues
 from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.duplicates import split_duplicates
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.photo_list import Photo, photo_root
-from splatpipe.pipeline.photos.preparation import Preparation, check_photos
-from splatpipe.pipeline.photos.scan import ExcludedPhoto, scan_folder
+from splatpipe.pipeline.photos.preparation import Preparation, Selection, select_photos
+from splatpipe.pipeline.photos.scan import ExcludedPhoto, by_reason, with_reason
 from splatpipe.pipeline.sfm.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairs import Layout
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
@@ -70,10 +70,14 @@ def read_capture(source: RunSource, config: LineConfig, threads: int, report: Re
     work = Preparation(config.ingest, threads, root, report)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries print their own warnings about unusual metadata tags
-        scan = scan_folder(root)
-        checked, broken = check_photos(scan, work)
-    photos, duplicates = split_duplicates(checked)
-    findings = [*_unreadable([*scan.left_out, *broken]), *_duplicates(duplicates)]
+        try:
+            chosen, findings = select_photos(root, work), []
+        except SplatpipeError as error:  # no photo of the band that ingest.bands names
+            everything = Preparation(config.ingest.model_copy(update={"bands": ALL}), threads, root, report)
+            chosen = select_photos(root, everything)
+            findings = [Finding("bands", "error", error.message, error.hint)]
+    photos = chosen.photos
+    findings += _left_out(chosen)
     if len(photos) < MIN_PHOTOS:
         findings.append(_too_few(len(photos)))
     groups, camera_of = group_cameras(photos)
@@ -82,10 +86,9 @@ def read_capture(source: RunSource, config: LineConfig, threads: int, report: Re
     positions = read_positions(photos, places.by_name)
     issues = find_position_issues(photos, positions, places)
     findings += [*troubles, *(finding_from_issue(issue) for issue in issues)]
-    left_out = sorted([*scan.left_out, *broken, *duplicates], key=lambda entry: entry.name)
     intake = Intake(
         tuple(photos),
-        tuple(LeftOutPhoto(entry.name, entry.reason) for entry in left_out),
+        tuple(LeftOutPhoto(entry.name, entry.reason) for entry in chosen.left_out),
         tuple(groups),
         camera_of,
         positions,
@@ -149,16 +152,33 @@ def _file_places(
     return places, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
 
 
-def _unreadable(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
-    """One finding per reason."""
-    by_reason: dict[str, list[str]] = {}
-    for entry in entries:
-        by_reason.setdefault(entry.reason, []).append(entry.name)
+def _left_out(chosen: Selection) -> list[Finding]:
+    """One finding per reason, for all duplicates one, and one for files that belong to photos."""
+    of_kind = {
+        kind: [entry for entry in chosen.left_out if entry.kind == kind]
+        for kind in ("unusable", "duplicate", "companion")
+    }
     hint = "A run leaves it out: copy it from the card again, or retake the photo."
-    return [
-        Finding("unreadable", "warning", f"{list_names(names)} {reason}.", hint, tuple(sorted(names)))
-        for reason, names in sorted(by_reason.items())
+    hints = "A run leaves them out: copy them from the card again, or retake the photos."
+    findings = [
+        Finding(
+            "unreadable",
+            "warning",
+            f"{with_reason(names, reason)}.",
+            hint if len(names) == 1 else hints,
+            tuple(sorted(names)),
+        )
+        for reason, names in sorted(by_reason(of_kind["unusable"]).items())
     ]
+    findings += _duplicates(of_kind["duplicate"])
+    for reason, names in sorted(by_reason(of_kind["companion"]).items()):
+        findings.append(Finding("companions", "note", f"{with_reason(names, reason)}.", "A run leaves them out."))
+    if chosen.note:
+        findings.append(Finding("bands", "note", chosen.note))
+    if chosen.masks:
+        names = [mask.name for mask in chosen.masks]
+        findings.append(Finding("companions", "note", f"Masks of photos: {list_names(names)}.", "A run applies them."))
+    return findings
 
 
 def _duplicates(entries: Sequence[ExcludedPhoto]) -> list[Finding]:

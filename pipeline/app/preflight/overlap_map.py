@@ -17,6 +17,7 @@ from splatpipe.pipeline.app.preflight.coverage import count_footprints, shades
 from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
 from splatpipe.pipeline.app.report.wording import count, length, plural
+from splatpipe.pipeline.survey.control_file import titled
 
 MAX_PAIRS = 5_000  # lines; if there are more, those of weakly connected photos come first
 STRENGTHS = ((0, "weak"), (25, "fair"), (80, "strong"))  # least number of matches of each class
@@ -217,7 +218,7 @@ def _control(frame: MapFrame, preflight: Preflight) -> str:
         inside = frame.holds(point.position_m)
         x, y = frame.point(point.position_m) if inside else frame.at_edge(point.position_m)
         name = printable(point.name)[:LONGEST_TITLE]
-        title = f"{point.kind} point {name}"
+        title = titled(point.kind, name)
         if not inside:
             off = math.dist(point.position_m, (frame.west + frame.metres / 2, frame.north - _tall(frame) / 2))
             title += f": {length(off)} from the centre of the map, outside it"

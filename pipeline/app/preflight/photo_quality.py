@@ -11,6 +11,7 @@ from splatpipe.pipeline.app.preflight.findings import Finding
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.sfm.quick_match import QuickFeatures
+from splatpipe.pipeline.sfm.refusal import texture_hint
 
 DULL = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
 DULL_SPREADS = 4.0  # times the usual deviation between photos, if a whole capture is blurred
@@ -19,6 +20,7 @@ MAD_TO_SIGMA = 1.4826  # of Gaussian noise
 JUMP_EV = 1.1  # relative to the neighbours; light and automatic exposure vary by 1.0 in good captures
 CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of clipped pixels, and its excess over most photos
 DARK_LEVEL, BRIGHT_LEVEL = 14.0, 244.0  # mean grey levels of a photo that shows nothing
+LITTLE_TEXTURE = 400  # median of the keypoints at 640 px; all captures tried have 740 or more, blurred small ones 250
 SAME_PICTURE = 1.0  # largest grey level difference between thumbnails of a photo saved twice
 
 
@@ -57,6 +59,15 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
         text = f"Blurred: {list_names(names)} (down to {least:.0%} of their neighbours' detail)."
         findings.append(Finding("blurred", "warning", text, "Retake them, or leave them out.", names))
     return findings
+
+
+def find_little_texture(glimpses: Sequence[QuickFeatures]) -> list[Finding]:
+    """Find captures that show hardly anything to match, as thermal ones."""
+    usual = float(np.median([len(glimpse.places) for glimpse in glimpses]))
+    if usual >= LITTLE_TEXTURE:
+        return []
+    hint = texture_hint((glimpse.width, glimpse.height) for glimpse in glimpses)
+    return [Finding("texture", "warning", "The photos have little texture: few of them will be placed.", hint)]
 
 
 def find_exposures(

@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import median
 
 from splatpipe.pipeline.engine.source import RunSource
+from splatpipe.pipeline.photos.companions import find_companions
 from splatpipe.pipeline.photos.names import is_photo
 from splatpipe.stages.forecast import has_control
 from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
@@ -18,7 +19,9 @@ SAMPLED = 9  # photos whose size is read; within a capture most are alike
 
 def size_of(source: RunSource) -> CaptureSize:
     """The size of a user's folder of photos."""
-    paths = [path for path in source.part_files["source.photos"].values() if is_photo(path)]
+    named = {name: path for name, path in source.part_files["source.photos"].items() if is_photo(path)}
+    companions = find_companions(name for name in named)
+    paths = [path for name, path in named.items() if name not in companions]
     found = capture_size(paths, has_file=source.named.get("source.geo") is not None)
     return replace(found, control=has_control(source))
 

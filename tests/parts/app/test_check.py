@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import splatpipe
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageFilter
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.cli_runs import overrides
@@ -198,6 +198,17 @@ def little(folder: Path) -> Path:
         noise = np.random.default_rng(number).integers(0, 255, (300, 400, 3), dtype=np.uint8)
         Image.fromarray(noise).save(folder / f"{number}.jpg")
     return folder
+
+
+def test_a_thermal_flight_is_told_to_have_little_texture(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    for number in range(17, 20):
+        with Image.open(capture_path() / name(number)) as photo:
+            blurred = photo.convert("L").resize((640, 480)).filter(ImageFilter.GaussianBlur(6))
+        blurred.save(tmp_path / "photos" / name(number), "MPO", save_all=True, append_images=[blurred], quality=90)
+    (finding,) = found(examined(tmp_path / "photos"), "texture")
+    assert "little texture" in finding.message
+    assert "run on the colour photos" in finding.hint
 
 
 def test_a_capture_that_cannot_be_reconstructed_exits_with_1_and_says_why(tmp_path: Path) -> None:

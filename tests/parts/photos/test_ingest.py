@@ -965,3 +965,44 @@ def test_photos_with_odd_tags_are_accepted(folder: Path) -> None:
     exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHII", 271, 2, 2**31, 9)
     save(folder / "exif.jpg", 4, exif=exif)
     assert {"geo.tif", "exif.jpg"} < set(ingest(folder).photos)
+
+
+def test_masks_beside_their_photos_are_used_and_are_no_photos(folder: Path) -> None:
+    """As OpenDroneMap wants them."""
+    half_black(WIDTH, HEIGHT).convert("RGB").save(folder / "a_mask.JPG", quality=90)
+    half_black(WIDTH, HEIGHT).save(folder / "b.png")  # of the photo's name
+    half_black(300, 300).save(folder / "b_mask.png")
+    result = ingest(folder)
+    assert list(result.photos) == ["a.jpg", "b.jpg"]
+    mask = result.mask("a.jpg")
+    assert mask is not None and np.mean(mask == 0) == pytest.approx(0.5, abs=0.01)
+    assert result.left_out == {}
+    assert any("b_mask.png has another aspect ratio" in warning for warning in result.warnings)
+    assert ingest(folder, out="off", masks=False).summary["masks"] == 0
+
+
+def test_a_mask_in_the_folder_of_masks_goes_before_one_beside_the_photo(folder: Path) -> None:
+    (folder / "masks").mkdir()
+    half_black(WIDTH, HEIGHT).save(folder / "masks" / "a_mask.png")
+    Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8)).save(folder / "a_mask.png")
+    result = ingest(folder)
+    assert_left_half(result.mask("a.jpg"))
+    assert not any("mask" in warning for warning in result.warnings)
+
+
+def test_the_bands_of_a_shot_are_no_photos_of_their_own(folder: Path) -> None:
+    for number, band in enumerate(("Green", "NIR"), 1):
+        packet = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a Camera:BandName="{band}"/></x:xmpmeta>'
+        tags = ImageFileDirectory_v2()
+        tags[700] = packet.encode()
+        for stem in "ab":
+            Image.fromarray(deep(9 * number + ord(stem), 257.0)[..., 2]).save(
+                folder / f"{stem}{number}.tif", tiffinfo=tags
+            )
+    result = ingest(folder)
+    assert list(result.photos) == ["a.jpg", "b.jpg"]
+    assert result.left_out["a2.tif"] == "shows the band near infrared, and colour is used"
+    near = ingest(folder, out="near", bands="nir")
+    assert list(near.photos) == ["a2.tif", "b2.tif"]
+    assert all(photo.converted for photo in near.photos.values())
+    assert len(ingest(folder, out="all", bands="all").photos) == 6

@@ -8,6 +8,7 @@ import pytest
 from lens_scene import HEIGHT, WIDTH, LensScene, make_lens, make_scene, orbit, strips
 
 from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.sfm import lens_trial
 from splatpipe.pipeline.sfm.focal import focal_sigmas
 from splatpipe.pipeline.sfm.lens_model import StatedLens, apart_px, named_params, narrow, simplest, widen
 from splatpipe.pipeline.sfm.lenses import calibrate
@@ -80,6 +81,42 @@ def test_a_fisheye_is_recognised_by_the_simple_lenss_residuals() -> None:
     found, rows = calibrate(scene.model, scene.verified, {}, "auto")
     assert rows[0]["freed"][0] == "fisheye" and found.cameras[1].model_name.endswith("FISHEYE")
     assert rms(apart_px(found.cameras[1], scene.lenses[1], turn=True)) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("focal", [480.0, 600.0])
+def test_a_wide_pinhole_is_no_fisheye(focal: float, seed: int) -> None:
+    lens = make_lens("FULL_OPENCV", (focal, focal, 612.0, 444.0, 0.0, 0.0, 0.002, -0.002, *[0.0] * 4))
+    scene = make_scene([lens], orbit(24, np.random.default_rng(seed)), seed)
+    found, rows = calibrate(scene.model, scene.verified, {}, "auto", seed)
+    assert not found.cameras[1].model_name.endswith("FISHEYE")
+    assert [row["kept"] for row in rows[0]["tried"] if row["freed"] == "fisheye"] in ([], [False])
+
+
+def test_a_fisheye_must_beat_a_pinhole_with_as_much_freedom(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no step is kept, a fisheye would win by its free principal point alone."""
+    monkeypatch.setattr(lens_trial, "MIN_EFFECT", 1e9)
+    scene = make_scene([make_lens("SIMPLE_PINHOLE", (480.0, 606.0, 447.0))], orbit(24, np.random.default_rng(1)), 1)
+    found, rows = calibrate(scene.model, scene.verified, {}, "auto")
+    (tried,) = [row for row in rows[0]["tried"] if row["freed"] == "fisheye"]
+    assert tried["held_out_gain"] > lens_trial.MIN_GAIN > tried["over_pinhole"]
+    assert not tried["kept"] and not found.cameras[1].model_name.endswith("FISHEYE")
+
+
+def test_objects_that_were_cut_out_are_photos_of_a_plain_pinhole() -> None:
+    """Points in the middle of the photos only: what the lens does at the corners is not known."""
+    scene = make_scene(
+        [make_lens("SIMPLE_PINHOLE", (1500.0, 600.0, 450.0))], orbit(30, np.random.default_rng(5)), 5, points=3000
+    )
+    model = scene.model
+    for number in model.reg_image_ids():
+        for at in list(model.images[number].get_observation_point2D_idxs()):
+            if np.linalg.norm(model.images[number].points2D[at].xy - [600.0, 450.0]) > 250.0:
+                model.delete_observation(number, at)
+    model.cameras[1].params = [1500.0, 600.0, 450.0, -0.9]  # has no rays at the corners
+    found, rows = calibrate(model, scene.verified, {}, "auto")
+    assert not found.cameras[1].model_name.endswith("FISHEYE")
+    assert [row for row in rows[0]["tried"] if row["freed"] == "fisheye"] == []
 
 
 def test_a_photo_with_hardly_any_points_stays_where_it_is(scene: LensScene) -> None:

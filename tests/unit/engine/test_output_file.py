@@ -263,3 +263,13 @@ def test_a_file_that_has_a_second_name_elsewhere_is_copied_before_it_is_changed(
     os.close(descriptor)
     assert (mine.read_bytes(), log.read_bytes()) == (b"mine\n", b"")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out.log"]
+
+
+@pytest.mark.parametrize("inner", ["", "below/out"])
+def test_an_out_that_is_a_link_to_nothing_is_named(tmp_path: Path, inner: str) -> None:
+    (tmp_path / "out").symlink_to(tmp_path / "nothing")
+    with pytest.raises(UsageError, match=r"out is a link to .*nothing, which does not exist\.") as caught:
+        own_folder(tmp_path / "out" / inner, "stages")
+    assert caught.value.hint == "Make that folder, or remove the link."
+    (tmp_path / "nothing").mkdir()
+    assert own_folder(tmp_path / "out" / inner, "stages").is_dir()

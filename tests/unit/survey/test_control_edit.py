@@ -204,3 +204,22 @@ def test_points_without_marks_are_read_by_name(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(SplatpipeError, match=wrong):
             read_points_file(path)
+
+
+@pytest.mark.parametrize("separator", [",", ";", " "])
+def test_marks_are_written_with_the_files_own_separator(tmp_path: Path, separator: str) -> None:
+    fields = ["388710.5137", "5299705.2081", "512.0120", "1", "2", "A.JPG", "P1"]
+    text = written(tmp_path / "gcp_list.txt", f"EPSG:32633\n{separator.join(fields)}\n")
+    text.with_mark(point("P1"), "sub/my photo.JPG", (3.0, 4.0)).with_mark(point("P1"), "A.JPG", (5.0, 6.0)).save()
+    found = read_control_file(tmp_path / "gcp_list.txt").points[0]
+    assert {mark.photo: (mark.x, mark.y) for mark in found.marks} == {"A.JPG": (5.0, 6.0), PHOTOS[1]: (3.0, 4.0)}
+    assert (found.name, found.x, found.z) == ("P1", 388710.5137, 512.012)
+
+
+def test_marks_are_added_to_points_whose_titles_are_a_comment(tmp_path: Path) -> None:
+    text = written(
+        tmp_path / "control.csv", "# CRS: EPSG:32633\n#Label,Easting,Northing,Altitude\nP1,388710.5,5299705.2,5\n"
+    )
+    text.with_mark(point("P1"), "A.JPG", (3.0, 4.0)).save()
+    found = read_control_file(tmp_path / "control.csv").points[0]
+    assert [(mark.photo, mark.x, mark.y) for mark in found.marks] == [("A.JPG", 3.0, 4.0)]

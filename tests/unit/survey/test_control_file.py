@@ -6,7 +6,7 @@ import pytest
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.survey.control_file import ControlFile, Mark, read_control_file
+from splatpipe.pipeline.survey.control_file import ControlFile, Mark, read_control_file, read_points_file, titled
 
 
 def read(folder: Path, text: str | bytes, name: str = "gcp_list.txt") -> ControlFile:
@@ -132,3 +132,67 @@ def test_too_large_files_are_refused(tmp_path: Path) -> None:
     many = "EPSG:32633\n" + "".join(f"{i} 0 1 2 3 A.JPG P{i}\n" for i in range(10_001))
     with pytest.raises(SplatpipeError, match="10,000 points"):
         read(tmp_path, many)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "EPSG:32633\n1.5 2.5 3.5 10 20 {photo} P 1\n",
+        "EPSG:32633\n1.5,2.5,3.5,10,20,{photo},P 1\n",
+        "EPSG:32633;;;;;;\n1,5;2,5;3,5;10;20;{photo};P 1\n",
+        "sep=;\nEPSG:32633\n1.5;2.5;3.5;10;20;{photo};P 1\n",
+        "EPSG:32633\n1.5\t2.5\t3.5\t10\t20\t{photo}\tP 1\n",
+        # Metashape, Pix4D, Trimble, Emlid: their titles, with the marks' columns
+        "# Coordinate system: WGS 84 / UTM zone 33N (EPSG::32633)\n"
+        "#Label,X/Easting,Y/Northing,Z/Altitude,Camera,X_px,Y_px\nP 1,1.5,2.5,3.5,{photo},10,20\n",
+        "EPSG:32633\nGCP label;X [m];Y [m];Z [m];Filename;x pixel;y pixel\nP 1;1.5;2.5;3.5;{photo};10;20\n",
+        "EPSG:32633\nPoint ID,Northing (m),Easting (m),Elev (m),Code,Photo,px,py\nP 1,2.5,1.5,3.5,GCP,{photo},10,20\n",
+        "Name,Easting,Northing,Elevation,CS name,Image,px,py\nP 1,1.5,2.5,3.5,EPSG:32633,{photo},10,20\n",
+    ],
+)
+@pytest.mark.parametrize("photo", ["A.JPG", "2026-09-26 15-24-47.JPG"])
+def test_separator_and_columns_of_other_programs_are_found(tmp_path: Path, text: str, photo: str) -> None:
+    found = read(tmp_path, text.format(photo=photo))
+    (point,) = found.points
+    assert found.crs == "EPSG:32633"
+    assert (point.x, point.y, point.z, point.marks) == (1.5, 2.5, 3.5, (Mark(photo, 10.0, 20.0),))
+    assert point.name.startswith("P")
+
+
+def test_points_of_a_receiver_without_marks_are_read_by_their_titles(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text(
+        "Name,Code,Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height,Easting RMS,CS name\n"
+        "P1,GCP,388710.5,5299705.2,465,13.5127,47.8412,512,0.01,ETRS89 / UTM 33N + height\n"
+    )
+    file = read_points_file(path)
+    assert file.crs == "EPSG:4979"
+    assert [(point.x, point.y, point.z) for point in file.points] == [(13.5127, 47.8412, 512.0)]
+
+
+@pytest.mark.parametrize(
+    "text", ["P1,5299705.2,388710.5,512,GCP\nP2,5299705.3,388711.5,513,GCP\n", "EPSG:32633\nP1;1;2;3\n"]
+)
+def test_points_without_titles_are_refused_with_what_is_wanted(tmp_path: Path, text: str) -> None:
+    with pytest.raises(SplatpipeError, match=r"by .* without titles: their order") as caught:
+        read(tmp_path, text)
+    assert "name,north,east,height,code" in caught.value.hint
+
+
+def test_a_line_that_cannot_be_read_names_the_separator_and_the_columns(tmp_path: Path) -> None:
+    with pytest.raises(SplatpipeError, match="separated by blanks, but at least 6 are needed: x y z pixel_x") as caught:
+        read(tmp_path, "EPSG:32633\n1|2|3|4|5|A.JPG\n")
+    assert "112.1 514.1 DJI_0005.JPG P01" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "said"),
+    [
+        ("", "point 12", "Point 12"),
+        ("Control", "point 12", "Control point 12"),
+        ("Check", "P1", "Check point P1"),
+        ("", "point A", "Point point A"),  # its own name
+    ],
+)
+def test_points_without_names_are_called_by_their_number(kind: str, name: str, said: str) -> None:
+    assert titled(kind, name) == said

@@ -318,6 +318,20 @@ def test_models_of_the_user_are_copied_and_never_linked(tmp_path: Path) -> None:
     assert all(path.stat().st_nlink == 1 for path in (tmp_path / "out" / "sparse" / "0").iterdir())
 
 
+def test_photos_that_a_model_of_the_user_has_and_its_folder_lacks_are_named(tmp_path: Path) -> None:
+    scene = survey(grid())
+    scene.names = [name.replace(" ", "_") for name in scene.names]
+    write_model(scene, tmp_path / "project" / "sparse")
+    (tmp_path / "out").mkdir()
+    parts = {"sparse.model": tmp_path / "project" / "sparse"} | ingested(tmp_path, [], [*scene.names[5:], "new.jpg"])
+    notes = Notes()
+    run(GeorefConfig(), Inputs(parts, tmp_path / "project"), tmp_path / "out", notes)
+    lost, new = (text for text in notes.warnings if "sparse/" in text)
+    assert lost.startswith("5 of 30 photos of the model in sparse/ are missing in images/: ")
+    assert all(name in lost for name in scene.names[:5])
+    assert new == "1 of 26 photos in images/ is not in the model in sparse/: new.jpg."
+
+
 TARGETS = {1: np.array([5.0, 5.0, 0.0]), 2: np.array([35.0, 5.0, 0.4]), 7: np.array([5.0, 40.0, 0.1])}
 
 

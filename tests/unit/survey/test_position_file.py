@@ -71,7 +71,7 @@ def test_angles_and_accuracies_of_a_csv(tmp_path: Path) -> None:
         ("# nothing\n\n", "is empty"),
         ("EPSG:4326\n", "lists no photo"),
         ("a.jpg 13.5 47.8 512\n", "Line 1 .* the first line must state the CRS"),
-        ("EPSG:4326\na.jpg 13.5\n", "Line 2 .* 2 fields, but at least 3"),
+        ("EPSG:4326\na.jpg 13.5\n", "Line 2 .* 2 fields separated by blanks, but at least 3 are needed: photo x y"),
         ("EPSG:4326\na.jpg 13.5 north\n", "Line 2 .* y is 'north'"),
         ("EPSG:4326\na.jpg 13.5 inf\n", "Line 2 .* y is 'inf'"),
         ("EPSG:4326\na.jpg 13.5 1e300\n", "Line 2 .* not a valid number"),
@@ -104,3 +104,75 @@ def test_hostile_files_are_refused_or_read_and_nothing_else(tmp_path: Path) -> N
             read(tmp_path, bytes(data))
         except SplatpipeError as error:
             assert error.message and error.hint
+
+
+PLACE = (13.5127, 47.8412, 512.0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "EPSG:4326\n{name},13.5127,47.8412,512\n",
+        "EPSG:4326;;;\n{name};13,5127;47,8412;512,0\n",
+        "sep=;\nEPSG:4326\n{name};13.5127;47.8412;512\n",
+        '"sep=,"\nname,lon,lat,alt\n"{name}",13.5127,47.8412,512\n',
+        "EPSG:4326\n{name} 13.5127 47.8412 512\n",  # by blanks
+        "EPSG:4326\n{name} 13,5127 47,8412 512\n",
+        "# image_name x y z\nEPSG:4326\n{name}\t13.5127\t47.8412\t512\n",
+        # Metashape: titles in a comment, the CRS in words
+        "# Coordinate system: WGS 84 (EPSG::4326)\n#Label,Longitude,Latitude,Altitude,Yaw,Pitch,Roll,Error_(m)\n"
+        "{name},13.5127,47.8412,512.0,,,,0.01\nlost.JPG,,,,,,,\n#Total Error,,,,,,,0.02\n",
+        '# Cameras (1)\n# Coordinate system: GEOGCS["W",DATUM["W",AUTHORITY["EPSG","6326"]],AUTHORITY["EPSG","4326"]]\n'
+        "#Label\tX/Longitude\tY/Latitude\tZ/Altitude\n{name}\t13.5127\t47.8412\t512\n",
+        # Pix4D's titles
+        "imagename,latitude [decimal degrees],longitude [decimal degrees],altitude [m],accuracy horizontal [m]\n"
+        "{name},47.8412,13.5127,512,0.02\n",
+        "imageName Longitude Latitude Altitude\n{name} 13.5127 47.8412 512\n",
+        # Emlid: projected coordinates in a CRS that is named only, and degrees
+        "Name,Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height,CS name\n"
+        "{name},388710.5,5299705.2,465,13.5127,47.8412,512,RDN2008 / Italy zone (N-E)\n",
+        "\ufeffSourceFile,GPSLatitude,GPSLongitude,GPSAltitude\r\n{name},47.8412,13.5127,512\r\n",  # exiftool
+    ],
+)
+@pytest.mark.parametrize("name", ["DJI_0001.JPG", "2026-09-26 15-24-47 left.JPG"])
+def test_separator_and_columns_of_other_programs_are_found(tmp_path: Path, text: str, name: str) -> None:
+    (photo,) = read(tmp_path, text.format(name=name)).photos
+    assert (photo.name, photo.x, photo.y, photo.z) == (name, *PLACE)
+
+
+def test_utf_16_of_a_spreadsheet_is_read(tmp_path: Path) -> None:
+    text = "Name\tLongitude\tLatitude\tAltitude\r\nä b.jpg\t13,5127\t47,8412\t512\r\n"
+    (photo,) = read(tmp_path, text.encode("utf-16")).photos
+    assert (photo.name, photo.x, photo.y, photo.z) == ("ä b.jpg", *PLACE)
+
+
+@pytest.mark.parametrize(
+    ("text", "crs"),
+    [
+        ("Name,Easting,Northing,Elevation,CS name\na.jpg,1,2,3,WGS 84 / UTM zone 33N\n", "WGS 84 / UTM zone 33N"),
+        ("# CRS: 32633\nname,x,y\na.jpg,1,2\n", "EPSG:32633"),
+        (
+            '# CoordinateSystem: PROJCS["WGS 84 / UTM zone 33N",AUTHORITY["EPSG","32633"]]\nlabel,x,y\na.jpg,1,2\n',
+            "EPSG:32633",
+        ),
+        ("EPSG:25832+7837,,,\na.jpg,1,2,3\n", "EPSG:25832+7837"),
+        ("name,lon,lat,ellipsoidal height\na.jpg,13,47,3\n", "EPSG:4979"),
+    ],
+)
+def test_the_crs_is_found_where_programs_state_it(tmp_path: Path, text: str, crs: str) -> None:
+    assert read(tmp_path, text).crs == crs
+
+
+def test_names_with_blanks_and_without_suffix_are_told_by_the_photos(tmp_path: Path) -> None:
+    path = tmp_path / "geo.txt"
+    path.write_text("EPSG:4326\nflight 1 12 13.5127 47.8412 512\nflight 1 13 13.5127 47.8413 512\n")
+    file = read_position_file(path, ["flight 1 12.JPG", "flight 1 13.JPG"])
+    assert [(photo.name, photo.y) for photo in file.photos] == [("flight 1 12", 47.8412), ("flight 1 13", 47.8413)]
+
+
+def test_what_cannot_be_read_names_the_separator_the_columns_and_an_example(tmp_path: Path) -> None:
+    with pytest.raises(
+        SplatpipeError, match="1 field separated by blanks, but at least 3 are needed: photo x y"
+    ) as caught:
+        read(tmp_path, "EPSG:4326\na.jpg|13.5|47.8\n")
+    assert "DJI_0001.JPG 13.5127 47.8412 512.3" in caught.value.hint

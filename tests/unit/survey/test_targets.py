@@ -119,7 +119,7 @@ def test_scale_bars_give_metres_and_the_wrong_one_is_reported(tmp_path: Path) ->
         ("name_a,name_b,metres\n" + "A" * 300 + ",B,1\n", "Line 2.*name"),
         ("name_a,name_b,metres\n" + "A,B,1\n" * 1001, "more than 1,000 bars"),
         ("name_a,name_b,metres\nA,B,1\x00\n", "no plain text"),
-        (b"\xff\xfe", "not UTF-8"),
+        (b"\xff\xd8", "not UTF-8"),
         (b"x" * (1 << 20) + b"x", "too large"),
     ],
 )

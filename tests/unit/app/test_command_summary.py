@@ -1,0 +1,14 @@
+"""Errors of other libraries become messages for the user."""
+
+from splatpipe.pipeline.app.command_summary import for_the_user
+from splatpipe.pipeline.engine.errors import MachineError
+
+
+def test_names_that_the_environment_cannot_write_are_told_with_what_to_do() -> None:
+    try:
+        "run \udcc3\udcbc".encode()
+    except UnicodeEncodeError as error:
+        shown = for_the_user(error)
+    assert isinstance(shown, MachineError)
+    assert "letters that this environment cannot write" in shown.message
+    assert "LC_ALL=C.UTF-8" in shown.hint
