@@ -13,7 +13,7 @@ STRICT_PX = 2.0  # filtered observations return only within this error, or they 
 SETTLED = 2e-3  # share of observations filtered after a robust adjustment: so few had hardly any influence
 MAX_ROUNDS = 4
 ROUGH_TOLERANCE, ROUGH_ITERATIONS = 1e-4, 10  # relative change of the cost: before wrong observations are filtered
-FINE_TOLERANCE, FINE_ITERATIONS = 1e-6, 100
+FINE_TOLERANCE, FINE_ITERATIONS = 1e-5, 100
 GRADIENT_TOLERANCE = 1e-6  # COLMAP's 1.0 stops while a focal length is still some pixels off
 # Wrong matches along an epipolar line have no third view to expose them, and bias the cameras. On flights with known
 # ground truth Cauchy loss left a third less of that bias than SOFT_L1, and the demo's centres 13 % nearer to the truth.

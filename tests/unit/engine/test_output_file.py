@@ -38,6 +38,7 @@ ALLOWED = {
     "pipeline/sfm/layout.py": "COLMAP's database",
     "pipeline/sfm/mapping.py": "COLMAP's database",
     "pipeline/sfm/matching.py": "COLMAP's database",
+    "pipeline/sfm/matching_process.py": "COLMAP's database",
     "pipeline/sfm/reduction.py": "COLMAP's database",
     "pipeline/sfm/view_graph.py": "COLMAP's database",
     "stages/features.py": "COLMAP's database",
