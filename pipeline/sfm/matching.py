@@ -19,6 +19,7 @@ from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
 TILE = 16  # photos; pairs are matched tile by tile, so that a block needs the descriptors of few photos
 PAIRS_A_PROCESS = 12  # at least: a process takes half a second to start and rebuilds its photos' search trees
+PROCESS_BYTES = 400_000_000  # of a matching process, at most: 0.2 to 0.36 GB with 1,300 to 10,000 keypoints a photo
 MATCHER = "splatpipe.pipeline.sfm.matching_process"
 
 
