@@ -1,7 +1,8 @@
 """Fit the forecasts' costs to finished runs, and show the errors on runs that were left out of the fit.
 
 python benchmarks/forecast.py                       # the table of figures that is kept: fits, leaves one capture out
-python benchmarks/forecast.py --add OUT NAME PRESET # reads a finished run's manifests into that table
+python benchmarks/forecast.py --add OUT NAME PRESET # reads a run's manifests (at least to `sparse`) into that table
+    --stage sparse --speed 0.5                      # … of one stage only; its machine was half as fast as the reference
 python benchmarks/forecast.py --costs               # prints the fitted costs, for stages/costs.py
 """
 
@@ -26,6 +27,7 @@ TABLE = Path(__file__).with_name("forecast.json")
 FITTED_TO = "preview"  # runs of other presets are reported, not fitted
 MEMORY_WITHIN = 0.3
 CPU_WITHIN = 1.5
+ROUNDING = 0.01  # of the costs in `stages/costs.py`, which have three digits
 SHOWN = ("features", "matches", "sparse", "initialize", "train")
 
 
@@ -33,13 +35,24 @@ def main() -> int:
     """Run the command; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--add", nargs=3, metavar=("OUT", "NAME", "PRESET"))
+    parser.add_argument("--stage", help="add this stage's figures only, and keep the others of the row")
+    parser.add_argument(
+        "--speed", type=float, default=1.0, help="of the run's machine: CPU seconds are multiplied by it"
+    )
     parser.add_argument("--costs", action="store_true")
     options = parser.parse_args()
     rows = json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.is_file() else []
     if options.add:
         out, name, preset = options.add
         row = read_run(Path(out), configured(preset), name).as_row(preset)
+        for figures in row["used"].values():
+            figures[0] = round(options.speed * figures[0], 2)
         kept = [old for old in rows if (old["name"], old["preset"]) != (name, preset)]
+        if options.stage:
+            row["used"] = {options.stage: row["used"][options.stage]}
+            for old in rows:
+                if (old["name"], old["preset"]) == (name, preset):
+                    row = {**old, "used": {**old["used"], **row["used"]}}
         lines = (
             json.dumps(entry) for entry in sorted([*kept, row], key=lambda entry: (entry["preset"], entry["name"]))
         )
@@ -76,7 +89,8 @@ def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[FinishedRun], list[Fin
 
 def holds(outcome: ForecastRatio) -> tuple[bool, bool]:
     """Whether the forecasts of the whole run's peak memory and CPU time were accurate enough."""
-    return abs(outcome.memory - 1.0) <= MEMORY_WITHIN, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
+    bounded = all(ratio >= 1.0 - ROUNDING for ratio in outcome.bounds.values())
+    return abs(outcome.memory - 1.0) <= MEMORY_WITHIN and bounded, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
 
 
 def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
@@ -92,6 +106,7 @@ def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
                 "seconds": sum(found["cpu_seconds"] for found in used),
                 "cpu": outcome.cpu,
                 "disk": outcome.disk,
+                "bound": max(outcome.bounds.values(), default=math.nan),
                 "holds": " ".join("yes" if well else "NO" for well in holds(outcome)),
                 **{stage: outcome.stages.get(stage, math.nan) for stage in SHOWN},
             }
@@ -100,6 +115,7 @@ def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
         "capture": "name",
         "peak MB": "used:.0f",
         "memory ×": "memory:.2f",
+        "bound of sparse ×": "bound:.2f",
         "CPU s": "seconds:.0f",
         "CPU ×": "cpu:.2f",
         "disk ×": "disk:.2f",

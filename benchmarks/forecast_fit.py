@@ -31,6 +31,11 @@ beside 250 of the stage itself. Training's value dates from before its frames we
 0.31 GB, but with few Gaussians, and memory limits rely on it."""
 
 
+BOUNDS = ("sparse",)
+"""Stages whose memory is bounded from above: what mapping takes depends on whether it leaves photos to the ladder, whose
+matching of stronger keypoints takes 1 to 3.3 GB."""
+
+
 @dataclass(frozen=True)
 class FinishedRun:
     """A finished run, read from its manifests.
@@ -40,8 +45,8 @@ class FinishedRun:
         size: Size of the capture.
         config: The options that it ran with.
         threads: Threads that it had.
-        counts: Keypoints of all photos, pairs, final Gaussians, iterations done.
-        used: Use of each of ``KINDS``, by stage.
+        counts: Keypoints of all photos, pairs and, after a training, final Gaussians and iterations done.
+        used: Use of each of ``KINDS``, by stage; CPU seconds are those of the reference machine.
     """
 
     name: str
@@ -70,10 +75,10 @@ class FinishedRun:
 
 
 def read_run(out: Path, config: LineConfig, name: str) -> FinishedRun:
-    """Read a run from the newest manifest of each stage in its OUT.
+    """Read a run from the newest manifest of each stage in its OUT; it may have ended after `sparse`.
 
     Raises:
-        ValueError: if it did not start from photos, or is not finished.
+        ValueError: if it did not start from photos, or did not get that far.
     """
     manifests: dict[str, dict[str, Any]] = {}
     for path in out.glob("stages/*/manifest.json"):
@@ -83,16 +88,16 @@ def read_run(out: Path, config: LineConfig, name: str) -> FinishedRun:
             manifests[manifest["stage"]] = manifest
     summaries = {stage: manifest["summary"] for stage, manifest in manifests.items()}
     size = capture_size(summaries)
-    if size is None or "flythrough" not in summaries:
-        raise ValueError(f"{out} holds no whole run of photos.")
+    if size is None or "sparse" not in summaries:
+        raise ValueError(f"{out} holds no photos that were placed.")
     counts = {
         "keypoints": float(summaries["features"]["keypoints"]),
         "pairs": float(summaries["matches"]["pairs"]),
-        "gaussians": float(summaries["train"]["gaussians"]),
-        "iterations": float(summaries["train"]["iterations"]),
     }
+    if "train" in summaries:
+        counts |= {kind: float(summaries["train"][kind]) for kind in ("gaussians", "iterations")}
     used = {stage: _used(manifest) for stage, manifest in manifests.items() if stage not in SELDOM}
-    return FinishedRun(name, size, config, int(manifests["train"]["machine"]["threads"]), counts, used)
+    return FinishedRun(name, size, config, int(manifests["sparse"]["machine"]["threads"]), counts, used)
 
 
 def _used(manifest: Mapping[str, Any]) -> dict[str, float]:
@@ -117,13 +122,16 @@ def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
         counts = [scene.keypoints[extractor] for run, scene in zip(runs, scenes, strict=True) if _uses(run, extractor)]
         keypoints[extractor] = _typical(counts, 0.0)
     chosen = [scene.pairs for run, scene in zip(runs, scenes, strict=True) if run.counts["pairs"] < _every(run)]
-    ended = [scene.flat for run, scene in zip(runs, scenes, strict=True) if run.config.train.stop_when_flat]
+    trained = [(run, scene) for run, scene in zip(runs, scenes, strict=True) if "gaussians" in run.counts]
+    ended = [scene.flat for run, scene in trained if run.config.train.stop_when_flat]
     stages = {}
     for stage, otherwise in base.stages.items():
         those = [(run.used[stage], each[stage]) for run, each in zip(runs, units, strict=True) if stage in run.used]
         if those:
             resident, memory = otherwise.resident, otherwise.memory
-            if stage not in BY_HAND:
+            if stage in BOUNDS:
+                memory = max(0.0, *(_beyond(used, of, resident) / of.memory for used, of in those))
+            elif stage not in BY_HAND:
                 resident, memory = _line(those, memory if stage in BY_GAUSSIANS else None)
             cpu = [used["cpu_seconds"] / of.cpu for used, of in those if used["cpu_seconds"] * of.cpu > 0.0]
             disk = [used["disk_bytes"] / of.disk for used, of in those if used["disk_bytes"] * of.disk > 0.0]
@@ -134,7 +142,7 @@ def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
     return Costs(
         keypoints,
         _typical(chosen, base.pairs),
-        _typical([scene.gaussians for scene in scenes], base.gaussians),
+        _typical([scene.gaussians for _run, scene in trained], base.gaussians),
         _typical(ended, base.flat),
         stages,
     )
@@ -148,13 +156,16 @@ def scene_of(run: FinishedRun, base: Costs) -> Costs:
         **base.keypoints,
         options.features.extractor: counts["keypoints"] / run.size.photos / bare.keypoint_megapixels,
     }
-    return replace(
-        base,
-        keypoints=keypoints,
-        pairs=counts["pairs"] / run.size.photos * NEIGHBOURS / options.matches.neighbours,
-        gaussians=counts["gaussians"] / bare.grown,
-        flat=counts["iterations"] / bare.iterations,
-    )
+    pairs = counts["pairs"] / run.size.photos * NEIGHBOURS / options.matches.neighbours
+    placed = replace(base, keypoints=keypoints, pairs=pairs)
+    if "gaussians" not in counts:
+        return placed
+    return replace(placed, gaussians=counts["gaussians"] / bare.grown, flat=counts["iterations"] / bare.iterations)
+
+
+def _beyond(used: Mapping[str, float], of: WorkUnits, resident: float) -> float:
+    """Bytes of a stage's memory beyond what is constant or known."""
+    return used["peak_memory_bytes"] - resident - of.fixed_bytes
 
 
 def _uses(run: FinishedRun, extractor: str) -> bool:
@@ -188,10 +199,11 @@ class ForecastRatio:
 
     Attributes:
         run: The run.
-        memory: Ratio of the whole run's peak.
-        cpu: Ratio of the whole run's CPU time.
+        memory: Ratio of the whole run's peak, without the stages of ``BOUNDS``; NaN if only these were recorded.
+        cpu: Ratio of the CPU time of all recorded stages.
         disk: Ratio of all remaining output.
         stages: Ratios of the CPU time of single stages.
+        bounds: Ratios of the memory of those of ``BOUNDS``.
     """
 
     run: FinishedRun
@@ -199,22 +211,25 @@ class ForecastRatio:
     cpu: float
     disk: float
     stages: Mapping[str, float]
+    bounds: Mapping[str, float]
 
 
 def compared(run: FinishedRun, costs: Costs) -> ForecastRatio:
     """Return the ratios of a run's forecast by these costs to its actual use."""
     needs = forecast(run.size, run.config, run.threads, costs=costs)
-    used = run.used
+    used, bounded = run.used, [stage for stage in BOUNDS if stage in run.used]
+    typical = [stage for stage in used if stage not in BOUNDS]
 
     def ratio(join: Callable[[Iterable[float]], float], predicted: Mapping[str, float], kind: str) -> float:
-        return join(predicted.values()) / join(used[stage][kind] for stage in used)
+        return math.nan if not predicted else join(predicted.values()) / join(used[stage][kind] for stage in predicted)
 
     return ForecastRatio(
         run,
-        ratio(max, {stage: float(needs[stage].memory_bytes) for stage in used}, "peak_memory_bytes"),
+        ratio(max, {stage: float(needs[stage].memory_bytes) for stage in typical}, "peak_memory_bytes"),
         ratio(sum, {stage: needs[stage].cpu_seconds for stage in used}, "cpu_seconds"),
         ratio(sum, {stage: float(needs[stage].disk_bytes) for stage in used}, "disk_bytes"),
         {stage: needs[stage].cpu_seconds / max(used[stage]["cpu_seconds"], 0.01) for stage in used},
+        {stage: needs[stage].memory_bytes / used[stage]["peak_memory_bytes"] for stage in bounded},
     )
 
 

@@ -84,8 +84,8 @@ class Costs:
 
 
 REFERENCE = Costs(
-    keypoints=MappingProxyType({"sift": 9000.0, "opencv-sift": 4061.0}),
-    pairs=10.5,
+    keypoints=MappingProxyType({"sift": 9000.0, "opencv-sift": 3288.0}),
+    pairs=11.1,
     gaussians=1860.0,
     flat=0.851,
     stages=MappingProxyType(
@@ -94,7 +94,7 @@ REFERENCE = Costs(
             "control": StageCosts(0.1, 180e6, 0.0, 1200.0),
             "features": StageCosts(0.287, 157e6, 266e6, 156.0),
             "matches": StageCosts(1.36e-05, 250e6, 185e6, 30.1),
-            "sparse": StageCosts(6.32e-05, 215e6, 723.0, 30.4),
+            "sparse": StageCosts(0.548, 215e6, 331e6, 31.4),
             "targets": StageCosts(0.21, 230e6, 100e6, 1300.0),
             "georef": StageCosts(0.019, 157e6, 724.0, 30.4),
             "undistort": StageCosts(0.0363, 241e6, 18.2e6, 0.598e6),
@@ -102,7 +102,7 @@ REFERENCE = Costs(
             "initialize": StageCosts(0.292, 538e6, 0.0, 206.0),
             "train": StageCosts(0.0896, 340e6, 1.0, 249.0),
             "clean": StageCosts(1.5, 620e6, 560.0, 249.0),
-            "evaluate": StageCosts(0.303, 1215e6, 500.0, 0.844e6),
+            "evaluate": StageCosts(0.217, 1215e6, 500.0, 0.606e6),
             "export": StageCosts(2.07e-05, 620e6, 560.0, 375.0),
             "flythrough": StageCosts(0.3, 486e6, 0.0, 0.13e6),
             "depths": StageCosts(12.0, 690e6, 0.0, 5e6),

@@ -23,6 +23,7 @@ from splatpipe.pipeline.render.splat_accuracy import measure_accuracy
 from splatpipe.pipeline.render.view_measures import (
     evaluate_view,
     flat_stems,
+    judged_views,
     mean_measures,
     mean_megapixels,
     shows_inside,
@@ -35,8 +36,8 @@ Pictures = tuple[tuple[Camera, Pixels, Mask | None], Pixels, Path, Mask | None] 
 MEASURED_TOGETHER = 4  # views, each with 0.3 GB of images in double precision
 
 
-def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `metrics.json` and `views/`: photo, render, error image and mask of every held-out view.
+def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
+    """Write `metrics.json` and `views/`: photo, render, error image and mask of every judged held-out view.
 
     All are at `JUDGED_MEGAPIXELS`, or at the dataset's size if that is smaller, whatever the training size. With a
     boundary, figures cover only the inside: pixels by the model's own depth, points by their position. Images keep the
@@ -44,7 +45,8 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
     """
     views = load_views(inputs["undistort.dataset"])
     held_out = load_split(inputs["split.views"]).held_out
-    chosen = [view for view in views if view.camera.name in set(held_out)]
+    judged = set(judged_views(held_out, config.most_views))
+    chosen = [view for view in views if view.camera.name in judged]
     gaussians = read_splat(inputs["clean.model"])
     options, _ = as_trained(inputs["train.rendering"], gaussians)
     device = choose_device(inputs.machine.device)
@@ -73,17 +75,17 @@ def run(_config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) ->
         for found in ordered_map(_measure, pictures(), min(inputs.machine.threads, MEASURED_TOGETHER)):
             per_view.append(found)
             report.progress(len(per_view), len(chosen), "measuring held-out photos", "photos")
-        floaters = measure_floaters(gaussians, cameras, set(held_out), inputs["undistort.dataset"], options, area)
+        floaters = measure_floaters(gaussians, cameras, judged, inputs["undistort.dataset"], options, area)
         accuracy = measure_accuracy(inputs.parts, cameras, held_out, partial(render_depth, gaussians, options=options))
-    means, judged = mean_measures(per_view), mean_megapixels(per_view)
-    result: dict[str, Any] = {"test_views": len(per_view), "judged_megapixels": judged, "mean": means}
-    result |= {"floaters": floaters, "accuracy": accuracy}
+    means = mean_measures(per_view)
+    counts: dict[str, Any] = {"test_views": len(per_view), "held_out_views": len(held_out)}
+    size = {"judged_megapixels": mean_megapixels(per_view)}
+    result: dict[str, Any] = {**counts, **size, "mean": means, "floaters": floaters, "accuracy": accuracy}
     if area is not None:
         result["whole"] = mean_measures([view["whole"] for view in per_view])
     result["per_view"] = per_view
     write_json(out / "metrics.json", result)
-    summary: dict[str, Any] = {"test_views": len(per_view)}
-    summary |= {name: means[name] for name in ("psnr", "psnr_cc", "ssim")} | {"judged_megapixels": judged}
+    summary = counts | {name: means[name] for name in ("psnr", "psnr_cc", "ssim")} | size
     if area is not None:
         summary["whole_psnr"] = result["whole"]["psnr"]
     return summary | {"veil": floaters["veil"]["mean"], "device": device.name}

@@ -153,6 +153,7 @@ def collect_metrics(inputs: Inputs, points: Points, registered: int, gaussians: 
         "peak_memory_bytes": train.get("peak_memory_bytes"),
         "judged_megapixels": measured["judged_megapixels"],
         "test_views": measured["test_views"],
+        "held_out_views": measured["held_out_views"],
         **measured["mean"],
         **({"whole": measured["whole"]} if "whole" in measured else {}),  # with a boundary, the rest covers the inside
         "floaters": measured["floaters"],

@@ -10,14 +10,15 @@ from statistics import median
 import numpy as np
 import pycolmap
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.machine import available_memory_bytes, resident_bytes, threads_within
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
+from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
-from splatpipe.pipeline.sfm.keypoints import Bytes, extract, single_threaded_opencv
+from splatpipe.pipeline.sfm.keypoints import Bytes, extract, extraction_bytes, single_threaded_opencv
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 from splatpipe.pipeline.sfm.refusal import little_texture, texture_hint
 
@@ -29,9 +30,11 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
 
     Raises:
         SplatpipeError: if no photo has enough keypoints.
+        MachineError: if memory is too small for a single photo.
     """
     photo_list = load_photo_list(inputs["ingest.photos"])
     cameras = read_json(inputs["ingest.cameras"])["cameras"]
+    threads = _threads(config, photo_list, inputs.machine)
     counts: list[int] = []
     colours: list[Bytes] = []
     with (
@@ -47,7 +50,7 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
             photos_dir=inputs.photos_dir,
             scratch=Path(scratch),
         )
-        found = ordered_map(work, photo_list.photos, inputs.machine.threads)
+        found = ordered_map(work, photo_list.photos, threads)
         for number, features in enumerate(found, start=1):
             database.write_keypoints(number, features.keypoints)
             kind = pycolmap.FeatureExtractorType.SIFT
@@ -64,6 +67,24 @@ def run(config: FeaturesConfig, inputs: Inputs, out: Path, report: Reporter) -> 
         "keypoints_per_photo": round(sum(counts) / len(counts)),
         "cameras": len(cameras),
     }
+
+
+def _threads(config: FeaturesConfig, photo_list: PhotoList, machine: Machine) -> int:
+    """Number of photos in work at once, as memory allows.
+
+    Raises:
+        MachineError: if it is too small for the largest one.
+    """
+    sizes = [(photo.width * photo.height, max(photo.width, photo.height)) for photo in photo_list.photos]
+    each = max(extraction_bytes(config, *size) for size in sizes)
+    needed, limit = resident_bytes() + each, available_memory_bytes()
+    if 0 < limit < needed:
+        raise MachineError(
+            f"Finding the keypoints of one photo takes {needed / 1e9:.2f} GB of memory, and this machine or container "
+            f"has {limit / 1e9:.2f} GB.",
+            hint="Give it more memory, or use smaller images, such as --set features.max_image_size=1000.",
+        )
+    return threads_within(machine.threads, each, machine.memory_bytes)
 
 
 def _check(photo_list: PhotoList, counts: list[int], report: Reporter) -> None:

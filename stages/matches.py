@@ -12,11 +12,12 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.machine import threads_within
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.layout import half_sizes, make_layout, make_views
-from splatpipe.pipeline.sfm.matching import look_alike, match_pairs, write_verified
+from splatpipe.pipeline.sfm.matching import PROCESS_BYTES, look_alike, match_pairs, write_verified
 from splatpipe.pipeline.sfm.options import MatchesConfig
 from splatpipe.pipeline.sfm.pairs import choose_pairing, components, select_pairs
 
@@ -41,7 +42,8 @@ def run(config: MatchesConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     pairs = select_pairs(layout, pairing, config.neighbours, cache(lambda: look_alike(features, config.seed)))
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         work = Path(scratch) / "database.db"
-        match_pairs(features, work, pairs, config.seed, inputs.machine.threads, report)
+        processes = threads_within(inputs.machine.threads, PROCESS_BYTES, inputs.machine.memory_bytes)
+        match_pairs(features, work, pairs, config.seed, processes, report)
         inliers = write_verified(work, features, out / "database.db")
     if not any(inliers.values()):
         raise SplatpipeError(

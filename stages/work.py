@@ -42,7 +42,11 @@ SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # memory per thread, likewise
 MAX_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times max_features: several orientations, whole scales
 NEIGHBOURS = 20  # per photo, behind `Costs.pairs`
 PHOTOS_OF_ONE_COST = 50  # up to this many photos, mapping costs the constant per photo; with more photos it costs more
-MAPPING_GROWTH = 0.5  # exponent of the number of photos in the mapping cost per photo
+MAPPING_GROWTH = 0.75  # exponent of the number of photos in the mapping cost per photo: seneca's 167, a room's 292
+WITHOUT_POSITIONS = 2.5  # times the mapping cost: pairs that only look alike, doubts, second mappings
+STRONGER_MEGAPIXELS = 4.3  # of an image in which photos that were not placed get further keypoints
+STRONGER_BYTES = 360.0  # of memory per pixel of these, on half of the threads
+JUDGED_ONE_IN = 8  # photos, behind the cost of `evaluate`
 PREVIEW_STEPS = 5  # density-control steps behind `Costs.gaussians`
 STEPS_POWER = 1.3  # exponent of Gaussians over steps: 1.5 on brighton (946,000 at `standard`), 0.9 on the demo
 SIZE_POWER = 0.5  # exponent of Gaussians over photo size: from 0.1 to 0.3 megapixels on the demo
@@ -110,11 +114,13 @@ class WorkUnits:
         cpu: Units of CPU time.
         memory: Units of memory, beyond the constant share.
         disk: Units of output on disk.
+        fixed_bytes: Memory that is known without a cost.
     """
 
     cpu: float
     memory: float
     disk: float
+    fixed_bytes: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -236,6 +242,19 @@ class CaptureWork:
         return min(every, self.costs.pairs * photos * options.neighbours / NEIGHBOURS)
 
     @property
+    def stronger_bytes(self) -> float:
+        """Memory for further keypoints in photos that mapping could not place, which may be none."""
+        return STRONGER_BYTES * MEGA * min(self.size.megapixels, STRONGER_MEGAPIXELS) * max(1, self.threads // 2)
+
+    @property
+    def judged_photos(self) -> int:
+        """Number of held-out photos that are judged."""
+        split, most = self.config.split, self.config.evaluate.most_views
+        named = sum(bool(name.strip()) for name in split.views.split(","))
+        held_out = named or (-(-self.size.photos // split.every) if split.every else 0)
+        return min(held_out, most) if most else held_out
+
+    @property
     def training_megapixels(self) -> float:
         """Megapixels of a training photo at the finest level."""
         return min(self.dataset_megapixels, self.config.train.max_megapixels or self.dataset_megapixels)
@@ -332,11 +351,12 @@ class CaptureWork:
         size, train = self.size, self.config.train
         photos, pixels = float(size.photos), size.photos * size.megapixels
         keypoints, gaussians = photos * self.keypoints, float(self.gaussians)
-        judged = photos * min(self.dataset_megapixels, JUDGED_MEGAPIXELS)
+        judged = self.judged_photos * min(self.dataset_megapixels, JUDGED_MEGAPIXELS)
         depths = photos * min(self.dataset_megapixels, self.config.depths.max_megapixels)
         looked_through = photos * min(self.dataset_megapixels, SEEN_MEGAPIXELS)
         extractor, at_once = self.config.features.extractor, float(self.threads * size.megapixels)
         mapping = (max(photos, PHOTOS_OF_ONE_COST) / PHOTOS_OF_ONE_COST) ** MAPPING_GROWTH
+        mapping *= 1.0 if size.positions else WITHOUT_POSITIONS
         done = self.done
         state = bytes_per_gaussian(train.sh_degree) * gaussians + PIXEL_BYTES * MEGA * self.window
         coarse_state = state
@@ -353,7 +373,7 @@ class CaptureWork:
             "control": WorkUnits(controlled, 0.0, controlled),
             "features": WorkUnits(looked, looked_at_once, keypoints),
             "matches": WorkUnits(self.pairs * self.keypoints, float(self.threads), keypoints),
-            "sparse": WorkUnits(keypoints * mapping, keypoints, keypoints),
+            "sparse": WorkUnits(photos * mapping, math.sqrt(photos), keypoints, self.stronger_bytes),
             "targets": WorkUnits(controlled * pixels, controlled * targets_at_once, controlled * photos),
             "georef": WorkUnits(photos, keypoints, keypoints),
             "undistort": WorkUnits(pixels, at_once, photos * self.dataset_megapixels),
@@ -362,7 +382,7 @@ class CaptureWork:
             "blocks": WorkUnits(done * self.coarse_training, coarse_state, 0.0),
             "train": WorkUnits(done * self.training, state, gaussians),
             "clean": WorkUnits(looked_through, gaussians, gaussians),
-            "evaluate": WorkUnits(judged, gaussians, judged),
+            "evaluate": WorkUnits(JUDGED_ONE_IN * judged, gaussians, JUDGED_ONE_IN * judged),
             "export": WorkUnits(gaussians, gaussians, gaussians),
             "flythrough": WorkUnits(self.film_pixels, gaussians if self.film_pixels else 0.0, self.film_pixels),
             "depths": WorkUnits(depths, 0.0, depths),
@@ -403,7 +423,7 @@ class CaptureWork:
                 found[stage] = Need(0, 0.0, 0)
                 continue
             cost = self.costs.stages[TRAINING.get(stage, stage)]
-            memory = cost.resident + cost.memory * units.memory
+            memory = cost.resident + cost.memory * units.memory + units.fixed_bytes
             if stage in TRAINING and most:
                 memory = min(memory, most)
             found[stage] = Need(

@@ -89,9 +89,17 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
             raise missing.error()
     if os.environ.get("SPLATPIPE_ISA"):  # an invalid one is reported now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401
-    machine = Machine(device, threads or available_cores(), began_s)
+    machine = Machine(device, threads or available_cores(), began_s, _memory_limit(config, device))
     forecast_needs = Forecaster(config, machine.threads)
     return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, forecast_needs)
+
+
+def _memory_limit(config: LineConfig, device: str) -> int:
+    """The user's limit on this machine's memory, bytes; 0 without one, or if it is for a CUDA device's."""
+    from splatpipe.pipeline.raster.cuda_library import why_not
+
+    limit = config.train.max_memory_bytes
+    return 0 if limit and device != "cpu" and why_not() is None else limit
 
 
 def spent_s() -> float:
@@ -103,16 +111,17 @@ def spent_s() -> float:
 
 
 def print_forecast(request: Request, until: str | None) -> None:
-    """Print the forecast for the whole pipeline, before its first training."""
+    """Print the forecast for the whole pipeline, before its first training, and whether memory may not suffice."""
     from splatpipe.pipeline.app.command_summary import PART_VARIABLE
     from splatpipe.pipeline.app.console import print_line
-    from splatpipe.pipeline.app.preflight.start import forecast_text
+    from splatpipe.pipeline.app.preflight.start import forecast_text, shortage_text
 
     trained = any((request.out / "stages").glob("train-*"))
-    if trained or until is not None or PART_VARIABLE in os.environ:
+    if trained or PART_VARIABLE in os.environ:
         return
-    if text := forecast_text(request):
-        print_line(text)
+    for text in (forecast_text(request) if until is None else "", shortage_text(request, until)):
+        if text:
+            print_line(text)
 
 
 def existing_request(

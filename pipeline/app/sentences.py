@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from splatpipe.pipeline.app.report.wording import count, length, number, plural, share
+from splatpipe.pipeline.app.report.wording import count, judged_of, length, number, plural, share
 from splatpipe.pipeline.engine.stage import Summary, stage_name
 
 Figures = Mapping[str, Any]
@@ -150,7 +150,8 @@ def _evaluate(facts: Figures) -> str:
     if not facts["test_views"]:
         return "no photo was held out for evaluation"
     psnr, ssim = number(facts["psnr"], 1), number(facts["ssim"], 2)
-    return f"{plural(facts['test_views'], 'held-out photo')}: PSNR {psnr} dB, SSIM {ssim}"
+    seen = judged_of(facts["test_views"], facts.get("held_out_views", 0), "held-out photo")
+    return f"{seen}: PSNR {psnr} dB, SSIM {ssim}"
 
 
 def _export(facts: Figures) -> str:

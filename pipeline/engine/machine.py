@@ -128,6 +128,39 @@ def free_memory_bytes(root: Path = Path("/")) -> int:
     return min(free, default=0)
 
 
+def threads_within(threads: int, each_bytes: int, limit_bytes: int = 0, root: Path = Path("/")) -> int:
+    """Number of threads, at least 1, whose memory together fits the free memory and the user's limit.
+
+    Args:
+        threads: The most.
+        each_bytes: Memory that each of them takes.
+        limit_bytes: The user's limit on the resident memory of this process; 0 for none.
+        root: The folder that contains ``proc`` and ``sys``.
+    """
+    rooms = [free_memory_bytes(root)] if free_memory_bytes(root) else []
+    rooms += [limit_bytes - resident_bytes(root)] if limit_bytes else []
+    return max(1, min([threads, *(room // each_bytes for room in rooms)]))
+
+
+def memory_limit_bytes(limit_bytes: int = 0, root: Path = Path("/")) -> int:
+    """The user's limit, or that of the machine or its control groups if it is smaller; 0 if none is known.
+
+    Args:
+        limit_bytes: The user's limit; 0 for none.
+        root: The folder that contains ``proc`` and ``sys``.
+    """
+    return min((limit for limit in (limit_bytes, available_memory_bytes(root)) if limit), default=0)
+
+
+def resident_bytes(root: Path = Path("/")) -> int:
+    """Resident memory of this process, bytes; 0 if the system does not report it.
+
+    Args:
+        root: The folder that contains ``proc``.
+    """
+    return (_field(_text(root / "proc/self/status"), "VmRSS:") or 0) << 10
+
+
 def _groups(root: Path, controller: str) -> Iterator[Path]:
     """Yield the folders of this process's control groups for a controller and their ancestors, innermost first."""
     own = _own_groups(_text(root / "proc/self/cgroup"))

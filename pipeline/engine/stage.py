@@ -45,11 +45,13 @@ class Machine:
         threads: Worker threads, at least 1.
         began_s: ``time.monotonic()`` at the start of the command, a clock that all processes on a machine share; 0 if
             unknown.
+        memory_bytes: The user's limit on memory; 0 for none.
     """
 
     device: str = "auto"
     threads: int = 1
     began_s: float = 0.0
+    memory_bytes: int = 0
 
 
 @dataclass(frozen=True)

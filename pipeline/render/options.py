@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from splatpipe.pipeline.engine.ranges import NonNegativeInt
 from splatpipe.pipeline.engine.stage import StageConfig
 
 JUDGED_MEGAPIXELS = 2.0
@@ -11,4 +12,6 @@ photo's pixels are mostly noise and Bayer pattern."""
 
 
 class EvaluateConfig(StageConfig):
-    """No options: `split` decides which photos are held out."""
+    most_views: NonNegativeInt = 0
+    """Judge at most this many of the held-out photos, spread evenly over them in order of name; 0: all. The others are
+    not trained on either."""

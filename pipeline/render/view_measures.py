@@ -101,6 +101,20 @@ def _measured(metric: metrics.Metric, pair: metrics.ImagePair) -> float | None:
     return round(value, 6) if math.isfinite(value) else None
 
 
+def judged_views(held_out: Sequence[str], most: int) -> list[str]:
+    """The held-out photos that are judged: at most ``most`` (0: all), evenly spread, the first and the last among them.
+
+    In order of name photos follow the capture's path, so these are spread in space and time.
+
+    Args:
+        held_out: Names of the held-out photos, in order.
+        most: Largest number of them.
+    """
+    if most == 0 or len(held_out) <= most:
+        return list(held_out)
+    return [held_out[round(place)] for place in np.linspace(0, len(held_out) - 1, most)]
+
+
 def mean_measures(per_view: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Each metric's mean over the views in which it is defined; None without any."""
     means: dict[str, float | None] = {}

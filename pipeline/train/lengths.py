@@ -160,9 +160,14 @@ def divided(footage: PhotoSizes, least: int, iterations: int) -> list[Length]:
 
 def lengths_of(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
     """Iterations at each photo size, in training order, as set by the options or derived from the photos."""
-    if config.iterations == "auto":
-        return lengths(footage, config.least_iterations)
-    return divided(footage, config.least_iterations, config.iterations)
+    least = config.least_iterations
+    if config.iterations != "auto":
+        return divided(footage, least, config.iterations)
+    wanted = lengths(footage, least)
+    if config.length_growth == 1.0:
+        return wanted
+    longer = sum(count for _level, count in wanted) / least
+    return divided(footage, least, round(least * longer**config.length_growth))
 
 
 def growth_until(each: Sequence[Length]) -> int:

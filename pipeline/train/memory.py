@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.heap import return_free_heap
+from splatpipe.pipeline.engine.machine import resident_bytes as resident_bytes
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.raster.device import free_bytes
 from splatpipe.pipeline.splat.gaussians import Gaussians
@@ -94,12 +93,3 @@ def over_memory(options: TrainConfig) -> bool:
         return False
     return_free_heap()
     return resident_bytes() > GROWTH_STOPS_AT * limit
-
-
-def resident_bytes() -> int:
-    """Resident memory of this process, bytes; 0 if the system does not report it."""
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) * 1024
-    except (OSError, StopIteration, ValueError):
-        return 0

@@ -47,6 +47,9 @@ class TrainConfig(StageConfig):
     enough at each size, at least `least_iterations`. A time budget plans its own number."""
     least_iterations: PositiveInt = 30_000
     """Minimum for `iterations=auto`, however few photos there are."""
+    length_growth: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
+    """How `iterations=auto` grows beyond `least_iterations`, as a power of what the photos ask for: 1 shows every photo
+    as often, however many there are; with 0.5 (`preview`), four times the photos take twice the iterations."""
     max_megapixels: Annotated[float, Field(ge=0.0, le=200.0)] = 0.0
     """Largest size of training photos, reached from smaller ones in steps; 0: that of the dataset."""
     time_budget_s: Annotated[float, Field(ge=0.0, le=LONGEST_BUDGET_S)] = 0.0

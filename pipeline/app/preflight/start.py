@@ -85,6 +85,35 @@ def forecast_text(request: Request) -> str:
     return f"{text}."
 
 
+def shortage_text(request: Request, until: str | None = None) -> str:
+    """Which stages are forecast to exceed the memory limit on a single thread, in a sentence; empty if none does.
+
+    Args:
+        request: The run. Its training keeps to the limit in any case.
+        until: The last stage; None for the whole pipeline.
+    """
+    from splatpipe.pipeline.app.preflight.sizing import size_of
+    from splatpipe.pipeline.engine.machine import memory_limit_bytes
+    from splatpipe.pipeline.engine.source import open_source
+    from splatpipe.stages.costs import REFERENCE
+    from splatpipe.stages.work import TRAINING, CaptureWork
+
+    limit, config = memory_limit_bytes(request.machine.memory_bytes), cast("LineConfig", request.config)
+    source = open_source(request.photos, request.out, request.stages, config)
+    size = size_of(source)
+    if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or not limit:
+        return ""
+    needs = CaptureWork.of(size, config, REFERENCE, 1, limit).needs(1.0)
+    names = [stage.name for stage in request.stages]
+    names = names[: names.index(until) + 1] if until in names else names
+    short = [name for name in names if name not in TRAINING and name in needs and needs[name].memory_bytes > limit]
+    if not short:
+        return ""
+    most = [f"{name} up to {needs[name].memory_bytes / 1e9:.1f} GB" for name in short]
+    text = f"Memory may not suffice: {', '.join(most)} by the forecast, and the limit is {limit / 1e9:.1f} GB"
+    return f"{text}; raise it (--max-memory, the container's limit), or give fewer or smaller photos."
+
+
 def blocks_text(blocks: BlockWork) -> str:
     """How the scene is divided into blocks, and what a block needs, in words."""
     division = blocks.division

@@ -16,7 +16,7 @@ from splatpipe.pipeline.app.report.report_inputs import ReportInputs, results_di
 from splatpipe.pipeline.app.report.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.training import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.verdict import judge
-from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number
+from splatpipe.pipeline.app.report.wording import count, duration, judged_of, judged_size, length, moment, number
 from splatpipe.pipeline.engine.errors import SplatpipeError
 
 if TYPE_CHECKING:
@@ -130,7 +130,8 @@ def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:
             cards.append((title, length(found.get("rmse_3d_m")), f"RMS of {count(found.get('count'))}, in 3D"))
             break
     if evaluate.get("psnr") is not None:
-        text = f"SSIM {number(evaluate.get('ssim'), 2)}, {count(evaluate.get('test_views'))} held-out photos"
+        seen = judged_of(evaluate.get("test_views", 0), evaluate.get("held_out_views", 0), "held-out photo")
+        text = f"SSIM {number(evaluate.get('ssim'), 2)}, {seen}"
         inside = ", inside the boundary" if evaluate.get("whole_psnr") is not None else ""
         at = f", at {size} megapixels" if (size := judged_size(evaluate)) else ""
         cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text + at + inside))

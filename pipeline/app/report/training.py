@@ -98,6 +98,7 @@ def views_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
         "rows_more": max(0, len(views) - MAX_ROWS),
         "mean": [number(metrics["mean"].get(name), digits) for name, _, digits in measures],
         "count": len(views),
+        "not_judged": max(0, metrics.get("held_out_views", len(views)) - len(views)),
         "bounded": "whole" in metrics,
         "judged": judged_size(metrics),
         "floaters": _floaters(metrics.get("floaters") or {}),
@@ -129,7 +130,7 @@ def _view_images(
             figures = list(zip((title for _, title, _ in measures), row["values"], strict=True))
             shown.append({"name": str(view["name"]), "pictures": pictures, "figures": figures})
     bars = [(str(view["name"]), float(view["psnr"])) for view in views if view.get("psnr") is not None]
-    charts = [{"svg": view_bars(bars, "dB"), "text": "All held-out photos, worst first."}] if len(bars) > 1 else []
+    charts = [{"svg": view_bars(bars, "dB"), "text": "All judged photos, worst first."}] if len(bars) > 1 else []
     return {"shown": shown, "charts": charts}
 
 

@@ -12,7 +12,17 @@ from typing import Any, Literal
 
 from splatpipe.pipeline.app.report.adjustment_results import adopted_focals_px, read_adjustment
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import count, duration, judged_size, length, moment, number, plural, share
+from splatpipe.pipeline.app.report.wording import (
+    count,
+    duration,
+    judged_of,
+    judged_size,
+    length,
+    moment,
+    number,
+    plural,
+    share,
+)
 from splatpipe.pipeline.engine.stage import stage_name
 from splatpipe.stages.line import LINE
 
@@ -368,7 +378,8 @@ def _views(inputs: ReportInputs) -> VerdictLine | None:
     level: Level = "good" if value >= PSNR_GOOD_DB else "doubt" if value >= PSNR_DOUBT_DB else "bad"
     quality = {"good": "good image quality", "doubt": "fair image quality", "bad": "poor image quality"}[level]
     at = f", at {size} megapixels" if (size := judged_size(metrics)) else ""
-    text = f"{plural(len(views), 'photo')} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded}{at} "
+    seen = judged_of(len(views), metrics.get("held_out_views", 0), "photo")
+    text = f"{seen} that training never saw: PSNR {number(mean['psnr'], 1)} dB{bounded}{at} "
     text += f"({value:.1f} after colour fit), SSIM {number(mean['ssim'], 2)}: {quality}"
     if level == "good" and worst < PSNR_DOUBT_DB:
         return VerdictLine(

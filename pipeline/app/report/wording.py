@@ -103,6 +103,11 @@ def plural(amount: int, one: str, more: str = "") -> str:
     return f"{amount:,} {one if amount == 1 else more or one + 's'}"
 
 
+def judged_of(judged: int, held_out: int, one: str) -> str:
+    """``37 photos``, or ``8 of 37 photos`` if only some of those held out were judged."""
+    return plural(judged, one) if judged >= held_out else f"{judged:,} of {plural(held_out, one)}"
+
+
 def judged_size(metrics: Mapping[str, Any]) -> str:
     """Megapixels at which held-out photos were evaluated; empty if unknown, as in runs of earlier versions."""
     judged = metrics.get("judged_megapixels")

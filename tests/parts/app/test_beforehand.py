@@ -9,7 +9,8 @@ from command import splatpipe
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.cli_runs import overrides, request_of
-from splatpipe.pipeline.app.preflight.start import forecast_text, require_memory
+from splatpipe.pipeline.app.preflight.start import forecast_text, require_memory, shortage_text
+from splatpipe.pipeline.engine import machine
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.session import Request
@@ -57,12 +58,25 @@ def test_a_run_states_its_cost_and_what_the_memory_limit_leaves_out(tmp_path: Pa
     assert forecast_text(request(tmp_path, "preview", time_budget_s=600.0)).endswith("GB of disk.")
 
 
+def test_a_run_says_which_stages_may_exceed_its_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shortage_text(request(tmp_path, "preview")) == ""
+    tight = request(tmp_path, "preview", max_memory_bytes=1_000_000_000)
+    text = shortage_text(tight)
+    assert "evaluate up to 1.3 GB" in text and "the limit is 1.0 GB" in text and "train" not in text
+    assert "features" not in text  # one photo at a time fits
+    assert shortage_text(tight, "features") == ""
+    monkeypatch.setattr(machine, "available_memory_bytes", lambda root=Path("/"): 400_000_000)
+    assert "features up to 0.4 GB" in shortage_text(request(tmp_path, "preview"), "features")
+
+
 @pytest.mark.parametrize("preset", ["preview", "standard", "high"])
 def test_forecasts_follow_lengths_windows_and_limits(preset: str) -> None:
     config = resolve(LineConfig, [load_preset(preset)])
     small, large = (CaptureSize(photos, 20.0, True) for photos in (50, 1000))
     each = [CaptureWork.of(size, config, REFERENCE, 2) for size in (small, large)]
-    assert all(work.iterations >= 20 * work.size.photos and work.window <= 0.53 for work in each)
+    visits = (20.0, 5.4) if preset == "preview" else (20.0, 20.0)  # a preview's grow with the root of the photos
+    assert all(work.iterations >= least * work.size.photos for work, least in zip(each, visits, strict=True))
+    assert all(work.window <= 0.53 for work in each)
     few, many = (forecast(size, config)["train"] for size in (small, large))
     decoded = 3 * 0.25e6 * (1000 - 50)  # bytes of the additional photos, at less than any preset's size
     assert many.cpu_seconds > few.cpu_seconds and many.scratch_bytes > few.scratch_bytes + decoded

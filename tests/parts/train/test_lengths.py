@@ -125,6 +125,16 @@ def test_a_schedule_grows_gaussians_into_the_finest_size_and_resets_none_there()
     ]
 
 
+def test_a_preview_grows_with_the_root_of_the_photos() -> None:
+    config = TrainConfig(least_iterations=1500, length_growth=0.5)
+    found = {photos: lengths_of(config, footage_of(photos, 0.3)) for photos in (11, 75, 300, 1200)}
+    assert found == {11: [(0, 1500)], 75: [(0, 1500)], 300: [(0, 3000)], 1200: [(0, 6000)]}
+    whole = config.model_copy(update={"length_growth": 1.0})
+    assert lengths_of(whole, footage_of(300, 4.0)) == lengths(footage_of(300, 4.0), 1500)
+    asked = sum(count for _level, count in lengths(footage_of(300, 4.0), 1500))
+    assert sum(count for _level, count in lengths_of(config, footage_of(300, 4.0))) == round((1500 * asked) ** 0.5)
+
+
 def test_many_photos_lengthen_the_phases_and_not_the_steps() -> None:
     few, many = (resolve_schedule(TrainConfig(least_iterations=1500), footage_of(n, 0.3)) for n in (50, 1000))
     assert (few.iterations, many.iterations) == (1500, 20_000)

@@ -40,6 +40,11 @@ SAID = [
     ("clean", {"gaussians": 900, "removed": 100}, "100 of 1,000 Gaussians removed (10.0 %)"),
     ("clean", {"removed": 0}, "nothing removed"),
     ("evaluate", {"test_views": 5, "psnr": 29.006, "ssim": 0.8797}, "5 held-out photos: PSNR 29.0 dB, SSIM 0.88"),
+    (
+        "evaluate",
+        {"test_views": 8, "held_out_views": 37, "psnr": 29.006, "ssim": 0.8797},
+        "8 of 37 held-out photos: PSNR 29.0 dB, SSIM 0.88",
+    ),
     ("flythrough", {"frames": 0}, "no film"),
     ("dsm", {"cells": 0}, "no surface model"),
 ]

@@ -72,6 +72,26 @@ def test_every_nth_view_is_measured_and_the_means_are_theirs(left: Path) -> None
         assert result["mean"][name] == pytest.approx(sum(values) / 3, abs=2e-6)
 
 
+def test_only_as_many_views_as_asked_are_judged_and_their_figures_are_the_same(
+    inputs: Inputs, left: Path, tmp_path: Path
+) -> None:
+    summary = evaluate.run(EvaluateConfig(most_views=2), inputs, tmp_path, tiny_scene.Recorder())
+    few, every = (json.loads((folder / "metrics.json").read_text()) for folder in (tmp_path, left))
+    assert (few["test_views"], few["held_out_views"]) == (2, 3) == (summary["test_views"], summary["held_out_views"])
+    assert every["held_out_views"] == 3
+    assert few["per_view"] == [every["per_view"][0], every["per_view"][2]]
+    assert few["floaters"]["veil"]["photos"] == 2 and len(list((tmp_path / "views").glob("*.render.png"))) == 2
+
+
+def test_judged_views_are_spread_evenly_from_the_first_to_the_last() -> None:
+    names = [f"{number:02}.jpg" for number in range(37)]
+    chosen = [int(name[:2]) for name in view_measures.judged_views(names, 8)]
+    assert chosen[0] == 0 and chosen[-1] == 36 and set(np.diff(chosen)) == {5, 6}
+    assert view_measures.judged_views(names, 0) == view_measures.judged_views(names, 37) == names
+    assert view_measures.judged_views(names, 1) == names[:1] and view_measures.judged_views([], 8) == []
+    assert [len(set(view_measures.judged_views(names[:n], 8))) for n in range(8, 37)] == [8] * 29
+
+
 def test_floaters_are_measured_with_or_without_held_out_views(left: Path, inputs: Inputs, tmp_path: Path) -> None:
     figures = json.loads((left / "metrics.json").read_text())["floaters"]
     assert figures["depth_disagreement"]["pixels"] > 0 and 0.0 <= figures["depth_disagreement"]["median"] < 0.1
