@@ -32,8 +32,8 @@ beside 250 of the stage itself. Training's value dates from before its frames we
 
 
 BOUNDS = ("sparse",)
-"""Stages whose memory is bounded from above: what mapping takes depends on whether it leaves photos to the ladder, whose
-matching of stronger keypoints takes 1 to 3.3 GB."""
+"""Stages whose memory is bounded from above: mapping takes much more if it leaves photos to the ladder, which matches
+stronger keypoints: 1 to 3.3 GB."""
 
 
 @dataclass(frozen=True)
