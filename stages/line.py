@@ -44,7 +44,7 @@ FEATURES = Stage(
 )
 MATCHES = Stage(
     "matches",
-    version=2,
+    version=3,
     config=MatchesConfig,
     reads=("features.database", "ingest.photos", "ingest.positions"),
     parts={"database": "database.db", "pairs": "pairs.json"},
@@ -52,7 +52,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=7,
+    version=8,
     config=SparseConfig,
     reads=(
         "matches.database",
@@ -188,7 +188,7 @@ CLEAN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=10,
+    version=11,
     config=EvaluateConfig,
     reads=(
         "clean.model",
@@ -206,7 +206,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=9,
+    version=10,
     config=ExportConfig,
     reads=(
         "clean.model",
