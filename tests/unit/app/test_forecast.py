@@ -42,9 +42,10 @@ def test_every_stage_has_a_forecast_that_grows_with_the_preset() -> None:
     assert {stage.name for stage in LINE} <= set(preview)
     for less, more in ((preview, standard), (standard, high)):
         assert whole(less).cpu_seconds < whole(more).cpu_seconds
-        assert less["train"].memory_bytes < more["train"].memory_bytes
+        assert whole(less).memory_bytes <= whole(more).memory_bytes
         assert whole(less).disk_bytes < whole(more).disk_bytes
         assert all(less[name].cpu_seconds <= more[name].cpu_seconds for name in less)
+    assert preview["train"].memory_bytes < standard["train"].memory_bytes  # standard has as many Gaussians as high
 
 
 def test_disabled_stages_cost_nothing() -> None:
