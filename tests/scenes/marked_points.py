@@ -25,7 +25,9 @@ def by_gps_alone(demo_run: Path, home: Path) -> Path:
     shutil.copytree(capture_path(), home / "photos of a house")
     (home / "points.csv").write_text(POINTS)
     out = linked_copy(demo_run, home / "out")
-    config = re.sub(r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text())
+    config = re.sub(
+        r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text(), count=1
+    )
     (out / "config.toml").unlink()
     (out / "config.toml").write_text(config)
     for stage in ("control", "targets", "georef"):

@@ -386,7 +386,9 @@ def found_run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = [",".join([name, *place]) for name, place in places.items()]
     (home / "photos of a house" / "control.csv").write_text("\n".join([listed[0][0], "name,x,y,z", *rows, ""]))
     out = linked_copy(demo_run, home / "out")
-    config = re.sub(r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text())
+    config = re.sub(
+        r"(?m)^photos = .*$", f'photos = "{home / "photos of a house"}"', (out / "config.toml").read_text(), count=1
+    )
     (out / "config.toml").unlink()
     (out / "config.toml").write_text(config)
     for stage in ("control", "georef"):  # the points are the demo's, and so are the targets that were found
