@@ -107,7 +107,9 @@ def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
                 "cpu": outcome.cpu,
                 "disk": outcome.disk,
                 "bound": max(outcome.bounds.values(), default=math.nan),
-                "holds": " ".join("yes" if well else "NO" for well in holds(outcome)),
+                "holds": ""
+                if math.isnan(outcome.memory)
+                else " ".join("yes" if well else "NO" for well in holds(outcome)),
                 **{stage: outcome.stages.get(stage, math.nan) for stage in SHOWN},
             }
         )
