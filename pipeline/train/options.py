@@ -49,7 +49,7 @@ class TrainConfig(StageConfig):
     """Minimum for `iterations=auto`, however few photos there are."""
     length_growth: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
     """How `iterations=auto` grows beyond `least_iterations`, as a power of what the photos ask for: 1 shows every photo
-    as often, however many there are; with 0.5 (`preview`), four times the photos take twice the iterations."""
+    as often, however many there are; with 0.5, four times the photos take twice the iterations."""
     max_megapixels: Annotated[float, Field(ge=0.0, le=200.0)] = 0.0
     """Largest size of training photos, reached from smaller ones in steps; 0: that of the dataset."""
     time_budget_s: Annotated[float, Field(ge=0.0, le=LONGEST_BUDGET_S)] = 0.0
