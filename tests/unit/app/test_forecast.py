@@ -42,7 +42,7 @@ def test_every_stage_has_a_forecast_that_grows_with_the_preset() -> None:
     assert {stage.name for stage in LINE} <= set(preview)
     for less, more in ((preview, standard), (standard, high)):
         assert whole(less).cpu_seconds < whole(more).cpu_seconds
-        assert less["train"].memory_bytes < more["train"].memory_bytes
+        assert less["features"].memory_bytes < more["features"].memory_bytes
         assert whole(less).disk_bytes < whole(more).disk_bytes
         assert all(less[name].cpu_seconds <= more[name].cpu_seconds for name in less)
 
