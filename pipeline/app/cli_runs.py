@@ -96,10 +96,12 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
 
 def _memory_limit(config: LineConfig, device: str) -> int:
     """The user's limit on this machine's memory, bytes; 0 without one, or if it is for a CUDA device's."""
+    limit = config.train.max_memory_bytes
+    if not limit or device == "cpu":
+        return limit
     from splatpipe.pipeline.raster.cuda_library import why_not
 
-    limit = config.train.max_memory_bytes
-    return 0 if limit and device != "cpu" and why_not() is None else limit
+    return limit if why_not() else 0
 
 
 def spent_s() -> float:

@@ -29,9 +29,8 @@ PREVIEW_SUFFIX = ".thm"  # a JPEG beside a camera's film or photo
 _TAG = "|".join(sorted(TAGS, key=len, reverse=True))
 _AFTER = re.compile(rf"(?P<owner>.+)[ ._-](?P<tag>{_TAG})")
 _BEFORE = re.compile(rf"(?P<tag>{_TAG})[ ._-](?P<owner>.+)")
-_COLOUR = re.compile(
-    r"(?:rgb|colou?r|image|img|frame|photo)[ ._-]?(?=.)"
-)  # what the photo has where the map has its tag
+# What the photo has where the map has its tag.
+_COLOUR = re.compile(r"(?:rgb|colou?r|image|img|frame|photo)[ ._-]?(?=.)")
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ def _measured(metric: metrics.Metric, pair: metrics.ImagePair) -> float | None:
 
 
 def judged_views(held_out: Sequence[str], most: int) -> list[str]:
-    """The held-out photos that are judged: at most ``most`` (0: all), evenly spread, the first and the last among them.
+    """The held-out photos that are judged: at most ``most`` (0: all), the middle one of as many equal stretches.
 
     In order of name photos follow the capture's path, so these are spread in space and time.
 
@@ -112,7 +112,7 @@ def judged_views(held_out: Sequence[str], most: int) -> list[str]:
     """
     if most == 0 or len(held_out) <= most:
         return list(held_out)
-    return [held_out[round(place)] for place in np.linspace(0, len(held_out) - 1, most)]
+    return [held_out[(2 * stretch + 1) * len(held_out) // (2 * most)] for stretch in range(most)]
 
 
 def mean_measures(per_view: Sequence[dict[str, Any]]) -> dict[str, float | None]:

@@ -42,9 +42,7 @@ STEPS = {
     WIDE_FISHEYE: (("k2",), ("cx", "cy"), ("k3",), ("k4",)),
 }
 PASSES = 2  # a group rejected with a wrong lens may be justified with a better one
-WIDE_ANGLE = (
-    1.2  # tangent of the widest angle off the axis at which photos have points, above which it may be a fisheye
-)
+WIDE_ANGLE = 1.2  # tangent of the widest angle off the axis at which photos have points: above, it may be a fisheye
 
 
 @dataclass(frozen=True)
@@ -168,7 +166,7 @@ class LensTrial:
             row = {
                 "freed": "fisheye",
                 "held_out_gain": round(gain, 4),
-                "over_pinhole": round(over, 4),
+                "over_pinhole": round(over, 4) if math.isfinite(over) else None,
                 "kept": sure and clear and wide,
             }
             kept[number] = sure and clear and wide

@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.reduction import copy_photos
 from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
 PAIRS_A_PROCESS = 12  # at least: a process takes half a second to start
-PROCESS_BYTES = 400_000_000  # of a matching process, at most: 0.16 to 0.27 GB with 1,300 to 10,000 keypoints a photo
+PROCESS_BYTES = 400_000_000  # of a matching process, at most: 0.16 to 0.27 GB on six captures
 MATCHER = "splatpipe.pipeline.sfm.matching_process"
 
 

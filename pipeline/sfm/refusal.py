@@ -6,10 +6,9 @@ from collections import Counter
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.sfm.pairs import components
 from splatpipe.pipeline.sfm.view_graph import ViewGraph
 
 FEW_KEYPOINTS = 200  # per photo, median; a drone's photo has thousands, and a thermal one some dozens
@@ -68,11 +67,6 @@ def refusal(placed: int, least: int, verified: ViewGraph, tried: int) -> Splatpi
 
 def _largest_group(verified: ViewGraph) -> tuple[int, int]:
     """How many photos the largest group of matching photos has, and how many matches its best pair has."""
-    pairs = list(verified.matches)
-    if not pairs:
-        return 1, 0
-    place = {number: at for at, number in enumerate(sorted(verified.names))}
-    rows, columns = ([place[pair[side]] for pair in pairs] for side in (0, 1))
-    graph = coo_array((np.ones(len(pairs)), (rows, columns)), shape=(len(place), len(place)))
-    _, labels = connected_components(graph, directed=False)
-    return int(np.bincount(labels).max()), max(map(len, verified.matches.values()))
+    places = {number: place for place, number in enumerate(sorted(verified.names))}
+    groups = components([(places[i], places[j]) for i, j in verified.matches], len(places))
+    return int(np.bincount(groups).max()), max(map(len, verified.matches.values()), default=0)

@@ -21,9 +21,8 @@ MAX_LINE_CHARS = 2000
 LARGEST = 1e9  # of a coordinate, metres or pixels: larger ones are neither on the earth nor in a photo
 UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
 CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg|coordinate[ _]?system)\s*[:=]\s*(\S.*)", re.IGNORECASE)
-AUTHORITY = re.compile(
-    r'\bEPSG(?:::?\s*|"\s*,\s*")(\d{4,6})\b', re.IGNORECASE
-)  # EPSG:1, EPSG::1, AUTHORITY["EPSG","1"]
+# EPSG:1, EPSG::1, AUTHORITY["EPSG","1"]
+AUTHORITY = re.compile(r'\bEPSG(?:::?\s*|"\s*,\s*")(\d{4,6})\b', re.IGNORECASE)
 SEPARATOR_LINE = re.compile(r'"?sep=.?"?', re.IGNORECASE)  # the first line that a spreadsheet writes
 UNITS = re.compile(r"[ _]*[(\[][^)\]]*[)\]]$")  # after a title
 GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "gps_longitude", "x/longitude", "longitude_deg")

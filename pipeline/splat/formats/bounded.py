@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import zlib
 from collections.abc import Callable
 from io import BufferedIOBase, BufferedReader
@@ -105,7 +106,7 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
         raise SplatpipeError(
             f"{path} has values that are not numbers in {len(bad)} of {len(gaussians)} Gaussians "
             f"(the first is number {int(bad[0])}).",
-            hint=f"Remove them: splatpipe edit {path} cleaned.ply --clean",
+            hint=f"Remove them: {_cleaning(path)}",
         )
     if not len(gaussians):
         return
@@ -113,14 +114,19 @@ def check_values(path: Path, gaussians: Gaussians) -> None:
         raise SplatpipeError(
             f"{path}: scales as large as exp({float(gaussians.log_scales.max()):.6g}) are not valid for a splat.",
             hint="A splat file holds the scales' logarithms; this file appears to hold something else. If it is only a "
-            f"few Gaussians, remove them: splatpipe edit {path} cleaned.ply --clean",
+            f"few Gaussians, remove them: {_cleaning(path)}",
         )
     if max(float(gaussians.means.max()), -float(gaussians.means.min())) > MAX_COORDINATE:
         far = int((gaussians.means.abs().amax(1) > MAX_COORDINATE).sum())
         raise SplatpipeError(
             f"{path} has coordinates beyond {MAX_COORDINATE:g} in {far} of {len(gaussians)} Gaussians.",
-            hint=f"Remove them: splatpipe edit {path} cleaned.ply --clean",
+            hint=f"Remove them: {_cleaning(path)}",
         )
+
+
+def _cleaning(path: Path) -> str:
+    """The command that drops a file's unusable values, for a shell, whatever the file is called."""
+    return f"splatpipe edit {shlex.quote(str(path))} cleaned.ply --clean"
 
 
 def keep_unusable(path: Path, gaussians: Gaussians) -> None:

@@ -74,7 +74,7 @@ def test_forecasts_follow_lengths_windows_and_limits(preset: str) -> None:
     config = resolve(LineConfig, [load_preset(preset)])
     small, large = (CaptureSize(photos, 20.0, True) for photos in (50, 1000))
     each = [CaptureWork.of(size, config, REFERENCE, 2) for size in (small, large)]
-    visits = (20.0, 5.4) if preset == "preview" else (20.0, 20.0)  # a preview's grow with the root of the photos
+    visits = (20.0, 5.4) if preset == "preview" else (20.0, 20.0)  # a preview's fall: train.length_growth
     assert all(work.iterations >= least * work.size.photos for work, least in zip(each, visits, strict=True))
     assert all(work.window <= 0.53 for work in each)
     few, many = (forecast(size, config)["train"] for size in (small, large))
