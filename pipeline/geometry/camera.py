@@ -146,8 +146,15 @@ class Camera:
         Args:
             points: World points; those at or behind the camera's plane have no meaningful projection.
         """
-        in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
-        return self.pixels_of(in_camera[:, :2] / in_camera[:, 2:])
+        in_camera = points @ self.cam_from_world[:3, :3].T
+        in_camera += self.cam_from_world[:3, 3]
+        pixels = np.empty((len(points), 2))
+        for axis, (focal, centre) in enumerate(((self.fx, self.cx), (self.fy, self.cy))):
+            column = pixels[:, axis]  # by columns: numpy takes three times as long for rows of two
+            np.divide(in_camera[:, axis], in_camera[:, 2], out=column)
+            column *= focal
+            column += centre
+        return pixels
 
     def pixels_of(self, rays: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
         """Pixels of rays given as x / z and y / z in the camera frame."""
@@ -160,7 +167,8 @@ class Camera:
         depths = self.depths(points)
         rows = np.flatnonzero((depths > 0.0) & np.isfinite(depths))
         pixels = self.project(points[rows])
-        inside = ((pixels >= 0.0) & (pixels < [self.width, self.height])).all(axis=1)
+        x, y = pixels.T
+        inside = (x >= 0.0) & (x < self.width) & (y >= 0.0) & (y < self.height)
         return rows[inside], pixels[inside], depths[rows[inside]]
 
     def unproject(
