@@ -71,6 +71,7 @@ def with_boundary(assignments: Sequence[str] | None, boundary: str | None) -> li
 
 
 def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
+    from splatpipe.pipeline.app.preflight.start import memory_limit
     from splatpipe.pipeline.engine.session import Request
     from splatpipe.pipeline.engine.source import with_absolute_files
     from splatpipe.pipeline.engine.stage import Machine
@@ -89,19 +90,9 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
             raise missing.error()
     if os.environ.get("SPLATPIPE_ISA"):  # an invalid one is reported now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401
-    machine = Machine(device, threads or available_cores(), began_s, _memory_limit(config, device))
+    machine = Machine(device, threads or available_cores(), began_s, memory_limit(config, device))
     forecast_needs = Forecaster(config, machine.threads)
     return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, forecast_needs)
-
-
-def _memory_limit(config: LineConfig, device: str) -> int:
-    """The user's limit on this machine's memory, bytes; 0 without one, or if it is for a CUDA device's."""
-    limit = config.train.max_memory_bytes
-    if not limit or device == "cpu":
-        return limit
-    from splatpipe.pipeline.raster.cuda_library import why_not
-
-    return limit if why_not() else 0
 
 
 def spent_s() -> float:

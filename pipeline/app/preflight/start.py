@@ -31,6 +31,12 @@ def require_readable(request: Request) -> None:
             read(path)
 
 
+def memory_limit(config: LineConfig, device: str) -> int:
+    """The user's limit on this machine's memory, bytes; 0 without one, or if it is for a CUDA device's."""
+    limit = config.train.max_memory_bytes
+    return 0 if limit and _on_cuda(device) else limit
+
+
 def require_memory(request: Request) -> None:
     """Check that training fits the memory limit; a CUDA device's memory is known only when training starts.
 
@@ -42,7 +48,7 @@ def require_memory(request: Request) -> None:
 
     config = cast("LineConfig", request.config)
     limit, least = config.train.max_memory_bytes, min_memory_bytes(config)
-    if 0 < limit < least and not _on_cuda(request):
+    if 0 < limit < least and not _on_cuda(request.machine.device):
         raise MachineError(
             f"Training does not fit in {limit / 1e9:.2f} GB: the libraries alone take most of {least / 1e9:.2f} GB.",
             hint=f"Give --max-memory at least {-(-least // 1_000_000)}M.",
@@ -63,7 +69,7 @@ def forecast_text(request: Request) -> str:
     config, threads = cast("LineConfig", request.config), request.machine.threads
     source = open_source(request.photos, request.out, request.stages, config)
     size = size_of(source)
-    if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request):
+    if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request.machine.device):
         return ""
     memory = available_memory_bytes()
     work = CaptureWork.of(size, config, REFERENCE, threads, memory)
@@ -122,11 +128,11 @@ def blocks_text(blocks: BlockWork) -> str:
     return f"{text}, about {round(blocks.load.trained, -3):,.0f} Gaussians and {blocks.photos:.0f} photos each"
 
 
-def _on_cuda(request: Request) -> bool:
-    """Whether training will run on a CUDA device."""
+def _on_cuda(device: str) -> bool:
+    """Whether training will run on a CUDA device, by the device that was asked for."""
     from splatpipe.pipeline.raster.cuda_library import why_not
 
-    return request.machine.device != "cpu" and why_not() is None
+    return device != "cpu" and why_not() is None
 
 
 def _read_control(path: Path) -> None:
