@@ -90,7 +90,9 @@ def test_only_new_trainings_run(dataset: Path, tmp_path: Path, capfd: pytest.Cap
 
 def test_following_a_training_reports_how_far_its_end_is_below_its_best(dataset: Path, tmp_path: Path) -> None:
     work = tmp_path / "work"
-    code, found = ablate(dataset, work, "--variants", "/dev/null", "--seeds", "1", "--curve", "1e-3")
+    none = tmp_path / "none.toml"
+    none.touch()
+    code, found = ablate(dataset, work, "--variants", str(none), "--seeds", "1", "--curve", "1e-3")
     (path,) = (work / "runs").glob("*/curve.json")
     curve = [each["psnr"] for each in json.loads(path.read_text())["rows"]]
     (only,) = found["rows"]
