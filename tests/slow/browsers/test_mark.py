@@ -48,7 +48,8 @@ def marking(gps_run: Path) -> Iterator[tuple[Served, Path]]:
 
 
 def state(page: Page) -> Any:
-    """Return what the page shows, once no request is pending."""
+    """Return what the page shows, once it has begun and no request is pending."""
+    page.evaluate("splatpipe.mark.ready")
     assert page.evaluate("splatpipe.mark.settled()") == 0
     return page.evaluate("splatpipe.mark.state()")
 
