@@ -150,7 +150,7 @@ BLOCKS = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=14,
+    version=15,
     config=TrainConfig,
     reads=(
         "undistort.dataset",

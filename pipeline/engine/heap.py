@@ -16,9 +16,10 @@ def return_free_heap() -> None:
 
 @contextlib.contextmanager
 def importing() -> Iterator[None]:
-    """Pause garbage collection while large libraries are imported: what they create stays, so it would find nothing."""
+    """Pause garbage collection while large libraries are imported: what they create stays, uncollected."""
     gc.disable()
     try:
         yield
     finally:
+        gc.freeze()
         gc.enable()

@@ -80,6 +80,7 @@ class Frame:
         rates: Sequence[Tensor],
         options: tuple[float, float, float, int],
         log_scale_limits: tuple[float, float],
+        far: tuple[float, float, float, float] | None,
         logit_gain: Tensor | None,
         seen: tuple[Tensor, Tensor] | None,
     ) -> int:
@@ -94,6 +95,7 @@ class Frame:
             rates: As for ``adam_step``.
             options: As for ``adam_step``.
             log_scale_limits: The stepped log-scales are clamped to these.
+            far: Centre x, y, z and unit of ``FarSteps``, which lengthens the steps of far positions; None for none.
             logit_gain: Derivative of the rendered logits with respect to the stepped ones; None if they are the same.
             seen: Written: the stepped rows, ascending, int64 (visible,), and dL/d(their centres on screen), pixels
                 (visible, 2), from the first entry on; None if not needed.

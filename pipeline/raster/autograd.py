@@ -60,6 +60,7 @@ class UnfinishedRender:
         rates: Mapping[str, Tensor],
         options: tuple[float, float, float, int],
         log_scale_limits: tuple[float, float],
+        far: tuple[float, float, float, float] | None,
     ) -> int:
         """Finish the pass and step the visible rows of the parameters; the probe gets a sparse gradient.
 
@@ -69,6 +70,7 @@ class UnfinishedRender:
             rates: Learning rate of every value of a row.
             options: As for ``_native.adam_step``.
             log_scale_limits: Limits to which the log-scales of these rows are clamped.
+            far: The centre and the unit of ``FarSteps``; None if no steps are lengthened.
 
         Returns:
             Number of rows skipped because their gradients were not finite.
@@ -83,6 +85,7 @@ class UnfinishedRender:
             [rates[name] for name in PARAMETERS],
             options,
             log_scale_limits,
+            far,
             None if self.logits_are_leaf else values["opacity_logits"].grad,
             seen,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,6 +17,7 @@ from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward
 from splatpipe.pipeline.raster.device import take_rows
 from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.step_lengths import FarSteps
 from splatpipe.pipeline.splat.gaussians import PARAMETERS
 
 _MEAN = "mean."
@@ -83,6 +85,7 @@ class Adam:
         visible: Bool[Tensor, " n"] | None = None,
         buffers: GradientBuffers | None = None,
         limits: Limits | None = None,
+        far: FarSteps | None = None,
     ) -> None:
         """Step the parameters in place against their ``.grad``; those without one are left alone.
 
@@ -97,6 +100,7 @@ class Adam:
             buffers: The gradient buffers of the render.
             limits: Values are clamped to these after the step, including rows not stepped (except on CUDA, where those
                 have been clamped before).
+            far: Lengthens the steps of far ``means``.
 
         Raises:
             ValueError: if a tensor does not match the moments, or cannot be stepped in place.
@@ -109,13 +113,14 @@ class Adam:
         if unfinished is not None and not fuses:
             unfinished.finish(parameters)  # before anything is changed, because it needs memory
         self.step_count += 1
-        if isinstance(unfinished, UnfinishedBackward) and fuses:
-            self._step_fused(parameters, rates, unfinished, visible is not None, limits)
-            return
         if isinstance(unfinished, UnfinishedRender) and fuses:
-            self._step_seen(parameters, rates, unfinished, limits)
+            self._step_seen(parameters, rates, unfinished, limits, far)
         else:
-            self._step_rows(parameters, rates, visible)
+            with nullcontext() if far is None else far.lengthened(parameters["means"].detach(), visible):
+                if isinstance(unfinished, UnfinishedBackward) and fuses:
+                    self._step_fused(parameters, rates, unfinished, visible is not None, limits)
+                    return
+                self._step_rows(parameters, rates, visible)
             self._held = None
         if self._held != limits:
             for name, (least, most) in (limits or {}).items():
@@ -155,6 +160,7 @@ class Adam:
         rates: Mapping[str, Rate],
         unfinished: UnfinishedRender,
         limits: Limits | None,
+        far: FarSteps | None,
     ) -> None:
         """Finish a backward pass on the CPU, fused with a step of the visible rows."""
         self._skipped += unfinished.step(
@@ -163,6 +169,7 @@ class Adam:
             {name: _columns(rates[name], parameters[name]) for name in PARAMETERS},
             (*self.betas, self.epsilon, self.step_count),
             (limits or {}).get("log_scales", (-math.inf, math.inf)),
+            None if far is None else (*far.centre, far.unit),
         )
 
     def _step_fused(
@@ -306,4 +313,6 @@ def _gradient(parameter: Tensor) -> Tensor:
 
 def _columns(rate: Rate, parameter: Tensor) -> Float[Tensor, " width"]:
     """The rate of every value of a row."""
+    if not isinstance(rate, Tensor):
+        return torch.full((math.prod(parameter.shape[1:]),), rate, dtype=torch.float32)
     return torch.as_tensor(rate, dtype=torch.float32).expand(parameter.shape[1:]).reshape(-1).contiguous()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -16,6 +15,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.device import CPU, take_rows
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, free_frames
+from splatpipe.pipeline.raster.step_lengths import FarSteps
 from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.sh import coefficient_count
 from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint, HostArrays
@@ -33,7 +33,6 @@ from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.memory import within_room
 from splatpipe.pipeline.train.plan import TrainingPlan
 from splatpipe.pipeline.train.schedule import ScheduleStep
-from splatpipe.pipeline.train.step_lengths import lengthen_far_steps
 from splatpipe.pipeline.train.techniques import Techniques
 
 SMALLEST_SCALE = 1e-6  # of a Gaussian, relative to the scene's extent: float32 covariances stay non-singular
@@ -153,11 +152,9 @@ class TrainState:
         limits = {"log_scales": (math.log(SMALLEST_SCALE * extent), math.log(LARGEST_SCALE * extent))}
         self._hand_gradients()
         tensors, rows = self.gaussians.tensors(), gradient_rows if given.sparse else None
-        steps = (
-            lengthen_far_steps(tensors["means"].detach(), rows, camera, extent) if given.by_distance else nullcontext()
-        )
-        with steps:
-            self.adam.step(tensors, rates, rows, buffers=self.buffers, limits=limits)
+        x, y, z = camera.centre().tolist()
+        far = FarSteps((x, y, z), extent) if given.by_distance else None
+        self.adam.step(tensors, rates, rows, buffers=self.buffers, limits=limits, far=far)
         self._drop_gradients()
 
     def _hand_gradients(self) -> None:

@@ -50,6 +50,8 @@ using PictureGradientArrays = std::tuple<std::optional<Cube<const float>>, std::
                                          std::optional<Grid<const float>>, std::optional<Grid<const float>>>;
 // for each parameter, the learning rate of each value of a row
 using RateArrays = std::array<Line<const float>, 5>;
+// centre, unit
+using FarTuple = std::array<float, 4>;
 // rows that are stepped; the gradients for their centres on the screen
 using SeenArrays = std::tuple<Line<int64_t>, Grid<float>>;
 // beta1, beta2, epsilon; the step, from 1
@@ -180,7 +182,7 @@ class Frame {
 
     int64_t step(const ParameterArrays<const float>& arrays, const ParameterArrays<float>& values,
                  const ParameterArrays<float>& means, const ParameterArrays<float>& squares, const RateArrays& rates,
-                 const AdamTuple& options, const std::array<float, 2>& limits,
+                 const AdamTuple& options, const std::array<float, 2>& limits, const std::optional<FarTuple>& far,
                  const std::optional<Line<const float>>& logit_gain, const std::optional<SeenArrays>& seen) {
         const splat::Parameters in = rendered(arrays);
         const size_t n = std::get<0>(values).shape(0);
@@ -192,6 +194,8 @@ class Frame {
         step.options = {beta1, beta2, epsilon, number};
         if (!splat::are_adam_options(step.options)) throw nb::value_error("options");
         step.log_scale_min = limits[0], step.log_scale_max = limits[1];
+        step.far.unit = std::numeric_limits<float>::infinity();
+        if (far) step.far = {{(*far)[0], (*far)[1], (*far)[2]}, (*far)[3]};
         step.logit_gain = logit_gain ? checked(*logit_gain, n, "logit_gain") : nullptr;
         if (seen) {
             const size_t visible = frame_->visible();
@@ -244,7 +248,8 @@ void bind_raster(nb::module_& m) {
              nb::arg("outputs").noconvert(), nb::arg("means2d").noconvert())
         .def("step", &Frame::step, nb::arg("parameters").noconvert(), nb::arg("values").noconvert(),
              nb::arg("means").noconvert(), nb::arg("squares").noconvert(), nb::arg("rates").noconvert(), "options"_a,
-             "log_scale_limits"_a, nb::arg("logit_gain").noconvert().none(), nb::arg("seen").noconvert().none())
+             "log_scale_limits"_a, "far"_a.none(), nb::arg("logit_gain").noconvert().none(),
+             nb::arg("seen").noconvert().none())
         .def_prop_ro("pairs", &Frame::pairs)
         .def_prop_ro("visible", &Frame::visible)
         .def("contributing_pairs", &Frame::contributing_pairs, nb::call_guard<nb::gil_scoped_release>());

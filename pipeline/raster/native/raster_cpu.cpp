@@ -1,6 +1,7 @@
 #include "raster_cpu.h"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <mutex>
 #include <utility>
@@ -82,6 +83,28 @@ void hold_scales(const FrameStep& step, const int32_t* rows, int count) {
         }
 }
 
+// Lengthens the steps of those of some rows that were far from the camera before; the same operations, in the same
+// order, as in step_lengths.py.
+void lengthen_steps(const FrameStep& step, const int32_t* rows, int count, const float* before) {
+    constexpr float kNoDistance = 1e-30f;
+    for (int i = 0; i < count; ++i, before += 3) {
+        if (rows[i] < 0) continue;
+        float ray[3];
+        for (int axis = 0; axis < 3; ++axis) ray[axis] = before[axis] - step.far.centre[axis];
+        const float distance = std::sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]);
+        if (!(distance > step.far.unit)) continue;
+        float* const value = step.tensors[0].values + 3 * int64_t{rows[i]};
+        const float factor = distance / step.far.unit;
+        float moved[3];
+        for (int axis = 0; axis < 3; ++axis) {
+            moved[axis] = (value[axis] - before[axis]) * factor;
+            ray[axis] /= std::max(distance, kNoDistance);
+        }
+        const float along = (moved[0] * ray[0] + moved[1] * ray[1] + moved[2] * ray[2]) * (factor - 1.0f);
+        for (int axis = 0; axis < 3; ++axis) value[axis] = before[axis] + moved[axis] + along * ray[axis];
+    }
+}
+
 // Prefetches rows that are stepped soon: a CPU cannot predict where they are.
 void fetch_moments(const AdamJob& job, const int32_t* rows, int count) {
     constexpr int kLineFloats = 16;
@@ -158,7 +181,11 @@ int64_t RasterFrame::step(const Parameters& in, const FrameStep& step) {
             int32_t rows[kBackRows];
             for (int i = 0; i < count; ++i) rows[i] = data_.keys[first + i] == kCulled ? -1 : data_.rows[first + i];
             at = end_gradients(step, rows, count, at, &back);
+            float before[3 * kBackRows];
+            for (int i = 0; i < count; ++i)
+                std::copy_n(step.tensors[0].values + 3 * int64_t{data_.rows[first + i]}, 3, before + 3 * i);
             skipped[static_cast<std::size_t>(task)] += kernels.some(adam.job(), rows, count, gradients);
+            lengthen_steps(step, rows, count, before);
             hold_scales(step, rows, count);
         }
     });

@@ -69,12 +69,19 @@ class Buffer {
     int64_t capacity_ = 0;
 };
 
+// Positions farther than `unit` from `centre` are stepped farther, as step_lengths.py says.
+struct FarSteps {
+    float centre[3];
+    float unit;  // infinite: none is
+};
+
 // The optimizer step fused with the end of a backward pass.
 struct FrameStep {
     std::vector<AdamRows> tensors;  // means, log_scales, quats, opacity_logits, sh, without gradients
     int64_t count;                  // rows, those of the rendered Gaussians first: the others are left unchanged
     AdamOptions options;
     float log_scale_min, log_scale_max;  // clamps the stepped rows afterwards
+    FarSteps far;                        // lengthens the steps of far rows
     const float* logit_gain;             // (count,): d(rendered logit) / d(stepped logit); null: 1
     int64_t* seen;                       // (visible()): the stepped rows, ascending; null if not needed
     float* means2d;                      // (visible(), 2): their gradients, as in ParameterGradients

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render, set_threads
+from splatpipe.pipeline.raster.step_lengths import FarSteps
 from splatpipe.pipeline.splat.gaussians import Gaussians
 from splatpipe.pipeline.train.dropout import _DropoutLogits
 
 LIMITS = {"log_scales": (-2.5, -1.0)}
 WIDE, TALL = random_camera(0), random_camera(3, 31, 64)
 STEPS = 4
+FAR = FarSteps((0.3, -0.2, 0.1), 2.0)  # in the middle of the scenes
 
 
 pytestmark = pytest.mark.usefixtures("isa")
@@ -49,7 +51,7 @@ def trained(start: Gaussians, fused: bool, dropout: bool = False, magnitudes: bo
         pictures = (rendered.colour, rendered.alpha, rendered.depth_square_sum)
         torch.stack([picture.square().mean() for picture in pictures if picture.requires_grad]).sum().backward()
         assert (scene.sh.grad is None) == fused
-        optimizer.step(scene.tensors(), rates_of(scene), rendered.visible, buffers, LIMITS)
+        optimizer.step(scene.tensors(), rates_of(scene), rendered.visible, buffers, LIMITS, FAR)
         assert probe.grad.is_sparse == fused
         probes.append(probe.grad.to_dense())
         for tensor in scene.tensors().values():

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 
-from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.train.step_lengths import lengthen_far_steps
+from splatpipe.pipeline.raster.step_lengths import FarSteps
 
 UNIT = 10.0
-
-
-def camera_at(centre: tuple[float, float, float]) -> Camera:
-    pose = np.eye(4)
-    pose[:3, 3] = -np.array(centre)
-    return Camera("a.jpg", 100, 50, 80.0, 80.0, 50.0, 25.0, pose)
 
 
 def stepped(means: torch.Tensor, step: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
     """Return how far each Gaussian moves for a given step."""
     moved = means.clone()
-    with lengthen_far_steps(moved, rows, camera_at((1.0, 2.0, 3.0)), UNIT):
+    with FarSteps((1.0, 2.0, 3.0), UNIT).lengthened(moved, rows):
         moved += step
     return moved - means
 
