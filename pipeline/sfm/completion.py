@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import pycolmap
 
 from splatpipe.pipeline.sfm.coarseness import coarseness
+
+Progress: TypeAlias = Callable[[int, int, str, str], None]
+"""Called with what is done, of how many, the current step, and the unit of both."""
 
 MIN_MATCHES = 15  # verified matches of a pair; COLMAP's own minimum
 STRICT_PX = 2.0  # filtered observations return only within this error, or they would come and go forever
@@ -17,6 +22,7 @@ FINE_TOLERANCE, FINE_ITERATIONS = 1e-5, 100
 GRADIENT_TOLERANCE = 1e-6  # COLMAP's 1.0 stops while a focal length is still some pixels off
 # Wrong matches along an epipolar line have no third view to expose them, and bias the cameras. On flights with known
 # ground truth Cauchy loss left a third less of that bias than SOFT_L1, and the demo's centres 13 % nearer to the truth.
+ADJUSTING = "adjusting everything (at most)"
 ROBUST_PX = 1.0  # scale of the loss: twice the keypoint noise
 
 
@@ -26,6 +32,7 @@ def complete(
     options: pycolmap.IncrementalPipelineOptions,
     stop: pycolmap.CancellationToken,
     place_left: bool = True,
+    on_progress: Progress = lambda *_: None,
 ) -> None:
     """Add all verified matches to a model, in place, and adjust it to convergence, on one thread.
 
@@ -38,6 +45,7 @@ def complete(
         options: The mapper's options, with its seeds.
         stop: Ends an adjustment early.
         place_left: Also place photos that need all matches; the ladder, with its own criteria, passes False.
+        on_progress: Called from this thread before each photo and each round of adjustment.
     """
     cache_options = pycolmap.DatabaseCacheOptions()
     cache_options.min_num_matches = MIN_MATCHES
@@ -46,15 +54,19 @@ def complete(
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     triangulation, mapping = options.get_triangulation(), options.get_mapper()
-    for number in sorted(model.reg_image_ids()):
+    placed = sorted(model.reg_image_ids())
+    for done, number in enumerate(placed):
+        on_progress(done, len(placed), "adding all matches", "photos")
         mapper.triangulate_image(triangulation, number)
     mapper.complete_and_merge_tracks(triangulation)
     if place_left:
         _place_left(mapper, mapping, triangulation)
+    on_progress(0, 1 + MAX_ROUNDS, ADJUSTING, "rounds")
     _adjust(mapper, options, stop, rough=True)
     mapper.filter_points(mapping)
     triangulation.complete_max_reproj_error = STRICT_PX * coarseness(model.cameras.values())
-    for _ in range(MAX_ROUNDS):
+    for number in range(1, 1 + MAX_ROUNDS):
+        on_progress(number, 1 + MAX_ROUNDS, ADJUSTING, "rounds")
         mapper.complete_and_merge_tracks(triangulation)
         _adjust(mapper, options, stop, rough=False)
         if mapper.filter_points(mapping) <= SETTLED * model.compute_num_observations():

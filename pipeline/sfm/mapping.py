@@ -6,7 +6,7 @@ Both run in a thread of their own, so that the calling thread can report progres
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -14,14 +14,11 @@ from typing import TypeAlias
 import pycolmap
 
 from splatpipe.pipeline.engine.parallel import run_in_thread
-from splatpipe.pipeline.sfm.completion import complete
+from splatpipe.pipeline.sfm.completion import Progress, complete
 from splatpipe.pipeline.sfm.reduction import best_keypoints, write_reduced
 from splatpipe.pipeline.sfm.view_graph import read_verified
 
 Model: TypeAlias = pycolmap.Reconstruction
-Progress: TypeAlias = Callable[[int, int, str], None]
-"""Called a few times a second with the photos placed, their total, and the current step."""
-
 
 BEST_KEYPOINTS = 400  # per photo; 700 placed no more photos in any capture, and took up to twice the time
 WORTH_IT = 0.9  # of the matches; if more remain after the reduction, it saves nothing
@@ -59,26 +56,31 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
         database: Cameras, images, keypoints and verified two-view geometries; only read.
         scratch: An existing folder for temporary files.
         options: Mapping options.
-        on_progress: Callback, called from the calling thread.
+        on_progress: Called a few times a second from the calling thread.
 
     Returns:
         All sub-models, the largest first.
     """
     total = _photos(database)
-    placed, begun, doing = 0, 0, "choosing keypoints"
+    placed, begun = 0, 0
+    now = (0, total, "choosing keypoints", "photos")
     stop = pycolmap.CancellationToken()
 
     def begin() -> None:
-        nonlocal placed, begun, doing
-        placed, begun = 2, begun + 1
-        doing = "placing photos" if begun < 2 else f"placing photos (model {begun})"
+        nonlocal placed, begun
+        placed, begun = 1, begun + 1
+        place()
 
     def place() -> None:
         nonlocal placed
         placed += 1
+        tell(min(placed, total), total, "placing photos" if begun < 2 else f"placing photos (model {begun})", "photos")
+
+    def tell(done: int, of: int, what: str, unit: str) -> None:
+        nonlocal now
+        now = (done, of, what, unit)
 
     def work() -> list[Model]:
-        nonlocal doing
         pycolmap.set_random_seed(options.seed)  # thread-local
         settings = incremental_options(options)
         with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
@@ -92,12 +94,11 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
                 next_image_callback=place,
                 cancellation_token=stop,
             )
-        doing = "adjusting everything"
         for model in found.values():
-            complete(model, database, settings, stop)
+            complete(model, database, settings, stop, on_progress=tell)
         return largest_first(found)
 
-    return run_in_thread(work, lambda: on_progress(min(placed, total), total, doing), stop.cancel)
+    return run_in_thread(work, lambda: on_progress(*now), stop.cancel)
 
 
 def map_global(database: Path, scratch: Path, options: MappingOptions, on_progress: Progress) -> list[Model]:
@@ -109,7 +110,7 @@ def map_global(database: Path, scratch: Path, options: MappingOptions, on_progre
         database: Cameras, images, keypoints and verified two-view geometries; only read.
         scratch: An existing folder for temporary files.
         options: Mapping options.
-        on_progress: Callback, called from the calling thread.
+        on_progress: Called a few times a second from the calling thread.
 
     Returns:
         All sub-models, the largest first.
@@ -121,7 +122,7 @@ def map_global(database: Path, scratch: Path, options: MappingOptions, on_progre
         with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
             return largest_first(pycolmap.global_mapping(database, folder, folder, global_options(options)))
 
-    return run_in_thread(work, lambda: on_progress(0, total, "placing all photos at once"), lambda: None)
+    return run_in_thread(work, lambda: on_progress(0, total, "placing all photos at once", "photos"), lambda: None)
 
 
 def _reduced(database: Path, folder: Path) -> Path:

@@ -83,12 +83,8 @@ class Reconstructor:
         wide = coarseness(self.verified.cameras.values())
         chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size, coarseness=wide), **options)
         work = map_incremental if mapper == "incremental" else map_global
-
-        def progress(placed: int, total: int, what: str) -> None:
-            self.report.progress(placed, total, what, "photos")
-
-        models = [model for model in work(self.database, self.capture.scratch, chosen, progress) if _has_points(model)]
-        progress(len(self.verified.names), len(self.verified.names), "placing photos")
+        found = work(self.database, self.capture.scratch, chosen, self.report.progress)
+        models = [model for model in found if _has_points(model)]
         return self._judged(MappingAttempt(how, mapper, chosen, models, None, time.process_time() - began))
 
     def map_further(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:

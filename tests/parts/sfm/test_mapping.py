@@ -1,6 +1,7 @@
 """Mapping from the strongest keypoints, completed by all: accurate cameras, bit-identical on repetition."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -8,7 +9,8 @@ import pytest
 from flight_scene import FOCAL_PX, GSD_M, SyntheticFlight, make_flight, write_database
 from mapped_apart import centre_errors, centres, oracle
 
-from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
+from splatpipe.pipeline.sfm.completion import complete
+from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options, map_global, map_incremental
 from splatpipe.pipeline.sfm.reduction import PAIR_FLOOR, best_keypoints, write_reduced
 from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
 
@@ -116,12 +118,23 @@ def test_the_same_seed_gives_the_same_bits(mapper: object, tmp_path: Path) -> No
 
 
 def test_progress_is_reported_and_an_interruption_ends_it(database: Path, tmp_path: Path) -> None:
-    reports: list[tuple[int, int, str]] = []
+    reports: list[tuple[int, int, str, str]] = []
 
-    def tell(placed: int, total: int, what: str) -> None:
-        reports.append((placed, total, what))
+    def tell(*report: Any) -> None:
+        reports.append(report)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         map_incremental(database, tmp_path, MappingOptions(), tell)
     assert reports[0][1] == PHOTOS
+
+
+def test_the_adjustment_reports_photos_and_rounds(database: Path, mapped: list[pycolmap.Reconstruction]) -> None:
+    reports: list[tuple[int, int, str, str]] = []
+    model, stop = pycolmap.Reconstruction(mapped[0]), pycolmap.CancellationToken()
+    options = incremental_options(MappingOptions())
+    complete(model, database, options, stop, on_progress=lambda *report: reports.append(report))
+    photos = [report for report in reports if report[3] == "photos"]
+    rounds = [report for report in reports if report[3] == "rounds"]
+    assert [done for done, *_ in photos] == list(range(PHOTOS)) and {of for _, of, *_ in photos} == {PHOTOS}
+    assert [done for done, *_ in rounds] == list(range(len(rounds))) and 2 <= len(rounds) <= rounds[0][1]
