@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
-from splatpipe.pipeline.engine.source import find_model
+from splatpipe.pipeline.engine.source import find_model, is_film
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.bands import ALL, AUTO
 from splatpipe.pipeline.photos.camera_groups import (
@@ -21,6 +22,7 @@ from splatpipe.pipeline.photos.camera_groups import (
     refused_calibrations,
     report_cameras,
 )
+from splatpipe.pipeline.photos.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.names import NAMES_SHOWN, list_names, printable
 from splatpipe.pipeline.photos.options import IngestConfig
@@ -44,6 +46,7 @@ from splatpipe.pipeline.photos.preparation import (
     select_photos,
 )
 from splatpipe.pipeline.photos.scan import by_reason, with_reason
+from splatpipe.pipeline.photos.video.frames import FRAMES_DIR, extract_frames
 from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lens_model import StatedLens
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
@@ -55,14 +58,20 @@ MIN_PHOTOS = 2
 
 
 def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Check every photo of the user's folder and write the parts photos, cameras, positions and left_out.
+    """Check every photo of the user's folder, or of the frames of the film that was given instead.
+
+    Writes the parts photos, cameras, lenses, positions and left_out.
 
     Raises:
         SplatpipeError: if fewer than two photos are left.
     """
-    root = photo_root(inputs.photos_dir)
+    given = photo_root(inputs.photos_dir)
     part = out / "photos"
     part.mkdir(parents=True, exist_ok=True)
+    filmed = is_film(given)
+    root = part / FRAMES_DIR if filmed else given
+    if filmed:
+        _report_film(extract_frames(given, root, config, inputs.machine.threads, report), report)
     if config.bands == AUTO and find_model(inputs.photos_dir) is not None:
         config = config.model_copy(update={"bands": ALL})  # a given model says which photos it is of
     work = Preparation(config, inputs.machine.threads, part, report)
@@ -76,8 +85,8 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         groups, camera_of = group_cameras(photos)
         groups, lenses = _lenses(inputs, groups, camera_of, photos, report)
         opacity = convert_unusual(photos, camera_of, work)
-        masked = prepare_masks(MASKS, root, chosen, opacity, work)
-        skies = prepare_masks(SKIES, root, chosen, {}, work)
+        masked = prepare_masks(MASKS, given, chosen, opacity, work)
+        skies = prepare_masks(SKIES, given, chosen, {}, work)
     places = _places(inputs, photos, report)
     positions = read_positions(photos, places.by_name)
     for issue in find_position_issues(photos, positions, places):
@@ -87,7 +96,10 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     report_cameras(described, report)
     if find_model(inputs.photos_dir) is None:  # a given model comes with its calibration
         _warn_of_focal(groups, refused_calibrations(photos), report)
-    save_photo_list(PhotoList(tuple(_photo(photo, camera_of, masked, skies) for photo in photos)), part)
+    listed = [_photo(photo, camera_of, masked, skies) for photo in photos]
+    if filmed:
+        listed = [replace(photo, converted=f"{FRAMES_DIR}/{photo.name}") for photo in listed]
+    save_photo_list(PhotoList(tuple(listed)), part)
     write_json(out / "cameras.json", cameras_json(groups))
     write_json(out / "lenses.json", lenses_json(lenses))
     write_json(out / "positions.json", positions_json(positions))
@@ -103,6 +115,14 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
     }
+
+
+def _report_film(issues: Sequence[CaptureIssue], report: Reporter) -> None:
+    for issue in issues:
+        if issue.severity == "warning":
+            report.warning(issue.message, issue.hint)
+        else:
+            report.note(f"{issue.message} {issue.hint}".rstrip())
 
 
 def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str], skies: set[str]) -> Photo:
@@ -132,6 +152,11 @@ def _require_photos(folder: Path, chosen: Selection) -> None:
     elif left_out:
         message = f"None of the {len(left_out)} pictures in {folder} can be used."
         hint = "Give JPEG, PNG or TIFF photos."
+    elif films := _films_in(folder):
+        message = (
+            f"There are no photos in {folder}, but {'films' if len(films) > 1 else 'a film'}: {list_names(films)}."
+        )
+        hint = f"Give the film itself: splatpipe run {printable(str(folder / films[0]))} OUT"
     elif scan.others:
         message = f"There are no photos in {folder}, only {scan.others} other file{'s' if scan.others > 1 else ''}."
         hint = "Give the folder that has the JPEG, PNG or TIFF photos."
@@ -139,6 +164,11 @@ def _require_photos(folder: Path, chosen: Selection) -> None:
         message = f"The folder {folder} is empty."
         hint = "Give the folder that has the JPEG, PNG or TIFF photos."
     raise SplatpipeError(message + (f" Left out:{listing}{more}" if left_out else ""), hint=hint)
+
+
+def _films_in(folder: Path) -> list[str]:
+    """Names of the films directly in a folder."""
+    return sorted(path.name for path in folder.iterdir() if is_film(path)) if folder.is_dir() else []
 
 
 def _report_excluded(chosen: Selection, config: IngestConfig, report: Reporter) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -34,7 +35,7 @@ def check(
 ) -> None:
     """Check a capture while still on site: its problems, and the time and memory of a run."""
     page = page.expanduser()
-    with CommandSummary(page, as_json) as done:
+    with CommandSummary(page, as_json) as done, TemporaryDirectory(prefix="splatpipe-check-") as scratch:
         from splatpipe.pipeline.app.console import RunConsole, print_line
         from splatpipe.pipeline.app.preflight.examination import examine_capture
         from splatpipe.pipeline.app.preflight.findings import as_json as preflight_as_json
@@ -48,7 +49,7 @@ def check(
         console = RunConsole()
         try:
             report = EventReporter("check", console)
-            preflight = examine_capture(photos, configs, threads or available_cores(), report)
+            preflight = examine_capture(photos, configs, threads or available_cores(), report, Path(scratch))
         finally:
             console.close()
         done.details = facts = preflight_as_json(preflight)

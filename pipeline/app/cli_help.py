@@ -42,7 +42,7 @@ class HelpPage:
 
 PAGES = {
     "run": HelpPage(
-        "Reads JPEG, PNG or TIFF photos (GPS from EXIF and XMP), and beside them gcp_list.txt, geo.txt, "
+        "Reads JPEG, PNG or TIFF photos (GPS from EXIF and XMP), or a film, and beside them gcp_list.txt, geo.txt, "
         "boundary.geojson and masks/, if present. Writes to OUT splat.ply, viewer.html, report.html, "
         "georef.json, ortho.tif, dsm.tif, a film and more, and the stages' artifacts in OUT/stages. The "
         "photos are not changed.",

@@ -42,7 +42,11 @@ def devices(incomplete: str) -> list[str]:
 
 
 PhotosArgument = Annotated[
-    Path, typer.Argument(callback=expand_user, help="Folder of photos, or a COLMAP folder with images/ and sparse/0.")
+    Path,
+    typer.Argument(
+        callback=expand_user,
+        help="Folder of photos, or a COLMAP folder with images/ and sparse/0, or a film (MP4, MOV).",
+    ),
 ]
 OutArgument = Annotated[
     Path, typer.Argument(callback=expand_user, help="Folder for the results; a stopped run resumes.")

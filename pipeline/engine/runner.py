@@ -27,6 +27,7 @@ from splatpipe.pipeline.engine.executor import Executor
 from splatpipe.pipeline.engine.line import Job, Line, explain, line_status
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
 from splatpipe.pipeline.engine.needs import ForecastFunction, no_forecasts, of_shard, used_with_shards
+from splatpipe.pipeline.engine.source import FILM_SUFFIXES
 from splatpipe.pipeline.engine.stage import JSON, Machine, Stage, Summary, stage_name
 from splatpipe.pipeline.engine.store import MIN_FREE_BYTES, Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.worker import Task
@@ -357,16 +358,17 @@ class Runner:
 
         Raises:
             MachineError: if OUT has disappeared.
-            SplatpipeError: if the photo folder has disappeared.
+            SplatpipeError: if the photo folder, or the film, has disappeared.
         """
         if not self.store.stages.is_dir():
             raise MachineError(
                 f"{self.store.out} has disappeared.",
                 hint="Was its disk disconnected, or the folder removed or renamed? Run again when it is back.",
             )
-        if not self.line.photos_dir.is_dir():
+        if not self.line.photos_dir.exists():
+            what = "film" if self.line.photos_dir.suffix.casefold() in FILM_SUFFIXES else "photo folder"
             raise SplatpipeError(
-                f"The photo folder {self.line.photos_dir} has disappeared.",
+                f"The {what} {self.line.photos_dir} has disappeared.",
                 hint="Restore it, then run again: finished work is kept.",
             )
 

@@ -1,4 +1,4 @@
-"""The user's folder: photos (with masks) or another program's reconstruction with its images, and survey files."""
+"""The user's input: a folder of photos (with masks), a film, or another program's reconstruction; and survey files."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from splatpipe.pipeline.engine.stage import NamedFile, Reporter, Stage
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
 MASK_FOLDERS = ("masks", "sky_masks")
+FILM_SUFFIXES = (".mp4", ".mov", ".m4v")
+SUBTITLE_SUFFIX = ".srt"
 AUTO, NONE = "auto", "none"  # values of an option that names a file, other than a path
 MAX_NAMED_BYTES = 64 << 20  # the size of a table of a million photos; a larger file was named by mistake
 ABSENT = Path(os.devnull)  # path of a part without a file: not a regular file, and empty if read
@@ -25,7 +27,7 @@ class RunSource:
     """The input of a run.
 
     Attributes:
-        folder: The folder the user named.
+        folder: The folder, or the film, that the user named.
         model: The COLMAP model in it, if it is a reconstruction and not just photos.
         named: The file of each single-file part, e.g. ``source.control``; None if there is none.
         skipped: Files to skip when collecting photos: those of single-file parts, used or not.
@@ -44,6 +46,7 @@ class RunSource:
             SplatpipeError: if the folder has too many files.
         """
         roots = [self.folder]
+        films = film_files(self.folder)
         if self.model is not None:
             roots = [self.folder / name for name in ("images", *MASK_FOLDERS)]
         beside = [self.folder.parent / name for name in MASK_FOLDERS]
@@ -54,6 +57,7 @@ class RunSource:
             for path in walk_files(root)
             if path not in self.skipped
         }
+        photos |= {os.path.relpath(path, self.folder.parent): path for path in films}
         if len(photos) > MAX_SOURCE_FILES:
             raise SplatpipeError(
                 f"{self.folder} contains {len(photos):,} files.",
@@ -83,10 +87,10 @@ class RunSource:
 
 
 def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: BaseModel | None = None) -> RunSource:
-    """Examine the folder that the user named as PHOTOS.
+    """Examine the folder or film that the user named as PHOTOS.
 
     Args:
-        photos: A folder of photos, or one with ``images/`` and ``sparse/0``.
+        photos: A folder of photos, or one with ``images/`` and ``sparse/0``, or a film.
         out: Where the run writes; must not lie inside the photos.
         stages: The pipeline, whose stages may read files that lie with the photos.
         config: The pipeline's configuration, which may name these files.
@@ -98,10 +102,12 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
     folder = photos.expanduser().resolve()
     if not folder.exists():
         raise SplatpipeError(f"There is no folder {photos}.", hint="Check the path of the photos.")
-    if not folder.is_dir():
-        raise SplatpipeError(f"{photos} is a file.", hint="Give the folder with the photos.")
-    if not os.access(folder, os.R_OK | os.X_OK):
-        raise SplatpipeError(f"The folder {photos} cannot be read: permission denied.", hint="Check its permissions.")
+    film = is_film(folder)
+    if not folder.is_dir() and not film:
+        raise SplatpipeError(f"{photos} is a file.", hint="Give the folder with the photos, or a film (MP4, MOV).")
+    if not os.access(folder, os.R_OK if film else os.R_OK | os.X_OK):
+        what = "film" if film else "folder"
+        raise SplatpipeError(f"The {what} {photos} cannot be read: permission denied.", hint="Check its permissions.")
     destination = out.expanduser().resolve()
     if destination == folder or folder in destination.parents:
         raise UsageError(
@@ -176,6 +182,29 @@ def _check_file(path: Path, option: str) -> Path:
             hint=f"Check the path, or set {option}=none.",
         )
     return path
+
+
+def is_film(path: Path) -> bool:
+    """Whether what the user named is a film, by its name: a file of its own, not a folder."""
+    return path.suffix.casefold() in FILM_SUFFIXES and path.is_file()
+
+
+def subtitles_beside(film: Path) -> Path | None:
+    """The subtitle file (SRT) beside a film: of the same name, whatever its letters' case."""
+    wanted = (film.stem + SUBTITLE_SUFFIX).casefold()
+    try:
+        found = sorted(path for path in film.parent.iterdir() if path.name.casefold() == wanted and path.is_file())
+    except OSError:
+        return None
+    return found[0] if found else None
+
+
+def film_files(path: Path) -> list[Path]:
+    """The files that a film consists of: itself, and its subtitles; none if the path is not a film's."""
+    if not is_film(path):
+        return []
+    subtitles = subtitles_beside(path)
+    return [path] if subtitles is None else [path, subtitles]
 
 
 def find_model(folder: Path) -> Path | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -20,6 +20,7 @@ import numpy as np
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.check import CheckedPhoto
 from splatpipe.pipeline.photos.detail import read_grey
+from splatpipe.pipeline.photos.names import list_names
 from splatpipe.pipeline.photos.scan import ExcludedPhoto
 from splatpipe.pipeline.photos.xmp import xmp_number
 
@@ -120,7 +121,39 @@ def choose_band(photos: Sequence[CheckedPhoto], wanted: str) -> BandChoice:
     ]
     others = sorted(set(counts) - {band})
     note = f"The photos are of {len(counts)} bands: {band} is used, without {', '.join(others)}; ingest.bands chooses."
+    lacking = _without(photos, {name for name, its in bands.items() if its == band})
+    if lacking:
+        note += f" Shots without a photo of that band: those of {list_names(lacking)}."
     return BandChoice(kept, left_out, note if others else "")
+
+
+def _without(photos: Sequence[CheckedPhoto], used: Container[str]) -> list[str]:
+    """The first photo of each shot that has none of the used ones; empty where these do not tell their shots."""
+    shots: dict[tuple[str, str], list[str]] = {}
+    for photo in photos:
+        shot = _shot_of(photo)
+        if shot is not None:
+            shots.setdefault(shot, []).append(photo.name)
+        elif photo.name in used:
+            return []
+    return sorted(min(names) for names in shots.values() if not any(name in used for name in names))
+
+
+def _shot_of(photo: CheckedPhoto) -> tuple[str, str] | None:
+    """What the photos of a shot have in common: its identifier, or the beginning of their names."""
+    identifier = photo.xmp.get("Camera:CaptureUUID") or photo.xmp.get("MicaSense:CaptureId")
+    return ("", identifier) if identifier else _shot_by_name(photo.name)[0]
+
+
+def _shot_by_name(name: str) -> tuple[tuple[str, str] | None, str]:
+    """The shot of a photo, as a folder and what its names have in common, and its band; None where no name tells."""
+    path = PurePosixPath(name)
+    stem = path.stem.casefold()
+    if found := _TAGGED.fullmatch(stem):
+        return (str(path.parent), _TIME.sub("", found["shot"])), TAGS[found["tag"]]
+    if found := _AUTEL.fullmatch(stem):
+        return (str(path.parent), found["shot"]), THERMAL if found["tag"] == "irx" else COLOUR
+    return None, ""
 
 
 def bands_of(photos: Sequence[CheckedPhoto]) -> dict[str, str]:
@@ -161,15 +194,9 @@ def _by_names(photos: Sequence[CheckedPhoto]) -> dict[str, str]:
     """The bands that names tell, in shots of several bands."""
     shots: dict[tuple[str, str], list[tuple[CheckedPhoto, str]]] = {}
     for photo in photos:
-        path = PurePosixPath(photo.name)
-        stem = path.stem.casefold()
-        if found := _TAGGED.fullmatch(stem):
-            key, band = _TIME.sub("", found["shot"]), TAGS[found["tag"]]
-        elif found := _AUTEL.fullmatch(stem):
-            key, band = found["shot"], THERMAL if found["tag"] == "irx" else COLOUR
-        else:
-            continue
-        shots.setdefault((str(path.parent), key), []).append((photo, band))
+        shot, band = _shot_by_name(photo.name)
+        if shot is not None:
+            shots.setdefault(shot, []).append((photo, band))
     told = [shot for shot in shots.values() if _is_shot(shot)]
     return {photo.name: band for shot in told for photo, band in shot}
 

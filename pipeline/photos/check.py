@@ -17,6 +17,7 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.exif import Exif, read_exif
+from splatpipe.pipeline.photos.extra_formats import DNG_REASON, EXTRA_FORMATS, is_dng
 from splatpipe.pipeline.photos.picture_file import (
     STRIP_ROWS,
     load_stored,
@@ -33,7 +34,6 @@ DRAFT = 8  # libjpeg reads every coefficient of a JPEG, whatever the scale of th
 FINGERPRINT_STEP = 8
 TAG_ORIENTATION = 274
 TAG_BITS_PER_SAMPLE = 258
-TAG_DNG_VERSION = 50706
 TAGS_GEOTIFF = (33550, 34735)  # ModelPixelScale, GeoKeyDirectory: the size of a map's pixels on the ground, its CRS
 PANORAMA = re.compile(r"(?:^|[ ._-])pano(?:rama)?(?:[ ._-]|\d|$)")  # in the names of stitched ones
 PANORAMA_ASPECT = 1.9  # a sphere's is 2; of the pictures of other cameras, 1.78 is the widest
@@ -106,7 +106,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
     except Exception as error:  # Pillow's readers raise almost anything on broken images
         return ExcludedPhoto(candidate.name, _decode_problem(error))
     with picture:
-        reason = _refusal_reason(picture, limits) or why_hollow(picture, data)
+        reason = _refusal_reason(picture, data, limits) or why_hollow(picture, data)
         return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
 
 
@@ -154,15 +154,15 @@ def _read_once(path: Path) -> tuple[bytes, str]:
     return data, sha.hexdigest()
 
 
-def _refusal_reason(picture: Image.Image, limits: PictureLimits) -> str:
+def _refusal_reason(picture: Image.Image, data: bytes, limits: PictureLimits) -> str:
     """Why an opened image must not be decoded; empty if it may be."""
     width, height = picture.size
     if width * height > limits.max_pixels:
         return f"claims {width} × {height} pixels, more than ingest.max_megapixels={limits.max_pixels / 1e6:g} allows"
     if max(width, height) < limits.min_side or 8 * min(width, height) < limits.min_side:
         return f"is only {width} × {height} pixels, less than ingest.min_size={limits.min_side}"
-    if picture.format == "TIFF" and _tiff_tag(picture, TAG_DNG_VERSION, None) is not None:
-        return "is a camera's raw file (DNG): develop it to JPEG or TIFF"
+    if picture.format == "TIFF" and is_dng(data):
+        return DNG_REASON
     if picture.format == "TIFF" and None not in (_tiff_tag(picture, tag, None) for tag in TAGS_GEOTIFF):
         return "is a map (GeoTIFF), made from photos: give the photos themselves"
     if picture.mode not in READ_MODES:
@@ -197,7 +197,10 @@ def _decode(candidate: Candidate, data: bytes, sha256: str, picture: Image.Image
         width=width,
         height=height,
         fingerprint=pixels.fingerprint,
-        plain=picture.mode in ("RGB", "L") and pixels.deep_range is None and not turned,
+        plain=picture.format not in EXTRA_FORMATS
+        and picture.mode in ("RGB", "L")
+        and pixels.deep_range is None
+        and not turned,
         transparent=pixels.transparent,
         deep_range=pixels.deep_range,
         exif=exif,

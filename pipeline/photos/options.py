@@ -21,6 +21,9 @@ class IngestConfig(StageConfig):
     bands: str = "auto"
     """Of photos of several spectral bands, those that are used: `auto` takes the colour photos, or else the sharpest
     band; a band, such as `green` or `near infrared`; `all`: every photo, each band as a camera of its own."""
+    max_frames: Annotated[int, Field(ge=3, le=100_000)] = 300
+    """Of a film (`splatpipe run flight.mp4 OUT`), at most so many frames are used. If sharp ones that overlap by 70 to
+    80 % are more, they are thinned evenly."""
     positions: str = "auto"
     """File of camera positions, which take precedence over those in the photos: `geo.txt` (ODM) or a CSV with a header.
     `auto`: `geo.txt` or `positions.csv` in the photo folder or beside it; `none`: only the photos' metadata."""

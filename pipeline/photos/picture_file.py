@@ -7,12 +7,25 @@ pictures are decoded one at a time in a process.
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 from PIL import Image
+
+from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.photos.extra_formats import (
+    RAW_MODULE,
+    is_dng,
+    is_heic,
+    is_installed,
+    open_dng,
+    open_heic,
+)
 
 # Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
@@ -21,6 +34,7 @@ LEAST_BYTES = 0.01  # of a large photo's file per pixel; one colour all over tak
 MOST_CHUNKS = 1_000_000  # of a PNG: libpng writes one for 8 kB
 TILE_TAGS = (322, 323)  # width and length of a TIFF's tiles
 LEAST_TILE = 4096  # pixels per side that a tile may have in a picture of any size
+HEAD_BYTES = 16
 STRIP_ROWS = 256  # of a picture, converted at a time
 INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -35,7 +49,7 @@ _one_large_at_a_time = threading.RLock()
 
 
 def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
-    """Open a JPEG, PNG or TIFF by its content, without Pillow's own size limit.
+    """Open a JPEG, PNG, TIFF, HEIC or DNG by its content, without Pillow's own size limit.
 
     Args:
         source: A path or a binary file object.
@@ -46,11 +60,27 @@ def open_picture(source: Any, *, max_pixels: int | None = None) -> Image.Image:
         OSError: if it is not such an image (Pillow's ``UnidentifiedImageError`` is one), or its tiles are too large.
     """
     Image.MAX_IMAGE_PIXELS = None  # Pillow's limit is process-wide and refuses 200 MP panoramas; ours is checked below
-    picture = Image.open(source, formats=PHOTO_FORMATS)
+    head = _head(source)
+    if is_heic(head):
+        picture = open_heic(source)
+    elif isinstance(source, BytesIO) and is_installed(RAW_MODULE) and is_dng(source.getvalue()):
+        picture = open_dng(source.getvalue())
+    else:
+        picture = Image.open(source, formats=PHOTO_FORMATS)
     if max_pixels is not None and picture.width * picture.height > max_pixels:
         raise ValueError(f"it has {picture.width} × {picture.height} pixels")
     _check_tiles(picture)
     return picture
+
+
+def _head(source: Any) -> bytes:
+    """A file's first bytes."""
+    if isinstance(source, str | os.PathLike):
+        with open_regular(Path(source)) as file:
+            return file.read(HEAD_BYTES)
+    head: bytes = source.read(HEAD_BYTES)
+    source.seek(0)
+    return head
 
 
 def _check_tiles(picture: Image.Image) -> None:

@@ -12,6 +12,13 @@ from typing import Literal
 from splatpipe.pipeline.engine.machine import pseudo_devices
 from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.companions import MASK, find_companions, other_formats, reason_of
+from splatpipe.pipeline.photos.extra_formats import (
+    DNG_REASON,
+    HEIC_REASON,
+    MODULES,
+    is_heic,
+    is_installed,
+)
 from splatpipe.pipeline.photos.names import is_plain, list_names
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"}
@@ -36,6 +43,7 @@ MAGICS = {  # first bytes of pictures whose names claim to be some
     "JPEG 2000": (b"\0\0\0\x0cjP  \r\n", b"\xff\x4f\xff\x51"),
     "OpenEXR": (b"\x76\x2f\x31\x01",),
 }
+DNG_SUFFIX = ".dng"
 RAW_REASON = "is a camera's raw file: develop it to JPEG or TIFF"
 TWIN_REASON = "is another format of a photo that is used"
 TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -114,6 +122,7 @@ def scan_folder(root: Path) -> Scan:
         root: The folder that names are relative to.
     """
     candidates: list[Candidate] = []
+    extra: dict[str, list[Candidate]] = {reason: [] for reason in MODULES if is_installed(MODULES[reason])}
     left_out: list[ExcludedPhoto] = []
     others = 0
     pseudo = pseudo_devices()
@@ -136,11 +145,17 @@ def scan_folder(root: Path) -> Scan:
             if reason == "":
                 others += 1
                 continue
-            reason = reason or _name_problem(path.relative_to(root))
-            if reason is None:
+            problem = _name_problem(path.relative_to(root))
+            if reason is None and problem is None:
                 candidates.append(Candidate(_name(path, root), path))
+            elif problem is None and reason in extra:
+                extra[reason].append(Candidate(_name(path, root), path))
             else:
-                left_out.append(ExcludedPhoto(_name(path, root), reason))
+                left_out.append(ExcludedPhoto(_name(path, root), reason or problem or ""))
+    for more in extra.values():
+        twins = other_formats([each.name for each in more], [each.name for each in candidates])
+        candidates += [each for each in more if each.name not in twins]
+        left_out += [ExcludedPhoto(each.name, TWIN_REASON, "companion") for each in more if each.name in twins]
     return _without_companions(sorted(candidates, key=lambda candidate: candidate.name), left_out, others)
 
 
@@ -148,9 +163,8 @@ def _without_companions(candidates: Sequence[Candidate], left_out: Sequence[Excl
     """The scan, with the files that belong to photos told apart from these."""
     companions = find_companions(candidate.name for candidate in candidates)
     photos = [candidate for candidate in candidates if candidate.name not in companions]
-    raws = {
-        entry.name for entry in left_out if entry.reason in (RAW_REASON, *map(_unsupported, OTHER_PICTURES.values()))
-    }
+    formats = (RAW_REASON, DNG_REASON, *map(_unsupported, OTHER_PICTURES.values()))
+    raws = {entry.name for entry in left_out if entry.reason in formats}
     twins = other_formats(raws, [photo.name for photo in photos])
     masks, excluded = [], []
     for candidate in candidates:
@@ -183,7 +197,7 @@ def _exclusion_reason(path: Path, pseudo: Container[int]) -> str | None:
     except OSError as error:
         return f"cannot be read ({error.strerror})" if claims else ""
     if suffix in RAW_SUFFIXES:  # most raw formats are TIFF files with a thumbnail in front
-        return RAW_REASON
+        return DNG_REASON if suffix == DNG_SUFFIX and head.startswith(TIFF_HEADS) else RAW_REASON
     kind = _kind(head)
     if kind == "photo":
         return None
@@ -215,6 +229,8 @@ def _claimed_format(suffix: str) -> str:
 
 
 def _unsupported(kind: str) -> str:
+    if kind == "HEIC":
+        return HEIC_REASON
     return f"is a {kind} picture, which is not supported: convert it to JPEG or PNG"
 
 
@@ -224,7 +240,7 @@ def _kind(head: bytes) -> str:
         return "photo"
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return "WebP"
-    if head[4:8] == b"ftyp" and head[8:12] in (b"heic", b"heix", b"mif1", b"msf1", b"hevc"):
+    if is_heic(head):
         return "HEIC"
     if head[4:12] in (b"ftypavif", b"ftypavis"):
         return "AVIF"

@@ -164,7 +164,10 @@ def _parse_lines(path: Path, lines: Sequence[str]) -> tuple[str, list[str], tupl
             case ["comment", *_]:
                 comments.append(line[len("comment") :].strip())
             case ["format", "ascii", _]:
-                raise SplatpipeError(f"{path} is a text PLY.", hint="Export it as a binary PLY.")
+                raise SplatpipeError(
+                    f"{path} is a text PLY.",
+                    hint="Export it as a binary PLY; coordinates of UTM and the like need 64 bits (property double).",
+                )
             case ["format", kind, "1.0"] if kind in _BYTE_ORDERS and not byte_order:
                 byte_order = _BYTE_ORDERS[kind]
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,15}", count, re.ASCII):

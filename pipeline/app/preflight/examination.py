@@ -50,7 +50,7 @@ from splatpipe.pipeline.app.preflight.places import (
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
 from splatpipe.pipeline.engine.needs import whole
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.engine.source import RunSource, open_source
+from splatpipe.pipeline.engine.source import RunSource, is_film, open_source
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.comparison import brighter_ev, duller
@@ -84,14 +84,17 @@ class PhotoExamination:
     levels: tuple[float, ...]
 
 
-def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: int, report: Reporter) -> Preflight:
+def examine_capture(
+    photos: Path, configs: Mapping[str, LineConfig], threads: int, report: Reporter, scratch: Path
+) -> Preflight:
     """Examine a capture as far as a minute or two allow.
 
     Args:
-        photos: The user's folder.
+        photos: The user's folder or film.
         configs: Configurations of the run that would follow, by preset; the files of the first one are used.
         threads: Number of threads.
         report: Receives the progress.
+        scratch: A folder for a film's frames, which the page of findings shows.
 
     Raises:
         SplatpipeError: if there is no such folder, or a file that an option names.
@@ -104,7 +107,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
     config = next(iter(configs.values()))
     # No OUT is written: any folder outside the photos will do.
     source = open_source(photos, folder.parent / f"{folder.name}-out", LINE, config)
-    intake, findings = read_capture(source, config, threads, report)
+    intake, findings = read_capture(source, config, threads, report, scratch)
     examination = examine_photos(intake, threads, report)
     control, control_problems = _control(source, config, intake)
     heights = predict_heights(source, config, intake, report)
@@ -127,6 +130,7 @@ def examine_capture(photos: Path, configs: Mapping[str, LineConfig], threads: in
         forecasts=forecasts,
         machine=machine,
         heights=heights,
+        frames=scratch if is_film(source.folder) else None,
         when_s=when_s,
         seconds=round(time.monotonic() - began_s, 3),
     )

@@ -11,7 +11,6 @@ from splatpipe.pipeline.app.page_file import printable
 from splatpipe.pipeline.app.preflight.findings import Finding, PhotoFacts, Preflight
 from splatpipe.pipeline.app.report.wording import number
 from splatpipe.pipeline.app.thumbnails import Thumbnail, crop_middle, thumbnail
-from splatpipe.pipeline.photos.photo_list import photo_root
 
 SIDE = 260  # pixels of a thumbnail's longer side
 CUT = (260, 195)  # photo pixels of a crop: blur of a pixel or two is invisible in a thumbnail
@@ -43,7 +42,6 @@ class FindingPicture:
 def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
     """Images for each finding, in order; the worst findings, which come first, have priority within the limits."""
     photos = {photo.name: photo for photo in preflight.photos}
-    root = photo_root(preflight.folder)
     left, cuts = MAX_PICTURES, MAX_CROPS
     every = []
     for finding in preflight.findings:
@@ -52,12 +50,12 @@ def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
         for name in names[: min(MAX_PER_FINDING, left)]:
             close = finding.code in CLOSE and cuts > 0
             cuts -= close
-            pictures.append(_make_picture(root, name, finding, photos.get(name), close=close))
+            pictures.append(_make_picture(preflight.root, name, finding, photos.get(name), close=close))
         if finding.code in CLOSE and pictures and cuts > 0:
             other = _sharp_neighbour(preflight, names[0])
             if other is not None:
                 cuts -= 1
-                pictures.insert(1, _make_picture(root, other.name, finding, other, close=True, beside=True))
+                pictures.insert(1, _make_picture(preflight.root, other.name, finding, other, close=True, beside=True))
         left = max(0, left - len(pictures))
         every.append(pictures)
     return every

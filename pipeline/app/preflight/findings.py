@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.photos.photo_list import photo_root
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.survey.predicted_flight import PredictedAccuracy
@@ -150,7 +151,7 @@ class Preflight:
     """The result of a preflight.
 
     Attributes:
-        folder: The user's folder; photo names are relative to its ``photo_root``.
+        folder: The user's folder, or film.
         photos: The usable photos, sorted by name.
         left_out: The excluded files.
         findings: The findings, worst first.
@@ -164,6 +165,7 @@ class Preflight:
         when_s: Time of the preflight, seconds since 1970.
         seconds: Its duration.
         heights: Predicted accuracy of the ground; None without accurate positions, or if nothing can be said.
+        frames: The folder of a film's frames; None for photos.
     """
 
     folder: Path
@@ -180,6 +182,12 @@ class Preflight:
     when_s: float
     seconds: float
     heights: PredictedAccuracy | None = None
+    frames: Path | None = None
+
+    @property
+    def root(self) -> Path:
+        """The folder that photo names are relative to."""
+        return photo_root(self.folder) if self.frames is None else self.frames
 
     @property
     def orphans(self) -> tuple[int, ...]:
@@ -195,7 +203,7 @@ class Preflight:
 def as_json(preflight: Preflight) -> JSON:
     """The output of ``check --json``; it has no paths other than the photos' names."""
     value = asdict(preflight)
-    del value["folder"]
+    del value["folder"], value["frames"]
     return value | {"verdict": preflight.worst or "fine", "orphans": list(preflight.orphans)}
 
 

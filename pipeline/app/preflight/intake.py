@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.app.preflight.findings import Finding, LeftOutPhoto
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.source import RunSource
+from splatpipe.pipeline.engine.source import RunSource, is_film
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.photos.bands import ALL
 from splatpipe.pipeline.photos.camera_groups import CameraGroup, group_cameras
@@ -23,6 +24,7 @@ from splatpipe.pipeline.photos.names import list_names, printable
 from splatpipe.pipeline.photos.photo_list import Photo, photo_root
 from splatpipe.pipeline.photos.preparation import Preparation, Selection, select_photos
 from splatpipe.pipeline.photos.scan import ExcludedPhoto, by_reason, with_reason
+from splatpipe.pipeline.photos.video.frames import extract_frames
 from splatpipe.pipeline.sfm.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairs import Layout
 from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
@@ -57,16 +59,22 @@ class Intake:
     layout: Layout
 
 
-def read_capture(source: RunSource, config: LineConfig, threads: int, report: Reporter) -> tuple[Intake, list[Finding]]:
+def read_capture(
+    source: RunSource, config: LineConfig, threads: int, report: Reporter, scratch: Path
+) -> tuple[Intake, list[Finding]]:
     """Check every photo completely, including its metadata.
 
     Args:
-        source: The user's folder.
+        source: The user's folder or film.
         config: Configuration of the run that would follow.
         threads: Number of threads.
         report: Receives the progress.
+        scratch: A folder for a film's frames.
     """
-    root = photo_root(source.folder)
+    root, filmed = photo_root(source.folder), []
+    if is_film(root):
+        issues = extract_frames(root, scratch, config.ingest, threads, report)
+        root, filmed = scratch, [finding_from_issue(issue) for issue in issues]
     work = Preparation(config.ingest, threads, root, report)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries print their own warnings about unusual metadata tags
@@ -77,7 +85,7 @@ def read_capture(source: RunSource, config: LineConfig, threads: int, report: Re
             chosen = select_photos(root, everything)
             findings = [Finding("bands", "error", error.message, error.hint)]
     photos = chosen.photos
-    findings += _left_out(chosen)
+    findings += [*filmed, *_left_out(chosen)]
     if len(photos) < MIN_PHOTOS:
         findings.append(_too_few(len(photos)))
     groups, camera_of = group_cameras(photos)

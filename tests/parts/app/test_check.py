@@ -31,7 +31,9 @@ Picture = Callable[[np.ndarray], np.ndarray]
 
 def examined(photos: Path, *sets: str) -> Preflight:
     config = overrides(None, list(sets), None).resolve(load_preset("preview"))
-    return examine_capture(photos, {"preview": config}, 2, EventReporter("check", lambda _event: None))
+    return examine_capture(
+        photos, {"preview": config}, 2, EventReporter("check", lambda _event: None), photos.parent / "frames"
+    )
 
 
 def found(preflight: Preflight, code: str) -> list[Finding]:
@@ -245,7 +247,7 @@ def test_points_that_no_photo_can_show_are_reported(
     photos = ring(tmp_path / "photos", leave_out=tuple(number for number in RING if number not in (1, 6, 11)))
     config = overrides(None, [], None).resolve(load_preset("preview"))
     source = open_source(photos, tmp_path / "out", LINE, config)
-    intake, _ = read_capture(source, config, 1, EventReporter("check", lambda _event: None))
+    intake, _ = read_capture(source, config, 1, EventReporter("check", lambda _event: None), tmp_path)
     stated = intake.positions.positions  # around the house, which all of them show
     latitude, longitude = np.mean([(each.latitude, each.longitude) for each in stated], axis=0)
     rows = [f"P{k},{latitude + step / 111_195.0:.8f},{longitude:.8f}" for k, step in enumerate(north_m)]
@@ -260,7 +262,7 @@ def test_accurate_positions_straight_down_are_told_what_control_would_buy(tmp_pa
     photos = ring(tmp_path / "photos")
     config = overrides(None, [], None).resolve(load_preset("preview"))
     quiet = EventReporter("check", lambda _event: None)
-    intake, _ = read_capture(open_source(photos, tmp_path / "out", LINE, config), config, 1, quiet)
+    intake, _ = read_capture(open_source(photos, tmp_path / "out", LINE, config), config, 1, quiet, tmp_path)
     rows = [
         f"{each.name} {each.longitude:.10f} {each.latitude:.10f} 500.0 {20 * k} 1 0 0.02 0.03"
         for k, each in enumerate(intake.positions.positions)

@@ -97,6 +97,14 @@ def test_a_band_that_no_photo_shows_is_refused(tmp_path: Path, colour: bool, sai
     assert caught.value.hint
 
 
+def test_shots_without_the_chosen_band_are_named(tmp_path: Path) -> None:
+    photos = [photo for photo in multispectral(tmp_path, colour=False) if photo.name != "DJI_0023.TIF"]
+    choice = choose_band(photos, "auto")
+    assert [photo.name for photo in choice.photos] == ["DJI_0013.TIF", "DJI_0033.TIF"]
+    assert choice.note.endswith("Shots without a photo of that band: those of DJI_0021.TIF.")
+    assert "without a photo" not in choose_band(multispectral(tmp_path), "auto").note  # colour ones state no shot
+
+
 def test_bands_are_told_by_name_where_metadata_are_lost(tmp_path: Path) -> None:
     for shot in range(3):
         for tag in ("GRE", "RED", "REG", "NIR"):

@@ -68,7 +68,7 @@ def test_a_scan_tells_masks_previews_and_raw_files_from_photos(tmp_path: Path) -
     for name in ("a.JPG", "b.jpg", "a_mask.JPG", "depth/a.png", "a.thm", "._a.JPG"):
         save(tmp_path / name, noise(1), format="PNG" if name.endswith("png") else "JPEG")
     (tmp_path / "a.DNG").write_bytes(b"II*\0" + bytes(60))
-    (tmp_path / "alone.dng").write_bytes(b"II*\0" + bytes(60))
+    (tmp_path / "alone.cr2").write_bytes(b"II*\0" + bytes(60))
     (tmp_path / "b.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(50))
     (tmp_path / "film.LRV").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(50))
     (tmp_path / "old.bmp").write_bytes(b"BM" + bytes(60))
@@ -78,7 +78,7 @@ def test_a_scan_tells_masks_previews_and_raw_files_from_photos(tmp_path: Path) -
     assert scan.left_out == (
         ExcludedPhoto("a.DNG", "is another format of a photo that is used", "companion"),
         ExcludedPhoto("a.thm", "is a preview that a camera wrote", "companion"),
-        ExcludedPhoto("alone.dng", "is a camera's raw file: develop it to JPEG or TIFF"),
+        ExcludedPhoto("alone.cr2", "is a camera's raw file: develop it to JPEG or TIFF"),
         ExcludedPhoto("b.heic", "is another format of a photo that is used", "companion"),
         ExcludedPhoto("depth/a.png", "is a depth map of another photo", "companion"),
         ExcludedPhoto("old.bmp", "is a BMP picture, which is not supported: convert it to JPEG or PNG"),

@@ -1,0 +1,1 @@
+"""Photos from a film: its container, its subtitles, its motion, and the frames that are chosen."""

@@ -1,0 +1,112 @@
+"""Measure a film, frame by frame: how sharp each is, and how the picture moves from one to the next.
+
+Only two small grey pictures are held at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+SHARP_SIDE, TRACKED_SIDE = 1920, 480  # pixels: the longer sides at which sharpness and motion are measured
+POINTS, QUALITY, APART = 300, 0.01, 8  # corners that are followed: at most, of the best one's strength, pixels
+WINDOW, LEVELS = (15, 15), 3  # of the search for a corner in the next frame: 60 pixels far
+TOLERANCE_PX = 1.5  # off the common motion: nearer and farther ground moves differently
+MIN_FOLLOWED, MIN_SHARE = 12, 0.25  # corners, and their share that agrees
+SCALES = (0.5, 2.0)  # of the area, from frame to frame
+LOST = 15  # frames without motion, such as a flash, before it counts as a cut
+
+
+@dataclass(frozen=True, eq=False)
+class Measures:
+    """What was measured of a film.
+
+    Attributes:
+        frames: The number of each measured frame, from 0.
+        times_s: When it is shown, from the film's start.
+        sharpness: Contrast of its finest details, grey levels; comparable where frames show about the same.
+        steps: Affine maps from the measured frame before to this one, coordinates as shares of width and height; NaN
+            where the picture is another one (a cut), as for the first.
+    """
+
+    frames: Int64[np.ndarray, " n"]
+    times_s: Float64[np.ndarray, " n"]
+    sharpness: Float64[np.ndarray, " n"]
+    steps: Float64[np.ndarray, "n 3 3"]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+def measure(film: Iterable[tuple[int, float, UInt8[np.ndarray, "h w 3"]]]) -> Iterator[Measures]:
+    """Measure frames one after the other.
+
+    Args:
+        film: Number, time in seconds, and pixels (BGR) of each frame.
+
+    Yields:
+        The measures of each frame, to be joined by ``joined``.
+    """
+    last: UInt8[np.ndarray, "h w"] | None = None
+    waited = 0
+    for number, time_s, pixels in film:
+        grey = _reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), SHARP_SIDE)
+        small = _reduced(grey, TRACKED_SIDE)
+        step = None if last is None else motion(last, small)
+        if step is not None or last is None or waited >= LOST:
+            last, waited = small, 0
+        else:
+            waited += 1  # compared again with the last good frame; this one is not chosen
+        sharp = 0.0 if waited else sharpness(grey)
+        step = np.eye(3) if waited else step
+        steps = np.full((1, 3, 3), np.nan) if step is None else step[None]
+        yield Measures(np.array([number]), np.array([time_s]), np.array([sharp]), steps)
+
+
+def joined(parts: Iterable[Measures]) -> Measures:
+    """Join the measures of frames."""
+    found = list(parts)
+    return Measures(
+        np.concatenate([np.zeros(0, np.int64), *(part.frames for part in found)]),
+        np.concatenate([np.zeros(0), *(part.times_s for part in found)]),
+        np.concatenate([np.zeros(0), *(part.sharpness for part in found)]),
+        np.concatenate([np.zeros((0, 3, 3)), *(part.steps for part in found)]),
+    )
+
+
+def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+    """Contrast of the finest details: geometric mean of that across and that down, as motion blurs in one direction."""
+    across, down = (cv2.meanStdDev(cv2.Sobel(grey, cv2.CV_16S, *order))[1][0, 0] for order in ((2, 0), (0, 2)))
+    return float(np.sqrt(across * down))
+
+
+def motion(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> Float64[np.ndarray, "3 3"] | None:
+    """The affine map from one frame to the next, in shares of width and height; None if they show different things."""
+    corners = cv2.goodFeaturesToTrack(first, POINTS, QUALITY, APART)
+    if corners is None or len(corners) < MIN_FOLLOWED:
+        return None
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=WINDOW, maxLevel=LEVELS)
+    kept = found[:, 0] == 1
+    if kept.sum() < MIN_FOLLOWED:
+        return None
+    affine, agree = cv2.estimateAffine2D(corners[kept], moved[kept], ransacReprojThreshold=TOLERANCE_PX)
+    if affine is None or agree.sum() < max(MIN_FOLLOWED, MIN_SHARE * len(corners)):
+        return None
+    if not SCALES[0] <= np.linalg.det(affine[:, :2]) <= SCALES[1]:
+        return None
+    height, width = first.shape
+    shares = np.diag([1.0 / width, 1.0 / height, 1.0])
+    return np.asarray(shares @ np.vstack([affine, [0.0, 0.0, 1.0]]) @ np.linalg.inv(shares))
+
+
+def _reduced(grey: np.ndarray, side: int) -> UInt8[np.ndarray, "h w"]:
+    height, width = grey.shape
+    scale = side / max(height, width)
+    if scale >= 1.0:
+        return np.asarray(grey, np.uint8)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
