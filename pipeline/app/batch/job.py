@@ -1,6 +1,6 @@
-"""The process of a workflow job: runs one stage of one capture by `splatpipe run --until`, or one shard.
+"""The process of a workflow job: runs its stages of one capture by `splatpipe run --until`, or one shard.
 
-    python -m splatpipe.pipeline.app.batch.job CALL CAPTURE STAGE THREADS MARKER
+    python -m splatpipe.pipeline.app.batch.job CALL CAPTURE JOB THREADS MARKER ATTEMPT
 
 It sits between Snakemake and the run so that every outcome is recorded, a capture that cannot succeed is not retried,
 and a signal reaches the run exactly once, whoever sent it to which process.
@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 
 from splatpipe.pipeline.app.batch.attempts import PERMANENT_FAILURES, AttemptLog, AttemptResult, read_attempts, spent_s
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob, workflow_jobs
 from splatpipe.pipeline.app.batch.shards import counts_shards, store_shard_jobs
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
 from splatpipe.pipeline.app.command_summary import PART_VARIABLE
@@ -41,22 +41,25 @@ def main() -> None:
     """Run the job given on the command line."""
     end_with_parent()
     call = Call(Path(sys.argv[1]))
-    key, stage, threads, marker = sys.argv[2], sys.argv[3], int(sys.argv[4]), Path(sys.argv[5])
-    if call.stop_file.exists():
-        sys.exit(EXIT_TERMINATED)
-    plan = call.plan()
-    capture = plan.capture(key)
-    log = AttemptLog(call.attempts_file(key, stage))
-    before = [each for each in log.read() if each.stage == stage]
-    if before and before[-1].final:
-        sys.exit(before[-1].exit_code)
-    job = next(job for job in call.jobs(capture) if job.stage == stage)
-    log.begin(stage)
-    ending = _disk_shortage(Path(plan.out), job) or _run(call, plan, capture, job, threads)
-    log.end(ending)
-    if ending.exit_code:
-        sys.exit(ending.exit_code)
-    if counts_shards(stage, LINE):
+    key, name, threads, marker, number = sys.argv[2], sys.argv[3], int(sys.argv[4]), Path(sys.argv[5]), int(sys.argv[6])
+    capture = call.plan().capture(key)
+    log = AttemptLog(call.attempts_file(key, name))
+    before = {each.stage: each for each in log.read()}
+    signals = _Signals()
+    for job in workflow_jobs(call.jobs(capture))[name]:
+        earlier = before.get(job.stage)
+        if earlier is not None and (earlier.succeeded or earlier.final):
+            code = earlier.exit_code or 0
+        elif call.stop_file.exists() or signals.received:
+            code = EXIT_TERMINATED
+        else:
+            log.begin(job.stage, number)
+            ending = _disk_shortage(call.out, job) or _run(call, capture, job, threads, signals)
+            log.end(ending)
+            code = ending.exit_code
+        if code:
+            sys.exit(code)
+    if counts_shards(name, LINE):
         store_shard_jobs(call, key, threads)
     marker.parent.mkdir(parents=True, exist_ok=True)
     write_file(marker, "")
@@ -76,7 +79,8 @@ def _disk_shortage(out: Path, job: StageJob) -> AttemptResult | None:
     )
 
 
-def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> AttemptResult:
+def _run(call: Call, capture: PlannedCapture, job: StageJob, threads: int, signals: _Signals) -> AttemptResult:
+    plan = call.plan()
     log = call.log(capture.name, job.stage)
     log.parent.mkdir(parents=True, exist_ok=True)
     spent = spent_s(read_attempts(call.attempts_files(capture.key)))
@@ -91,7 +95,7 @@ def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, th
             start_new_session=True,
             preexec_fn=end_with_parent,  # noqa: PLW1509 (one thread)
         )
-    _forward_signals(process)
+    signals.forward_to(process)
     output, _ = process.communicate()
     out = Path(plan.out) / capture.name
     shard = job.stage != stage_name(job.stage)
@@ -127,16 +131,25 @@ def end_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-def _forward_signals(process: subprocess.Popen[bytes]) -> None:
-    forwarded: list[int] = []
+class _Signals:
+    """Signals to end, forwarded once to the stage's process: a second one would keep it from writing its report."""
 
-    def forward(number: int, _frame: FrameType | None) -> None:
-        if not forwarded:  # a second signal would keep the run from writing its report
-            forwarded.append(number)
+    def __init__(self) -> None:
+        self.received = False
+        self._process: subprocess.Popen[bytes] | None = None
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, self._forward)
+
+    def forward_to(self, process: subprocess.Popen[bytes]) -> None:
+        """Forward to this process, also a signal that came before it was known."""
+        self._process = process
+        if self.received:
             process.send_signal(signal.SIGTERM)
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, forward)
+    def _forward(self, _number: int, _frame: FrameType | None) -> None:
+        if not self.received and self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+        self.received = True
 
 
 def _ending(code: int, output: bytes, events: Path) -> AttemptResult:
