@@ -1,7 +1,8 @@
 """A Slurm cluster of two hosts on this machine: its own folder, ports and accounting, and only its own processes.
 
 The second host is a slurmd in a UTS namespace of its own, so that both have their own names, jobs and limits. Memory
-limits are enforced by control groups.
+limits are enforced by control groups of version 1. The process has to be in a mount namespace of its own, in which the
+cluster's configuration is that of the machine: jobs find it only there.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import os
 import shutil
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -25,7 +25,9 @@ PROGRAMS = {
     "slurmd": "slurm-wlm",
     "unshare": "util-linux",
 }
-SECOND_HOST = "splatpipe-two"
+HOSTS = ("splatpipe-one", "splatpipe-two")  # the nodes' names
+CONFIGURATION = Path("/etc/slurm")
+GROUPS = Path("/sys/fs/cgroup")
 CLUSTER = "splatpipe"
 PATIENCE_S = 60.0
 CONTROLLERS = ("memory", "cpuset", "freezer")  # of control groups version 1, as far as Slurm uses them
@@ -65,23 +67,20 @@ class Cluster:
             raise Problem(f"Needs {', '.join(missing)}: apt install {' '.join(missing)}.")
         if os.geteuid() != 0:
             raise Problem("Needs root, for control groups and a host's name: sudo make test-cluster.")
+        if lacking := [name for name in CONTROLLERS if not (GROUPS / name / "tasks").exists()]:
+            raise Problem(f"Needs control groups of version 1 below {GROUPS}: {', '.join(lacking)}.")
         shutil.rmtree(folder, ignore_errors=True)
         self.folder = folder
-        for name in ("spool", "state", "data", "log"):
+        for name in ("etc", "spool", "state", "data", "log"):
             (folder / name).mkdir(parents=True)
         self.cpus, self.memory_mb = cpus, memory_mb
-        self.hosts = (socket.gethostname(), SECOND_HOST)
         self._first_port = free_ports(len(PORTS))
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-
-    @property
-    def environment(self) -> dict[str, str]:
-        """Environment variables with which Slurm's commands find this cluster."""
-        return {**os.environ, "SLURM_CONF": str(self.folder / "slurm.conf")}
 
     def start(self) -> None:
         """Start all daemons and wait until both hosts are idle."""
         self._write_configuration()
+        subprocess.run(["mount", "--bind", str(self.folder / "etc"), str(CONFIGURATION)], check=True)
         self._start_munge()
         self._start_database()
         self.start_daemon("slurmdbd", ["slurmdbd", "-D"])
@@ -91,23 +90,21 @@ class Cluster:
         self._await("the controller", lambda: self._answers("slurmctld"))
         self.run("sacctmgr", "-i", "add", "account", "survey")
         self.run("sacctmgr", "-i", "add", "user", "root", "account=survey", check=False)
-        for host in self.hosts:
+        for host in HOSTS:
             self.start_host(host)
         self._await("both hosts", lambda: set(self.node_states().values()) == {"idle"})
 
     def start_host(self, host: str) -> None:
         """Start a host's slurmd; the second one in a UTS namespace of its own."""
         command = ["slurmd", "-D"]
-        if host != self.hosts[0]:
+        if host != HOSTS[0]:
             command = ["unshare", "--uts", "sh", "-c", f"hostname {host} && exec slurmd -D"]
         self.start_daemon(host, command)
 
     def start_daemon(self, name: str, command: Sequence[str]) -> None:
         """Start a daemon, whose output goes to the folder ``log``."""
         with (self.folder / "log" / f"{name}.out").open("ab") as output:
-            self._processes[name] = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=self.environment
-            )
+            self._processes[name] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
 
     def end_daemon(self, name: str, *, at_once: bool = False) -> None:
         """End a daemon and wait for its end."""
@@ -128,8 +125,8 @@ class Cluster:
         for name in reversed(list(self._processes)):
             self.end_daemon(name)
         for controller in CONTROLLERS:
-            for host in ("slurm", *(f"slurm_{host}" for host in self.hosts)):
-                top = Path("/sys/fs/cgroup") / controller / host
+            for host in HOSTS:
+                top = GROUPS / controller / f"slurm_{host}"
                 for folder in sorted(top.rglob("*"), reverse=True) if top.is_dir() else ():
                     if folder.is_dir():
                         with suppress(OSError):
@@ -143,9 +140,7 @@ class Cluster:
         Raises:
             Problem: if it fails.
         """
-        done = subprocess.run(
-            command, capture_output=True, text=True, env=self.environment, timeout=PATIENCE_S, check=False
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         if check and done.returncode:
             raise Problem(f"{' '.join(command)} failed: {done.stderr.strip()}")
         return done.stdout.strip()
@@ -159,7 +154,7 @@ class Cluster:
         if self._processes[daemon].poll() is not None:
             raise Problem(f"{daemon} has ended; its output is in {self.folder / 'log'}.")
         words = ("sacctmgr", "-n", "list", "cluster") if daemon == "slurmdbd" else ("scontrol", "ping")
-        done = subprocess.run(words, capture_output=True, text=True, env=self.environment, check=False)
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
         return done.returncode == 0 and (daemon == "slurmdbd" or "is UP" in done.stdout)
 
     @staticmethod
@@ -203,7 +198,7 @@ class Cluster:
     def _write_configuration(self) -> None:
         munge = f"AuthType=auth/munge\nAuthInfo=socket={self.folder / 'munge' / 'socket'}\n"
         host = "127.0.0.1"
-        dbd = self.folder / "slurmdbd.conf"
+        dbd = self.folder / "etc" / "slurmdbd.conf"
         dbd.write_text(
             f"{munge}DbdHost=localhost\nDbdAddr={host}\nDbdPort={self._port('slurmdbd')}\nSlurmUser=root\n"
             f"StorageType=accounting_storage/mysql\nStorageHost={host}\nStoragePort={self._port('mariadb')}\n"
@@ -212,19 +207,20 @@ class Cluster:
             encoding="utf-8",
         )
         dbd.chmod(0o600)
-        one, two = self.hosts
+        one, two = HOSTS
+        here = socket.gethostname()
         node = f"CPUs={self.cpus} RealMemory={self.memory_mb} State=UNKNOWN"
         self._write_slurm_conf(
             munge,
-            f"NodeName={one} NodeHostname={one} NodeAddr={host} Port={self._port('one')} {node}\n"
+            f"NodeName={one} NodeHostname={here} NodeAddr={host} Port={self._port('one')} {node}\n"
             f"NodeName={two} NodeHostname={two} NodeAddr={host} Port={self._port('two')} {node}\n"
             f"PartitionName=normal Nodes={one},{two} Default=YES MaxTime=INFINITE State=UP\n",
         )
 
     def _write_slurm_conf(self, munge: str, nodes: str) -> None:
         log = self.folder / "log"
-        (self.folder / "slurm.conf").write_text(
-            f"ClusterName={CLUSTER}\nSlurmctldHost={self.hosts[0]}(127.0.0.1)\n{munge}"
+        (self.folder / "etc" / "slurm.conf").write_text(
+            f"ClusterName={CLUSTER}\nSlurmctldHost={socket.gethostname()}(127.0.0.1)\n{munge}"
             f"SlurmctldPort={self._port('slurmctld')}\nSlurmUser=root\nSlurmdUser=root\n"
             f"StateSaveLocation={self.folder / 'state'}\nSlurmdSpoolDir={self.folder / 'spool'}/%n\n"
             f"SlurmctldPidFile={self.folder / 'slurmctld.pid'}\nSlurmdPidFile={self.folder}/slurmd-%n.pid\n"
@@ -239,19 +235,8 @@ class Cluster:
             f"PropagateResourceLimits=NONE\nLaunchParameters=use_interactive_step\n{nodes}",
             encoding="utf-8",
         )
-        (self.folder / "cgroup.conf").write_text(
-            "CgroupAutomount=no\nCgroupMountpoint=/sys/fs/cgroup\nCgroupPlugin=cgroup/v1\n"
+        (self.folder / "etc" / "cgroup.conf").write_text(
+            f"CgroupAutomount=no\nCgroupMountpoint={GROUPS}\nCgroupPlugin=cgroup/v1\n"
             "ConstrainCores=no\nConstrainRAMSpace=yes\nConstrainSwapSpace=no\nAllowedRAMSpace=100\n",
             encoding="utf-8",
         )
-
-
-if __name__ == "__main__":  # for looking around: starts the cluster, and ends it at the end of stdin
-    cluster = Cluster(Path(sys.argv[1]))
-    try:
-        cluster.start()
-        sys.stdout.write(f"export SLURM_CONF={cluster.environment['SLURM_CONF']}\n{cluster.run('sinfo')}\n")
-        sys.stdout.flush()
-        sys.stdin.read()
-    finally:
-        cluster.stop()

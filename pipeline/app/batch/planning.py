@@ -166,7 +166,7 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
     if first is not None and not settings.retry_failed:
         planned = _with_previous_failure(planned, first, request.out)
     if names and not planned.message:
-        planned = _with_input_error(planned, request)
+        planned = _with_input_error(planned, request, settings)
     memory = available_memory_bytes() if settings.local else 0
     forecast_needs = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
     # If the stage that counts the shards has to run, it will determine their number.
@@ -175,11 +175,11 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
     return _CaptureDraft(planned, tuple(needed), () if planned.message else names, forecast_needs, shards)
 
 
-def _with_input_error(planned: PlannedCapture, request: Request) -> PlannedCapture:
+def _with_input_error(planned: PlannedCapture, request: Request, settings: Settings) -> PlannedCapture:
     """Detect errors that would end the run before its first stage: such a failure leaves no trace in OUT."""
     try:
         require_readable(request)
-        require_memory(request)
+        require_memory(request, settings.until or None, here=settings.local)
     except SplatpipeError as error:
         return replace(planned, message=error.message, hint=error.hint)
     return planned
