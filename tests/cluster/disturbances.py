@@ -13,7 +13,7 @@ from nights import Batch, Night
 
 STAGE = "features"
 # Long enough to be disturbed: the preset's extractor would take a second.
-OPTIONS = ("--preset", "preview", "--until", STAGE, "--set", "features.extractor=sift")
+OPTIONS = ("--preset", "preview", "--until", STAGE, "--set", "features.extractor=sift", "--threads", "1")
 PHOTOS = 8
 MARKS = (b"splatpipe", b"snakemake", b"srun", b"slurmstepd")  # in the command lines of a job's processes
 
@@ -43,7 +43,7 @@ def _must_fail(night: Night, batch: Batch, reason: str) -> None:
     batch.end(1)
     capture = batch.capture()
     told = f"{capture['state']} in {capture['stage']}: {capture['reason']} {capture['hint']}"
-    night.say(f"   exit code 1; {told}")
+    night.say(f"exit code 1; {told}")
     if capture["state"] != "failed" or reason not in capture["reason"]:
         raise Problem(f"It has to fail with “{reason}”.\n{batch.output()}")
 
@@ -54,7 +54,7 @@ def _must_succeed(night: Night, batch: Batch, *, earlier: str = "", tries: int =
     capture = batch.capture()
     notices = batch.notices.read_text(encoding="utf-8").split("\n")[:-1]
     told = ", ".join(f"{name} {capture[name]}" for name in ("state", "tries", "earlier"))
-    night.say(f"   exit code 0; {told}, notices {notices}")
+    night.say(f"exit code 0; {told}, notices {notices}")
     if notices != ["house done", f"{batch.out.name} done"] or capture["tries"] != tries:
         raise Problem(f"There have to be {tries} attempts and two notices.\n{batch.output()}")
     if earlier not in " ".join(capture["earlier"]) or bool(earlier) != bool(capture["earlier"]):
@@ -140,7 +140,7 @@ def drained(night: Night) -> None:
     finally:
         for host in HOSTS:
             night.cluster.run("scontrol", "update", f"nodename={host}", "state=resume")
-    night.say(f"   while it waits: {reason}")
+    night.say(f"while it waits: {reason}")
     if "down or drained" not in reason or "down or drained" not in page:
         raise Problem("The page has to say that the nodes are drained.")
     _must_succeed(night, batch)
@@ -153,7 +153,7 @@ def host_down(night: Night) -> None:
     night.cluster.end_daemon(HOSTS[1], at_once=True)
     _end_processes(job)
     batch.wait_for("the host to be down", lambda: night.cluster.node_states()[HOSTS[1]].startswith("down"))
-    night.say(f"   {HOSTS[1]} is {night.cluster.node_states()[HOSTS[1]]}; it is started again")
+    night.say(f"{HOSTS[1]} is {night.cluster.node_states()[HOSTS[1]]}; it is started again")
     night.cluster.start_host(HOSTS[1])
     _must_succeed(night, batch)
 
@@ -170,20 +170,19 @@ def batch_killed(night: Night) -> None:
             raise Problem("Its jobs or its page have not ended.")
         time.sleep(1.0)
     capture = batch.capture()
-    night.say(f"   {capture['state']} in {capture['stage']}: {batch.state()['message']}")
+    night.say(f"{capture['state']} in {capture['stage']}: {batch.state()['message']}")
     if capture["state"] != "stopped":
         raise Problem("The capture has to be stopped.")
     _again(night, batch)
 
 
-ALL = (
+TOGETHER = (
     cancelled,
     killed_on_the_other_host,
     requeued,
     beyond_its_memory,
     too_large_for_any_node,
     at_its_time_limit,
-    drained,
-    host_down,
     batch_killed,
 )
+ALONE = (drained, host_down)  # these take the hosts from the others

@@ -124,7 +124,10 @@ def build(torch_index: str) -> None:
             command = ["docker", "import", "-", base]
             subprocess.run(command, stdin=tar.stdout, stdout=subprocess.DEVNULL, check=True)
         shutil.rmtree(folder)
-    told = docker("build", "--network", "host", "-f", ROOT / DOCKERFILE, ROOT, buildkit=False)
+    small = WORK / "secret"
+    small.mkdir(exist_ok=True)
+    (small / "Dockerfile").write_text(f"FROM {base}\nRUN --mount=type=secret,id=pip true\n", encoding="utf-8")
+    told = docker("build", small, buildkit=False)
     if told.returncode == 0 or "BuildKit" not in told.stderr:
         raise Problem(f"Without BuildKit it has to be refused: {told.stderr[-500:]}")
     say(f"Without BuildKit: {told.stderr.strip().splitlines()[-1]}")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from batch_captures import call_of, demo, link, planned
@@ -219,17 +220,26 @@ def test_a_retry_requests_no_more_memory_than_the_largest_node_has(tmp_path: Pat
     assert '"features": [2, 900, 21, 2]' in text and '"ingest"' not in text
 
 
-def run_job(call: Call, monkeypatch: pytest.MonkeyPatch, endings: dict[str, int], number: int) -> tuple[int, list[str]]:
-    """Run a joined job in this process with a stand-in for its stages' commands."""
-    ran: list[str] = []
+def run_job(
+    call: Call, monkeypatch: pytest.MonkeyPatch, started: Sequence[str], ending: AttemptResult, number: int
+) -> tuple[int, str]:
+    """Run a joined job in this process with a stand-in for its command, which starts stages and ends."""
+    ran = ""
 
-    def run(_call: Call, _capture: object, job: StageJob, _threads: int, _signals: object) -> AttemptResult:
-        ran.append(job.stage)
-        return AttemptResult(endings.get(job.stage, 0))
+    def run(_call: Call, _capture: object, job: StageJob, _threads: int, _signals: object, progress: Any) -> object:
+        nonlocal ran
+        ran = job.stage
+        events = call.folder / "events.jsonl"
+        with progress.following(events), events.open("a") as file:
+            for stage in started:
+                file.write(json.dumps({"kind": "stage_started", "stage": stage}) + "\n")
+            file.write('{"kind": "stage_st')
+        return ending
 
     monkeypatch.setattr(job_module, "_run", run)
     monkeypatch.setattr(job_module, "end_with_parent", lambda: None)
-    monkeypatch.setattr(job_module, "_Signals", lambda: SimpleNamespace(received=False))
+    monkeypatch.setattr(job_module, "_Signals", lambda: None)
+    monkeypatch.setattr(job_module, "FOLLOW_S", 0.01)
     marker = call.folder / "done" / "features"
     monkeypatch.setattr(sys, "argv", ["job", str(call.folder), "0001-house", "features", "2", str(marker), str(number)])
     try:
@@ -240,19 +250,31 @@ def run_job(call: Call, monkeypatch: pytest.MonkeyPatch, endings: dict[str, int]
     return 0, ran
 
 
-def test_a_job_of_several_stages_goes_on_where_its_last_attempt_ended(
+def test_a_job_of_several_stages_is_one_command_that_goes_on_where_its_last_attempt_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stages = (small("ingest", joined=True), small("control", joined=True), small("features"), small("train"))
-    call = cluster_call(tmp_path, *stages)
-    assert run_job(call, monkeypatch, {"control": EXIT_STAGE}, 1) == (EXIT_STAGE, ["ingest", "control"])
-    assert run_job(call, monkeypatch, {}, 2) == (0, ["control", "features"])
-    attempts = AttemptLog(call.attempts_file("0001-house")).read()
-    assert [(each.stage, each.number) for each in attempts] == [
-        ("ingest", 1), ("control", 1), ("control", 2), ("features", 2),
-    ]  # fmt: skip
+    names = ("ingest", "control", "features")
+    call = cluster_call(tmp_path, *(small(name, joined=name != "features") for name in names), small("train"))
+
+    def recorded() -> list[tuple[str, int, int | None]]:
+        return [(e.stage, e.number, e.exit_code) for e in AttemptLog(call.attempts_file("0001-house")).read()]
+
+    assert run_job(call, monkeypatch, ("ingest", "mesh", "control"), DIED, 1) == (EXIT_STAGE, "features")
+    assert recorded() == [("ingest", 1, 0), ("control", 1, EXIT_STAGE)]
+    assert run_job(call, monkeypatch, ("control",), DONE, 2) == (0, "features")
+    assert recorded()[2:] == [("control", 2, 0), ("features", 2, 0)]
     call.stop_file.touch()
-    assert run_job(call, monkeypatch, {}, 3) == (0, [])
+    assert run_job(call, monkeypatch, (), DIED, 3) == (0, "") and len(recorded()) == 4
+
+
+def test_a_hopeless_stage_is_not_repeated_and_without_room_none_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call = cluster_call(tmp_path, small("ingest", joined=True), replace(small("features"), disk_bytes=1 << 62))
+    code, ran = run_job(call, monkeypatch, (), DONE, 1)
+    assert (code, ran) == (4, "") and "the stages to features need about" in house(call).reason
+    assert run_job(call, monkeypatch, (), DONE, 2) == (4, "")
+    assert len(AttemptLog(call.attempts_file("0001-house")).read()) == 1
 
 
 ANSWERS = {
