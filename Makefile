@@ -8,6 +8,8 @@
 # make release                 checks wheel and sdist in clean environments: licences, SBOM, types, the demo's bits
 # make aarch64                 builds the kernels and their C++ tests for 64-bit Arm, and runs them under QEMU
 # make test-image              builds the container image and runs the demo in it (Linux, root, buildah, runc)
+# make test-docker             builds the image with a Docker daemon of its own, and tries it and the compose file (root)
+# make test-cluster            runs batches on a Slurm of two hosts on this machine (Linux, root, Debian's slurm-wlm)
 # make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/cuda.md
 # make sanitize                runs the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    installs torch without CUDA from PyTorch's own CPU index
@@ -45,7 +47,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-.PHONY: run test test-all aarch64 gpu-visit release sdist test-image options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-all aarch64 gpu-visit release sdist test-image test-docker test-cluster options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -76,6 +78,16 @@ test-isa: .venv/.tested
 test-image: | .venv/bin/python
 	@echo "== the image"
 	@$(BIN)/python tests/image $(if $(filter cpu,$(TORCH)),--torch-index https://download.pytorch.org/whl/cpu)
+
+# The image and the compose file with a Docker daemon of its own: see docs/containers.md. Requires root.
+test-docker: | .venv/bin/python
+	@echo "== the image, with Docker"
+	@$(BIN)/python tests/image/with_docker.py $(if $(filter cpu,$(TORCH)),--torch-index https://download.pytorch.org/whl/cpu)
+
+# Batches on a Slurm of two hosts with enforced memory: see docs/unattended.md. Requires root.
+test-cluster: $(EITHER)
+	@echo "== the cluster"
+	@$(BIN)/python tests/cluster $(ONLY:%=--only %)
 
 test-captures: .venv/.tested
 	@$(BIN)/python -m pytest -q tests/slow/captures --captures=../shared/data

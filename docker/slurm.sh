@@ -13,6 +13,12 @@
 # work is kept, and the job is requeued and resumes. With a GPU: #SBATCH --gres=gpu:1, the cuda image, and --nv below.
 set -euo pipefail
 
+lacks() {
+  echo "splatpipe: $1" >&2
+  exit 4
+}
+
+[ $# -ge 2 ] || { echo "usage: sbatch $0 PHOTOS OUT [options of splatpipe run]" >&2; exit 2; }
 photos=$(realpath "$1")
 out=$(realpath -m "$2")
 shift 2
@@ -20,8 +26,11 @@ image=${SPLATPIPE_IMAGE-splatpipe.sif}
 mkdir -p "$out"
 
 if [ -n "$image" ]; then
+  command -v apptainer > /dev/null || lacks "there is no apptainer on $(hostname). Load its module before sbatch, or set SPLATPIPE_IMAGE= (empty) for a splatpipe on PATH."
+  [ -e "$image" ] || lacks "there is no image $image. Set SPLATPIPE_IMAGE to its path, or to nothing for a splatpipe on PATH."
   command=(apptainer run --containall --no-home --bind "$photos:/photos:ro" --bind "$out:/out" "$image" run /photos /out --wait "$@")
 else
+  command -v splatpipe > /dev/null || lacks "there is no splatpipe on PATH on $(hostname). Activate its environment before sbatch, or set SPLATPIPE_IMAGE to an image for Apptainer."
   command=(splatpipe run "$photos" "$out" --wait "$@")
 fi
 

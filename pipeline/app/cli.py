@@ -130,7 +130,7 @@ def run(
         again = stages_to_rerun(rerun or [], rerun_from, until)
         request = request_of(photos, out, resolved, device, threads)
         require_readable(request)
-        require_memory(request)
+        require_memory(request, until)
         print_forecast(request, until)
         with RunSession(request, wait) as runner:
             done.outcome = runner.outcome

@@ -68,7 +68,7 @@ def batch(
     """Run many captures unattended: finished results are reused, and a failed capture does not stop the others."""
     from splatpipe.pipeline.app.batch.capture_list import with_files_from
     from splatpipe.pipeline.app.batch.planning import Settings
-    from splatpipe.pipeline.app.batch.snakemake_process import open_profile
+    from splatpipe.pipeline.app.batch.snakemake_process import open_profile, require_snakemake
     from splatpipe.pipeline.app.notice import check_command
     from splatpipe.pipeline.engine.config import load_preset
 
@@ -81,11 +81,25 @@ def batch(
         if notify is not None:
             check_command(notify)
         where = open_profile(profile)
+        require_snakemake(where)
         tables = tuple(with_files_from(Path.cwd(), table) for table in overrides(config, assignments, None).tables)
         if where.local:  # problems of the machine or the options are reported now
             request_of(captures, out, overrides(config, assignments, None).resolve(load_preset(preset)), device)
         gpu = _uses_gpu(device, where)
-        settings = Settings(preset, tables, until or "", device, gpu, threads, retries, retry_failed, where.local)
+        node_threads, node_memory = where.largest_machine()
+        settings = Settings(
+            preset=preset,
+            tables=tables,
+            until=until or "",
+            device=device,
+            gpu=gpu,
+            threads=threads,
+            retries=retries,
+            retry_failed=retry_failed,
+            local=where.local,
+            node_threads=node_threads,
+            node_memory_bytes=node_memory,
+        )
         if dry_run:
             code = _dry_run(captures, out, settings, where)
         else:

@@ -59,8 +59,7 @@ PAGES = {
     ),
     "batch": HelpPage(
         "Reads a folder of capture folders, or a list (TOML, CSV) with options for each. Writes a run to OUT/NAME for "
-        "each capture, and batch.html, batch.csv and batch.json about all of them. Needs Snakemake: "
-        "pip install 'splatpipe\\[batch]'.",
+        "each capture, and batch.html, batch.csv and batch.json about all of them.",
         ("batch CAPTURES OUT --dry-run", "batch captures.toml OUT --retries 3"),
         "docs/unattended.md",
         "0 all captures succeeded, 1 some failed, 2 invalid command line or list, 3 Snakemake failed, 4 this "

@@ -16,7 +16,6 @@ from pathlib import Path
 
 TAG = "splatpipe:cpu"
 SUITE = "bookworm"  # Debian 12, as in the base's name
-CERT_INSIDE = "/etc/index-certificates.pem"  # separate from Debian's own, which a package of the image writes
 DOCKERFILE = Path("docker") / "Dockerfile"
 DRIVERS = ("overlay", "vfs")  # the second works everywhere, but copies all files for every layer
 TOOLS = ("buildah", "debootstrap", "runc")
@@ -118,7 +117,7 @@ class ImageTools:
 
 def build_image(tools: ImageTools, root: Path, torch_index: str, say: Callable[[str], None]) -> None:
     """Build the target ``cpu`` from a checkout."""
-    base = _base(root)
+    base = base_of(root)
     if not tools.has(base):
         say(f"A stand-in for {base}, by debootstrap:")
         _make_base(tools, base, root / "build" / "image" / "base")
@@ -129,7 +128,8 @@ def build_image(tools: ImageTools, root: Path, torch_index: str, say: Callable[[
     tools.buildah("bud", *arguments, "-f", root / DOCKERFILE, root, quiet=False)
 
 
-def _base(root: Path) -> str:
+def base_of(root: Path) -> str:
+    """The name of the image's base."""
     found = re.search(r"^ARG BASE=(\S+)$", (root / DOCKERFILE).read_text(encoding="utf-8"), re.MULTILINE)
     if found is None:
         raise Problem(f"{DOCKERFILE} names no base.")
@@ -137,6 +137,20 @@ def _base(root: Path) -> str:
 
 
 def _make_base(tools: ImageTools, base: str, folder: Path) -> None:
+    make_base_folder(folder)
+    container = tools.buildah("from", "scratch")
+    tools.buildah("add", "-q", container, folder, "/")
+    tools.buildah("commit", "-q", container, base)
+    tools.buildah("rm", container)
+    shutil.rmtree(folder)
+
+
+def make_base_folder(folder: Path) -> None:
+    """Make a stand-in for the base by debootstrap.
+
+    Args:
+        folder: Its root; emptied.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     command = ["debootstrap", "--variant=minbase", SUITE, str(folder)]
     if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
@@ -145,11 +159,6 @@ def _make_base(tools: ImageTools, base: str, folder: Path) -> None:
         shutil.rmtree(folder / leftover)
         (folder / leftover / "partial").mkdir(parents=True)
     _make_slim(folder)
-    container = tools.buildah("from", "scratch")
-    tools.buildah("add", "-q", container, folder, "/")
-    tools.buildah("commit", "-q", container, base)
-    tools.buildah("rm", container)
-    shutil.rmtree(folder)
 
 
 def _make_slim(folder: Path) -> None:
@@ -165,7 +174,43 @@ def _make_slim(folder: Path) -> None:
 
 
 def _index(work: Path) -> list[object]:
-    """Return arguments that pass pip's package index to the build alone: a secret, mounts, a certificate."""
+    """Return arguments that pass pip's package index to the build alone: secrets, and mounts of local folders."""
+    arguments = index_secrets(work)
+    values = [value for name, value in _pip_settings().items() if name not in ("cert", "constraint")]
+    for place in sorted({place for value in values for place in _local_paths(value)}):
+        arguments += ["-v", f"{place}:{place}:ro"]
+    return arguments
+
+
+def index_secrets(work: Path, address_of: Callable[[Path], str] | None = None) -> list[object]:
+    """Return arguments that pass this machine's package indexes and their certificates to a build, as secrets.
+
+    Args:
+        work: Folder for the secrets' files.
+        address_of: Returns the address at which the build finds a local folder of packages; None if it is mounted.
+    """
+    settings = _pip_settings()
+    if address_of is not None:
+        for name, value in settings.items():
+            if name == "find-links":
+                settings[name] = " ".join(
+                    address_of(Path(word)) if Path(word).is_dir() else word for word in value.split()
+                )
+    certificate = settings.pop("cert", "")
+    lines = (f"{name} = {value.replace(chr(10), ' ')}" for name, value in settings.items() if name != "constraint")
+    secret = work / "pip.conf"
+    secret.write_text("[global]\n" + "\n".join(lines) + "\n", encoding="utf-8")
+    secret.chmod(0o600)
+    arguments: list[object] = ["--secret", f"id=pip,src={secret}"]
+    if (npm := Path.home() / ".npmrc").is_file():
+        arguments += ["--secret", f"id=npm,src={npm}"]
+    if certificate:
+        arguments += ["--secret", f"id=cert,src={certificate}"]
+    return arguments
+
+
+def _pip_settings() -> dict[str, str]:
+    """This machine's configuration of pip."""
     listed = subprocess.run(
         [sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True, check=True
     ).stdout
@@ -173,18 +218,7 @@ def _index(work: Path) -> list[object]:
     for line in listed.splitlines():
         name, _, value = line.partition("=")
         settings[name.rpartition(".")[2]] = str(ast.literal_eval(value))
-    certificate = settings.pop("cert", "")
-    lines = (f"{name} = {value.replace(chr(10), ' ')}" for name, value in settings.items())
-    secret = work / "pip.conf"
-    secret.write_text("[global]\n" + "\n".join(lines) + "\n", encoding="utf-8")
-    secret.chmod(0o600)
-    arguments: list[object] = ["--secret", f"id=pip,src={secret}"]
-    for place in sorted({place for value in settings.values() for place in _local_paths(value)}):
-        arguments += ["-v", f"{place}:{place}:ro"]
-    if certificate:
-        arguments += ["-v", f"{certificate}:{CERT_INSIDE}:ro", "--build-arg", f"PIP_CERT={CERT_INSIDE}"]
-        arguments += ["--build-arg", f"NODE_EXTRA_CA_CERTS={CERT_INSIDE}"]
-    return arguments
+    return settings
 
 
 def _local_paths(value: str) -> list[Path]:

@@ -15,11 +15,11 @@ from pathlib import Path
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
 from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, BatchPlan, Call, PlannedCapture
 from splatpipe.pipeline.app.batch.publication import PAGE_FILE, publish
+from splatpipe.pipeline.app.batch.slurm import ASK_INTERVAL_S, store_queue
 from splatpipe.pipeline.app.batch.snakemake_process import (
     Profile,
     end_group,
     last_error_line,
-    require_snakemake,
     snakemake_command,
     snakemake_environment,
     start_snakemake,
@@ -163,6 +163,7 @@ class Driver:
         self._monitor = BatchMonitor(call)
         self._before: dict[str, CaptureState] = {}
         self._published_s = 0.0
+        self._asked_s = 0.0
         self._last: BatchState | None = None
         self._unwritten = ""
         self._notice_s = TIME_LIMIT_S
@@ -202,13 +203,13 @@ class Driver:
         return state
 
     def _work(self, lock: int) -> None:
-        require_snakemake()
         write_workflow(self._call, self._plan, LINE)
         with _guarded(self._call, lock) as send:
             process = start_snakemake(self._call, self._plan, self._profile)
             send({"group": process.pid, "local": self._profile.local})
             try:
                 while process.poll() is None:
+                    self._ask_engine()
                     self._report(self._monitor.state())
                     time.sleep(POLL_S)
             except BaseException:
@@ -221,6 +222,12 @@ class Driver:
                 process.wait()
                 raise
         self._check(process.returncode)
+
+    def _ask_engine(self) -> None:
+        """Ask now and then why jobs are waiting."""
+        if self._profile.executor == "slurm" and time.monotonic() - self._asked_s > ASK_INTERVAL_S:
+            store_queue(self._call.folder)
+            self._asked_s = time.monotonic()
 
     def _check(self, code: int) -> None:
         """Raise an error if Snakemake failed and no capture's failure explains it."""
@@ -318,7 +325,6 @@ def dry_run(call: Call, profile: Profile) -> int:
     Returns:
         Snakemake's exit code.
     """
-    require_snakemake()
     plan = call.plan()
     write_workflow(call, plan, LINE)
     sys.stderr.write("".join(f"{plan_text(capture)}\n" for capture in plan.captures))

@@ -1,6 +1,6 @@
-"""The process of a workflow job: runs one stage of one capture by `splatpipe run --until`, or one shard.
+"""The process of a workflow job: runs its stages of one capture by one `splatpipe run --until`, or one shard.
 
-    python -m splatpipe.pipeline.app.batch.job CALL CAPTURE STAGE THREADS MARKER
+    python -m splatpipe.pipeline.app.batch.job CALL CAPTURE JOB THREADS MARKER ATTEMPT
 
 It sits between Snakemake and the run so that every outcome is recorded, a capture that cannot succeed is not retried,
 and a signal reaches the run exactly once, whoever sent it to which process.
@@ -15,12 +15,14 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
 from splatpipe.pipeline.app.batch.attempts import PERMANENT_FAILURES, AttemptLog, AttemptResult, read_attempts, spent_s
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob, workflow_jobs
 from splatpipe.pipeline.app.batch.shards import counts_shards, store_shard_jobs
 from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
 from splatpipe.pipeline.app.command_summary import PART_VARIABLE
@@ -34,6 +36,7 @@ from splatpipe.pipeline.engine.stage import JSON, stage_name
 from splatpipe.stages.line import LINE
 
 SPLATPIPE = tuple(python_module("splatpipe.pipeline.app.cli"))
+FOLLOW_S = 0.5
 RESERVE_BYTES = 256 << 20  # of the disk, reserved for what other captures' stages write at the same time
 
 
@@ -41,42 +44,109 @@ def main() -> None:
     """Run the job given on the command line."""
     end_with_parent()
     call = Call(Path(sys.argv[1]))
-    key, stage, threads, marker = sys.argv[2], sys.argv[3], int(sys.argv[4]), Path(sys.argv[5])
-    if call.stop_file.exists():
-        sys.exit(EXIT_TERMINATED)
-    plan = call.plan()
-    capture = plan.capture(key)
-    log = AttemptLog(call.attempts_file(key, stage))
-    before = [each for each in log.read() if each.stage == stage]
-    if before and before[-1].final:
-        sys.exit(before[-1].exit_code)
-    job = next(job for job in call.jobs(capture) if job.stage == stage)
-    log.begin(stage)
-    ending = _disk_shortage(Path(plan.out), job) or _run(call, plan, capture, job, threads)
-    log.end(ending)
-    if ending.exit_code:
-        sys.exit(ending.exit_code)
-    if counts_shards(stage, LINE):
+    key, name, threads, marker, number = sys.argv[2], sys.argv[3], int(sys.argv[4]), Path(sys.argv[5]), int(sys.argv[6])
+    capture = call.plan().capture(key)
+    log = AttemptLog(call.attempts_file(key, name))
+    stages = workflow_jobs(call.jobs(capture))[name]
+    before = {each.stage: each for each in log.read()}
+    left = [stage for stage in stages if stage.stage not in before or not before[stage.stage].succeeded]
+    if left:
+        earlier = before.get(left[0].stage)
+        if earlier is not None and earlier.final:
+            sys.exit(earlier.exit_code)
+        signals = _Signals()
+        if call.stop_file.exists():
+            sys.exit(EXIT_TERMINATED)
+        progress = _StageProgress(log, [stage.stage for stage in left], number)
+        ending = _disk_shortage(call.out, left) or _run(call, capture, left[-1], threads, signals, progress)
+        progress.end(ending)
+        if ending.exit_code:
+            sys.exit(ending.exit_code)
+    if counts_shards(name, LINE):
         store_shard_jobs(call, key, threads)
     marker.parent.mkdir(parents=True, exist_ok=True)
     write_file(marker, "")
 
 
-def _disk_shortage(out: Path, job: StageJob) -> AttemptResult | None:
-    """The failure if the stage must not start, e.g. for lack of disk space; None if it may."""
+class _StageProgress:
+    """Records the attempts at a job's stages, as the events of its one command tell them, one after the other.
+
+    Args:
+        log: The log of the attempts; the first one begins now.
+        stages: The stages that the command will run.
+        number: Snakemake's number of the attempt.
+    """
+
+    def __init__(self, log: AttemptLog, stages: Sequence[str], number: int) -> None:
+        self._log, self._left, self._number = log, list(stages), number
+        self._over = threading.Event()
+        self._log.begin(self._left[0], number)
+
+    @contextmanager
+    def following(self, events: Path) -> Iterator[None]:
+        """Follow the events that a command appends to a file."""
+        if len(self._left) == 1:
+            yield
+            return
+        offset = events.stat().st_size if events.exists() else 0
+        follower = threading.Thread(target=self._follow, args=(events, offset))
+        follower.start()
+        try:
+            yield
+        finally:
+            self._over.set()
+            follower.join()
+
+    def end(self, ending: AttemptResult) -> None:
+        """Record the end of the command: of all its stages if it succeeded, else of the one that was running."""
+        self._log.end(ending)
+        for stage in self._left[1:] if ending.exit_code == 0 else ():
+            self._log.begin(stage, self._number)
+            self._log.end(ending)
+
+    def _follow(self, events: Path, offset: int) -> None:
+        with suppress(OSError, ValueError, KeyError):  # a disk that is full or gone: the command itself reports it
+            while True:
+                over = self._over.wait(FOLLOW_S)
+                if events.exists():
+                    with events.open("rb") as file:
+                        file.seek(offset)
+                        whole = file.read().rpartition(b"\n")[0]
+                    offset += len(whole) + 1 if whole else 0
+                    for line in whole.splitlines():
+                        self._take(line)
+                if over:
+                    return
+
+    def _take(self, line: bytes) -> None:
+        event = json.loads(line)
+        if event["kind"] == "stage_started" and event["stage"] in self._left[1:]:
+            while self._left[0] != event["stage"]:  # those between were reused
+                self._log.end(AttemptResult(0))
+                self._left.pop(0)
+                self._log.begin(self._left[0], self._number)
+
+
+def _disk_shortage(out: Path, stages: Sequence[StageJob]) -> AttemptResult | None:
+    """The failure if the stages must not start, e.g. for lack of disk space; None if they may."""
     free = shutil.disk_usage(out).free
-    if free >= job.disk_bytes + RESERVE_BYTES:
+    needed = (sum(stage.disk_bytes for stage in stages) + RESERVE_BYTES) / 1e9
+    if free >= 1e9 * needed:
         return None
-    needed = (job.disk_bytes + RESERVE_BYTES) / 1e9
+    what = f"the stage {stages[0].stage} needs" if len(stages) == 1 else f"the stages to {stages[-1].stage} need"
     return AttemptResult(
         EXIT_MACHINE,
-        f"The disk has {free / 1e9:.1f} GB free, and the stage {job.stage} needs about {needed:.1f}.",
+        f"The disk has {free / 1e9:.1f} GB free, and {what} about {needed:.1f}.",
         "Make room, then repeat the command: finished work is kept.",
         final=True,
     )
 
 
-def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> AttemptResult:
+def _run(
+    call: Call, capture: PlannedCapture, job: StageJob, threads: int, signals: _Signals, progress: _StageProgress
+) -> AttemptResult:
+    """Run the command of a job's last stage, which runs those before it as well."""
+    plan = call.plan()
     log = call.log(capture.name, job.stage)
     log.parent.mkdir(parents=True, exist_ok=True)
     spent = spent_s(read_attempts(call.attempts_files(capture.key)))
@@ -91,11 +161,13 @@ def _run(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, th
             start_new_session=True,
             preexec_fn=end_with_parent,  # noqa: PLW1509 (one thread)
         )
-    _forward_signals(process)
-    output, _ = process.communicate()
+    signals.forward_to(process)
     out = Path(plan.out) / capture.name
     shard = job.stage != stage_name(job.stage)
-    return _ending(process.returncode, output, shard_events(out, job.stage) if shard else out / EVENTS_FILE)
+    events = shard_events(out, job.stage) if shard else out / EVENTS_FILE
+    with progress.following(events):
+        output, _ = process.communicate()
+    return _ending(process.returncode, output, events)
 
 
 def command_of(call: Call, plan: BatchPlan, capture: PlannedCapture, job: StageJob, threads: int) -> list[str]:
@@ -127,16 +199,25 @@ def end_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-def _forward_signals(process: subprocess.Popen[bytes]) -> None:
-    forwarded: list[int] = []
+class _Signals:
+    """Signals to end, forwarded once to the stage's process: a second one would keep it from writing its report."""
 
-    def forward(number: int, _frame: FrameType | None) -> None:
-        if not forwarded:  # a second signal would keep the run from writing its report
-            forwarded.append(number)
+    def __init__(self) -> None:
+        self.received = False
+        self._process: subprocess.Popen[bytes] | None = None
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, self._forward)
+
+    def forward_to(self, process: subprocess.Popen[bytes]) -> None:
+        """Forward to this process, also a signal that came before it was known."""
+        self._process = process
+        if self.received:
             process.send_signal(signal.SIGTERM)
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, forward)
+    def _forward(self, _number: int, _frame: FrameType | None) -> None:
+        if not self.received and self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+        self.received = True
 
 
 def _ending(code: int, output: bytes, events: Path) -> AttemptResult:

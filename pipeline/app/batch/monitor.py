@@ -10,9 +10,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.attempts import Attempt, read_attempts
+from splatpipe.pipeline.app.batch.attempts import Attempt, as_engine_knows, read_attempts
+from splatpipe.pipeline.app.batch.engine_errors import read_errors
 from splatpipe.pipeline.app.batch.pictures import capture_picture
-from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob, workflow_jobs
+from splatpipe.pipeline.app.batch.slurm import read_queue
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState, Level
 from splatpipe.pipeline.app.report import REPORT_FILE
 from splatpipe.pipeline.app.report.report_inputs import ReportInputs, read_report_inputs
@@ -88,8 +90,21 @@ class BatchMonitor:
             return self._with_facts(failed, planned, ())
         if not planned.jobs:
             return self._with_facts(CaptureState(planned.name, "reused", progress=1.0), planned, ())
-        attempts = read_attempts(self._call.attempts_files(planned.key))
+        attempts = self._attempts(planned, ended=ended)
         return self._with_facts(self._capture_state(planned, attempts, ended=ended), planned, attempts)
+
+    def _attempts(self, planned: PlannedCapture, *, ended: bool) -> list[Attempt]:
+        """A capture's attempts; those elsewhere as their engine knows them."""
+        attempts = read_attempts(self._call.attempts_files(planned.key))
+        if self._plan.local:
+            return attempts
+        errors = read_errors(self._call.folder)
+        found = []
+        for name, of_job in workflow_jobs(self._call.jobs(planned)).items():
+            stages = [job.stage for job in of_job]
+            own = [each for each in attempts if each.stage in stages]
+            found += as_engine_knows(own, errors.get((planned.key, name), ()), stages, running=not ended)
+        return found
 
     def _capture_state(self, planned: PlannedCapture, attempts: Sequence[Attempt], *, ended: bool) -> CaptureState:
         """A capture's state from its jobs' attempts; for parallel shards, the first of ``STATE_PRIORITY``."""
@@ -119,14 +134,23 @@ class BatchMonitor:
         if own and not own[-1].alive and self._is_final(own):
             earlier = tuple(reason for reason in _reasons(attempts) if reason != _reasons(own[-1:])[0])
             return replace(state, state="failed", reason=own[-1].reason, hint=own[-1].hint, earlier=earlier)
-        return replace(state, state="stopped", reason=STOPPED, hint=RESUME_HINT) if ended else state
+        if ended:
+            return replace(state, state="stopped", reason=STOPPED, hint=RESUME_HINT)
+        return state if self._plan.local else replace(state, reason=self._queue_reason(planned, stage))
+
+    def _queue_reason(self, planned: PlannedCapture, stage: str) -> str:
+        """Why the engine does not start the job that runs a stage; empty if it does not say."""
+        for name, of_job in workflow_jobs(self._call.jobs(planned)).items():
+            if any(job.stage == stage for job in of_job):
+                return read_queue(self._call.folder).get(f"{planned.key}/{name}", "")
+        return ""
 
     def _is_final(self, own: Sequence[Attempt]) -> bool:
         """Whether a failed stage will not be retried."""
         last = own[-1]
         if self._call.stop_file.exists() and last.exit_code in (None, EXIT_INTERRUPTED, EXIT_TERMINATED):
             return False  # it was ended with the batch
-        return last.final or len(own) > self._plan.retries
+        return last.final or max(len(own), last.number) > self._plan.retries
 
     def _fraction(self, planned: PlannedCapture, stage: str) -> float:
         """The progress of a running stage from its events, 0 to 1."""
@@ -145,7 +169,8 @@ class BatchMonitor:
         if self._facts.get(planned.key, (None,))[0] != known:
             self._facts[planned.key] = (known, self._read(planned, state))
         facts = self._facts[planned.key][1]
-        under_way = time.time() - attempts[-1].began_s if state.state == "running" else 0.0
+        began_s = max((each.began_s for each in attempts), default=0.0)
+        under_way = time.time() - began_s if state.state == "running" else 0.0
         return replace(
             state,
             verdict="" if state.state == "failed" else facts.verdict,  # it would add nothing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ MIN_S = 1.0  # of a process that only joins
 
 @dataclass(frozen=True)
 class StageJob:
-    """A job of the workflow: one stage of one capture, or one of its shards.
+    """One stage of one capture, or one of its shards, as a job of the workflow or part of one.
 
     Attributes:
         stage: Its name; for a shard e.g. ``train.2``.
@@ -29,6 +29,7 @@ class StageJob:
         memory_bytes: Expected peak memory, with a margin.
         seconds: Expected duration with these threads.
         disk_bytes: Expected disk space at its end, or while it runs.
+        joined: Whether it runs in the same job as the next stage.
     """
 
     stage: str
@@ -36,12 +37,32 @@ class StageJob:
     memory_bytes: int
     seconds: float
     disk_bytes: int
+    joined: bool = False
 
     @property
     def resources(self) -> list[int]:
-        """The resources requested in the workflow: threads, megabytes of memory, minutes, megabytes of disk."""
-        minutes = round(RUNTIME_MIN + RUNTIME_FACTOR * self.seconds / 60.0)
-        return [self.threads, max(1, self.memory_bytes // MEGABYTE), minutes, max(1, self.disk_bytes // MEGABYTE)]
+        """The resources requested in the workflow, if it is a job by itself."""
+        return resources_of([self])
+
+
+def resources_of(stages: Sequence[StageJob]) -> list[int]:
+    """Resources requested for stages that run one after the other: threads, megabytes of memory, minutes, megabytes of
+    disk."""
+    minutes = round(RUNTIME_MIN + RUNTIME_FACTOR * sum(stage.seconds for stage in stages) / 60.0)
+    memory, disk = max(stage.memory_bytes for stage in stages), sum(stage.disk_bytes for stage in stages)
+    return [max(stage.threads for stage in stages), max(1, memory // MEGABYTE), minutes, max(1, disk // MEGABYTE)]
+
+
+def workflow_jobs(stages: Iterable[StageJob]) -> dict[str, list[StageJob]]:
+    """The workflow's jobs, each by the name of its last stage, with the stages that it runs, in order."""
+    jobs: dict[str, list[StageJob]] = {}
+    beside: list[StageJob] = []
+    for stage in stages:
+        beside.append(stage)
+        if not stage.joined:
+            jobs[stage.stage] = beside
+            beside = []
+    return jobs
 
 
 @dataclass(frozen=True)
@@ -86,6 +107,8 @@ class BatchPlan:
         gpu: Whether the stages that can use a GPU get one.
         retries: How often a failed stage is retried.
         local: Whether the jobs run on this machine rather than where a profile sends them.
+        node_memory_bytes: Memory of the largest machine that a profile sends them to, which no retry exceeds; 0 if
+            unknown.
         warnings: Warnings from planning.
         unlisted: Captures of earlier calls that are no longer listed.
     """
@@ -98,6 +121,7 @@ class BatchPlan:
     gpu: bool = False
     retries: int = 0
     local: bool = True
+    node_memory_bytes: int = 0
     warnings: tuple[str, ...] = ()
     unlisted: tuple[str, ...] = ()
 
@@ -156,7 +180,7 @@ class Call:
 
         Args:
             key: The capture's key.
-            job: The name of a job's stage; all stages that are not shards share one file.
+            job: A job's name; all that are not shards share one file.
         """
         return self.folder / "tries" / f"{key}{_shard(job)}.jsonl"
 

@@ -8,11 +8,20 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.capture_list import ListedCapture
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture
-from splatpipe.pipeline.app.batch.shards import MEMORY_MARGIN, NOTHING, missing_shards, shard_jobs, stage_job
+from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.shards import (
+    MEMORY_MARGIN,
+    NOTHING,
+    counts_shards,
+    missing_shards,
+    shard_jobs,
+    stage_job,
+)
+from splatpipe.pipeline.app.batch.workflow import GPU_STAGES
 from splatpipe.pipeline.app.cli_runs import Overrides, request_of
 from splatpipe.pipeline.app.preflight.sizing import size_of
 from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
@@ -31,8 +40,10 @@ from splatpipe.pipeline.engine.source import open_source
 from splatpipe.pipeline.engine.stage import Shard, stage_name
 from splatpipe.pipeline.engine.store import Part, is_copy
 from splatpipe.stages.forecast import forecast, machine_speed
+from splatpipe.stages.line import LINE
 
-CLUSTER_THREADS = 8  # of a job on another machine; a profile's set-threads overrides it
+CLUSTER_THREADS = 8  # of a job on another machine at most; a profile's set-threads overrides it
+LIGHT_S = 300.0  # a shorter stage shares its job with its neighbours: an engine's queue costs some 30 s a job
 LONGEST_SLUG = 40
 NOT_RETRIED = "Nothing has changed since, so it was not retried; use --retry-failed to do so."
 
@@ -51,6 +62,8 @@ class Settings:
         retries: How often a failed stage is retried.
         retry_failed: Also retry what failed because of its photos or options, even if nothing changed.
         local: Whether the jobs run on this machine.
+        node_threads: Processors of the largest machine that runs jobs elsewhere; 0 if unknown.
+        node_memory_bytes: Its memory; 0 if unknown.
     """
 
     preset: str = "standard"
@@ -62,6 +75,8 @@ class Settings:
     retries: int = 0
     retry_failed: bool = False
     local: bool = True
+    node_threads: int = 0
+    node_memory_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -96,11 +111,12 @@ def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings)
         _draft_capture(capture, f"{at:04d}-{_slug(capture.name)}", call, settings)
         for at, capture in enumerate(captures, 1)
     ]
-    threads = settings.threads or _threads(drafts, local=settings.local)
-    planned = tuple(_with_jobs(draft, threads) for draft in drafts)
+    threads = settings.threads or _threads(drafts, settings)
+    planned = tuple(_with_jobs(draft, threads, settings) for draft in drafts)
     for draft in drafts:
         if draft.shards:
-            call.write_shards(draft.planned.key, shard_jobs(draft.shards, draft.forecast_needs(threads), threads))
+            needs = draft.forecast_needs(threads)
+            call.write_shards(draft.planned.key, shard_jobs(draft.shards, needs, threads, local=settings.local))
     return BatchPlan(
         out=str(call.out),
         began_s=began_s,
@@ -110,6 +126,7 @@ def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings)
         gpu=settings.gpu,
         retries=settings.retries,
         local=settings.local,
+        node_memory_bytes=settings.node_memory_bytes,
     )
 
 
@@ -149,7 +166,7 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
     if first is not None and not settings.retry_failed:
         planned = _with_previous_failure(planned, first, request.out)
     if names and not planned.message:
-        planned = _with_input_error(planned, request)
+        planned = _with_input_error(planned, request, settings)
     memory = available_memory_bytes() if settings.local else 0
     forecast_needs = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
     # If the stage that counts the shards has to run, it will determine their number.
@@ -158,11 +175,11 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
     return _CaptureDraft(planned, tuple(needed), () if planned.message else names, forecast_needs, shards)
 
 
-def _with_input_error(planned: PlannedCapture, request: Request) -> PlannedCapture:
+def _with_input_error(planned: PlannedCapture, request: Request, settings: Settings) -> PlannedCapture:
     """Detect errors that would end the run before its first stage: such a failure leaves no trace in OUT."""
     try:
         require_readable(request)
-        require_memory(request)
+        require_memory(request, settings.until or None, here=settings.local)
     except SplatpipeError as error:
         return replace(planned, message=error.message, hint=error.hint)
     return planned
@@ -210,13 +227,13 @@ def _with_previous_failure(planned: PlannedCapture, first: StageStatus, out: Pat
     return planned
 
 
-def _threads(drafts: Sequence[_CaptureDraft], *, local: bool) -> int:
-    """Threads per job: the machine's threads divided by the captures that can run at once.
+def _threads(drafts: Sequence[_CaptureDraft], settings: Settings) -> int:
+    """Threads per job: the machine's threads divided by the captures that can run at once; elsewhere those of a job.
 
     Many captures in parallel finish sooner than one after the other with all threads, some of which are always idle.
     """
-    if not local:
-        return CLUSTER_THREADS
+    if not settings.local:
+        return min(CLUSTER_THREADS, settings.node_threads or CLUSTER_THREADS)
     cores = available_cores()
     peaks = [max(_needs_of(draft, cores, draft.names).values(), key=_memory) for draft in drafts if draft.names]
     if not peaks:
@@ -236,7 +253,29 @@ def _memory(need: Need) -> int:
     return need.memory_bytes
 
 
-def _with_jobs(draft: _CaptureDraft, threads: int) -> PlannedCapture:
+def _with_jobs(draft: _CaptureDraft, threads: int, settings: Settings) -> PlannedCapture:
     needs = _needs_of(draft, threads, draft.needed)
-    jobs = tuple(stage_job(name, needs[name], threads) for name in draft.names)
-    return replace(draft.planned, jobs=jobs, weights={name: need.seconds(threads) for name, need in needs.items()})
+    jobs = [stage_job(name, needs[name], threads, local=settings.local) for name in draft.names]
+    if not settings.local:  # a stage that is turned off needs no job: the next one's command passes it
+        jobs = _joined([job for job in jobs if needs[job.stage].memory_bytes] or jobs[-1:], settings.gpu)
+    weights = {name: need.seconds(threads) for name, need in needs.items()}
+    return replace(draft.planned, jobs=tuple(jobs), weights=weights)
+
+
+def _joined(jobs: Sequence[StageJob], gpu: bool) -> list[StageJob]:
+    """Join light stages that follow one another into one job each.
+
+    A stage with shards has jobs of its own, and one that counts them ends its job, so that they can start. Stages with
+    and without a GPU are not joined.
+    """
+    sharded = {stage.name for stage in LINE if stage.shards is not None}
+    return [
+        replace(
+            job,
+            joined=max(job.seconds, after.seconds) < LIGHT_S
+            and not {job.stage, after.stage} & sharded
+            and not counts_shards(job.stage, LINE)
+            and not (gpu and (job.stage in GPU_STAGES) != (after.stage in GPU_STAGES)),
+        )
+        for job, after in pairwise(jobs)
+    ] + list(jobs[-1:])

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import pwd
 import re
 import runpy
+import shlex
 import signal
 import subprocess
 import sys
@@ -21,8 +23,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatpipe.pipeline.app.batch.engine_errors import record_errors
 from splatpipe.pipeline.app.batch.job import end_with_parent
 from splatpipe.pipeline.app.batch.plan import MEGABYTE, BatchPlan, Call
+from splatpipe.pipeline.app.batch.slurm import largest_node
 from splatpipe.pipeline.app.batch.workflow import SNAKEFILE
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
@@ -35,7 +39,10 @@ POLL_S = 0.05
 MAX_PROFILE_BYTES = 1 << 20
 LOG_TAIL = 4000  # characters of Snakemake's log that are searched for its last message
 PROFILE_FILES = ("config.v9+.yaml", "config.v8+.yaml", "config.yaml")
-ERROR_LINE = re.compile(r"^(?:[A-Za-z]*(?:Error|Exception)\b.*|.*\berror: .*)", re.MULTILINE)
+ERROR_LINE = re.compile(r"^(?:[A-Za-z]*(?:Error|Exception)\b(?::\n)?.*|.*\berror: .*)", re.MULTILINE)
+SNAKEMAKE = "snakemake>=9.20,<10"
+# Executor plugins by their profile's name, in the versions with which the shipped profiles were tried.
+PLUGINS = {"slurm": "snakemake-executor-plugin-slurm==2.8.0"}
 
 
 @dataclass(frozen=True)
@@ -51,14 +58,32 @@ class Profile:
     text: str = ""
 
     @property
+    def executor(self) -> str:
+        """The name of the executor."""
+        return self.value("executor") or "local"
+
+    @property
     def local(self) -> bool:
         """Whether jobs run on this machine."""
-        found = re.search(r"^executor\s*:\s*[\"']?([\w-]+)", self.text, re.MULTILINE)
-        return found is None or found[1] == "local"
+        return self.executor == "local"
 
     def sets(self, option: str) -> bool:
         """Whether the profile sets an option."""
         return re.search(rf"^{re.escape(option)}\s*:", self.text, re.MULTILINE) is not None
+
+    def value(self, option: str) -> str:
+        """An option's value, also within another's, if it is one word; else empty."""
+        found = re.search(rf"^\s*{re.escape(option)}\s*:\s*[\"']*([\w.-]+)", self.text, re.MULTILINE)
+        return found[1] if found else ""
+
+    def largest_machine(self) -> tuple[int, int]:
+        """Processors and bytes of memory of the largest machine that jobs can have, each 0 if unknown.
+
+        A profile's ``max-threads`` takes precedence over what Slurm says.
+        """
+        stated = self.value("max-threads")
+        cpus, memory = largest_node(self.value("slurm_partition")) if self.executor == "slurm" else (0, 0)
+        return int(stated) if stated.isdecimal() else cpus, memory
 
 
 def open_profile(folder: Path | None) -> Profile:
@@ -76,16 +101,27 @@ def open_profile(folder: Path | None) -> Profile:
     raise UsageError(f"{folder} is not a Snakemake profile.", hint="Name a folder that has a config.yaml.")
 
 
-def require_snakemake() -> None:
-    """Check that Snakemake is installed.
+def require_snakemake(profile: Profile) -> None:
+    """Check that Snakemake is installed, and the plugin with which the profile submits jobs.
 
     Raises:
-        MachineError: if Snakemake is not installed.
+        MachineError: if one is not installed.
     """
     if importlib.util.find_spec("snakemake") is None:
+        raise MachineError("Snakemake is not installed.", hint=_install(SNAKEMAKE))
+    name = f"snakemake-executor-plugin-{profile.executor}"
+    if not profile.local and importlib.util.find_spec(name.replace("-", "_")) is None:
         raise MachineError(
-            "Snakemake is not installed.", hint=f"Install it: {sys.executable} -m pip install 'splatpipe[batch]'"
+            f"Snakemake has no executor {profile.executor}, which the profile names.",
+            hint=_install(PLUGINS.get(profile.executor, name)),
         )
+
+
+def _install(package: str) -> str:
+    """The command that installs a package into this installation."""
+    if importlib.util.find_spec("pip") is None:  # as in the image
+        return f'Build the image with --build-arg SNAKEMAKE_PLUGINS="{package}".'
+    return f"Install it: {sys.executable} -m pip install {shlex.quote(package)}"
 
 
 def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str]:
@@ -110,8 +146,16 @@ def snakemake_environment(call: Call) -> dict[str, str]:
     """Environment variables for Snakemake: no implicit profile, no cache outside the batch's folder."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SNAKEMAKE_")}
     # Snakemake does not start without HOME and a user name, which an arbitrary container user lacks.
-    nobody = {"HOME": str(call.folder), "LOGNAME": f"user-{os.getuid()}"}
+    nobody = {"HOME": str(call.folder), "LOGNAME": _user_name()}
     return {**nobody, **environment, **SAFE_PATH, "XDG_CACHE_HOME": str(call.folder / "cache")}
+
+
+def _user_name() -> str:
+    """This user's name, by which Slurm knows them; one made up if the machine has none."""
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return f"user-{os.getuid()}"
 
 
 def start_snakemake(call: Call, plan: BatchPlan, profile: Profile) -> subprocess.Popen[bytes]:
@@ -161,11 +205,12 @@ def last_error_line(call: Call) -> str:
     with suppress(OSError):
         text = read_end(call.snakemake_log, LOG_TAIL).decode("utf-8", errors="replace")
         found = ERROR_LINE.findall(text) or [line for line in text.splitlines() if line.strip()]
-        return str(found[-1]).strip() if found else ""
+        return " ".join(str(found[-1]).split()) if found else ""
     return ""
 
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     end_with_parent()
+    record_errors(Path.cwd())
     runpy.run_module("snakemake", run_name="__main__", alter_sys=True)

@@ -29,7 +29,7 @@ class CaptureState:
         progress: Progress of the whole capture, 0 to 1, by forecast time.
         verdict: The report's headline; empty if there is none yet.
         level: The verdict's level; empty if there is none yet.
-        reason: Why it failed or was stopped, in one sentence; else empty.
+        reason: Why it failed, was stopped or is waiting in another machine's queue, in one sentence; else empty.
         hint: What to do about it.
         tries: Attempts at the stage in this batch; once all are done, of the stage with the most.
         earlier: Why earlier attempts failed, with their stages, even if a later one succeeded.

@@ -1,8 +1,8 @@
-"""Generates a call's Snakemake workflow: one rule per stage, with exactly the jobs of the plan.
+"""Generates a call's Snakemake workflow: one rule per job's last stage, with exactly the jobs of the plan.
 
 The artifact store remains the only cache: each call has its own folder and its own output names, none of which exist
 yet, so that neither file times nor Snakemake's records decide anything. An output is a marker file that the job writes
-when its stage is done.
+when its stages are done.
 """
 
 from __future__ import annotations
@@ -12,7 +12,14 @@ import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.plan import SHARDS_FOLDER, BatchPlan, Call
+from splatpipe.pipeline.app.batch.plan import (
+    MEGABYTE,
+    SHARDS_FOLDER,
+    BatchPlan,
+    Call,
+    resources_of,
+    workflow_jobs,
+)
 from splatpipe.pipeline.app.batch.shards import counts_shards
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.python_module import python_module
@@ -23,9 +30,13 @@ GPU_STAGES = ("blocks", "train", "clean", "evaluate", "flythrough")
 
 _HEAD = """\
 # Written by splatpipe batch for one call; the next call writes its own.
-# By capture and stage: threads, megabytes of memory, minutes, megabytes of disk.
+# By capture and last stage of a job: threads, megabytes of memory, minutes, megabytes of disk.
 JOBS = {jobs}
 BEFORE = {{capture: dict(zip(list(jobs)[1:], jobs)) for capture, jobs in JOBS.items()}}
+
+
+def memory(megabytes, attempt):
+    return min(megabytes * attempt, max(megabytes, {largest}))
 
 
 def before(wildcards, stage):
@@ -71,11 +82,12 @@ _RULE = """
     priority: {priority}
     threads: lambda wildcards: {jobs}[0]
     resources:
-        mem_mb=lambda wildcards, attempt: {jobs}[1] * attempt,
+        mem_mb=lambda wildcards, attempt: memory({jobs}[1], attempt),
         runtime=lambda wildcards, attempt: {jobs}[2] * attempt,
         disk_mb=lambda wildcards: {jobs}[3],
+        attempt=lambda wildcards, attempt: attempt,
 {gpu}    shell:
-        "exec {job} {{wildcards.capture:q}} {output_name} {{threads}} {{output:q}}"
+        "exec {job} {{wildcards.capture:q}} {output_name} {{threads}} {{output:q}} {{resources.attempt}}"
 """
 
 
@@ -85,11 +97,14 @@ def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
     Args:
         call: The call, whose folder is passed to the jobs.
         plan: The plan.
-        stages: The pipeline, in order; a stage without a job gets no rule.
+        stages: The pipeline, in order; a stage that is no job's last gets no rule.
     """
     jobs: dict[str, dict[str, JSON]] = {
-        capture.key: {job.stage: job.resources for job in capture.jobs} for capture in plan.captures if capture.jobs
+        capture.key: {name: resources_of(of_job) for name, of_job in workflow_jobs(capture.jobs).items()}
+        for capture in plan.captures
+        if capture.jobs
     }
+    largest = plan.node_memory_bytes // MEGABYTE or 'float("inf")'
     done = f"done-{plan.began_s:.3f}"  # storage that outlives the call still has those of earlier calls
     wanted = {name for stages_of in jobs.values() for name in stages_of}
     words = python_module("splatpipe.pipeline.app.batch.job", str(call.folder))
@@ -113,7 +128,7 @@ def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
         rules.append(_RULE.format(**rule, **names, kind=kind, after=after, jobs=own))
     lines = ",\n".join(f"    {json.dumps(key)}: {json.dumps(of_capture)}" for key, of_capture in jobs.items())
     shards = _SHARDS.format(done=done, folder=SHARDS_FOLDER) if divided else ""
-    return _HEAD.format(done=done, jobs=f"{{\n{lines}\n}}", shards=shards) + "".join(rules)
+    return _HEAD.format(done=done, jobs=f"{{\n{lines}\n}}", shards=shards, largest=largest) + "".join(rules)
 
 
 def _shard_rule(stage: str, rule: Mapping[str, JSON], after: str) -> str:

@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
 
 
+COMMAND_BYTES = 80_000_000  # of the command that waits for the stage's process; measured 66 MB
+
+
 def require_readable(request: Request) -> None:
     """Read the survey files as georef will, to report errors now.
 
@@ -37,13 +40,19 @@ def memory_limit(config: LineConfig, device: str) -> int:
     return 0 if limit and _on_cuda(device) else limit
 
 
-def require_memory(request: Request) -> None:
+def require_memory(request: Request, until: str | None = None, *, here: bool = True) -> None:
     """Check that training fits the memory limit; a CUDA device's memory is known only when training starts.
+
+    Args:
+        request: The run.
+        until: The last stage; None for the whole pipeline.
+        here: Whether training will run on this machine, and in this container or job, whose limit counts, too.
 
     Raises:
         MachineError: if the training libraries and the smallest model need more.
     """
     from splatpipe.pipeline.engine.errors import MachineError
+    from splatpipe.pipeline.engine.machine import memory_limit_bytes
     from splatpipe.stages.forecast import min_memory_bytes
 
     config = cast("LineConfig", request.config)
@@ -53,6 +62,26 @@ def require_memory(request: Request) -> None:
             f"Training does not fit in {limit / 1e9:.2f} GB: the libraries alone take most of {least / 1e9:.2f} GB.",
             hint=f"Give --max-memory at least {-(-least // 1_000_000)}M.",
         )
+    machine, least = memory_limit_bytes() if here else 0, least + COMMAND_BYTES
+    if 0 < machine < least and _will_train(request, until) and not _on_cuda(request.machine.device):
+        raise MachineError(
+            f"Training does not fit in this machine's or container's {machine / 1e9:.2f} GB of memory: the libraries "
+            f"alone take most of {least / 1e9:.2f} GB.",
+            hint=f"Give the container at least {-(-least // (1 << 20))}m (docker run --memory), or use --until sparse.",
+        )
+
+
+def _will_train(request: Request, until: str | None) -> bool:
+    """Whether training is among the stages that a run has yet to do."""
+    from splatpipe.pipeline.engine.line import line_status
+    from splatpipe.pipeline.engine.session import status_of
+
+    names = [stage.name for stage in request.stages]
+    if "train" not in names or (until in names and names.index(until) < names.index("blocks")):
+        return False
+    if not (request.out / "stages").is_dir():
+        return True
+    return not any(status.stage.name == "train" and status.artifact for status in line_status(*status_of(request)))
 
 
 def forecast_text(request: Request) -> str:

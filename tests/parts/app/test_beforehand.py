@@ -9,7 +9,7 @@ from command import splatpipe
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.cli_runs import overrides, request_of
-from splatpipe.pipeline.app.preflight.start import forecast_text, require_memory, shortage_text
+from splatpipe.pipeline.app.preflight.start import COMMAND_BYTES, forecast_text, require_memory, shortage_text
 from splatpipe.pipeline.engine import machine
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError
@@ -46,6 +46,21 @@ def test_the_smallest_limit_that_the_message_names_is_accepted(tmp_path: Path) -
     with pytest.raises(MachineError) as raised:
         require_memory(request(tmp_path, "standard", max_memory_bytes=least - 1))
     assert f"{-(-least // 1_000_000)}M" in raised.value.hint
+
+
+def test_a_container_that_is_too_small_to_train_is_refused_at_once_unless_it_need_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    least = min_memory_bytes(LineConfig()) + COMMAND_BYTES
+    asked = request(tmp_path, "standard")
+    monkeypatch.setattr(machine, "memory_limit_bytes", lambda limit=0: least)
+    require_memory(asked)
+    monkeypatch.setattr(machine, "memory_limit_bytes", lambda limit=0: 700 << 20)
+    require_memory(asked, "sparse")
+    require_memory(asked, here=False)
+    with pytest.raises(MachineError, match=r"this machine's or container's 0\.73 GB") as raised:
+        require_memory(asked)
+    assert f"{-(-least // (1 << 20))}m (docker run --memory)" in raised.value.hint
 
 
 def test_a_run_states_its_cost_and_what_the_memory_limit_leaves_out(tmp_path: Path) -> None:

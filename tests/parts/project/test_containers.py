@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -62,6 +63,18 @@ def test_the_slurm_job_ends_with_the_exit_code_of_its_command(tmp_path: Path) ->
     _, output = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 1, output
     assert "There is no folder" in output
+
+
+@pytest.mark.parametrize(("image", "sentence"), [("splatpipe.sif", "set SPLATPIPE_IMAGE= (empty)"), ("", "on PATH")])
+def test_the_slurm_job_says_what_to_set_where_it_finds_no_splatpipe(tmp_path: Path, image: str, sentence: str) -> None:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name in ("realpath", "mkdir", "hostname"):
+        (programs / name).symlink_to(str(shutil.which(name)))
+    command = [str(shutil.which("bash")), str(SLURM), str(tmp_path), str(tmp_path / "out")]
+    environment = {"PATH": str(programs), "SPLATPIPE_IMAGE": image}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 4 and sentence in done.stderr, done.stderr
 
 
 @pytest.mark.parametrize(("number", "queued"), [(signal.SIGUSR1, "requeue 7\n"), (signal.SIGTERM, "")])
