@@ -52,7 +52,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=8,
+    version=9,
     config=SparseConfig,
     reads=(
         "matches.database",

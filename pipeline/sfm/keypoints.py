@@ -27,6 +27,7 @@ DESCRIPTOR_NORM = 512.0  # COLMAP's: 8-bit descriptors are 512 times the unit ve
 EXTRACTION_BYTES = {"opencv-sift": 250, "sift": 370}
 """Memory per pixel of the image that keypoints are found in: its scale space. Measured: 239 to 242 from 0.5 to 1.9
 megapixels (OpenCV), 360 at 4.3 (COLMAP)."""
+CONTRAST = 0.04  # OpenCV's default
 DECODING_BYTES = 8  # per pixel of the photo: Pillow's four, and ours as RGB with a strip being converted
 
 
@@ -68,7 +69,9 @@ def single_threaded_opencv() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def extract(photo: Photo, config: FeaturesConfig, part: Path, photos_dir: Path, scratch: Path) -> Features:
+def extract(
+    photo: Photo, config: FeaturesConfig, part: Path, photos_dir: Path, scratch: Path, contrast: float = CONTRAST
+) -> Features:
     """Extract the keypoints of a photo in its unmasked area.
 
     Args:
@@ -77,6 +80,7 @@ def extract(photo: Photo, config: FeaturesConfig, part: Path, photos_dir: Path, 
         part: The folder of the artifact ``ingest.photos``.
         photos_dir: The user's folder.
         scratch: An existing folder for temporary files.
+        contrast: As for ``opencv_sift``.
 
     Raises:
         SplatpipeError: If the photo is missing or has changed since it was checked.
@@ -89,7 +93,7 @@ def extract(photo: Photo, config: FeaturesConfig, part: Path, photos_dir: Path, 
     small = reduced(pixels, config.max_image_size)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     if config.extractor == "opencv-sift":
-        keypoints, descriptors = opencv_sift(grey)
+        keypoints, descriptors = opencv_sift(grey, contrast)
     else:
         keypoints, descriptors = colmap_sift(grey, math.ceil(config.max_features / share), scratch)
     scale = np.array([pixels.shape[1] / grey.shape[1], pixels.shape[0] / grey.shape[0]])
@@ -168,19 +172,20 @@ def colmap_sift(grey: Bytes, limit: int, scratch: Path) -> tuple[Floats, Bytes]:
     return keypoints, descriptors
 
 
-def opencv_sift(grey: Bytes) -> tuple[Floats, Bytes]:
+def opencv_sift(grey: Bytes, contrast: float = CONTRAST) -> tuple[Floats, Bytes]:
     """Run OpenCV's SIFT with square-rooted descriptors (RootSIFT; Arandjelović and Zisserman, CVPR 2012).
 
     All keypoints are returned: OpenCV's own limit keeps the strongest responses, which costs half the matches.
 
     Args:
         grey: (h, w).
+        contrast: The least contrast of a keypoint; fainter ones are noise, or the texture of what has little.
 
     Returns:
         As ``colmap_sift``.
     """
     # Without precise upscaling every keypoint is a quarter of a pixel off.
-    detector = cv2.SIFT_create(enable_precise_upscale=True)
+    detector = cv2.SIFT_create(contrastThreshold=contrast, enable_precise_upscale=True)
     found, values = detector.detectAndCompute(grey, None)
     if values is None or len(found) == 0:
         return np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8)
