@@ -15,14 +15,16 @@ COMMAND_BYTES = 80_000_000  # of the command that waits for the stage's process;
 
 
 def require_readable(request: Request) -> None:
-    """Read the survey files as georef will, to report errors now.
+    """Read the survey files as georef will, and a film's index as ingest will, to report errors now.
 
     Raises:
-        SplatpipeError: if the GCP file, the scale bars or the boundary cannot be read.
+        SplatpipeError: if the GCP file, the scale bars or the boundary cannot be read, or a film is truncated or none.
     """
-    from splatpipe.pipeline.engine.source import open_source
+    from splatpipe.pipeline.engine.source import is_film, open_source
 
     source = open_source(request.photos, request.out, request.stages, request.config)
+    if is_film(source.folder):
+        _read_film(source.folder)
     readers = {
         "source.control": _read_control,
         "source.scale_bars": _read_scale_bars,
@@ -162,6 +164,12 @@ def _on_cuda(device: str) -> bool:
     from splatpipe.pipeline.raster.cuda_library import why_not
 
     return device != "cpu" and why_not() is None
+
+
+def _read_film(path: Path) -> None:
+    from splatpipe.pipeline.photos.video.boxes import read_container
+
+    read_container(path)
 
 
 def _read_control(path: Path) -> None:

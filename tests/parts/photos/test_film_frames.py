@@ -1,6 +1,7 @@
 """A film instead of a photo folder: its frames are ingest's artifact, and everything behind sees photos."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from PIL import Image
 from scenes import videos
 
 from splatpipe.pipeline.app.preflight.intake import read_capture
+from splatpipe.pipeline.app.preflight.start import require_readable
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
@@ -149,6 +151,15 @@ def test_what_is_no_film_of_a_flight_is_refused_in_a_sentence(flown: Path, tmp_p
         extract_frames(tmp_path / "noisy.mp4", tmp_path / "b", IngestConfig(), 1, quiet)
     with pytest.raises(SplatpipeError, match=r"more than ingest\.max_megapixels"):
         extract_frames(flown / "flight.mp4", tmp_path / "c", IngestConfig(max_megapixels=0.1), 1, quiet)
+
+
+def test_what_is_no_film_is_refused_before_its_gigabytes_are_hashed(tmp_path: Path) -> None:
+    path = tmp_path / "zeros.mp4"
+    path.touch()
+    os.truncate(path, 4 << 30)
+    request = Request(LINE, LineConfig(), path, tmp_path / "out", Machine())
+    with pytest.raises(SplatpipeError, match=r"zeros\.mp4 is no MP4 or MOV film"):
+        require_readable(request)
 
 
 def test_a_folder_of_films_names_the_command(flown: Path, tmp_path: Path) -> None:
