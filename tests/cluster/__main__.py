@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -27,7 +27,7 @@ INSIDE = "SPLATPIPE_TEST_CLUSTER"  # set in the mount namespace
 def main() -> int:
     """Run the test; return the exit code: 0 if everything holds."""
     parser = argparse.ArgumentParser(prog="make test-cluster", description=__doc__)
-    parser.add_argument("--only", default="", help="run one part: compare_with_local, or a disturbance by name")
+    parser.add_argument("--only", default="", help="the parts to run, with commas: compare_with_local, or disturbances")
     options = parser.parse_args()
     if INSIDE not in os.environ:
         os.environ[INSIDE] = "1"
@@ -40,12 +40,15 @@ def main() -> int:
             say(f"{cluster.run('sinfo', '--version')} runs on two hosts: {dict(cluster.node_states())}.")
             night = Night(cluster, WORK, say)
             try:
-                parts = [part for part in (compare_with_local, *ALONE) if options.only in ("", part.__name__)]
-                failed += [part.__name__ for part in parts if not holds(part, night)]
-                together = [part for part in TOGETHER if options.only in ("", part.__name__)]
-                with ThreadPoolExecutor(AT_ONCE) as pool:
-                    held = list(pool.map(lambda part: holds(part, night), together))
-                failed += [part.__name__ for part, good in zip(together, held, strict=True) if not good]
+                wanted = options.only.split(",") if options.only else []
+
+                def run(parts: Iterable[Callable[[Night], None]], at_once: int = 1) -> list[str]:
+                    chosen = [part for part in parts if not wanted or part.__name__ in wanted]
+                    with ThreadPoolExecutor(at_once) as pool:
+                        held = list(pool.map(lambda part: holds(part, night), chosen))
+                    return [part.__name__ for part, good in zip(chosen, held, strict=True) if not good]
+
+                failed = [*run([compare_with_local]), *run(TOGETHER, AT_ONCE), *run(ALONE)]
             finally:
                 night.end()
         finally:

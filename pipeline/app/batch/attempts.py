@@ -118,6 +118,8 @@ def as_engine_knows(
         elif (each.ended_s is None and each.alive) or not running:
             found.append(each)
     for number, error in enumerate(errors, 1):
+        if any(each.final for each in found):
+            break  # Snakemake's retries of a hopeless stage, which do not begin it again
         if not any(each.number == number and not each.succeeded for each in found):
             done = {each.stage for each in found if each.succeeded and each.number <= number}
             stage = next((stage for stage in stages if stage not in done), stages[-1])

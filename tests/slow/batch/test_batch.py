@@ -173,7 +173,7 @@ def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
 
 def run_job(call: Call, stage: str) -> int:
     words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder), "0001-house", stage, "1"]
-    return subprocess.run([*words, str(call.folder / "marker")], check=False).returncode
+    return subprocess.run([*words, str(call.folder / "marker"), "1"], check=False).returncode
 
 
 def test_a_job_without_disk_space_is_not_started_and_a_hopeless_one_is_not_repeated(tmp_path: Path) -> None:
@@ -198,7 +198,10 @@ def test_a_folder_of_any_name_is_one_word_of_the_workflows_command(tmp_path: Pat
     call = call_of(tmp_path / "a\nb \"c\" \\n {d} 'e' $(f) é😀", planned("house", "georef"))
     (line,) = [line for line in workflow_text(call, call.plan(), LINE).splitlines() if line.startswith('        "exec')]
     command = ast.literal_eval(line.strip()).format(
-        wildcards=SimpleNamespace(capture=Plain("x")), threads=1, output=Plain("y")
+        wildcards=SimpleNamespace(capture=Plain("x")),
+        threads=1,
+        output=Plain("y"),
+        resources=SimpleNamespace(attempt=1),
     )
     assert shlex.split(command)[5] == str(call.folder)
 

@@ -146,6 +146,15 @@ def test_retries_are_those_of_the_job_whichever_of_its_stages_fails(tmp_path: Pa
     assert (house(call).state, house(call).stage, house(call).reason) == ("failed", "features", DIED.message)
 
 
+def test_retries_of_a_hopeless_stage_are_no_attempts(tmp_path: Path) -> None:
+    call = cluster_call(tmp_path, small("ingest", joined=True), small("features"), retries=2)
+    attempt(call, "ingest", PERMANENT)
+    for _retry in range(3):
+        report(call, "features", slurm_says("FAILED"))
+        assert (house(call).state, house(call).stage, house(call).reason) == ("failed", "ingest", PERMANENT.message)
+        assert (house(call).tries, house(call).earlier) == (1, ())
+
+
 def test_with_the_batch_stopped_nothing_counts_that_its_engine_has_not_ended(tmp_path: Path) -> None:
     call = cluster_call(tmp_path, small("train"), retries=0)
     attempt(call, "train", TERMINATED)
