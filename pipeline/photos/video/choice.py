@@ -1,9 +1,9 @@
 """Choose the frames of a film that become photos: sharp ones, each overlapping the one before by 70 to 80 %.
 
 The overlap of two frames is the mean, over a grid of points, of the share of the picture that a shift by the point's
-motion would leave: for a flight straight on it is the shared area. Where the picture turns or warps, as in circling about
-a subject that stays in its middle, the camera sees other sides of things, which match no more long before they leave the
-picture: such motion counts several times. A hovering camera gives no further frame.
+motion would leave: for a flight straight on it is the shared area. Where the picture turns or warps, as in circling
+about a subject that stays in its middle, the camera sees other sides of things, which match no more long before they
+leave the picture: such motion counts several times. A hovering camera gives no further frame.
 """
 
 from __future__ import annotations
