@@ -1,8 +1,9 @@
 """Choose the frames of a film that become photos: sharp ones, each overlapping the one before by 70 to 80 %.
 
 The overlap of two frames is the mean, over a grid of points, of the share of the picture that a shift by the point's
-motion would leave: for a flight straight on it is the shared area; turning, climbing and circling about a subject count
-as well. A hovering camera gives no further frame.
+motion would leave: for a flight straight on it is the shared area. Where the picture turns or warps, as in circling
+about a subject that stays in its middle, the camera sees other sides of things, which match no more long before they
+leave the picture: such motion counts several times. A hovering camera gives no further frame.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from splatpipe.pipeline.photos.video.motion import Measures
 LEAST, MOST = 0.7, 0.8  # overlap of successive frames
 NEARER = 0.9  # overlap up to which frames are accepted if all others are blurred
 GRID = 5  # points per side
+TURNING = 2.5  # times counts what a point moves apart from the shift of all: steps of some 15° around a house
 BLURRED = 0.5  # of the sharpness that the sharper frames around have
 AROUND_S = 3.0  # what is around, to both sides
 SHARPER = 0.9  # their quantile
@@ -76,8 +78,10 @@ def overlaps_with(maps: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " n
     """The overlap of frames with another one, by the affine maps that lead from it to them."""
     side = (np.arange(GRID) + 0.5) / GRID
     points = np.stack([*map(np.ravel, np.meshgrid(side, side)), np.ones(GRID * GRID)])
-    moved = maps @ points - points
-    return np.asarray(np.prod(np.clip(1.0 - np.abs(moved[:, :2]), 0.0, 1.0), axis=1).mean(axis=1))
+    moved = (maps @ points - points)[:, :2]
+    shift = moved.mean(axis=2, keepdims=True)
+    moved = shift + TURNING * (moved - shift)
+    return np.asarray(np.prod(np.clip(1.0 - np.abs(moved), 0.0, 1.0), axis=1).mean(axis=1))
 
 
 def _usual(measures: Measures) -> Float64[np.ndarray, " n"]:

@@ -84,7 +84,10 @@ def test_turning_and_climbing_count_as_motion() -> None:
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     turn[:2, 2] = 0.5 - turn[:2, :2] @ [0.5, 0.5]
     climb[:2, :2], climb[:2, 2] = 0.7 * np.eye(2), 0.15
-    assert (overlaps_with(np.stack([np.eye(3), turn, climb])) < [1.01, 0.8, 0.9]).all()
+    assert (overlaps_with(np.stack([np.eye(3), turn, climb])) < [1.01, 0.6, 0.7]).all()
+    shift = np.eye(3)
+    shift[0, 2] = 0.25
+    assert overlaps_with(shift[None])[0] == pytest.approx(0.75)
 
 
 def test_motion_is_measured_to_a_fraction_of_a_pixel() -> None:
