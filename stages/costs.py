@@ -94,7 +94,7 @@ REFERENCE = Costs(
             "control": StageCosts(0.1, 180e6, 0.0, 1200.0),
             "features": StageCosts(0.287, 157e6, 266e6, 156.0),
             "matches": StageCosts(1.36e-05, 250e6, 185e6, 30.1),
-            "sparse": StageCosts(0.548, 215e6, 331e6, 31.4),
+            "sparse": StageCosts(0.548, 215e6, 347e6, 31.4),
             "targets": StageCosts(0.21, 230e6, 100e6, 1300.0),
             "georef": StageCosts(0.019, 157e6, 724.0, 30.4),
             "undistort": StageCosts(0.0363, 241e6, 18.2e6, 0.598e6),
