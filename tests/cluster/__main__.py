@@ -45,7 +45,12 @@ def main() -> int:
                 def run(parts: Iterable[Callable[[Night], None]], at_once: int = 1) -> list[str]:
                     chosen = [part for part in parts if not wanted or part.__name__ in wanted]
                     with ThreadPoolExecutor(at_once) as pool:
-                        held = list(pool.map(lambda part: holds(part, night), chosen))
+                        try:
+                            held = list(pool.map(lambda part: holds(part, night), chosen))
+                        except KeyboardInterrupt:
+                            pool.shutdown(wait=False, cancel_futures=True)
+                            night.end()
+                            raise
                     return [part.__name__ for part, good in zip(chosen, held, strict=True) if not good]
 
                 failed = [*run([compare_with_local]), *run(TOGETHER, AT_ONCE), *run(ALONE)]

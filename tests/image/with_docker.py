@@ -25,10 +25,10 @@ ROOT = Path(__file__).resolve().parents[2]
 WORK = ROOT / "build" / "docker"
 PROGRAMS = {"docker": "docker.io", "dockerd": "docker.io", "debootstrap": "debootstrap"}
 TAG = "splatpipe:cpu"
-PHOTOS = 12
+PHOTOS = 6
 USER = "54321:54321"
 PATIENCE_S = 60.0
-SHORT = ("--preset", "preview", "--set", "train.iterations=300")
+SHORT = ("--preset", "preview", "--set", "train.iterations=100")
 
 
 def main() -> int:
@@ -47,9 +47,9 @@ def main() -> int:
         with daemon():
             if not options.no_build:
                 build(options.torch_index)
-            check_restrictions()
             check_memory()
             check_compose()
+            check_restrictions()
     except Problem as problem:
         say(f"FAILED: {problem}")
         return 1
@@ -192,9 +192,9 @@ def check_memory() -> None:
         say(f"--memory {limit}: exit code {done.returncode} after {time.monotonic() - began_s:.0f} s. {told[-330:]}")
         if done.returncode != 4 or "Training does not fit" not in told or (out / "stages").exists():
             raise Problem("It has to be refused at once, with 4.")
-    for limit, code, killed in (("200m", 3, "the stage's process"), ("40m", 137, "process 1")):
+    for limit, code, killed in (("110m", 3, "the stage's process"), ("40m", 137, "process 1")):
         sizes = [*places, "-v", f"{new_out(limit)}:/out", "--memory", limit, "--memory-swap", limit]
-        done = contained(sizes, "run", "/photos", "/out", *SHORT, "--until", "features")
+        done = contained(sizes, "run", "/photos", "/out", *SHORT, "--until", "ingest")
         told = " ".join(done.stderr.replace("│", " ").split())
         say(f"--memory {limit} kills {killed}: exit code {done.returncode}. {told[-250:]}")
         if done.returncode != code:

@@ -10,15 +10,19 @@ import logging
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
+from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import appended_file
-from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.small_file import read_end, read_small
 
 SNAKEMAKE_LOGGER = "snakemake.logging"
 ERRORS_FILE = "engine.jsonl"  # below a call's folder
 MAX_LOG_BYTES = 16 << 20
+LOG_TAIL_BYTES = 1 << 16
+MEMORY = re.compile(rb"slurmstepd\S*: error: .*\boom[-_]kill\b")
 LONGEST_MESSAGE = 300  # characters of an engine's own words
 STATE = re.compile(r"status is: '([A-Z_]+)'")
 BOILERPLATE = re.compile(
@@ -53,11 +57,13 @@ class EngineError:
         message: The engine's words.
         job: Its own number of the job, e.g. Slurm's; empty if it gave none.
         log: The file with the output of the job; empty if there is none.
+        killed_for_memory: Whether its log says so: Slurm may report such a job as just failed.
     """
 
     message: str
     job: str = ""
     log: str = ""
+    killed_for_memory: bool = False
 
     @property
     def decides(self) -> bool:
@@ -71,8 +77,8 @@ class EngineError:
             return ENDED_BY_ENGINE[self._state][0]
         if self._state:
             return f"Slurm ended its job {self.job} as {self._state}, before it could say why."
-        words = " ".join(BOILERPLATE.sub("", self.message).split()).strip("' ")
-        return f"Its job failed: {words[:LONGEST_MESSAGE]}" if words else "Its job failed without a message."
+        words = " ".join(BOILERPLATE.sub("", self.message).split()).strip("'. ")
+        return f"Its job failed: {words[:LONGEST_MESSAGE]}." if words else "Its job failed without a message."
 
     @property
     def hint(self) -> str:
@@ -84,7 +90,7 @@ class EngineError:
     @property
     def _state(self) -> str:
         found = STATE.search(self.message)
-        return found[1] if found else ""
+        return "OUT_OF_MEMORY" if self.killed_for_memory else found[1] if found else ""
 
 
 class ErrorRecorder(logging.Filter):
@@ -104,10 +110,18 @@ class ErrorRecorder(logging.Filter):
             logs = [str(log) for log in getattr(record, "log", None) or () if log]
             aux = getattr(record, "aux", None) or {}
             message, job = getattr(record, "rule_msg", None) or "", aux.get("external_jobid") or ""
-            error = EngineError(str(message), str(job), "".join(logs[-1:]))
+            log = "".join(logs[-1:])
+            error = EngineError(str(message), str(job), log, killed_for_memory=_tells_of_memory(log))
             with appended_file(self._path) as file:
                 file.write(json.dumps({"of": [marker.parent.name, marker.name], **asdict(error)}).encode() + b"\n")
         return True
+
+
+def _tells_of_memory(log: str) -> bool:
+    """Whether Slurm has written into a job's output that the kernel killed one of its processes for memory."""
+    with suppress(OSError, SplatpipeError):
+        return MEMORY.search(read_end(Path(log), LOG_TAIL_BYTES)) is not None
+    return False
 
 
 def record_errors(folder: Path) -> None:

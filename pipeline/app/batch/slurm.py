@@ -25,6 +25,7 @@ REASONS = {
     "PartitionTimeLimit": "its time limit is above that of its partition",
     "PartitionDown": "its partition is down",
     "ReqNodeNotAvail": "the nodes that could run it are down or drained",
+    "Nodes required for job are DOWN": "the nodes that could run it are down or drained",
     "NodeDown": "its node is down",
     "BeginTime": "Slurm starts it again in a moment",
 }

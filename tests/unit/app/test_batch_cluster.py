@@ -47,14 +47,14 @@ def small(stage: str, *, joined: bool = False) -> StageJob:
     return StageJob(stage, 2, 900_000_000, 60.0, 1_000_000, joined)
 
 
-def report(call: Call, job: str, message: str, number: str = "12") -> None:
+def report(call: Call, job: str, message: str, number: str = "12", log: str = "/logs/12.log") -> None:
     """Report the end of a job as Snakemake logs it."""
     record = logging.LogRecord("snakemake.logging", logging.ERROR, "", 0, "Error in rule", None, None)
     record.__dict__ |= {
         "event": "job_error",
         "rule_msg": f"{message}For further error details see the cluster/cloud log and the log files of the rule(s).",
         "output": [f"done-1/0001-house/{job} (send to storage)"],
-        "log": [None, "/logs/12.log"],
+        "log": [None, log],
         "aux": {"external_jobid": number},
     }
     assert ErrorRecorder(call.folder / ERRORS_FILE).filter(record)
@@ -115,6 +115,19 @@ def test_the_reason_is_the_engines_where_it_ended_the_job_and_else_the_jobs_own(
     assert house(call).state == "failed" and reason in house(call).reason and house(call).hint
 
 
+def test_a_job_that_slurm_calls_failed_is_out_of_memory_if_its_log_says_so(tmp_path: Path) -> None:
+    log = tmp_path / "12.log"
+    line = (
+        "slurmstepd-two: error: Detected 1 oom-kill event(s) in StepId=2.0. Some of your processes may have been killed"
+    )
+    for text, reason in (("srun: error", DIED.message), (line, "more memory than its job had requested")):
+        call = cluster_call(tmp_path / reason[:5], small("train"), retries=0)
+        log.write_text(f"Building DAG of jobs...\n{text}\n")
+        attempt(call, "train", DIED)
+        report(call, "train", slurm_says("FAILED"), log=str(log))
+        assert reason in house(call).reason
+
+
 def test_a_job_that_dies_before_it_begins_is_an_attempt(tmp_path: Path) -> None:
     call = cluster_call(tmp_path, small("ingest", joined=True), small("features"), small("train"))
     attempt(call, "ingest", DONE)
@@ -122,7 +135,7 @@ def test_a_job_that_dies_before_it_begins_is_an_attempt(tmp_path: Path) -> None:
     assert (house(call).state, house(call).stage, house(call).tries) == ("waiting", "features", 1)
     report(call, "features", slurm_says("NODE_FAIL"))
     assert (house(call).state, house(call).stage, house(call).tries) == ("failed", "features", 2)
-    assert house(call).earlier == ("features: Its job failed: sbatch: error: Memory is too large'.",)
+    assert house(call).earlier == ("features: Its job failed: sbatch: error: Memory is too large.",)
 
 
 def test_an_attempt_that_the_engine_starts_again_by_itself_is_none(tmp_path: Path) -> None:
@@ -167,7 +180,7 @@ def test_malformed_lines_of_the_engines_reports_are_skipped(tmp_path: Path) -> N
     assert not read_errors(tmp_path)
     good = '{"of": ["k", "train"], "message": "m", "job": "", "log": ""}\n'
     (tmp_path / ERRORS_FILE).write_text('{"of"\n[]\n7\n{"of": 1}\n' + good)
-    assert [error.reason for error in read_errors(tmp_path)["k", "train"]] == ["Its job failed: m"]
+    assert [error.reason for error in read_errors(tmp_path)["k", "train"]] == ["Its job failed: m."]
 
 
 def test_other_messages_of_snakemake_are_not_recorded(tmp_path: Path) -> None:
