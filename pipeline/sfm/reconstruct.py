@@ -84,6 +84,7 @@ class Reconstructor:
         chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size, coarseness=wide), **options)
         work = map_incremental if mapper == "incremental" else map_global
         found = work(self.database, self.capture.scratch, chosen, self.report.progress)
+        self.report.progress(len(self.verified.names), len(self.verified.names), "placing photos", "photos")
         models = [model for model in found if _has_points(model)]
         return self._judged(MappingAttempt(how, mapper, chosen, models, None, time.process_time() - began))
 

@@ -43,17 +43,18 @@ class Group:
         return Path("tests/slow") / self.name
 
     def digest(self, root: Path) -> str:
-        """Return the sha256 (hex) of the group's sources, tests and dependencies; comments do not count.
+        """Return the sha256 (hex) of the group's sources, tests and tested versions; comments and order do not count.
 
         Raises:
             AssertionError: if a source does not exist.
         """
-        files = {root / EVERYWHERE, *_files(root, str(self.folder))}
+        files = set(_files(root, str(self.folder)))
         for pattern in self.sources:
             found = set(_files(root, pattern))
             assert found, f"{TABLE}: {self.name} names {pattern}, which does not exist"
             files |= found
-        return sha([[str(path.relative_to(root)), file_digest(path)] for path in sorted(files)])
+        versions = sorted(line for line in (root / EVERYWHERE).read_text().splitlines() if "==" in line)
+        return sha([versions, *([str(path.relative_to(root)), file_digest(path)] for path in sorted(files))])
 
 
 @dataclass(frozen=True)
