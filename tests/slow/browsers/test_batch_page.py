@@ -143,7 +143,7 @@ def test_without_scripts_the_browser_refreshes_it(tmp_path: Path, browser: Brows
         page = context.new_page()
         page.goto(path.as_uri())
         write_page(batch(CaptureState("one", "failed", "train"), ended_s=time.time(), exit_code=3), path)
-        expect(page.locator("h2").first).to_have_text("1 of 1 capture failed; 0 finished")
+        expect(page.locator("h2").first).to_have_text("1 of 1 capture failed; 0 finished", timeout=60_000)
 
 
 def test_a_page_that_is_no_longer_updated_says_so(tmp_path: Path, open_page: Callable) -> None:
