@@ -150,7 +150,8 @@ def test_manifests_state_what_shards_took_and_their_forecast(numbers: Path, out:
     assert manifests["sum.3"]["forecast"] == Need(100, 1.0, 10).as_json()
     whole = manifests["sum"]
     assert [shard["key"] for shard in whole["shards"]] == [outcome.artifacts[name].key for name in SHARDS]
-    assert whole["seconds"] >= sum(shard["seconds"] for shard in whole["shards"]) > 0.2
+    shards_s = sum(shard["seconds"] for shard in whole["shards"])  # each rounded to milliseconds
+    assert whole["seconds"] >= shards_s - 1e-3 * len(whole["shards"]) and shards_s > 0.2
     assert whole["peak_memory_bytes"] >= max(shard["peak_memory_bytes"] for shard in whole["shards"])
     manifest = used_and_forecast(whole)
     own = used_and_forecast({**whole, "shards": []})["used"]["disk_bytes"]
