@@ -17,11 +17,11 @@ from PIL import Image, ImageFile
 
 HEIC_MODULE, RAW_MODULE = "pi_heif", "rawpy"
 HEIC_REASON = (
-    "is a HEIC picture: convert it to JPEG, or install its reader (pip install 'splatpipe[heic]') and run with "
+    "is a HEIC picture: convert it to JPEG, or install its reader (pip install pi-heif) and run with "
     "--rerun-from ingest"
 )
 DNG_REASON = (
-    "is a camera's raw file: develop it to JPEG or TIFF, or install its reader (pip install 'splatpipe[raw]') and run "
+    "is a camera's raw file: develop it to JPEG or TIFF, or install its reader (pip install rawpy) and run "
     "with --rerun-from ingest"
 )
 MODULES = {HEIC_REASON: HEIC_MODULE, DNG_REASON: RAW_MODULE}  # which reader makes a photo of such a file
@@ -51,7 +51,7 @@ def open_heic(source: Any) -> Image.Image:
         OSError: if there is no reader, or it cannot read the file.
     """
     if not is_installed(HEIC_MODULE):
-        raise OSError("no reader of HEIC pictures is installed: pip install 'splatpipe[heic]'")
+        raise OSError("no reader of HEIC pictures is installed: pip install pi-heif")
     reader = importlib.import_module(HEIC_MODULE)
     try:
         picture: Image.Image = reader.HeifImageFile(source)

@@ -137,3 +137,13 @@ def _check_size(view: View, pixels: Pixels, path: Path) -> None:
         raise StageError(
             f"{path.name} is {width}×{height} pixels, but its camera says {view.camera.width}×{view.camera.height}."
         )
+
+
+def reduced(pixels: Pixels, longest: int) -> Pixels:
+    """Downscale an image to a longer side of at most ``longest`` pixels by area averaging; never upscale."""
+    height, width = pixels.shape[:2]
+    scale = longest / max(height, width)
+    if scale >= 1.0:
+        return pixels
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)

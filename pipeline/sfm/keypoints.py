@@ -123,16 +123,6 @@ def largest(keypoints: Floats, places: int) -> npt.NDArray[np.int64]:
     return np.asarray(order[ranks[index.ravel()] < places], np.int64)
 
 
-def reduced(pixels: Bytes, longest: int) -> Bytes:
-    """Downscale an image to a longer side of at most ``longest`` pixels by area averaging; never upscale."""
-    height, width = pixels.shape[:2]
-    scale = longest / max(height, width)
-    if scale >= 1.0:
-        return pixels
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def _pixels_at(image: Bytes, points: npt.NDArray[np.floating]) -> Bytes:
     """Return the pixel values at points (n, 2; the centre of the first pixel is (0.5, 0.5))."""
     x = np.clip(np.floor(points[:, 0]).astype(int), 0, image.shape[1] - 1)

@@ -19,7 +19,8 @@ from splatpipe.pipeline.photos.detail import (
     read_grey,
     signature_of,
 )
-from splatpipe.pipeline.sfm.keypoints import DESCRIPTOR_NORM, reduced
+from splatpipe.pipeline.photos.images import reduced
+from splatpipe.pipeline.sfm.keypoints import DESCRIPTOR_NORM
 from splatpipe.pipeline.sfm.pairs import Pair
 
 LONGEST_PX = 640  # longer side of the matched images: a fifth of a second per photo

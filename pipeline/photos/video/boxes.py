@@ -10,6 +10,7 @@ import datetime
 import math
 import os
 import re
+import shlex
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -105,7 +106,7 @@ def _read(file: BufferedReader, size: int, name: str) -> Container:
     if b"moof" in top:
         raise SplatpipeError(
             f"{name} is a fragmented MP4, which does not list its frames.",
-            hint=f"Convert it: ffmpeg -i {name} -c copy whole.mp4",
+            hint=f"Convert it: ffmpeg -i {shlex.quote(name)} -c copy whole.mp4",
         )
     start, end = top[b"moov"]
     if end - start > MAX_INDEX_BYTES:

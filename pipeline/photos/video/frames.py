@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -139,7 +140,8 @@ def _measure(film: Path, container: Container, threads: int, report: Reporter) -
         raise SplatpipeError(
             f"None of the {container.frames:,} frames of {name} can be decoded: it has no key frame, or a codec "
             f"({printable(container.codec)}) that OpenCV lacks.",
-            hint=f"If it plays, convert it: ffmpeg -i {name} -c:v libx264 -crf 16 readable.mp4; else copy it again.",
+            hint=f"If it plays, convert it: ffmpeg -i {shlex.quote(name)} -c:v libx264 -crf 16 readable.mp4; "
+            "else copy it again.",
         )
     if counted[0] < WHOLE * container.frames:
         raise SplatpipeError(

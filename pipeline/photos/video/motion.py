@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
+from splatpipe.pipeline.photos.images import reduced
+
 SHARP_SIDE, TRACKED_SIDE = 1920, 480  # pixels: the longer sides at which sharpness and motion are measured
 POINTS, QUALITY, APART = 300, 0.01, 8  # corners that are followed: at most, of the best one's strength, pixels
 WINDOW, LEVELS = (15, 15), 3  # of the search for a corner in the next frame: 60 pixels far
@@ -54,8 +56,8 @@ def measure(film: Iterable[tuple[int, float, UInt8[np.ndarray, "h w 3"]]]) -> It
     last: UInt8[np.ndarray, "h w"] | None = None
     waited = 0
     for number, time_s, pixels in film:
-        grey = _reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), SHARP_SIDE)
-        small = _reduced(grey, TRACKED_SIDE)
+        grey = reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), SHARP_SIDE)
+        small = reduced(grey, TRACKED_SIDE)
         step = None if last is None else motion(last, small)
         if step is not None or last is None or waited >= LOST:
             last, waited = small, 0
@@ -101,12 +103,3 @@ def motion(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) ->
     height, width = first.shape
     shares = np.diag([1.0 / width, 1.0 / height, 1.0])
     return np.asarray(shares @ np.vstack([affine, [0.0, 0.0, 1.0]]) @ np.linalg.inv(shares))
-
-
-def _reduced(grey: np.ndarray, side: int) -> UInt8[np.ndarray, "h w"]:
-    height, width = grey.shape
-    scale = side / max(height, width)
-    if scale >= 1.0:
-        return np.asarray(grey, np.uint8)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)

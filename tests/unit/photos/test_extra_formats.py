@@ -95,8 +95,8 @@ def test_without_a_reader_the_message_says_how_to_convert_or_what_to_install(tmp
     scan = scan_folder(tmp_path)
     assert scan.candidates == ()
     first, second, third = (entry.reason for entry in scan.left_out)
-    assert "convert it to JPEG" in first and "'splatpipe[heic]'" in first
-    assert "develop it to JPEG or TIFF" in second and "'splatpipe[raw]'" in second
+    assert "convert it to JPEG" in first and "pip install pi-heif" in first
+    assert "develop it to JPEG or TIFF" in second and "pip install rawpy" in second
     assert third == "is a camera's raw file: develop it to JPEG or TIFF"
 
 
