@@ -15,6 +15,7 @@ import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.photos.images import reduced
 from splatpipe.pipeline.photos.photo_list import Photo, decode, decode_mask
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 
