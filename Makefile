@@ -11,7 +11,7 @@
 # make test-image              builds the container image and runs the demo in it (Linux, root, buildah, runc)
 # make test-docker             builds the image with a Docker daemon of its own, and tries it and the compose file (root)
 # make test-cluster            runs batches on a Slurm of two hosts on this machine (Linux, root, Debian's slurm-wlm)
-# make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/cuda.md
+# make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/gpu_visit.md
 # make sanitize                runs the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    installs torch without CUDA from PyTorch's own CPU index
 # SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or a list: "80;90"
