@@ -19,16 +19,16 @@ from mapped_apart import centre_errors, centres
 from sfm_speed import database_of
 from tables import Row, print_table
 
-from splatpipe.pipeline.sfm import completion
-from splatpipe.pipeline.sfm.coarseness import coarseness
-from splatpipe.pipeline.sfm.mapping import (
+from splatpipe.pipeline.sfm.mapping import completion
+from splatpipe.pipeline.sfm.mapping.mapping import (
     BEST_KEYPOINTS,
     MappingOptions,
     incremental_options,
     largest_first,
 )
-from splatpipe.pipeline.sfm.reduction import best_keypoints, write_reduced
-from splatpipe.pipeline.sfm.view_graph import read_verified
+from splatpipe.pipeline.sfm.matching.reduction import best_keypoints, write_reduced
+from splatpipe.pipeline.sfm.model.coarseness import coarseness
+from splatpipe.pipeline.sfm.model.view_graph import read_verified
 
 TOLERANCES = (1e-6, 1e-5)
 EXACT = 1e-10

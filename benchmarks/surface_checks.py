@@ -21,7 +21,7 @@ from splatpipe.demo.orthographic import AHEAD_M, MARGIN_M, facade_view, top_view
 from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED
 from splatpipe.demo.relief import relief_in
 from splatpipe.demo.visibility import FEWEST, photos_that_see
-from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
+from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
 
 TOLERANCE_GSD = 2.0  # for clouds and meshes
 SAMPLES = 100_000  # of the true surface and of a product: the standard deviation of a share is below 0.002

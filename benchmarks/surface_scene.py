@@ -15,7 +15,7 @@ from scipy.spatial import Delaunay
 from surface_measures import near_steps
 from surface_products import Points, Raster
 
-from splatpipe.demo.orthographic import ParallelView
+from splatpipe.demo.parallel_view import ParallelView
 from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED, parts_of, unit_normals
 from splatpipe.demo.relief import Relief, surface_model
 from splatpipe.demo.truth import Triangles, centre, true_poses, true_surface

@@ -128,7 +128,15 @@ def demo_run(demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) 
     from splatpipe.demo import capture_path
 
     out = shared_folder(tmp_path_factory) / "demo_run"
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *demo_options]
+    command = [
+        sys.executable,
+        "-m",
+        "splatpipe.pipeline.app.cli.main",
+        "run",
+        str(capture_path()),
+        str(out),
+        *demo_options,
+    ]
     with (out.parent / "demo_run.lock").open("a+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the first worker makes it, the others wait
         if not os.fstat(lock.fileno()).st_size:

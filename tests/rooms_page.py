@@ -120,21 +120,25 @@ def graph(edges: Edges) -> str:
 
 def rooms_table(rooms: Iterable[str]) -> str:
     """Return a row for each room: what it holds, its modules, their lines, the largest; and its other sources."""
-    lines = ["| room | holds | modules | lines | largest module | other sources |", "|---|---|---|---|---|---|"]
+    rows = [["room", "holds", "modules", "lines", "largest module", "other sources"]]
     for room in rooms:
         modules = {path: _lines(path) for path in _sources(room, (".py",)) if path.name != "__init__.py"}
         others = list(_sources(room, OTHER_SOURCES))
         largest = max(modules, key=lambda path: (modules[path], path.name), default=None)
-        cells = (
-            f"`{_name(room)}`",
-            _holds(room),
-            f"{len(modules)}",
-            f"{_rounded(sum(modules.values())):,}",
-            f"`{largest.relative_to(_folder(ROOMS))}`, {_rounded(modules[largest]):,}" if largest else "",
-            f"{len(others)} files, {_rounded(sum(map(_lines, others))):,} lines" if others else "",
+        rows.append(
+            [
+                f"`{_name(room)}`",
+                _holds(room),
+                f"{len(modules)}",
+                f"{_rounded(sum(modules.values())):,}",
+                f"`{largest.relative_to(_folder(ROOMS))}`, {_rounded(modules[largest]):,}" if largest else "",
+                f"{len(others)} files, {_rounded(sum(map(_lines, others))):,} lines" if others else "",
+            ]
         )
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    if not any(row[-1] for row in rows[1:]):
+        rows = [row[:-1] for row in rows]
+    rows.insert(1, ["---"] * len(rows[0]))
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def line_graph() -> str:

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.raster import cuda_driver, cuda_library, rasterizer
-from splatpipe.pipeline.raster.cuda import kernels_of
-from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.cuda import cuda_driver, cuda_library
+from splatpipe.pipeline.raster.cuda.cuda import kernels_of
+from splatpipe.pipeline.raster.cuda.cuda_forecast import most_pairs_of
 
 DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")

@@ -13,16 +13,16 @@ import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.coarseness import coarseness
-from splatpipe.pipeline.sfm.completion import complete
-from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
-from splatpipe.pipeline.sfm.judging import Judgement, judge
-from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options, map_global, map_incremental
+from splatpipe.pipeline.sfm.judging.judging import Judgement, judge
+from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, adjust_within, focal_sigmas
+from splatpipe.pipeline.sfm.mapping.completion import complete
+from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options, map_global, map_incremental
+from splatpipe.pipeline.sfm.model.coarseness import coarseness
+from splatpipe.pipeline.sfm.model.structure import Structure, cameras_of, make_model, poses_of
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.probing import FILL, PROBES, THIN, pairs_a_photo, probe
-from splatpipe.pipeline.sfm.refusal import refusal
-from splatpipe.pipeline.sfm.structure import Structure, cameras_of, make_model, poses_of
-from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
+from splatpipe.pipeline.sfm.recovery.probing import FILL, PROBES, THIN, pairs_a_photo, probe
+from splatpipe.pipeline.sfm.recovery.refusal import refusal
 
 Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]

@@ -13,9 +13,9 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring
-from splatpipe.pipeline.survey.boundary_file import WGS84, BoundaryFile, read_boundary
-from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
-from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.crs.crs import parse_crs, to_geodetic
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.files.boundary_file import WGS84, BoundaryFile, read_boundary
 
 FORMAT = 1
 WITHOUT = "Or run without a boundary: --set georef.boundary=none."

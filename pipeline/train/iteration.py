@@ -14,11 +14,11 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.train.flatness import end_epoch, ends_at
 from splatpipe.pipeline.train.hooks import Shot
-from splatpipe.pipeline.train.memory import over_memory
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.schedule import ScheduleStep
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep
+from splatpipe.pipeline.train.state.memory import over_memory
+from splatpipe.pipeline.train.state.state import TrainState
 
 SSIM_WEIGHT = 0.2  # weight of 1 - SSIM in the loss, the rest is L1; published
 

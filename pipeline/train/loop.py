@@ -10,35 +10,35 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.plan_area import read_model_area
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
-from splatpipe.pipeline.train.brightness import decided_exposure
-from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
-from splatpipe.pipeline.train.exposure import Exposure, exposures_json
+from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import write_panorama
+from splatpipe.pipeline.train.appearance.brightness import decided_exposure
+from splatpipe.pipeline.train.appearance.exposure import Exposure, exposures_json
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.flatness import ends_at
-from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
 from splatpipe.pipeline.train.iteration import curve_facts, iterate
-from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
-from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, load_or_write_plan, make_plan
-from splatpipe.pipeline.train.planning import PlanningInput, under_budgets
-from splatpipe.pipeline.train.shortage import iterate_within_memory
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.start import read_start
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
-from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.photos.stream import PhotoStream, TrainingPhoto
+from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, load_or_write_plan, make_plan
+from splatpipe.pipeline.train.plan.start import read_start
+from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrder
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.planning.measure import Step
+from splatpipe.pipeline.train.planning.planning import PlanningInput, under_budgets
+from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
+from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
+from splatpipe.pipeline.train.state.history import History
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import Techniques, begin_sky, make_techniques
 
 CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # minimum time between checkpoints: what a kill may cost

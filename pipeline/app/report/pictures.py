@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from markupsafe import Markup
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.photo_list import Photo, decode, load_photo_list
+from splatpipe.pipeline.photos.files.photo_list import Photo, decode, load_photo_list
 
 VIEW_SIDE = 960  # pixels of the longer side of a held-out photo in the report
 VIEW_QUALITY = 82

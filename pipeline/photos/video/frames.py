@@ -18,10 +18,10 @@ from PIL.TiffImagePlugin import IFDRational
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
-from splatpipe.pipeline.engine.source import subtitles_beside
+from splatpipe.pipeline.engine.runs.source import subtitles_beside
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.capture_issues import CaptureIssue
-from splatpipe.pipeline.photos.names import is_plain, printable
+from splatpipe.pipeline.photos.files.names import is_plain, printable
+from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.video.boxes import REFILM, Container, read_container
 from splatpipe.pipeline.photos.video.choice import Choice, choose

@@ -15,9 +15,9 @@ from some_splats import some_gaussians
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.batch.capture_list import read_captures
-from splatpipe.pipeline.app.cli import app
+from splatpipe.pipeline.app.cli.main import app
 from splatpipe.pipeline.engine.config import load_file, load_preset, option_names, parse_set, resolve
-from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.splat.containers.ply import write_splat
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
@@ -221,7 +221,7 @@ def test_rooms_within_a_room_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     assert part.startswith("### app\n")
     assert "preflight_ --> report_" in part
     assert "| `report` |" in part
-    assert "`cli`" in part.partition("Beside them: ")[2]
+    assert "`renders`" in part.partition("Beside them: ")[2]
 
 
 def test_the_quick_commands_of_the_pages_run(tmp_path: Path) -> None:

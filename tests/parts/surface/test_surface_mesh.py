@@ -16,13 +16,13 @@ from house_site import true_height
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface.blocks import SIDE, blocks_of, keys_of, surface_blocks
-from splatpipe.pipeline.surface.mesh_files import write_mesh
-from splatpipe.pipeline.surface.photo_set import PhotoSet
-from splatpipe.pipeline.surface.point_colours import photo_set
-from splatpipe.pipeline.surface.surface_mesh import MeshTask, decimate, make_mesh, vertex_colours
-from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, in_order, without_crumbs
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.depths.photo_set import PhotoSet
+from splatpipe.pipeline.surface.shapes.blocks import SIDE, blocks_of, keys_of, surface_blocks
+from splatpipe.pipeline.surface.shapes.mesh_files import write_mesh
+from splatpipe.pipeline.surface.shapes.point_colours import photo_set
+from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, decimate, make_mesh, vertex_colours
+from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, in_order, without_crumbs
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 FRAME = Frame("enu", Similarity.identity(), Origin(47.8412, 13.5127, 512.0), "ellipsoidal", crs="EPSG:32633")
 BOX = house_site().box

@@ -14,20 +14,20 @@ from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.render.view_measures import shows_inside
-from splatpipe.pipeline.splat import backdrop as counted
-from splatpipe.pipeline.splat.backdrop import backdrop_limit, coarse_start
-from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
-from splatpipe.pipeline.train import schedule as scheduled
-from splatpipe.pipeline.train.backdrop import Backdrop
+from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header, write_splat
+from splatpipe.pipeline.splat.sky import backdrop as counted
+from splatpipe.pipeline.splat.sky.backdrop import backdrop_limit, coarse_start
+from splatpipe.pipeline.splat.sky.panorama import write_panorama
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.start import read_start
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.plan import schedule as scheduled
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.start import read_start
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.backdrop import Backdrop
+from splatpipe.pipeline.train.techniques.techniques import make_techniques
 from splatpipe.pipeline.web.options import ExportConfig
 from splatpipe.stages import evaluate, export, initialize
 

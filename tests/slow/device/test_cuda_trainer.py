@@ -10,17 +10,17 @@ import torch
 from random_scene import random_camera, random_scene
 from waiting import never_waiting
 
-from splatpipe.pipeline.photos.dataset import Split, View
-from splatpipe.pipeline.raster import cuda, cuda_library
+from splatpipe.pipeline.photos.pixels.dataset import Split, View
+from splatpipe.pipeline.raster.cuda import cuda, cuda_library
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, free_bytes, take_rows
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.shortage import iterate_within_memory
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.techniques import make_techniques
-from splatpipe.pipeline.train.upload import Uploader
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.upload import Uploader
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import make_techniques
 
 MISSING = cuda_library.why_not()
 pytestmark = [

@@ -10,12 +10,12 @@ from on_cpu import kernels_on_cpu
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
-from splatpipe.pipeline.raster.cuda_forecast import Forecast, FrameFacts, FrameSize
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
+from splatpipe.pipeline.raster.cuda.cuda_forecast import Forecast, FrameFacts, FrameSize
+from splatpipe.pipeline.raster.cuda.cuda_library import why_not
 from splatpipe.pipeline.raster.cuda_frame import CudaFrame, shot_of
-from splatpipe.pipeline.raster.cuda_library import why_not
 from splatpipe.pipeline.raster.definitions import RenderOptions
-from splatpipe.pipeline.splat.gaussians import PARAMETERS
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 
 TILE_PX = 16
 OPACITY = 0.05

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.engine import lock as engine_lock
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
-from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_shard, running_shards
 from splatpipe.pipeline.engine.machine import Mount
+from splatpipe.pipeline.engine.runs import lock as engine_lock
+from splatpipe.pipeline.engine.runs.lock import LOCK_FILE, is_locked, locked, locked_shard, running_shards
 
 ELSEWHERE = {"process": 4711, "host": "node7", "boot": "another", "turn": "first"}
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import skies
 
-from splatpipe.pipeline.splat.sky_mask import agreed, find_skies, find_sky, is_open, roofed, up_of, votes_of
+from splatpipe.pipeline.splat.sky.sky_mask import agreed, find_skies, find_sky, is_open, roofed, up_of, votes_of
 
 WHITE = (0.92, 0.92, 0.91)
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from house_site import EAVES_M, ExactDepths, cameras, depths_of, edge_distance, photo_camera, true_height
 
-from splatpipe.pipeline.surface.heights import HeightInput, Heights, surface_heights, tile_heights
-from splatpipe.pipeline.surface.holes import fill_holes
-from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sheet import Sheet
-from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, photos_seeing
-from splatpipe.pipeline.surface.tiles import Tile
+from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache, photos_seeing
+from splatpipe.pipeline.surface.heights.heights import HeightInput, Heights, surface_heights, tile_heights
+from splatpipe.pipeline.surface.heights.holes import fill_holes
+from splatpipe.pipeline.surface.rasters.lattice import Lattice
+from splatpipe.pipeline.surface.rasters.tiles import Tile
+from splatpipe.pipeline.surface.sheets.sheet import Sheet
 
 CELL_M = 0.2  # two pixels of the cameras that look down
 LATTICE = Lattice(-11.04, 8.07, CELL_M, 110, 80)

@@ -10,20 +10,20 @@ import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.demo.geodesy import Origin as DemoOrigin
-from splatpipe.pipeline.app.cli_runs import overrides, with_boundary
+from splatpipe.pipeline.app.commands.runs import overrides, with_boundary
 from splatpipe.pipeline.app.preflight.boundary import boundary_findings
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.scan import Candidate
-from splatpipe.pipeline.survey import boundary_file
+from splatpipe.pipeline.photos.files.scan import Candidate
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.survey.boundary import lay_boundary
-from splatpipe.pipeline.survey.boundary_file import crossing_of, read_boundary
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.files import boundary_file
+from splatpipe.pipeline.survey.files.boundary_file import crossing_of, read_boundary
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.photo_positions import Position, read_positions
+from splatpipe.pipeline.survey.positions.photo_positions import Position, read_positions
 
 DEMO = DemoOrigin()
 WORLD_FROM_MODEL = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))

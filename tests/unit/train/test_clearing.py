@@ -9,15 +9,15 @@ import pytest
 import tiny_scene
 import torch
 
-from splatpipe.pipeline.photos.dataset import load_views
-from splatpipe.pipeline.splat.free_space import FreeSpace, near_or_free
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.floater_pruning import STEPS_BETWEEN, FloaterPruning, free_space_of
+from splatpipe.pipeline.photos.pixels.dataset import load_views
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality.free_space import FreeSpace, near_or_free
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.techniques import Techniques, make_techniques
+from splatpipe.pipeline.train.plan.plan import make_plan
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.floater_pruning import STEPS_BETWEEN, FloaterPruning, free_space_of
+from splatpipe.pipeline.train.techniques.techniques import Techniques, make_techniques
 
 OPTIONS = TrainConfig(prune_free_space=2)
 SCHEDULE = resolve_schedule(OPTIONS)

@@ -13,19 +13,19 @@ import skies
 import torch
 
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
-from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.distortion_loss import CENTRE_EVERY, DistortionLoss
-from splatpipe.pipeline.train.dropout import Dropout
-from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS
+from splatpipe.pipeline.splat.sky.sky_mask import SkyMask
+from splatpipe.pipeline.train.appearance.exposure import Exposure
+from splatpipe.pipeline.train.appearance.robust import RobustMask
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep, resolve_schedule
 from splatpipe.pipeline.train.random_numbers import ELSEWHERE
-from splatpipe.pipeline.train.robust import RobustMask
-from splatpipe.pipeline.train.schedule import ScheduleStep, resolve_schedule
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.techniques.distortion_loss import CENTRE_EVERY, DistortionLoss
+from splatpipe.pipeline.train.techniques.dropout import Dropout
 
 META = torch.device("meta")
 CAMERAS = [replace(skies.look(heading_deg=10.0 * number).scaled(160, 120), name=f"{number}.jpg") for number in range(3)]

@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.hooks import Shot, Technique
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.schedule import ScheduleStep
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.techniques import Techniques
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep
+from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, Checkpoint
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import Techniques
 
 
 class Tint(Technique):
