@@ -82,7 +82,7 @@ class InlierMatches:
 NOTHING = InlierMatches(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-def glimpse(photo: CheckedPhoto) -> QuickFeatures:
+def quick_features(photo: CheckedPhoto) -> QuickFeatures:
     """Read a photo, extract its largest keypoints at low resolution, and measure detail and brightness around them.
 
     Raises:

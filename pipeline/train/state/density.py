@@ -98,8 +98,8 @@ class Density:
         """
         schedule, extent, iteration = step.schedule, step.extent, step.iteration
         gone = prune_mask(gaussians, schedule, extent, iteration, self.statistics.max_radius_px)
-        if not bool((gone | step.unwanted).all()):  # a model is never emptied
-            gone |= step.unwanted
+        if not bool((gone | step.prune_mask).all()):  # a model is never emptied
+            gone |= step.prune_mask
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, self.statistics.score())
         score = score if step.ranked is None else step.ranked(score)
