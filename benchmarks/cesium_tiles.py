@@ -29,7 +29,7 @@ import torch
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from splatpipe.pipeline.delivery.globe import write_tiles_on_globe
+from splatpipe.pipeline.delivery.ecef_tiles import write_tiles_on_globe
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.rasterizer import RenderOptions

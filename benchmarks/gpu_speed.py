@@ -171,7 +171,7 @@ def iteration_times(count: int | None, what: Planned, megapixels: float, where: 
 
 def choose_rules(where: torch.device) -> AbstractContextManager[None]:
     """Select torch's settings as training does on a device: a fixed order of summation."""
-    return chosen(where).one_order()
+    return chosen(where).deterministic()
 
 
 def chosen(where: torch.device) -> Device:

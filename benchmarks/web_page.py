@@ -23,7 +23,7 @@ from opened_run import OpenedRun, open_run
 from playwright.sync_api import Browser, CDPSession, Page, sync_playwright
 from viewer_page import FLAGS, multiplied
 
-from splatpipe.pipeline.delivery.handover import in_world
+from splatpipe.pipeline.delivery.delivery_frame import in_world
 from splatpipe.pipeline.splat.levels.levels import build_levels
 from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts
 from splatpipe.pipeline.survey.crs.frames import load_frame

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatpipe.pipeline.delivery.handover import (
+from splatpipe.pipeline.delivery.delivery_frame import (
     bounded_comments,
     cameras_json,
     facts_of,

@@ -25,7 +25,7 @@ from splatpipe.pipeline.survey.adjustment.adjusted_positions import (
 )
 from splatpipe.pipeline.survey.adjustment.georef_input import GeorefInput
 from splatpipe.pipeline.survey.adjustment.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE, LensKnowledge
-from splatpipe.pipeline.survey.boundary import lay_boundary
+from splatpipe.pipeline.survey.boundary import write_boundary
 from splatpipe.pipeline.survey.control.accuracy import GeoreferencedModel, accuracy_json, control_json, no_control
 from splatpipe.pipeline.survey.control.blunders import gsd_m
 from splatpipe.pipeline.survey.control.control import ControlResult, place_by_control
@@ -118,7 +118,7 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         frame = arbitrary_frame(model, positions, frame.why)
     frame = _declared(frame, config, controlled, report)
     placed_points = (controlled.placed.model if controlled is not None else model).points
-    bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
+    bounded = write_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
     control, accuracy = _accuracy(config, controlled, (model, positions, frame), photos, report)
     adjustment = {} if found is None else adjustment_json(found, accuracy["gsd_m"])
     if controlled is not None and controlled.block is not None:

@@ -22,7 +22,7 @@ from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
 from timeouts import TIMEOUT_S
 
-from splatpipe.pipeline.engine.heap import importing
+from splatpipe.pipeline.engine.heap import imports_outside_gc
 
 DEMO = (
     "features.extractor=opencv-sift",
@@ -67,7 +67,7 @@ def pytest_configure() -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Import the tests' modules and what they test without garbage collection; later collections leave them out."""
-    with importing():
+    with imports_outside_gc():
         result = yield
         gc.freeze()
     return result

@@ -44,9 +44,9 @@ def examine(place: Path) -> dict[str, JSON]:
 
 def _cuda() -> str:
     """Whether training uses CUDA here; if not, why not and what to do about it."""
-    from splatpipe.pipeline.raster.cuda.cuda_library import cannot_compute, load, why_not
+    from splatpipe.pipeline.raster.cuda.cuda_library import cannot_compute, load, unavailable_reason
 
-    if missing := why_not() or cannot_compute():
+    if missing := unavailable_reason() or cannot_compute():
         return f"not used. {missing.reason} {missing.hint}"
     _, device = load().device(0)
     return f"used: {device.described()}"

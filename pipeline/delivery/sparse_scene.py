@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float64
 
-from splatpipe.pipeline.delivery.handover import pose_in_world
+from splatpipe.pipeline.delivery.delivery_frame import pose_in_world
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import Points
 from splatpipe.pipeline.survey.crs.frames import Frame

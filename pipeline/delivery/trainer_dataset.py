@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from splatpipe.pipeline.delivery.handover import pose_in_world
+from splatpipe.pipeline.delivery.delivery_frame import pose_in_world
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction

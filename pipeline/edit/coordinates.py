@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from splatpipe.pipeline.delivery.handover import frame_of
+from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.splat.model.scene import NO_OFFSET, SceneFacts, turn_of
 from splatpipe.pipeline.survey.crs.world import World, open_world

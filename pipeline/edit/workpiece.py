@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
-from splatpipe.pipeline.delivery.handover import frame_of
+from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

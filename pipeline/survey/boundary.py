@@ -40,7 +40,7 @@ class Boundary:
     share: float
 
 
-def lay_boundary(
+def write_boundary(
     path: Path, frame: Frame, points: Float64[np.ndarray, "n 3"], out: Path, report: Reporter
 ) -> dict[str, JSON]:
     """Write the part `georef.boundary`: the polygons in the world and the model frame; null without a boundary.

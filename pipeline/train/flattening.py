@@ -85,9 +85,9 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
     path = out / FLATTENED
     if not path.is_file():
         device = choose_device(machine.device, note=report.note)
-        with same_bits(machine.threads), device.one_order():
-            course = _course(trained, device, machine.threads)
-            state = go_through(course, out, report)
+        with same_bits(machine.threads), device.deterministic():
+            setup = _course(trained, device, machine.threads)
+            state = go_through(setup, out, report)
             aside = path.with_suffix(".part")
             write_splat(aside, state.finished())
             aside.replace(path)
@@ -106,8 +106,8 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetu
     trained_on = [view for view in views if view.camera.name in kept]
     sky = _sky(trained, trained_on, threads)
 
-    def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
-        return PhotoOrder([view.camera for view in trained_on], looks, options.seed, plan.megapixels)
+    def order_of(sizes: Sequence[TrainingSize]) -> TrainingOrder:
+        return PhotoOrder([view.camera for view in trained_on], sizes, options.seed, plan.megapixels)
 
     def techniques() -> Techniques:
         made = make_techniques(plan, sky, device=device.tensors)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpipe.pipeline.delivery.globe import write_tiles_on_globe
-from splatpipe.pipeline.delivery.handover import cameras_json
+from splatpipe.pipeline.delivery.delivery_frame import cameras_json
+from splatpipe.pipeline.delivery.ecef_tiles import write_tiles_on_globe
 from splatpipe.pipeline.delivery.trainer_dataset import write_colmap, write_points_ply, write_transforms
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json

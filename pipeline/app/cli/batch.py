@@ -119,9 +119,9 @@ def _uses_gpu(device: str, profile: Profile) -> bool:
     """Whether to request a GPU; on a cluster only if named explicitly, since without GPUs the job would never start."""
     if device != "auto" or not profile.local:
         return device == "cuda"
-    from splatpipe.pipeline.raster.cuda.cuda_library import why_not
+    from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 
-    return why_not() is None
+    return unavailable_reason() is None
 
 
 def _run(captures: Path, out: Path, settings: Settings, profile: Profile, command: str) -> BatchState:

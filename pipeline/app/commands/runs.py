@@ -82,11 +82,11 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     if device not in ("auto", "cpu", "cuda"):
         raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
     if device == "cuda":  # reported now, not when training begins; `auto` falls back to the CPU if CUDA does not work
-        from splatpipe.pipeline.raster.cuda.cuda_library import why_not
+        from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 
         if unfit := config.train.unfit_for_cuda():
             raise UsageError(unfit, hint="Omit --device, or give --device cpu.")
-        if missing := why_not():
+        if missing := unavailable_reason():
             raise missing.error()
     if os.environ.get("SPLATPIPE_ISA"):  # an invalid one is reported now, not when training begins
         import splatpipe.pipeline.raster.isa  # noqa: F401

@@ -161,9 +161,9 @@ def blocks_text(blocks: BlockWork) -> str:
 
 def _on_cuda(device: str) -> bool:
     """Whether training will run on a CUDA device, by the device that was asked for."""
-    from splatpipe.pipeline.raster.cuda.cuda_library import why_not
+    from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 
-    return device != "cpu" and why_not() is None
+    return device != "cpu" and unavailable_reason() is None
 
 
 def _read_film(path: Path) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from splatpipe.pipeline.delivery.handover import in_world
+from splatpipe.pipeline.delivery.delivery_frame import in_world
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, card_fault
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.runs.run_folder import Contents

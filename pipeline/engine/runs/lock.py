@@ -33,11 +33,11 @@ from splatpipe.pipeline.engine.small_file import open_regular, read_small
 
 LOCK_FILE = ".lock"  # below stages/; it is never removed, and only its holder works
 PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
-BEAT_S = 4.0  # between touches; rare enough not to burden a server
+HEARTBEAT_S = 4.0  # between touches; rare enough not to burden a server
 SILENCE_S = 20.0  # without a touch: five missed ones cannot be explained by a busy disk
 SETTLE_S = 1.0  # time for two machines that sign at once to see which was last
 POLL_S = 0.25
-LONGEST = 4096  # bytes read of a signature
+MAX_SIGNATURE_BYTES = 4096  # bytes read of a signature
 WIDTH = 1024  # bytes to which signatures are padded: of two written over each other, the last is intact
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in all containers of a machine
@@ -123,7 +123,7 @@ class Hold:
             os.close(descriptor)
 
     def _beat(self) -> None:
-        while not self._over.wait(BEAT_S):
+        while not self._over.wait(HEARTBEAT_S):
             with suppress(OSError):
                 found = _read_signature(self._path)
                 if found != self._holder and (found is not None or self._path.stat().st_size == 0):
@@ -325,7 +325,7 @@ def _wait_for_silence(path: Path, waiting: _Queue) -> Holder | None:
         time.sleep(POLL_S)
         now = _mtime_ns(path)
         # While a server does not answer, no touch arrives: a check that hangs counts as BEAT_S at most.
-        silence_s += min(time.monotonic() - began_s, BEAT_S)
+        silence_s += min(time.monotonic() - began_s, HEARTBEAT_S)
         if now != touched:
             if (signed := _read_signature(path)) is None:
                 return None
@@ -381,7 +381,7 @@ def _try_flock(descriptor: int, out: Path, kind: int) -> bool:
 def _read_signature(path: Path) -> Holder | None:
     """The signer of the file, or None. The file is reopened so that NFS queries the server."""
     with suppress(OSError, ValueError, TypeError, KeyError, RecursionError):
-        read = json.loads(read_small(path, LONGEST))
+        read = json.loads(read_small(path, MAX_SIGNATURE_BYTES))
         return Holder(int(read["process"]), str(read["host"])[:255], str(read["boot"]), str(read["turn"]))
     return None
 

@@ -32,7 +32,7 @@ from splatpipe.pipeline.engine.errors import (
     card_fault,
 )
 from splatpipe.pipeline.engine.events import Event, EventReporter
-from splatpipe.pipeline.engine.heap import importing, return_free_heap
+from splatpipe.pipeline.engine.heap import imports_outside_gc, return_free_heap
 from splatpipe.pipeline.engine.runs.children import CHILDREN_MEMORY, die_with_parent
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Shard, StageConfig, load_body
 
@@ -120,7 +120,7 @@ def execute(task: Task, send: IO[str]) -> None:
     started = _Usage.now()
     try:
         module, _, name = task.config_type.partition(":")
-        with importing():
+        with imports_outside_gc():
             config_type: type[StageConfig] = getattr(__import__(module, fromlist=[name]), name)
             body = load_body(task.entry)
         config = config_type.model_validate(task.config)

@@ -23,7 +23,7 @@ from splatpipe.pipeline.raster.cuda.cuda_api import (
     SplatStream,
 )
 from splatpipe.pipeline.raster.cuda.cuda_forecast import Forecast, most_pairs_of
-from splatpipe.pipeline.raster.cuda.cuda_library import CudaDevice, CudaLibrary, load, why_not
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaDevice, CudaLibrary, load, unavailable_reason
 from splatpipe.pipeline.splat.model.upload import upload
 
 ALIGNMENT = 256  # bytes, of memory passed to kernels
@@ -253,7 +253,7 @@ def kernels_of(device: torch.device) -> CudaKernels | None:
 
 @functools.cache
 def _on_cuda(index: int) -> CudaKernels | None:
-    return None if why_not() else CudaKernels(load(), torch.device("cuda", index))
+    return None if unavailable_reason() else CudaKernels(load(), torch.device("cuda", index))
 
 
 def cuda_device(device: torch.device) -> CudaDevice | None:

@@ -123,7 +123,7 @@ class Forecast:
 
     def _room(self, size: FrameSize) -> FrameAllocation:
         while self._readings and self._readings[0].arrived():
-            self.learn(self._readings.popleft().facts())
+            self.update(self._readings.popleft().facts())
         known = [facts for facts in (self._before, self._recent) if facts is not None]
         pairs = max((self._foreseen(facts, size) for facts in known), default=0)
         passes = 1
@@ -143,7 +143,7 @@ class Forecast:
         """Learn from an enqueued frame once its facts have arrived."""
         self._readings.append(PendingFacts(memory, size, capacity))
 
-    def learn(self, facts: FrameFacts) -> None:
+    def update(self, facts: FrameFacts) -> None:
         """Learn from a frame."""
         self._seen += 1
         if self._seen > WINDOW:

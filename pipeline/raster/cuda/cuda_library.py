@@ -208,7 +208,7 @@ def reason_of(installed: CudaInstallation) -> NoCuda | None:
     return None
 
 
-def why_not(path: Path = LIBRARY) -> NoCuda | None:
+def unavailable_reason(path: Path = LIBRARY) -> NoCuda | None:
     """Why CUDA cannot be used here; None if it can. Checks cheap things first, and torch last.
 
     Args:

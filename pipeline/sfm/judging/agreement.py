@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
-from splatpipe.pipeline.sfm.model.coarseness import coarseness
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 EXPLAINED_PX = 4.0  # distance from the epipolar line that verification itself allows; more in large photos
@@ -99,7 +99,7 @@ def compare(
             continue
         cameras = model.images[i].camera, model.images[j].camera
         focal = (cameras[0].mean_focal_length() + cameras[1].mean_focal_length()) / 2.0
-        bounds[row] = EXPLAINED_PX * coarseness(cameras)
+        bounds[row] = EXPLAINED_PX * pixel_tolerance_scale(cameras)
         bound = bounds[row] / focal
         errors = epipolar_errors(rays[i][found[:, 0]], rays[j][found[:, 1]], poses[i], poses[j], bound)
         good = errors <= bound

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 from splatpipe.pipeline.sfm.judging.agreement import EXPLAINED_PX, Agreement, Rays, compare, contradicting
 from splatpipe.pipeline.sfm.judging.cuts import find_cut
-from splatpipe.pipeline.sfm.model.coarseness import coarseness
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 SAMPLE = 24  # matches per pair: the adjustment has six unknowns per photo
@@ -321,6 +321,6 @@ def _two_view(
     places = [verified.keypoints[number][rows[:, at]].astype(np.float64) for at, number in enumerate((one, two))]
     cameras = [model.images[number].camera for number in (one, two)]
     options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = EXPLAINED_PX * coarseness(cameras), 0
+    options.max_error, options.random_seed = EXPLAINED_PX * pixel_tolerance_scale(cameras), 0
     found = pycolmap.estimate_essential_matrix(places[0], places[1], cameras[0], cameras[1], options)
     return None if found is None else np.asarray(found["cam2_from_cam1"].matrix())

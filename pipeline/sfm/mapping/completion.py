@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import pycolmap
 
-from splatpipe.pipeline.sfm.model.coarseness import coarseness
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 
 Progress: TypeAlias = Callable[[int, int, str, str], None]
 """Called with what is done, of how many, the current step, and the unit of both."""
@@ -64,7 +64,7 @@ def complete(
     on_progress(0, 1 + MAX_ROUNDS, ADJUSTING, "rounds")
     _adjust(mapper, options, stop, rough=True)
     mapper.filter_points(mapping)
-    triangulation.complete_max_reproj_error = STRICT_PX * coarseness(model.cameras.values())
+    triangulation.complete_max_reproj_error = STRICT_PX * pixel_tolerance_scale(model.cameras.values())
     for number in range(1, 1 + MAX_ROUNDS):
         on_progress(number, 1 + MAX_ROUNDS, ADJUSTING, "rounds")
         mapper.complete_and_merge_tracks(triangulation)
@@ -98,7 +98,7 @@ def _adjust(
     rough: bool,
 ) -> None:
     """Run a global bundle adjustment through COLMAP's function, since the mapper's method holds the GIL throughout."""
-    adjustment = adjustment_options(options, coarseness(mapper.reconstruction.cameras.values()), rough=rough)
+    adjustment = adjustment_options(options, pixel_tolerance_scale(mapper.reconstruction.cameras.values()), rough=rough)
     mapper.observation_manager.filter_observations_with_negative_depth()
     pycolmap.bundle_adjustment(mapper.reconstruction, adjustment, stop)
 
@@ -110,7 +110,7 @@ def adjustment_options(
 
     Args:
         options: The mapper's.
-        coarse: The cameras' ``coarseness``.
+        coarse: The cameras' ``pixel_tolerance_scale``.
         rough: Before wrong observations are filtered.
     """
     adjustment = options.get_global_bundle_adjustment()

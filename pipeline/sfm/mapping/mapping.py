@@ -43,7 +43,7 @@ class MappingOptions:
     min_model_size: int = 3
     relaxed: bool = False
     hold_focal: bool = False
-    coarseness: float = 1.0
+    pixel_tolerance_scale: float = 1.0
 
 
 def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_progress: Progress) -> list[Model]:
@@ -147,10 +147,10 @@ def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipeline
     result.ba_global_max_num_iterations = 20
     result.ba_global_function_tolerance = result.ba_local_function_tolerance = GOOD_ENOUGH
     result.mapper.ba_global_ignore_redundant_points3D = True
-    result.mapper.init_max_error *= options.coarseness
-    result.mapper.filter_max_reproj_error *= options.coarseness
-    result.triangulation.complete_max_reproj_error *= options.coarseness
-    result.triangulation.merge_max_reproj_error *= options.coarseness
+    result.mapper.init_max_error *= options.pixel_tolerance_scale
+    result.mapper.filter_max_reproj_error *= options.pixel_tolerance_scale
+    result.triangulation.complete_max_reproj_error *= options.pixel_tolerance_scale
+    result.triangulation.merge_max_reproj_error *= options.pixel_tolerance_scale
     if options.relaxed:
         result.mapper.init_min_num_inliers = 50
         result.mapper.init_min_tri_angle = 6.0

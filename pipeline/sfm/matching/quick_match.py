@@ -82,7 +82,7 @@ class InlierMatches:
 NOTHING = InlierMatches(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-def glimpse(photo: CheckedPhoto) -> QuickFeatures:
+def quick_features(photo: CheckedPhoto) -> QuickFeatures:
     """Read a photo, extract its largest keypoints at low resolution, and measure detail and brightness around them.
 
     Raises:
@@ -117,10 +117,12 @@ def glimpse(photo: CheckedPhoto) -> QuickFeatures:
     )
 
 
-def match_glimpses(glimpses: Sequence[QuickFeatures], pairs: Iterable[Pair], threads: int) -> dict[Pair, InlierMatches]:
+def match_quick_features(
+    all_features: Sequence[QuickFeatures], pairs: Iterable[Pair], threads: int
+) -> dict[Pair, InlierMatches]:
     """Match pairs of photos; return the inliers of each pair, which may be empty."""
     listed = sorted(set(pairs))
-    found = ordered_map(lambda pair: agreement(glimpses[pair[0]], glimpses[pair[1]]), listed, threads)
+    found = ordered_map(lambda pair: agreement(all_features[pair[0]], all_features[pair[1]]), listed, threads)
     return dict(zip(listed, found, strict=True))
 
 

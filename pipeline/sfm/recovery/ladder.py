@@ -19,7 +19,7 @@ from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.judging.agreement import compare
 from splatpipe.pipeline.sfm.mapping.completion import complete
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options
-from splatpipe.pipeline.sfm.model.coarseness import coarseness
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 from splatpipe.pipeline.sfm.model.structure import (
     Structure,
     cameras_of,
@@ -32,7 +32,7 @@ from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.pairing.pairs import Pair
 from splatpipe.pipeline.sfm.recovery.ladder_growth import MIN_OBSERVATIONS, ModelMapper, mean_error_px, observations
 from splatpipe.pipeline.sfm.recovery.ladder_joins import join
-from splatpipe.pipeline.sfm.recovery.ladder_keypoints import strengthen
+from splatpipe.pipeline.sfm.recovery.ladder_keypoints import reextract
 from splatpipe.pipeline.sfm.recovery.ladder_pairs import match_more, tried_pairs
 from splatpipe.pipeline.sfm.recovery.ladder_partners import Ranked, choose_pairs, rank_partners
 from splatpipe.pipeline.sfm.recovery.ladder_poses import LARGE_SHARE, MIN_PARTNERS, PoseEstimate, place, sightings
@@ -77,13 +77,13 @@ def run_ladder(capture: MappingInput, found: MappingResult, config: SparseConfig
         been extended.
     """
     held = any(row.get("focal_held") for row in found.tried if row.get("chosen"))
-    wide = coarseness(found.verified.cameras.values())
-    options = MappingOptions(config.seed, config.min_model_size, hold_focal=bool(held), coarseness=wide)
+    wide = pixel_tolerance_scale(found.verified.cameras.values())
+    options = MappingOptions(config.seed, config.min_model_size, hold_focal=bool(held), pixel_tolerance_scale=wide)
     work = LadderContext(capture, options, report)
     if not config.ladder:
         return found
     rungs: list[tuple[str, Callable[[LadderContext, MappingResult], MappingResult]]] = [
-        ("registration", settle),
+        ("registration", register_until_stable),
         ("more pairs", with_more_pairs),
         ("stronger keypoints", with_stronger_keypoints),
     ]
@@ -119,7 +119,7 @@ def unplaced(found: MappingResult) -> list[int]:
     return [number for number in sorted(found.verified.names) if number not in placed]
 
 
-def settle(work: LadderContext, found: MappingResult) -> MappingResult:
+def register_until_stable(work: LadderContext, found: MappingResult) -> MappingResult:
     """Register single photos and join sub-models, using the existing matches, until neither places more."""
     while True:
         grown = _joined(work, _registered(work, found))
@@ -137,7 +137,7 @@ def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
     if not pairs:
         return found
     database = match_more(work.capture, found.database, pairs, work.options.seed, work.report)
-    grown = settle(work, _on(found, replace(found, database=database, verified=read_verified(database))))
+    grown = register_until_stable(work, _on(found, replace(found, database=database, verified=read_verified(database))))
     return grown if len(unplaced(grown)) < len(left) else found
 
 
@@ -150,14 +150,14 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
     pairs = _among(found, ranked, photos)
     if not pairs:
         return found
-    stronger = strengthen(work.capture, found, photos, pairs, work.options.seed, work.report)
+    stronger = reextract(work.capture, found, photos, pairs, work.options.seed, work.report)
     verified = read_verified(stronger.database)
     wider = replace(found, database=stronger.database, verified=verified, colours=stronger.colours)
     wider = _on(found, wider)
     growth = ModelMapper(wider.database, wider.model, work.options)
     growth.triangulate([number for number in photos if wider.model.exists_image(number)])
     growth.end()
-    grown = settle(work, wider)
+    grown = register_until_stable(work, wider)
     return grown if len(unplaced(grown)) < len(left) else found
 
 

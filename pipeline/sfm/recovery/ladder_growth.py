@@ -10,7 +10,7 @@ import pycolmap
 
 from splatpipe.pipeline.sfm.mapping.completion import MIN_MATCHES, adjustment_options
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options
-from splatpipe.pipeline.sfm.model.coarseness import coarseness
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 
 MIN_OBSERVATIONS = 15  # of an added photo, after the adjustment
 
@@ -61,7 +61,9 @@ class ModelMapper:
         """
         moved = sorted(photos)
         for rough in (True, False):
-            options = adjustment_options(self._options, coarseness(self._model.cameras.values()), rough=rough)
+            options = adjustment_options(
+                self._options, pixel_tolerance_scale(self._model.cameras.values()), rough=rough
+            )
             problem = _only(self._model, moved)
             pycolmap.create_default_bundle_adjuster(options, problem, self._model).solve()
             self._mapper.filter_points(self._options.get_mapper())

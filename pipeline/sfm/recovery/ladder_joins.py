@@ -89,7 +89,7 @@ def join(
     if fitted is None:
         return None
     similarity, inliers = fitted
-    if not _sure(ties, inliers) or not _foretells(ties, seed):
+    if not _sure(ties, inliers) or not _cross_validates(ties, seed):
         return None
     return _united(model, here, other, there, verified, similarity, ties.rows[inliers])
 
@@ -218,7 +218,7 @@ def _sure(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
     return enough and links >= MIN_LINKS and len(np.unique(ties.cells[inliers])) >= MIN_CELLS
 
 
-def _foretells(ties: TiePoints, seed: int) -> bool:
+def _cross_validates(ties: TiePoints, seed: int) -> bool:
     """Cross-validate: whether the fit to either half of the points explains the other half nearly as well."""
     _, order = np.unique(ties.rows[:, 0], return_inverse=True)
     for odd in (0, 1):

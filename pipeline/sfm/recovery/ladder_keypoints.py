@@ -45,7 +45,7 @@ class ExtendedDatabase:
     keypoints: int
 
 
-def strengthen(
+def reextract(
     capture: MappingInput,
     found: MappingResult,
     photos: Sequence[int],

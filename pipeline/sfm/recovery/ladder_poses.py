@@ -126,7 +126,7 @@ def place(
         return None
     if len(np.unique(seen.partners[inliers])) < MIN_PARTNERS and not (held >= MANY_INLIERS and share >= LARGE_SHARE):
         return None
-    if not _foretells(seen.keypoints, places, spots, camera, limit, seed):
+    if not _cross_validates(seen.keypoints, places, spots, camera, limit, seed):
         return None
     taken = dict(zip(seen.keypoints[inliers][::-1].tolist(), seen.rows[inliers][::-1].tolist(), strict=True))
     observations = sorted({row: (keypoint, row) for keypoint, row in sorted(taken.items(), reverse=True)}.values())
@@ -163,7 +163,7 @@ def _spread(places: Float64[np.ndarray, "k 2"], camera: pycolmap.Camera) -> bool
     return len(np.unique(cells[:, 0] * CELLS + cells[:, 1])) >= MIN_CELLS
 
 
-def _foretells(
+def _cross_validates(
     keypoints: Int64[np.ndarray, " k"],
     places: Float64[np.ndarray, "k 2"],
     spots: Float64[np.ndarray, "k 3"],

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 SHARE = 0.5  # Gaussians outside for each one inside
-FEWEST = 5_000  # outside, however few are inside: with fewer, the inside grows to fill the holes in the photos
+MIN_OUTSIDE = 5_000  # outside, however few are inside: with fewer, the inside grows to fill the holes in the photos
 
 
 def backdrop_limit(inside: int, cap: int | None = None) -> int:
@@ -16,7 +16,7 @@ def backdrop_limit(inside: int, cap: int | None = None) -> int:
         inside: Number of Gaussians inside.
         cap: Limit on all Gaussians, of which the backdrop gets at most its share; None for no limit.
     """
-    most = max(FEWEST, int(SHARE * inside))
+    most = max(MIN_OUTSIDE, int(SHARE * inside))
     return most if cap is None else min(most, int(SHARE / (1.0 + SHARE) * cap))
 
 

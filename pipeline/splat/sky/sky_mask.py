@@ -129,7 +129,7 @@ def find_skies(
         if seen.drawn is not None:
             return SkyMask.packed(seen.drawn), votes_of(seen.camera, seen.drawn, up), True
         mask = find_sky(seen, seen.camera.in_view(points)[1], up)
-        mask &= ~roofed(seen.camera, mask, points, up)
+        mask &= ~below_structure(seen.camera, mask, points, up)
         return SkyMask.packed(mask), votes_of(seen.camera, mask, up), False
 
     searched = list(ordered_map(search, range(len(cameras)), threads))
@@ -138,7 +138,7 @@ def find_skies(
     return [mask if keep or drawn else mask.emptied() for (mask, _, drawn), keep in zip(searched, kept, strict=True)]
 
 
-def roofed(
+def below_structure(
     camera: Camera, sky: Bool[np.ndarray, "h w"], points: Float64[np.ndarray, "m 3"], up: Float64[np.ndarray, " 3"]
 ) -> Bool[np.ndarray, "h w"]:
     """Regions of a sky mask with something above, such as a ceiling or a lintel, which therefore are not sky.

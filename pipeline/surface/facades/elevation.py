@@ -24,7 +24,7 @@ from splatpipe.pipeline.surface.heights.heights import TILE as HEIGHTS_TILE
 from splatpipe.pipeline.surface.heights.heights import HeightInput, surface_heights
 from splatpipe.pipeline.surface.ortho.orthophoto import TILE, OrthoInput, orthophotos
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
-from splatpipe.pipeline.surface.sheets.sheet import Sheet
+from splatpipe.pipeline.surface.sheets.raster_plane import RasterPlane
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # extent of a wall's details: reveals and doors, sills and cornices, but not balconies
 MAX_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
@@ -47,7 +47,7 @@ class Elevation:
     """
 
     wall: Wall
-    sheet: Sheet
+    sheet: RasterPlane
     depth: Float32[np.ndarray, "h w"]
     sigma: Float32[np.ndarray, "h w"]
     colour: UInt8[np.ndarray, "h w 4"]
@@ -62,7 +62,7 @@ class Elevation:
         )
 
 
-def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
+def wall_sheet(wall: Wall, cell_m: float) -> RasterPlane:
     """The sheet of a wall: whole cells from end to end and from top to foot, with any excess split between both sides.
 
     Args:
@@ -84,7 +84,7 @@ def wall_sheet(wall: Wall, cell_m: float) -> Sheet:
     from_local[:3, 3] = [-wall.along @ wall.left, 0.0, -wall.facing @ wall.left]
     over = width * cell_m - wall.length_m, height * cell_m - (wall.high_m - wall.low_m)
     lattice = Lattice(-over[0] / 2.0, wall.high_m + over[1] / 2.0, cell_m, width, height)
-    return Sheet(from_local, lattice, HeightRange(-BEHIND_M, BEFORE_M))
+    return RasterPlane(from_local, lattice, HeightRange(-BEHIND_M, BEFORE_M))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ def remove_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
     return result
 
 
-def _photos_in_front(sheet: Sheet, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
+def _photos_in_front(sheet: RasterPlane, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
     """Photos in front of a wall, in its sheet's frame, with their exposure gains."""
     rows = [
         row

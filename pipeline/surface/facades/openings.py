@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from splatpipe.pipeline.surface.sheets.sheet import Sheet
+from splatpipe.pipeline.surface.sheets.raster_plane import RasterPlane
 
 RECESS_M, JUT_M = 0.05, 0.12  # behind the plane: window frames; in front of it: canopies, not shutters and plinths
 STEP_GSD = 2.0  # and at least this many pixels: depths of coarse photos scatter more
@@ -22,20 +22,20 @@ SQUARE = 0.8  # share of its level rectangle that an opening fills to be drawn a
 Ring = Float64[np.ndarray, "_ 2"]
 
 
-def recesses(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
+def recesses(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
     """Outlines of openings (areas behind the plane surrounded by the wall's face) on the sheet, metres."""
     limit = max(RECESS_M, STEP_GSD * sheet.lattice.cell_m)
     face = np.isfinite(depth) & (np.nan_to_num(depth, nan=-np.inf) >= -limit)
     return _rings(np.nan_to_num(depth, nan=0.0) < -limit, sheet, face)
 
 
-def projections(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
+def projections(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
     """Outlines of parts that project from the plane, likewise."""
     limit = max(JUT_M, STEP_GSD * sheet.lattice.cell_m)
     return _rings(np.nan_to_num(depth, nan=0.0) > limit, sheet, None)
 
 
-def outlines(depth: Float32[np.ndarray, "h w"], sheet: Sheet) -> list[Ring]:
+def outlines(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
     """Outlines of the known wall, with small holes and notches closed."""
     known = np.isfinite(depth).astype(np.uint8)
     reach = round(BRIDGED_M / sheet.lattice.cell_m)
@@ -51,7 +51,7 @@ def _square(cells: int) -> UInt8[np.ndarray, "k k"]:
     return np.ones((side, side), np.uint8)
 
 
-def _rings(there: Bool[np.ndarray, "h w"], sheet: Sheet, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
+def _rings(there: Bool[np.ndarray, "h w"], sheet: RasterPlane, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
     """Outlines of connected parts, along the cells' borders, from the largest.
 
     Args:

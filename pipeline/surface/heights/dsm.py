@@ -22,7 +22,7 @@ from splatpipe.pipeline.surface.heights.heights import TILE, HeightInput, surfac
 from splatpipe.pipeline.surface.rasters.geotiff import CONFIDENCE, HEIGHTS, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.sheets.sheet import GridSheet, grid_sheets
+from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, grid_sheets
 from splatpipe.pipeline.surface.sheets.sheet_work import Arrays, SheetWork
 
 CACHE_BYTES = 512 << 20  # limit for depths in memory

@@ -28,7 +28,7 @@ from splatpipe.pipeline.surface.ortho.orthophoto import EXTENDED_CELLS, TILE, Or
 from splatpipe.pipeline.surface.rasters.geotiff import COLOURS, gdal, open_raster, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.sheets.sheet import GridSheet, grid_sheets
+from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, grid_sheets
 from splatpipe.pipeline.surface.sheets.sheet_work import Arrays, SheetWork
 
 PIXEL_BYTES = 1 << 30  # limit for decoded photos in memory; beyond it, all are kept on disk

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from splatpipe.pipeline.delivery.handover import facts_of, georef_facts
+from splatpipe.pipeline.delivery.delivery_frame import facts_of, georef_facts
 from splatpipe.pipeline.delivery.sparse_scene import GLTF_FROM_WORLD
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.output_file import new_file

@@ -20,7 +20,7 @@ from splatpipe.pipeline.surface.depths.site_extent import SiteExtent
 from splatpipe.pipeline.surface.shapes.blocks import surface_blocks
 from splatpipe.pipeline.surface.shapes.mesh_files import write_mesh
 from splatpipe.pipeline.surface.shapes.point_colours import photo_set, point_colours
-from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, without_crumbs
+from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, remove_small_components
 from splatpipe.pipeline.surface.shapes.tsdf import open3d, tsdf_mesh
 
 MAX_BLOCKS = 55_000  # of voxels: 0.25 GB, and 2.5 million triangles before decimation; beyond it voxels are larger
@@ -104,7 +104,7 @@ def fine_mesh(task: MeshTask, photos: PhotoSet, report: Reporter) -> tuple[Trian
     mesh = tsdf_mesh(photos, box, blocks, task.threads, report)
     if task.surface.area is not None:
         mesh = mesh.select(task.surface.area.contains(mesh.vertices)[mesh.triangles].all(axis=1))
-    mesh = without_crumbs(mesh, CRUMB_VOXELS * blocks.voxel_m**2)
+    mesh = remove_small_components(mesh, CRUMB_VOXELS * blocks.voxel_m**2)
     if not len(mesh.triangles):
         raise SplatpipeError(
             "No surface is seen by three photos, so there is no mesh.", "Add overlap, or use a wider boundary."

@@ -75,7 +75,7 @@ def in_order(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(mesh.vertices[order], turned[np.lexsort(turned.T[::-1])])
 
 
-def without_crumbs(mesh: TriangleMesh, least_m2: float) -> TriangleMesh:
+def remove_small_components(mesh: TriangleMesh, least_m2: float) -> TriangleMesh:
     """The mesh without connected pieces below an area.
 
     Args:

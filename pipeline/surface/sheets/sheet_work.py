@@ -13,7 +13,7 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.splat.containers.archives import open_archive
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.sheets.sheet import GridSheet
+from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet
 
 Arrays = dict[str, np.ndarray]
 

@@ -265,8 +265,8 @@ def _is_finite(position: Position) -> bool:
 
 def _rotations(positions: Sequence[Position], centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
     """World to camera, by the stated angles; without them straight down, headed along the flight."""
-    course = np.gradient(centres[:, :2], axis=0)
-    along = np.degrees(np.arctan2(course[:, 0], course[:, 1])).tolist()
+    direction = np.gradient(centres[:, :2], axis=0)
+    along = np.degrees(np.arctan2(direction[:, 0], direction[:, 1])).tolist()
     angles = np.array(
         [
             (each.yaw_deg, each.pitch_deg, each.roll_deg or 0.0)

@@ -70,8 +70,8 @@ QUIET = 2.0  # times the stated sigmas; control with residuals up to this keeps 
 MISTAKEN = 100.0  # times the stated sigmas: no receiver, but mistakes; hand-held ones reach some 50 times 2 cm
 STRAY = 0.1  # relative deviation of a focal length from its prior that is worth a warning
 SUSPICIOUS = 1.0  # noise over sigmas; sound control with realistic sigmas stays well below
-LONELY = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
-CROWD = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
+SINGLE_BLUNDER_GAIN = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
+MANY_OFF_SIGMAS = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
 SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
 ROUNDS = 4  # of adjustment, each without a blunder found in the one before, or with larger sigmas
 
@@ -226,14 +226,14 @@ def _without_one(settled: _TrustedAdjustment, case: _Case) -> tuple[int, float, 
     none."""
     result, capture = case.result, case.capture
     chosen = _chosen(settled.survey)
-    if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > CROWD:
+    if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > MANY_OFF_SIGMAS:
         return None
     for worst in np.argsort(-settled.done.normed, kind="stable")[:SUSPECTS].tolist():
         index = chosen[worst]
         points = list(settled.survey.points)
         points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
         rest = _try(settled.survey.with_points(points), settled.factor, case)
-        if rest.noise <= settled.noise / LONELY:
+        if rest.noise <= settled.noise / SINGLE_BLUNDER_GAIN:
             model = model_of(rest.done.reconstruction, capture.photos)
             found = locate(settled.survey.points[index], model, capture.photos, case.config.mark_sigma_px).found
             if found is not None:

@@ -29,7 +29,7 @@ SLOW = 0.5  # correlation above which the stated accuracy depends on how errors 
 OUTLIER_NOISES = 6.0  # times the noise of all positions
 OUTLIER_SIGMAS = 3.0  # times the stated sigma: a smaller error is not an outlier
 ROUNDS = 4
-COLLAPSE = math.log(1.5)  # of the scale from the robust fit's, which noise of half of that cannot make
+MAX_LOG_SCALE_CHANGE = math.log(1.5)  # of the scale from the robust fit's, which noise of half of that cannot make
 
 
 class FrameUndeterminedError(Exception):
@@ -153,7 +153,7 @@ def _fitted(
     chosen = points.only(inliers)
     before = _before(flights[inliers])
     correlated, alone = True, fit_with_noise(chosen, before, start)
-    if abs(math.log(alone.similarity.scale / start.scale)) > COLLAPSE:
+    if abs(math.log(alone.similarity.scale / start.scale)) > MAX_LOG_SCALE_CHANGE:
         # A walk is as smooth as slow errors: with a scale near zero, all of it could be explained as error.
         correlated, alone = False, fit_with_noise(chosen, before, start, correlated=False)
     covariance = alone.covariance[:3, :3]
@@ -174,7 +174,7 @@ def _fitted(
         turned = turn_about_axis(alone.similarity, axes[:, -1], alone.centre, prior)
         noisy = fit_with_noise(chosen, before, turned, prior, correlated=correlated)
         noisy = replace(noisy, covariance=doubt**2 * noisy.covariance)
-    if abs(math.log(noisy.similarity.scale / start.scale)) > COLLAPSE:
+    if abs(math.log(noisy.similarity.scale / start.scale)) > MAX_LOG_SCALE_CHANGE:
         noisy = fit_with_noise(chosen, before, start, correlated=False, held=True)
         with_prior = contradicted = False
     stated = np.median(chosen.sigmas, axis=0)[[0, 2]] if points.shared is None else np.zeros(2)

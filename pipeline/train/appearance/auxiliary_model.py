@@ -56,7 +56,7 @@ class AuxiliaryModel:
             self.adam.step(self.tensors, rates, rows)
         self.drop_gradients()
 
-    def begin_again(self) -> None:
+    def roll_back(self) -> None:
         """Drop what an incomplete backward pass left behind."""
         self.drop_gradients()
 

@@ -88,14 +88,14 @@ def log_gains(
     photo, number, logs = photo[shared], number[shared], logs[shared]
     rows = [np.flatnonzero(photo == each) for each in range(photos)]
     rows = [own for own in rows if len(own) >= MIN_SEEN]
-    gains, shown = np.zeros((len(rows), 3)), np.zeros_like(logs)  # ``shown``: the gain of each observation's photo
+    gains, applied = np.zeros((len(rows), 3)), np.zeros_like(logs)  # of each photo, and of each observation
     for _ in range(ROUNDS):
-        surface = np.stack([np.bincount(number, channel, len(count)) for channel in (logs - shown).T], axis=1)
+        surface = np.stack([np.bincount(number, channel, len(count)) for channel in (logs - applied).T], axis=1)
         apart = logs - surface[number] / count[number, None]
         gains = np.array([np.median(apart[own], axis=0) for own in rows]).reshape(-1, 3)
         gains -= gains.mean(axis=0) if len(rows) else 0.0
         for own, gain in zip(rows, gains, strict=True):
-            shown[own] = gain
+            applied[own] = gain
     return gains
 
 

@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import json_text, read_json
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.train.appearance.auxiliary_model import AuxiliaryModel
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 
 FIRST_RATE = 1e-3  # learning rate: a photo has about a hundred visits, which change its exposure by at most a tenth
 LAST_RATE = 0.1  # of the first; exponential in between
@@ -49,7 +49,7 @@ class Exposure(AuxiliaryModel, Technique):
         deviations = self._deviations()
         return torch.eye(3, 4, device=deviations.device) + deviations[self._row[name]].view(3, 4)
 
-    def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> Float[Tensor, "h w 3"]:
         """A render as the photo's exposure would show it."""
         return self.applied(picture, shot.photo.camera.name)
 
@@ -71,7 +71,7 @@ class Exposure(AuxiliaryModel, Technique):
         found.give()
         return found
 
-    def after_step(self, shot: Shot) -> None:
+    def after_step(self, shot: RenderedView) -> None:
         """Step the photo's map."""
         if self.is_given:
             return

@@ -29,7 +29,7 @@ from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.appearance.neighbour_cameras import NeighbourCameras
 from splatpipe.pipeline.train.appearance.photo_cells import PhotoCells
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 
@@ -100,14 +100,14 @@ class RobustMask(Technique):
         self._before = None
         return replace(settings, depth=True)
 
-    def begin_again(self) -> None:
+    def roll_back(self) -> None:
         """Undo what was recorded of the photo: it will be visited again."""
         if self._before is not None:
             row, scores, left_out = self._before
             self.scores[row], self.left_out[row] = scores, left_out
             self._before = None
 
-    def counted(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
+    def mask_pixels(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> TrainingPhoto:
         """The photo without what the other photos contradict."""
         return self.leave_out_contradicted(photo, shot.rendered, picture)
 

@@ -30,7 +30,7 @@ from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, Panorama, cells
 from splatpipe.pipeline.splat.sky.sky_mask import WORK_MEGAPIXELS, SkyMask, SkyPhoto, directions, find_skies, up_of
 from splatpipe.pipeline.train.appearance.auxiliary_model import AuxiliaryModel
 from splatpipe.pipeline.train.appearance.photo_sky import PhotoSkies, PhotoSky
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.photos.stream import EVERYWHERE
 from splatpipe.pipeline.train.random_numbers import ELSEWHERE
 
@@ -128,17 +128,17 @@ class SkyModel(AuxiliaryModel, Technique):
         colours = first_colours(((photo(index), masks[index].unpacked()) for index in shown), up)
         return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
 
-    def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> Float[Tensor, "h w 3"]:
         """The render over the sky, or over another colour where the photo shows none."""
         camera, behind = shot.photo.camera, shot.settings.background
         self._seen = self.seen(camera)
         return self.composite(shot.rendered, camera, self._seen, behind, shot.now.colour(ELSEWHERE))
 
-    def penalty(self, shot: Shot) -> Float[Tensor, ""]:
+    def penalty(self, shot: RenderedView) -> Float[Tensor, ""]:
         """Opacity in front of the sky, and the sky's roughness."""
         return self.loss(shot.rendered.alpha, self._seen, shot.photo.inside)
 
-    def after_step(self, shot: Shot) -> None:
+    def after_step(self, shot: RenderedView) -> None:
         """Step the colours."""
         if not self.is_given:
             self.step(shot.now.share)

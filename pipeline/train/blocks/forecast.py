@@ -216,7 +216,7 @@ def coarse_coverages(
         MachineError: if the requested device is not available.
     """
     device = choose_device(machine.device)
-    with same_bits(machine.threads), device.one_order():
+    with same_bits(machine.threads), device.deterministic():
         return list(iterate_coverages(coarse, read_splat(coarse / "model.ply"), views, observed, device))
 
 

@@ -98,7 +98,7 @@ def train_block(
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     device = choose_device(machine.device, config.unfit_for_cuda(), report.note)
-    with same_bits(machine.threads), device.one_order(), device.memory_limit(config.max_memory_bytes):
+    with same_bits(machine.threads), device.deterministic(), device.memory_limit(config.max_memory_bytes):
         block = Block.of(config, parts, task, device)
         scope = block.scope_reader.scope()
         windows = scope.windows
@@ -107,7 +107,7 @@ def train_block(
             report.note("there is nothing to train")
             return _leave(block, plan, out, (block.start(), History())) | device.facts()
         report.note(f"{len(plan.train_views)} photos, {plan.described()}")
-        state = go_through(block.course(plan, scope, out), out, report)
+        state = go_through(block.setup(plan, scope, out), out, report)
         left = _leave(block, plan, out, (state.finished(), state.whole_history()))
     return summary_of(state, plan) | left | device.facts()
 
@@ -186,7 +186,7 @@ class Block:
         size = round(1e-6 * seen.pixels(TrainingSize(schedule.finest.level)), 4)
         return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
 
-    def course(self, plan: TrainingPlan, scope: BlockScope, out: Path) -> TrainingSetup:
+    def setup(self, plan: TrainingPlan, scope: BlockScope, out: Path) -> TrainingSetup:
         """The block's training setup.
 
         Args:
@@ -203,9 +203,9 @@ class Block:
             for level, pairs in windows.items()
         }
 
-        def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
+        def order_of(sizes: Sequence[TrainingSize]) -> TrainingOrder:
             cameras = [view.camera for view in views]
-            return WindowOrder(cameras, looks, plan.options.seed, plan.megapixels, pieces, cells)
+            return WindowOrder(cameras, sizes, plan.options.seed, plan.megapixels, pieces, cells)
 
         return TrainingSetup(
             plan,

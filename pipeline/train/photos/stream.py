@@ -122,14 +122,14 @@ class PhotoStream:
     @staticmethod
     def over(
         views: Sequence[View],
-        looks: Sequence[TrainingSize],
+        sizes: Sequence[TrainingSize],
         seed: int,
         first: int,
         cache: Path,
         max_megapixels: float | None = None,
     ) -> PhotoStream:
         """A stream over whole photos; arguments as for the class and ``PhotoOrder``."""
-        order = PhotoOrder([view.camera for view in views], looks, seed, max_megapixels)
+        order = PhotoOrder([view.camera for view in views], sizes, seed, max_megapixels)
         return PhotoStream(views, order, first, cache)
 
     def to(self, device: torch.device) -> PhotoStream:

@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 from splatpipe.pipeline.train.densify import room_at
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.lengths import PhotoSizes, lengths
-from splatpipe.pipeline.train.plan.limits import FEWEST, LONGEST, worthwhile_iterations
+from splatpipe.pipeline.train.plan.limits import MAX_ITERATIONS, MIN_ITERATIONS, worthwhile_iterations
 from splatpipe.pipeline.train.plan.plan import footage_of
 from splatpipe.pipeline.train.plan.schedule import Schedule, resolve_schedule
 from splatpipe.pipeline.train.plan.start import started
@@ -187,8 +187,8 @@ class BudgetChoice:
 
     @property
     def last_iteration(self) -> int:
-        """Maximum iterations: beyond the schedule until the time is up, unless the schedule has ``LONGEST``."""
-        return self.iterations if self.iterations >= LONGEST else int(POLISH * self.iterations)
+        """Maximum iterations: beyond the schedule until the time is up, unless the schedule has ``MAX_ITERATIONS``."""
+        return self.iterations if self.iterations >= MAX_ITERATIONS else int(POLISH * self.iterations)
 
 
 def choose(task: BudgetTask) -> BudgetChoice:
@@ -196,7 +196,7 @@ def choose(task: BudgetTask) -> BudgetChoice:
 
     Photos grow to the dataset's size first, as long as ``wanted_iterations`` and room for the first growth fit: a size
     whose parts would be seen too seldom loses to the next smaller one. Then the cap grows; the remaining time goes into
-    iterations, up to ``LONGEST``. Only if everything is at its maximum may a flat loss end the training early;
+    iterations, up to ``MAX_ITERATIONS``. Only if everything is at its maximum may a flat loss end the training early;
     otherwise it ends a photo size, and larger photos come earlier.
     """
     most = task.config.max_gaussians
@@ -212,8 +212,8 @@ def choose(task: BudgetTask) -> BudgetChoice:
             cap = _largest(first, most, lambda gaussians: _fits(task, size, gaussians, iterations))
     else:  # too little time for even that: fewer iterations, then fewer Gaussians
         least = min(first, FEWEST_GAUSSIANS)
-        cap = _largest(least, first, lambda gaussians: _fits(task, size, gaussians, FEWEST))
-    iterations = _largest(FEWEST, max(LONGEST, iterations), lambda count: _fits(task, size, cap, count))
+        cap = _largest(least, first, lambda gaussians: _fits(task, size, gaussians, MIN_ITERATIONS))
+    iterations = _largest(MIN_ITERATIONS, max(MAX_ITERATIONS, iterations), lambda count: _fits(task, size, cap, count))
     options = planned_options(task, size, cap, iterations)
     is_most = size >= task.megapixels and cap >= most
     return BudgetChoice(options, iterations, task.left(cap), task.takes(options, size), is_most)

@@ -47,8 +47,8 @@ WINDOW_SHARE = 0.25  # largest share of the memory for pixels and Gaussians that
 
 FIRST_ITERATIONS = 1500  # wanted within FIRST_SECONDS: with fewer the colours have not settled
 FIRST_SECONDS = 30.0
-LONGEST = 30_000  # iterations, as published: little is gained beyond
-FEWEST = 300  # iterations, however short the time: with fewer the model stays as blurred as it began
+MAX_ITERATIONS = 30_000  # iterations, as published: little is gained beyond
+MIN_ITERATIONS = 300  # iterations, however short the time: with fewer the model stays as blurred as it began
 
 
 def numbers_of(sh_degree: int) -> int:
@@ -86,10 +86,10 @@ def window_within(room_bytes: int, window_pixels: int) -> int:
 
 
 def worthwhile_iterations(seconds: float) -> int:
-    """Minimum iterations worth doing in a training of ``seconds``, from ``FEWEST`` to ``LONGEST``.
+    """Minimum iterations worth doing in a training of ``seconds``, from ``MIN_ITERATIONS`` to ``MAX_ITERATIONS``.
 
     They grow with the square root of the time, so that the work per iteration grows as much; 10 minutes give about
     the 7,000 iterations of the standard preset.
     """
     wanted = FIRST_ITERATIONS * math.sqrt(max(seconds, 1.0) / FIRST_SECONDS)
-    return int(min(LONGEST, max(FEWEST, wanted)))
+    return int(min(MAX_ITERATIONS, max(MIN_ITERATIONS, wanted)))

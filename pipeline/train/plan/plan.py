@@ -84,8 +84,8 @@ class TrainingPlan:
         schedule = asdict(self.schedule)
         parts = {f"{part}_{name}": value for part in ("rates", "density") for name, value in schedule.pop(part).items()}
         found = parts | self.options.model_dump(mode="json") | schedule
-        looks = [f"{size} until {stretch.until:,}" for size, stretch in zip(*self._size_labels(), strict=True)]
-        return found | {"initial_gaussians": self.initial_gaussians, "stretches": "; ".join(looks)}
+        sizes = [f"{size} until {stretch.until:,}" for size, stretch in zip(*self._size_labels(), strict=True)]
+        return found | {"initial_gaussians": self.initial_gaussians, "stretches": "; ".join(sizes)}
 
     def digest(self) -> str:
         """SHA-256 of ``to_json``: identifies the plan in its checkpoints."""

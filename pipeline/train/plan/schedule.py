@@ -215,23 +215,23 @@ def schedule_of(config: TrainConfig, footage: PhotoSizes, each: list[Length]) ->
         footage: The photos that are trained on.
         each: Levels and their iterations, in training order.
     """
-    pace = Pace.of(config, footage)
+    scale = IterationScale.of(config, footage)
     few = FEW_DROPOUT * share_of_few(footage.photos)
     return Schedule(
         iterations=sum(count for _level, count in each),
         seed=config.seed,
         sh_degree=config.sh_degree,
-        sh_every=pace.lasting(1000, 5),
+        sh_every=scale.scaled_length(1000, 5),
         stretches=stretches(footage, each, config.coarse_levels),
         dropout=round(few, 4) if config.dropout == "auto" else config.dropout,
         background=BACKGROUNDS[config.background],
-        rates=PUBLISHED if config.density == "published" else rates_of(pace.iterations),
-        density=_density(config, each, pace),
+        rates=PUBLISHED if config.density == "published" else rates_of(scale.iterations),
+        density=_density(config, each, scale),
     )
 
 
 @dataclass(frozen=True)
-class Pace:
+class IterationScale:
     """How fast a model is trained.
 
     A site with more photos takes more iterations, but each Gaussian is seen no more often: phases keep their length,
@@ -246,29 +246,29 @@ class Pace:
     photos: int
 
     @staticmethod
-    def of(config: TrainConfig, footage: PhotoSizes) -> Pace:
+    def of(config: TrainConfig, footage: PhotoSizes) -> IterationScale:
         """The pace of a training; one with a given length keeps the published phase lengths, whatever the photos."""
         if config.iterations == "auto":
-            return Pace(config.least_iterations, footage.photos)
-        return Pace(config.iterations, 1)
+            return IterationScale(config.least_iterations, footage.photos)
+        return IterationScale(config.iterations, 1)
 
-    def lasting(self, published: int, shares: int) -> int:
+    def scaled_length(self, published: int, shares: int) -> int:
         """Length of a phase, iterations: as published, or 1/``shares`` of a short run; at least one visit per photo."""
         return max(1, min(published, self.iterations // shares), self.photos)
 
 
-def _density(config: TrainConfig, each: list[Length], pace: Pace) -> DensitySchedule:
+def _density(config: TrainConfig, each: list[Length], scale: IterationScale) -> DensitySchedule:
     published = config.density == "published"
     gradient = PUBLISHED_GRADIENT if published else GRADIENT
     return DensitySchedule(
         on=config.densify,
         seed=config.seed,
         cap=config.max_gaussians,
-        first=pace.lasting(500, 5),
+        first=scale.scaled_length(500, 5),
         last=max(1, growth_until(each)),
-        every=pace.lasting(100, 10),
+        every=scale.scaled_length(100, 10),
         gradient=gradient * (BUDGET_SHARE if config.time_budget_s else 1.0),
-        reset_every=max(RESET_EVERY, RESET_VISITS * pace.photos) if published else 0,
+        reset_every=max(RESET_EVERY, RESET_VISITS * scale.photos) if published else 0,
         reset_until=each[0][1] if len(each) > 1 else 0,
         prune_screen_px=PRUNE_SCREEN_PX if published else 0.0,
         prune_free_space=config.prune_free_space,

@@ -96,32 +96,32 @@ class PhotoOrder(TrainingOrder):
     """
 
     def __init__(
-        self, cameras: Sequence[Camera], looks: Sequence[TrainingSize], seed: int, max_megapixels: float | None = None
+        self, cameras: Sequence[Camera], sizes: Sequence[TrainingSize], seed: int, max_megapixels: float | None = None
     ) -> None:
-        self._cameras, self._looks, self._seed, self.max_megapixels = cameras, looks, seed, max_megapixels
+        self._cameras, self._sizes, self._seed, self.max_megapixels = cameras, sizes, seed, max_megapixels
         photos = len(cameras)
-        epochs = [permutation(seed, epoch, photos) for epoch in range(-(-len(looks) // max(1, photos)))]
-        self._views = np.concatenate(epochs)[: len(looks)] if epochs else np.zeros(0, np.int64)
-        self._turns = np.zeros(len(looks), np.int64)  # earlier visits of the same photo at the same size
-        sizes = {
+        epochs = [permutation(seed, epoch, photos) for epoch in range(-(-len(sizes) // max(1, photos)))]
+        self._views = np.concatenate(epochs)[: len(sizes)] if epochs else np.zeros(0, np.int64)
+        self._turns = np.zeros(len(sizes), np.int64)  # earlier visits of the same photo at the same size
+        pixel_sizes = {
             (camera.width, camera.height, look.window_pixels)
-            for look in set(looks)
+            for look in set(sizes)
             for camera in (self.camera(view, look.level) for view in range(photos))
         }
-        self._windows = {size: windows_of(*size) for size in sizes}
-        self._given = np.full(len(looks), -1, np.int64)  # windows that do not follow from the turn; -1: they do
-        for look in sorted(set(looks), key=lambda look: (look.level, look.window_pixels)):
+        self._windows = {size: windows_of(*size) for size in pixel_sizes}
+        self._given = np.full(len(sizes), -1, np.int64)  # windows that do not follow from the turn; -1: they do
+        for look in sorted(set(sizes), key=lambda look: (look.level, look.window_pixels)):
             self._mix(look)
         before: Counter[tuple[int, TrainingSize]] = Counter()
-        for place, key in enumerate(zip(self._views.tolist(), looks, strict=True)):
+        for place, key in enumerate(zip(self._views.tolist(), sizes, strict=True)):
             self._turns[place] = before[key]
             before[key] += 1
-        self._rounds = rounds_ended(self._ends(), len(looks))
+        self._rounds = rounds_ended(self._ends(), len(sizes))
 
     def _ends(self) -> Iterable[int]:
         """The iterations that end rounds: of photos, or of their windows if they have several."""
         photos = max(1, len(self._cameras))
-        for look, begun, until in runs(self._looks):
+        for look, begun, until in runs(self._sizes):
             counts = {len(self._windows_at(view, look)) for view in range(len(self._cameras))}
             if len(counts) == 1:  # epochs of photos, which a change of size does not restart
                 begun = photos * -(-begun // photos)
@@ -136,7 +136,7 @@ class PhotoOrder(TrainingOrder):
         if len(set(counts)) < 2:
             return
         pairs = np.array([(view, window) for view, count in enumerate(counts) for window in range(count)])
-        places = np.array([place for place, each in enumerate(self._looks) if each == look])
+        places = np.array([place for place, each in enumerate(self._sizes) if each == look])
         rows = in_rounds(self._seed, len(pairs), len(places))
         self._views[places], self._given[places] = pairs[rows].T
 
@@ -146,11 +146,11 @@ class PhotoOrder(TrainingOrder):
 
     def __len__(self) -> int:
         """How many iterations there are."""
-        return len(self._looks)
+        return len(self._sizes)
 
     def at(self, iteration: int) -> TrainingCrop:
         """What an iteration, from 1, trains on."""
-        view, look = int(self._views[iteration - 1]), self._looks[iteration - 1]
+        view, look = int(self._views[iteration - 1]), self._sizes[iteration - 1]
         camera, ended = self.camera(view, look.level), int(self._rounds[iteration - 1])
         windows, given = self._windows_at(view, look), int(self._given[iteration - 1])
         if len(windows) == 1 or given >= 0:
@@ -167,7 +167,7 @@ class PhotoOrder(TrainingOrder):
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
-        return _wanted_again(self._views[first - 1 :].tolist(), self._looks[first - 1 :])
+        return _wanted_again(self._views[first - 1 :].tolist(), self._sizes[first - 1 :])
 
 
 class WindowOrder(TrainingOrder):
@@ -180,36 +180,36 @@ class WindowOrder(TrainingOrder):
         looks: Training size of each iteration, ``looks[i]`` for iteration ``i`` + 1.
         seed: Seed of the random order.
         max_megapixels: As for ``PhotoOrder``.
-        parts: By level: pairs of a photo's index and a window at that level; at least one for each level in ``looks``.
+        parts: By level: pairs of a photo's index and a window at that level; at least one for each level in ``sizes``.
         cells: The part of each photo that counts, by photo index, as in ``TrainingCrop``; others count whole.
     """
 
     def __init__(
         self,
         cameras: Sequence[Camera],
-        looks: Sequence[TrainingSize],
+        sizes: Sequence[TrainingSize],
         seed: int,
         max_megapixels: float | None,
         parts: Mapping[int, Sequence[tuple[int, PixelRectangle]]],
         cells: Mapping[int, Bool[np.ndarray, "rows columns"]] | None = None,
     ) -> None:
-        self._cameras, self._looks, self.max_megapixels, self._parts = cameras, looks, max_megapixels, parts
+        self._cameras, self._sizes, self.max_megapixels, self._parts = cameras, sizes, max_megapixels, parts
         self._cells = cells or {}
-        levels = np.array([look.level for look in looks], np.int64)
-        self._rows = np.zeros(len(looks), np.int64)  # rows of the level's parts
+        levels = np.array([look.level for look in sizes], np.int64)
+        self._rows = np.zeros(len(sizes), np.int64)  # rows of the level's parts
         for level in np.unique(levels).tolist():
             wanted, count = np.flatnonzero(levels == level), len(parts[level])
             self._rows[wanted] = in_rounds(seed, count, len(wanted))
-        ends = (range(begun, until + 1, len(parts[look.level])) for look, begun, until in runs(looks))
-        self._rounds = rounds_ended((end for each in ends for end in each), len(looks))
+        ends = (range(begun, until + 1, len(parts[look.level])) for look, begun, until in runs(sizes))
+        self._rounds = rounds_ended((end for each in ends for end in each), len(sizes))
 
     def __len__(self) -> int:
         """How many iterations there are."""
-        return len(self._looks)
+        return len(self._sizes)
 
     def at(self, iteration: int) -> TrainingCrop:
         """What an iteration, from 1, trains on."""
-        level = self._looks[iteration - 1].level
+        level = self._sizes[iteration - 1].level
         view, window = self._parts[level][int(self._rows[iteration - 1])]
         ended = int(self._rounds[iteration - 1])
         return TrainingCrop(view, level, self.camera(view, level), window, self._cells.get(view), ended)
@@ -220,8 +220,8 @@ class WindowOrder(TrainingOrder):
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
-        looks, rows = self._looks[first - 1 :], self._rows[first - 1 :].tolist()
-        return _wanted_again([self._parts[look.level][row][0] for look, row in zip(looks, rows, strict=True)], looks)
+        sizes, rows = self._sizes[first - 1 :], self._rows[first - 1 :].tolist()
+        return _wanted_again([self._parts[look.level][row][0] for look, row in zip(sizes, rows, strict=True)], sizes)
 
 
 def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"]:
@@ -230,10 +230,10 @@ def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"
     return np.concatenate(rounds)[:visits]
 
 
-def runs(looks: Sequence[TrainingSize]) -> Iterable[tuple[TrainingSize, int, int]]:
+def runs(sizes: Sequence[TrainingSize]) -> Iterable[tuple[TrainingSize, int, int]]:
     """Runs of equal training sizes, each with the number of iterations done before it and by its end."""
     done = 0
-    for look, same in groupby(looks):
+    for look, same in groupby(sizes):
         begun, done = done, done + sum(1 for _ in same)
         yield look, begun, done
 
@@ -251,11 +251,11 @@ def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits
     return found
 
 
-def _wanted_again(views: Sequence[int], looks: Sequence[TrainingSize]) -> dict[int, list[int]]:
+def _wanted_again(views: Sequence[int], sizes: Sequence[TrainingSize]) -> dict[int, list[int]]:
     """The photos visited more than once in these iterations, with their levels."""
     times: Counter[int] = Counter()
     levels: defaultdict[int, set[int]] = defaultdict(set)
-    for view, look in zip(views, looks, strict=True):
+    for view, look in zip(views, sizes, strict=True):
         times[view] += 1
         levels[view].add(look.level)
     return {view: sorted(levels[view]) for view in sorted(times) if times[view] > 1}

@@ -44,7 +44,7 @@ def iterate_within_memory(
     pairs = 0 if kernels is None else kernels.forecast.most_pairs
     while not _fits(step, state, plan, photo):
         # Not inside the except block: the error keeps the iteration's tensors alive.
-        state.begin_again()
+        state.roll_back()
         if state.gaussians.means.device.type == "cuda":
             torch.cuda.empty_cache()  # torch's cached blocks may be too fragmented for the next request
         _take_less(state, kernels, report)

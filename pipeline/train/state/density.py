@@ -34,7 +34,7 @@ class DensityStep:
         extent: Scene extent, world units.
         limit: Maximum number of Gaussians after the step, if any are added.
         iteration: The iteration that ends.
-        unwanted: (n,) Gaussians to remove, whatever their size and opacity.
+        prune_mask: (n,) Gaussians to remove, whatever their size and opacity.
         ranked: How techniques modify the score; None for unmodified.
     """
 
@@ -42,7 +42,7 @@ class DensityStep:
     extent: float
     limit: int
     iteration: int
-    unwanted: Bool[Tensor, " n"]
+    prune_mask: Bool[Tensor, " n"]
     ranked: Callable[[Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
 
 
@@ -98,8 +98,8 @@ class Density:
         """
         schedule, extent, iteration = step.schedule, step.extent, step.iteration
         gone = prune_mask(gaussians, schedule, extent, iteration, self.statistics.max_radius_px)
-        if not bool((gone | step.unwanted).all()):  # a model is never emptied
-            gone |= step.unwanted
+        if not bool((gone | step.prune_mask).all()):  # a model is never emptied
+            gone |= step.prune_mask
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, self.statistics.score())
         score = score if step.ranked is None else step.ranked(score)

@@ -170,11 +170,11 @@ class TrainState:
         for tensor in (*self.gaussians.tensors().values(), *self.drawn.tensors().values()):
             tensor.grad = None
 
-    def begin_again(self) -> None:
+    def roll_back(self) -> None:
         """Discard an iteration that did not reach its step, and whatever its backward pass left behind."""
         self.buffers = GradientBuffers()
         self._drop_gradients()
-        self.techniques.begin_again()
+        self.techniques.roll_back()
 
     def control_density(self, plan: TrainingPlan, iteration: int) -> None:
         """Grow, prune and reset if this iteration calls for it; once growth has ended, only prune and reset.
@@ -213,11 +213,11 @@ class TrainState:
     def _growth(self, plan: TrainingPlan, limit: int, iteration: int) -> tuple[DensifiedGaussians, dict[str, int]]:
         """The rows that density control chooses, and its counts; changes nothing."""
         gaussians = self.gaussians.detach()
-        gone = self.techniques.unwanted(gaussians, iteration)
+        gone = self.techniques.prune_mask(gaussians, iteration)
         if gone is None:
             gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         schedule = plan.schedule.density
-        ranked = partial(self.techniques.ranked, gaussians=gaussians, schedule=schedule)
+        ranked = partial(self.techniques.adjust_scores, gaussians=gaussians, schedule=schedule)
         step = DensityStep(schedule, plan.extent, limit, iteration, gone, ranked)
         growth, counts = self.density.control(gaussians, step)
         return along_curve(growth), counts
@@ -225,7 +225,7 @@ class TrainState:
     def _clear(self, iteration: int) -> None:
         """Remove the Gaussians that a technique rejects; this goes on after the last step of density control."""
         try:
-            gone = self.techniques.unwanted(self.gaussians.detach(), iteration)
+            gone = self.techniques.prune_mask(self.gaussians.detach(), iteration)
         except torch.OutOfMemoryError:  # of a device: the next check finds them
             return
         if gone is not None and bool(gone.any()) and not bool(gone.all()):

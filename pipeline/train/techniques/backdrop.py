@@ -29,7 +29,7 @@ class Backdrop(Technique):
     def __init__(self, area: PlanArea, density: DensitySchedule) -> None:
         self._area, self._density = area, density
 
-    def ranked(
+    def adjust_scores(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
     ) -> Float[Tensor, " n"]:
         """The same score, but 0 for Gaussians outside for which the backdrop has no room."""
@@ -41,7 +41,7 @@ class Backdrop(Technique):
         score[wanted[best[room:]]] = 0.0
         return score
 
-    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+    def prune_mask(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """The least opaque Gaussians outside in excess of the backdrop's share; None between density-control steps."""
         if not self._density.is_step(iteration):
             return None

@@ -18,7 +18,7 @@ from torch import Tensor
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.photos.stream import EVERYWHERE
 from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 
@@ -71,7 +71,7 @@ class DistortionLoss(Technique):
         if "centre" in arrays:
             self._centre = arrays["centre"].clone()
 
-    def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
+    def penalty(self, shot: RenderedView) -> Float[Tensor, ""] | None:
         """The spread of depths along the photo's rays, weighted."""
         if not self.is_counted(shot.now.place):
             return None

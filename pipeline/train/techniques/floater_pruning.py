@@ -60,7 +60,7 @@ class FloaterPruning(Technique):
         due = iteration % (STEPS_BETWEEN * density.every) == 0 and iteration <= LAST_LOOK * self._schedule.iterations
         return density.on and due and density.first <= iteration
 
-    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+    def prune_mask(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """Gaussians in free space; None if it is not time to check."""
         if not self.is_due(iteration):
             return None

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.photos.stream import EVERYWHERE
 from splatpipe.pipeline.train.techniques.distortion_loss import MIN_ALPHA
 
@@ -36,7 +36,7 @@ class SmoothnessLoss(Technique):
     def __init__(self, weight: float) -> None:
         self._weight = weight
 
-    def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
+    def penalty(self, shot: RenderedView) -> Float[Tensor, ""] | None:
         """The unevenness of the photo's depths, weighted."""
         return self._weight * unevenness(shot.rendered, shot.photo.camera, shot.photo.inside)
 

@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.appearance.exposure import Exposure
 from splatpipe.pipeline.train.appearance.robust import RobustMask
 from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.densify import DensitySchedule
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
@@ -126,33 +126,33 @@ class Techniques:
             model = technique.before_render(model, now)
         return model
 
-    def shown(self, shot: Shot) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, shot: RenderedView) -> Float[Tensor, "h w 3"]:
         """The render as the photo would show it."""
         picture = shot.rendered.colour
         for technique in self.each:
-            picture = technique.shown(picture, shot)
+            picture = technique.apply_appearance(picture, shot)
         return picture
 
-    def counted(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
+    def mask_pixels(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> TrainingPhoto:
         """The photo, masked to the pixels that count."""
         photo = shot.photo
         for technique in self.each:
-            photo = technique.counted(photo, picture, shot)
+            photo = technique.mask_pixels(photo, picture, shot)
         return photo
 
-    def with_penalties(self, loss: Float[Tensor, ""], shot: Shot) -> Float[Tensor, ""]:
+    def with_penalties(self, loss: Float[Tensor, ""], shot: RenderedView) -> Float[Tensor, ""]:
         """The photo's loss plus the penalties."""
         for technique in self.each:
             penalty = technique.penalty(shot)
             loss = loss if penalty is None else loss + penalty
         return loss
 
-    def begin_again(self) -> None:
+    def roll_back(self) -> None:
         """Undo what the hooks changed: the iteration restarts."""
         for technique in self.each:
-            technique.begin_again()
+            technique.roll_back()
 
-    def after_step(self, shot: Shot) -> None:
+    def after_step(self, shot: RenderedView) -> None:
         """Step the techniques' own parameters."""
         for technique in self.each:
             technique.after_step(shot)
@@ -162,17 +162,17 @@ class Techniques:
         for technique in self.each:
             technique.after_epoch(iteration)
 
-    def ranked(
+    def adjust_scores(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
     ) -> Float[Tensor, " n"]:
         """The score by which density control ranks Gaussians."""
         for technique in self.each:
-            score = technique.ranked(score, gaussians, schedule)
+            score = technique.adjust_scores(score, gaussians, schedule)
         return score
 
-    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+    def prune_mask(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """The Gaussians to remove after an iteration; None if no technique checks in this iteration."""
-        found = [technique.unwanted(gaussians, iteration) for technique in self.each]
+        found = [technique.prune_mask(gaussians, iteration) for technique in self.each]
         masks = [mask.to(gaussians.means.device) for mask in found if mask is not None]
         return torch.stack(masks).any(dim=0) if masks else None
 

@@ -17,7 +17,7 @@ from pyproj import Transformer
 from tiny_scene import Recorder, cameras, true_model
 
 from splatpipe.pipeline.app.cli.edit import steps_in_order
-from splatpipe.pipeline.delivery.handover import frame_of
+from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.edit.editing import EditTask, edit_splat
 from splatpipe.pipeline.edit.pictures import choose_views, oblique_view
 from splatpipe.pipeline.edit.record import with_edits

@@ -16,7 +16,7 @@ from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, map_incremental
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.sfm.recovery.ladder import LadderContext, run_ladder, settle, without
+from splatpipe.pipeline.sfm.recovery.ladder import LadderContext, register_until_stable, run_ladder, without
 from splatpipe.pipeline.sfm.recovery.ladder_joins import join
 from splatpipe.pipeline.sfm.recovery.ladder_pairs import match_more, propose_pairs
 from splatpipe.stages import features, matches
@@ -213,7 +213,7 @@ def test_a_photo_of_another_place_is_not_placed(
     matches[7, 8] = np.array(poster, np.uint32)
     wrong = replace(before, verified=replace(before.verified, matches=matches))
     work = LadderContext(room, MappingOptions(), corner_photos.Recorder())
-    assert settle(work, wrong).model.num_reg_images() == COUNT - 1
+    assert register_until_stable(work, wrong).model.num_reg_images() == COUNT - 1
 
 
 def test_if_all_photos_are_registered_nothing_changes(

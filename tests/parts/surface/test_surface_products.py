@@ -29,7 +29,7 @@ from splatpipe.pipeline.surface.ortho.known_cells import known_cells
 from splatpipe.pipeline.surface.ortho.ortho import OrthoTask, make_ortho
 from splatpipe.pipeline.surface.rasters.grid import make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.sheets.sheet import grid_sheets
+from splatpipe.pipeline.surface.sheets.raster_plane import grid_sheets
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 from splatpipe.stages import dsm as dsm_stage
 

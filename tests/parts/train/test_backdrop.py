@@ -42,7 +42,7 @@ AREA = PlanArea(AXES, ((HALF,),))
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tiny scene's backdrop is also part of its inside."""
-    monkeypatch.setattr(counted, "FEWEST", 5)
+    monkeypatch.setattr(counted, "MIN_OUTSIDE", 5)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_without_a_boundary_nothing_is_ranked_or_removed() -> None:
     plan = TrainingPlan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, 150, 40)
     techniques, score = make_techniques(plan), torch.rand(150)
     assert techniques.find(Backdrop) is None
-    assert techniques.ranked(score, tiny_scene.true_model(), schedule.density) is score
+    assert techniques.adjust_scores(score, tiny_scene.true_model(), schedule.density) is score
 
 
 def test_pixels_are_inside_or_outside_by_their_surface() -> None:

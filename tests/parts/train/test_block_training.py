@@ -140,7 +140,7 @@ def test_windows_that_show_the_cell_are_each_used_as_often_as_without_blocks(sit
         block = Block.of(config, other, replace(TASK, number=number, window_pixels=400), cpu())
         scope = block.scope_reader.scope()
         plan = block.plan(scope.windows)
-        order = block.course(plan, scope, tmp_path).order_of(plan.schedule.training_sizes_until(plan.last_iteration))
+        order = block.setup(plan, scope, tmp_path).order_of(plan.schedule.training_sizes_until(plan.last_iteration))
         each = [order.at(iteration) for iteration in range(1, len(order) + 1)]
         times = Counter((visit.view, visit.level, visit.window) for visit in each)
         assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2

@@ -41,9 +41,9 @@ from splatpipe.pipeline.train.plan.budget import (
 )
 from splatpipe.pipeline.train.plan.lengths import PART_VISITS, WHOLE_VISITS, PhotoSizes, lengths_of
 from splatpipe.pipeline.train.plan.limits import (
-    FEWEST,
     FIXED_BYTES,
-    LONGEST,
+    MAX_ITERATIONS,
+    MIN_ITERATIONS,
     PIXEL_BYTES,
     SMALLEST_WINDOW,
     bytes_per_gaussian,
@@ -220,13 +220,13 @@ def test_more_time_never_plans_less() -> None:
 
 def test_no_limit_is_exceeded_however_much_time_there_is() -> None:
     choice = plan_for(1e6, cap=20_000)
-    assert choice.options.max_gaussians == 20_000 and choice.iterations == choice.last_iteration == LONGEST
+    assert choice.options.max_gaussians == 20_000 and choice.iterations == choice.last_iteration == MAX_ITERATIONS
     assert choice.options.max_megapixels == 0.0
 
 
 def test_too_little_time_still_plans_the_smallest_training() -> None:
     choice = choose(replace(task_of(0.01, size=2.0), sparse=500_000))
-    assert choice.options.iterations == FEWEST and choice.options.max_gaussians == FEWEST_GAUSSIANS
+    assert choice.options.iterations == MIN_ITERATIONS and choice.options.max_gaussians == FEWEST_GAUSSIANS
     assert choice.options.max_megapixels == SMALLEST_MEGAPIXELS
 
 

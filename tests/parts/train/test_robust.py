@@ -202,11 +202,11 @@ def test_a_repeated_visit_counts_once(robust: RobustMask) -> None:
     for number, colour in enumerate((true_photo(camera), painted(true_photo(camera), CARS[2]))):
         before = {name: tensor.clone() for name, tensor in robust.to_arrays().items()}
         robust.settings(plain, model, camera, now)
-        robust.begin_again()  # memory ran out before the photo was processed
+        robust.roll_back()  # memory ran out before the photo was processed
         assert all(torch.equal(tensor, before[name]) for name, tensor in robust.to_arrays().items()), number
         looked(robust, camera, colour)
         assert not torch.equal(robust.scores, before["scores"]), number
-        robust.begin_again()
+        robust.roll_back()
         assert all(torch.equal(tensor, before[name]) for name, tensor in robust.to_arrays().items()), number
         looked(robust, camera, colour)
 

@@ -320,7 +320,9 @@ def test_rows_lie_along_a_curve_after_density_control() -> None:
 
 
 def test_an_unused_card_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
+    monkeypatch.setattr(
+        cuda_library, "unavailable_reason", lambda: cuda_library.NoCuda("The driver is old.", "Install another.")
+    )
     notes: list[str] = []
     monkeypatch.setattr(cuda_driver, "has_card", lambda: False)
     assert choose_device("auto", "", notes.append).name == "cpu" and not notes
@@ -333,7 +335,9 @@ def test_an_unused_card_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_training_reports_a_card_that_it_does_not_use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
+    monkeypatch.setattr(
+        cuda_library, "unavailable_reason", lambda: cuda_library.NoCuda("The driver is old.", "Install another.")
+    )
     monkeypatch.setattr(cuda_driver, "has_card", lambda: True)
     tiny_scene.write_dataset(tmp_path / "dataset")
     parts = {"undistort.dataset": tmp_path / "dataset"}
@@ -348,14 +352,14 @@ def test_a_training_reports_a_card_that_it_does_not_use(monkeypatch: pytest.Monk
 def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     kornia = TrainConfig(loss="kornia").unfit_for_cuda()
     assert "kornia" in kornia and not TrainConfig().unfit_for_cuda()
-    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("There is none.", "Buy one."))
+    monkeypatch.setattr(cuda_library, "unavailable_reason", lambda: cuda_library.NoCuda("There is none.", "Buy one."))
     assert choose_device("cpu").name == choose_device("auto").name == "cpu"
     with pytest.raises(UsageError, match='no device "gpu"'):
         choose_device("gpu")
     with pytest.raises(MachineError, match="There is none") as failure:
         choose_device("cuda")
     assert failure.value.hint == "Buy one."
-    monkeypatch.setattr(cuda_library, "why_not", lambda: None)
+    monkeypatch.setattr(cuda_library, "unavailable_reason", lambda: None)
     monkeypatch.setattr(cuda_library, "cannot_compute", lambda: cuda_library.NoCuda("It is full.", "Wait."))
     assert choose_device("auto").name == "cpu"
     with pytest.raises(MachineError, match="It is full"):

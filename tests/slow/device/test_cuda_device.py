@@ -23,7 +23,7 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sh import coefficient_count
 from splatpipe.pipeline.splat.quality import metrics
 
-MISSING = cuda_library.why_not()
+MISSING = cuda_library.unavailable_reason()
 pytestmark = [
     pytest.mark.cuda,
     pytest.mark.skipif(MISSING is not None, reason="" if MISSING is None else MISSING.reason),

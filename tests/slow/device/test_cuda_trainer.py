@@ -22,7 +22,7 @@ from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.pipeline.train.techniques.techniques import make_techniques
 
-MISSING = cuda_library.why_not()
+MISSING = cuda_library.unavailable_reason()
 pytestmark = [
     pytest.mark.cuda,
     pytest.mark.skipif(MISSING is not None, reason="" if MISSING is None else MISSING.reason),
@@ -92,7 +92,7 @@ def test_a_training_has_the_same_bits_twice_and_the_cpus_loss(device: Device, op
     found = []
     for place in (device, device, cpu()):
         training, plan = make_training(options, place)
-        with place.one_order():
+        with place.deterministic():
             for photo in photos(place, options.iterations):
                 iterate(training, plan, photo)
         found.append((training.whole_history().last_loss(), training.finished().tensors()))

@@ -125,7 +125,7 @@ def test_what_was_not_forecast_is_still_rendered(kernels):
     whole, gradients = backward_of(RenderOptions(3), kernels)
     blind = kernels_on_cpu()
     blind.forecast.most_pairs = 1
-    blind.forecast.learn(FrameFacts(FrameSize(60, 20), 60, pairs=10, chunks=1))  # far too few
+    blind.forecast.update(FrameFacts(FrameSize(60, 20), 60, pairs=10, chunks=1))  # far too few
     assert blind.forecast.room(FrameSize(60, 20)).passes == 1
     chunked, ours = backward_of(RenderOptions(3), blind)
     assert all(torch.equal(getattr(chunked, name), picture) for name, picture in vars(whole).items())

@@ -30,7 +30,7 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An OUT's folder; silence expires a signature soon."""
     monkeypatch.setattr(engine_lock, "PATIENCE_S", 0.2)
     monkeypatch.setattr(engine_lock, "SILENCE_S", 1.5)
-    monkeypatch.setattr(engine_lock, "BEAT_S", 0.1)
+    monkeypatch.setattr(engine_lock, "HEARTBEAT_S", 0.1)
     monkeypatch.setattr(engine_lock, "POLL_S", 0.02)
     (tmp_path / "stages").mkdir()
     return tmp_path

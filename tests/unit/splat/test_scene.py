@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.delivery.handover import facts_of, frame_of
+from splatpipe.pipeline.delivery.delivery_frame import facts_of, frame_of
 from splatpipe.pipeline.splat.containers.ply import read_splat_header, write_splat
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

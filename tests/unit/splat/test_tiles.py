@@ -15,7 +15,7 @@ import torch
 from glb_parts import parts
 from some_splats import some_gaussians
 
-from splatpipe.pipeline.delivery.globe import write_tiles_on_globe
+from splatpipe.pipeline.delivery.ecef_tiles import write_tiles_on_globe
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.levels.levels import LevelNode, build_levels

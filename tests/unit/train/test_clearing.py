@@ -55,10 +55,10 @@ def space(dataset: Path) -> FreeSpace:
 
 def test_gaussians_in_front_of_the_wall_are_marked_at_the_scheduled_steps(space: FreeSpace) -> None:
     gaussians, clearing = haze_and_wall(), FloaterPruning(space, SCHEDULE)
-    found = clearing.unwanted(gaussians, LOOKS)
+    found = clearing.prune_mask(gaussians, LOOKS)
     assert found is not None and found.tolist() == [True] * 4 + [False] * 4
     assert torch.equal(found, near_or_free(gaussians, space, 2))
-    assert clearing.unwanted(gaussians, LOOKS + SCHEDULE.density.every) is None
+    assert clearing.prune_mask(gaussians, LOOKS + SCHEDULE.density.every) is None
 
 
 @pytest.mark.parametrize("density", ["published", "absolute"])

@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.appearance.photo_cells import PhotoCells
 from splatpipe.pipeline.train.appearance.photo_sky import photo_sky_on_cpu, photo_sky_on_device
 from splatpipe.pipeline.train.appearance.robust import GRID, UNKNOWN, RobustMask
 from splatpipe.pipeline.train.appearance.sky import SkyModel
-from splatpipe.pipeline.train.hooks import Shot
+from splatpipe.pipeline.train.hooks import RenderedView
 from splatpipe.pipeline.train.iteration import SSIM_WEIGHT
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
@@ -91,8 +91,8 @@ def said(photos: list[TrainingPhoto], weights: list[float], penalties: bool) -> 
         given = RenderOptions(0, background=LATE.background, near=0.5, depth=False)
         settings = techniques.settings(given, model, photo.camera, LATE)
         rendered = rasterizer.render(model, photo.camera, settings)
-        shot = Shot(photo, rendered, settings, LATE)
-        loss = photo_loss(techniques.shown(shot), photo.colour, SSIM_WEIGHT, photo.mask, photo.inner)
+        shot = RenderedView(photo, rendered, settings, LATE)
+        loss = photo_loss(techniques.apply_appearance(shot), photo.colour, SSIM_WEIGHT, photo.mask, photo.inner)
         total = total + weight * techniques.with_penalties(loss, shot)
     total.backward()  # type: ignore[no-untyped-call]
     found = {name: tensor.grad for name, tensor in model.tensors().items()}

@@ -12,7 +12,7 @@ import tiny_scene
 from plyfile import PlyData
 from pydantic import ValidationError
 
-from splatpipe.pipeline.delivery.handover import facts_of, in_world, pose_in_world
+from splatpipe.pipeline.delivery.delivery_frame import facts_of, in_world, pose_in_world
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
 from splatpipe.pipeline.raster.rasterizer import RenderOptions

@@ -12,7 +12,7 @@ import torch
 import trimesh
 from plyfile import PlyData
 
-from splatpipe.pipeline.delivery.handover import facts_of, in_world
+from splatpipe.pipeline.delivery.delivery_frame import facts_of, in_world
 from splatpipe.pipeline.delivery.sparse_scene import sparse_glb
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.camera import Camera

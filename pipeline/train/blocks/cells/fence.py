@@ -28,7 +28,7 @@ class Fence(Technique):
     def __init__(self, partition: Partition, block: int, share: int, density: DensitySchedule) -> None:
         self._partition, self._block, self._share, self._density = partition, block, share, density
 
-    def ranked(
+    def adjust_scores(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
     ) -> Float[Tensor, " n"]:
         """The same score, but 0 for Gaussians for which the cell or the margin has no room."""
@@ -40,7 +40,7 @@ class Fence(Technique):
             score[wanted[best[room:]]] = 0.0
         return score
 
-    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+    def prune_mask(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """Gaussians outside cell and margin, and the least opaque in excess of the shares; None between checks."""
         due = iteration >= self._density.first and iteration % self._density.every == 0
         return ~self.kept(gaussians) if due and self._density.on else None

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from splatpipe.pipeline.delivery.handover import frame_of
+from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.splat.levels.levels import LevelNode
 from splatpipe.pipeline.splat.levels.tiles import EsriCrs, box_z_up, refuse_nowhere, write_tiles
 from splatpipe.pipeline.splat.model.scene import Scene

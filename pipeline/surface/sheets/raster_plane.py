@@ -24,7 +24,7 @@ SIDE = 2048  # cells per side of a ground sheet: four blocks of the files
 
 
 @dataclass(frozen=True, eq=False)
-class Sheet:
+class RasterPlane:
     """A plane with cells, and the height range to consider over it.
 
     Attributes:
@@ -80,7 +80,7 @@ class GridSheet:
 
     grid: Grid
     part: Tile
-    sheet: Sheet
+    sheet: RasterPlane
 
     def heights(
         self, tile: Tile, over: Float64[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]
@@ -126,7 +126,7 @@ def grid_sheets(grid: Grid, low: float, high: float, side: int = SIDE) -> Iterat
         yield GridSheet(grid, part, _sheet(grid, part, low, high))
 
 
-def _sheet(grid: Grid, part: Tile, low: float, high: float) -> Sheet:
+def _sheet(grid: Grid, part: Tile, low: float, high: float) -> RasterPlane:
     middle, unit_m = (low + high) / 2.0, grid.crs.height_unit_m
     column, row = part.column + part.width / 2.0, part.row + part.height / 2.0
     steps = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -140,4 +140,4 @@ def _sheet(grid: Grid, part: Tile, low: float, high: float) -> Sheet:
     from_local[:3, :3] = [east, np.cross(up, east), up]
     from_local[:3, 3] = -from_local[:3, :3] @ here
     lattice = Lattice(-part.width / 2.0 * cell_m, part.height / 2.0 * cell_m, cell_m, part.width, part.height)
-    return Sheet(from_local, lattice, HeightRange((low - middle) * unit_m, (high - middle) * unit_m))
+    return RasterPlane(from_local, lattice, HeightRange((low - middle) * unit_m, (high - middle) * unit_m))

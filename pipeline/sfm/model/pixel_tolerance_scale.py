@@ -11,7 +11,7 @@ import pycolmap
 USUAL_PX = 3200
 
 
-def coarseness(cameras: Iterable[pycolmap.Camera]) -> float:
+def pixel_tolerance_scale(cameras: Iterable[pycolmap.Camera]) -> float:
     """Return the factor by which to widen pixel thresholds; 1 for photos of the usual size and smaller.
 
     Args:
