@@ -1,4 +1,4 @@
-"""Kernels, built from the sources beside this file. Arrays are C-contiguous CPU tensors of the given dtype, never copied."""
+"""Kernels, built from the sources here. Arrays are C-contiguous CPU tensors of the given dtype, never copied."""
 
 from collections.abc import Sequence
 from typing import Any
