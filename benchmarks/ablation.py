@@ -25,8 +25,8 @@ from variants import NAME, Variant, base_of, choose, config_of, split
 
 from splatpipe.pipeline.engine.digests import HashTable, digest
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.runner import versions
-from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.engine.runs.runner import versions
+from splatpipe.pipeline.engine.runs.source import open_source
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.stages.line import LINE
 

@@ -19,16 +19,16 @@ from mapped_apart import centre_errors, centres
 from sfm_speed import database_of
 from tables import Row, print_table
 
-from splatpipe.pipeline.sfm import completion
-from splatpipe.pipeline.sfm.coarseness import coarseness
-from splatpipe.pipeline.sfm.mapping import (
+from splatpipe.pipeline.sfm.mapping import completion
+from splatpipe.pipeline.sfm.mapping.mapping import (
     BEST_KEYPOINTS,
     MappingOptions,
     incremental_options,
     largest_first,
 )
-from splatpipe.pipeline.sfm.reduction import best_keypoints, write_reduced
-from splatpipe.pipeline.sfm.view_graph import read_verified
+from splatpipe.pipeline.sfm.matching.reduction import best_keypoints, write_reduced
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
+from splatpipe.pipeline.sfm.model.view_graph import read_verified
 
 TOLERANCES = (1e-6, 1e-5)
 EXACT = 1e-10
@@ -47,7 +47,7 @@ def compare(path: Path) -> list[Row]:
     """A row for each tolerance."""
     database = database_of(path)
     verified = read_verified(database)
-    options = MappingOptions(coarseness=coarseness(verified.cameras.values()))
+    options = MappingOptions(pixel_tolerance_scale=pixel_tolerance_scale(verified.cameras.values()))
     settings = incremental_options(options)
     with tempfile.TemporaryDirectory() as folder:
         reduced = Path(folder) / "best.db"
@@ -62,7 +62,7 @@ def compare(path: Path) -> list[Row]:
         completion.complete(model, database, settings, pycolmap.CancellationToken())
         found.append((tolerance, time.process_time() - began_s, model))
     exact = pycolmap.Reconstruction(found[0][2])
-    adjustment = completion.adjustment_options(settings, options.coarseness, rough=False)
+    adjustment = completion.adjustment_options(settings, options.pixel_tolerance_scale, rough=False)
     adjustment.ceres.solver_options.function_tolerance = EXACT
     for _ in range(FURTHER):
         pycolmap.bundle_adjustment(exact, adjustment)

@@ -75,7 +75,8 @@ class BatchTrial:
         self.listed.write_text(text, encoding="utf-8")
 
     def command(self, *more: str) -> list[str]:
-        return [sys.executable, "-m", "splatpipe.pipeline.app.cli", "batch", str(self.listed), str(self.out), *more]
+        program = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main"]
+        return [*program, "batch", str(self.listed), str(self.out), *more]
 
     def start(self) -> subprocess.Popen[str]:
         """Start the batch."""
@@ -218,7 +219,7 @@ def kill_in_training(out: Path, batch: subprocess.Popen[str]) -> bool:
     while batch.poll() is None:
         if events.is_file() and b'"stage_started", "stage": "train"' in events.read_bytes():
             for process, words in descendants(batch.pid).items():
-                if "splatpipe.pipeline.engine.worker" in words and str(out) in parent_words(process):
+                if "splatpipe.pipeline.engine.runs.worker" in words and str(out) in parent_words(process):
                     os.kill(process, signal.SIGKILL)
                     print(f"    killed process {process}, which trained {out.name}")
                     return True

@@ -35,15 +35,15 @@ from measure import SilentReporter
 from tables import Row, print_table
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.photos.photo_list import load_photo_list
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.photos.files.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import MappingInput
-from splatpipe.pipeline.sfm.doubles import doubles_reasons, find_doubles
-from splatpipe.pipeline.sfm.judging import judge
-from splatpipe.pipeline.sfm.ladder import run_ladder
+from splatpipe.pipeline.sfm.judging.doubles import doubles_reasons, find_doubles
+from splatpipe.pipeline.sfm.judging.judging import judge
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
-from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
+from splatpipe.pipeline.sfm.recovery.ladder import run_ladder
 from splatpipe.stages.line import LINE, MATCHES
 
 GUESS = 1.2  # of the longer side: COLMAP's guess if nothing is known

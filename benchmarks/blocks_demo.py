@@ -40,7 +40,7 @@ KILLED_AT = 0.3  # of a block's iterations
 
 def splatpipe(*words: object) -> list[str]:
     """Return the words of a splatpipe command."""
-    return [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, words)]
+    return [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", *map(str, words)]
 
 
 def run(photos: Path, out: Path, sets: Sequence[str], *more: object) -> None:

@@ -26,7 +26,7 @@ from splatpipe.demo.truth import depth_map, true_poses, true_surface, truth_from
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring, read_model_area
-from splatpipe.pipeline.photos.images import reduced_view
+from splatpipe.pipeline.photos.pixels.images import reduced_view
 from splatpipe.pipeline.raster.threads import same_bits
 
 MARGIN_M = 1.0  # around the house, as if drawn by hand on a map

@@ -20,7 +20,7 @@ from playwright.sync_api import Page, sync_playwright
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.scene import Axes, turn_of
+from splatpipe.pipeline.splat.model.scene import Axes, turn_of
 
 PATIENCE_MS = 600_000.0  # for a busy machine
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

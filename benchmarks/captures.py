@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.scene import Axes, Scene
+from splatpipe.pipeline.splat.model.scene import Axes, Scene
 
 Picture = Float[np.ndarray, "h w 3"]
 NEAR_M = 0.1

@@ -29,16 +29,16 @@ import torch
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
+from splatpipe.pipeline.delivery.ecef_tiles import write_tiles_on_globe
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import build_levels
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
-from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.survey.geodesy import geodetic_from_ecef
-from splatpipe.pipeline.survey.globe import write_tiles_on_globe
+from splatpipe.pipeline.splat.levels.levels import build_levels
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.survey.crs.geodesy import geodetic_from_ecef
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PLACE = SplatOrigin(52.2, 21.0, 150.0, "ellipsoidal", "EPSG:32634")

@@ -167,7 +167,7 @@ def is_reported(fault: CaptureFault, findings: list[dict[str, object]]) -> bool:
 
 
 def check(capture: Path) -> dict[str, list[dict[str, object]]]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "check", str(capture), "--json"]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "check", str(capture), "--json"]
     done = subprocess.run(
         [*command, "-o", str(capture / "check.html")], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=False
     )

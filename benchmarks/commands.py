@@ -33,7 +33,7 @@ class Command:
 
 def splatpipe(name: str, arguments: Sequence[str], log: Path) -> Command:
     """Return a call of the pipeline whose error message is reported."""
-    return Command(name, ("-m", "splatpipe.pipeline.app.cli", *arguments, "--json"), log)
+    return Command(name, ("-m", "splatpipe.pipeline.app.cli.main", *arguments, "--json"), log)
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,10 @@ from splatpipe.demo.truth import centre, depth_map, true_poses, true_surface, tr
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.photos.images import Pixels
-from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
-from splatpipe.pipeline.photos.resampling import resample
-from splatpipe.pipeline.photos.undistortion import plan_views
+from splatpipe.pipeline.photos.files.photo_list import decode, load_photo_list
+from splatpipe.pipeline.photos.pixels.images import Pixels
+from splatpipe.pipeline.photos.pixels.resampling import resample
+from splatpipe.pipeline.photos.pixels.undistortion import plan_views
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.view_measures import flat_stems, mean_measures, measure
 

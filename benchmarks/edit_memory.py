@@ -21,9 +21,9 @@ from pathlib import Path
 
 import torch
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import write_splat_parts
-from splatpipe.pipeline.splat.scene import SceneFacts, SplatOrigin
+from splatpipe.pipeline.splat.containers.ply import write_splat_parts
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import SceneFacts, SplatOrigin
 
 BYTES = 236  # per Gaussian of degree 3 in memory
 PART = 500_000
@@ -140,7 +140,7 @@ def main() -> None:
             half.unlink(missing_ok=True)
             write(half, count // 2)
             few_enough = {"most": count * 3 // 5, "megabytes": max(1, count * 20 // 1_000_000)}
-            command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "edit"]
+            command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "edit"]
             command += [str(folder / each.format(size=size)) for each in (edit.source, edit.out)]
             command += ["--threads", "1", "--no-pictures", *shlex.split(edit.steps.format(folder=folder, **few_enough))]
             peaks[size] = measured(command)

@@ -32,8 +32,8 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import fit_similarity
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.render.rendering import render_pixels
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 LATITUDE, LONGITUDE, HEIGHT_M = 47.84119, 13.51269, 515.0  # the demo's origin
 METRES_PER_DEGREE = 111_320.0

@@ -15,9 +15,9 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.photos.camera_groups import DEFAULT_FOCAL
-from splatpipe.pipeline.sfm.footprints import StatedPoses
-from splatpipe.pipeline.sfm.pairs import Layout, Pair, select_pairs
+from splatpipe.pipeline.photos.intake.camera_groups import DEFAULT_FOCAL
+from splatpipe.pipeline.sfm.pairing.footprints import StatedPoses
+from splatpipe.pipeline.sfm.pairing.pairs import Layout, Pair, select_pairs
 
 WIDTH, HEIGHT, FOCAL_PX, RADIAL = 2000, 1500, 1500.0, -0.04
 FLYING_M = 60.0

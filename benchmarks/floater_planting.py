@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.reference import project
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 KINDS = ("single", "cluster", "near a surface", "haze", "oversized")
 SHARES = (1.0, 1.0, 1.0, 0.5, 0.2)  # of each kind: large floaters are rare

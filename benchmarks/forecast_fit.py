@@ -20,7 +20,7 @@ from splatpipe.stages.work import NEIGHBOURS, CaptureSize, CaptureWork, WorkUnit
 KINDS = ("cpu_seconds", "peak_memory_bytes", "disk_bytes")
 BY_GAUSSIANS = ("train", "clean", "evaluate", "export")
 """Stages whose memory grows with the Gaussians, of which runs at `preview` have too few to show how: the memory per
-Gaussian is counted in training (`train/limits.py`), and was measured on seneca's 325,000 in the later stages."""
+Gaussian is counted in training (`train/plan/limits.py`), and was measured on seneca's 325,000 in the later stages."""
 
 SELDOM = ("control", "targets", "blocks")
 """Stages that have nothing to do for most captures, so nothing is fitted to them."""

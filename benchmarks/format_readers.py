@@ -24,8 +24,8 @@ from survey_readers import check_colmap, check_laz
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.containers.ply import write_splat
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
-from splatpipe.pipeline.splat.ply import write_splat
 
 SAME_DB = 0.1  # below the result of our own reader
 SURE_DB = 100.0  # above this, differences are rounding

@@ -21,11 +21,11 @@ from round_trips import MAX_GROWTH, bytes_of, working_folder, written
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.containers.ply import write_splat
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import write_splat
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene
 
 ASKED_S = {"sog": 120.0, "streamed-sog": 120.0}
 OTHERS_ASKED_S = 5.0

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from jaxtyping import Float64
 
-from splatpipe.pipeline.splat.sh import rotate_sh
+from splatpipe.pipeline.splat.model.sh import rotate_sh
 
 PREFIX = "KHR_gaussian_splatting:"
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}

@@ -26,7 +26,7 @@ ROOM = ("pipeline", "native")
 FITS = {  # ends with an error if the library does not fit; in processes of their own, as the second starts the device
     STABLE: "import numpy; from splatpipe.pipeline.native import _native; print(_native.isa())",
     CUDA: (
-        "from splatpipe.pipeline.raster.cuda_library import load\n"
+        "from splatpipe.pipeline.raster.cuda.cuda_library import load\n"
         "code, device = load().device(0)\n"
         "assert code == 0, load().error(code)\n"
         "print(device.described())"

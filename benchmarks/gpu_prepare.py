@@ -24,8 +24,8 @@ from gpu_parts import Row
 from gpu_visit import BUILT_PEERS, SEEDS, VisitScale
 from measure import DEFAULT_START, InitialSettings, prepare, size_factor
 
-from splatpipe.pipeline.photos.dataset import IMAGES, Split, split_views
 from splatpipe.pipeline.photos.options import SplitConfig
+from splatpipe.pipeline.photos.pixels.dataset import IMAGES, Split, split_views
 
 ROOT = Path(__file__).resolve().parents[1]
 DATASET, POINTS = "bench_sceaux", "sparse"

@@ -22,13 +22,14 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import cuda, rasterizer
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.cuda import cuda
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.render.options import EvaluateConfig
-from splatpipe.pipeline.splat import metrics
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import coefficient_count
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import coefficient_count
+from splatpipe.pipeline.splat.quality import metrics
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.stages import evaluate

@@ -18,15 +18,16 @@ from gpu_parts import Refusal, Row
 from gpu_proofs import SSIM_WEIGHT, random_model, view_of
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import cuda, rasterizer
+from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.pipeline.raster.cuda_forecast import Forecast, FrameFacts, FrameSize
+from splatpipe.pipeline.raster.cuda import cuda
+from splatpipe.pipeline.raster.cuda.cuda_forecast import Forecast, FrameFacts, FrameSize
 from splatpipe.pipeline.raster.cuda_frame import TILE_PX
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions
 from splatpipe.pipeline.raster.sky import STEP_PX, SkyLayer, laid_over_nodes
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 KERNELS = "splat4cuda"  # in the mangled name of each kernel of ours, and of no other
 SMALL, SMALL_SIZE = 3000, (161, 117)  # Gaussians, and image size: a tool slows kernels down a hundredfold

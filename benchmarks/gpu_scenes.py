@@ -15,15 +15,15 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
-from splatpipe.pipeline.photos.images import load_colour
-from splatpipe.pipeline.raster import cuda
-from splatpipe.pipeline.raster.cuda_library import load, why_not
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.sh import coefficient_count
+from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.pixels.images import load_colour
+from splatpipe.pipeline.raster.cuda import cuda
+from splatpipe.pipeline.raster.cuda.cuda_library import load, unavailable_reason
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import coefficient_count
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
 
 PACK = Path(os.environ.get("SPLATPIPE_PACK", ".gpu_visit"))
 CAPTURE = "sceaux"  # the packed capture
@@ -56,7 +56,7 @@ def device() -> Iterator[torch.device]:
         with cuda.use_kernels(cuda.CudaKernels(load(Path(harness)), torch.device("cpu"))):
             yield torch.device("cpu")
         return
-    if missing := why_not():
+    if missing := unavailable_reason():
         raise missing.error()
     yield torch.device("cuda", torch.cuda.current_device())
 

@@ -21,21 +21,22 @@ from gpu_scenes import MEGAPIXELS
 from torch.profiler import ProfilerActivity, profile
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_split
-from splatpipe.pipeline.raster import cuda, rasterizer
-from splatpipe.pipeline.raster.cuda_forecast import FrameFacts, FrameSize
+from splatpipe.pipeline.photos.pixels.dataset import load_split
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.cuda import cuda
+from splatpipe.pipeline.raster.cuda.cuda_forecast import FrameFacts, FrameSize
 from splatpipe.pipeline.raster.cuda_frame import TILE_PX
 from splatpipe.pipeline.raster.definitions import RenderOptions
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.brightness import decided_exposure
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.appearance.brightness import decided_exposure
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.photos.stream import PhotoStream
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import begin_sky, make_techniques
 
 WARMUP, REPEATS = 30, 100  # iterations; the first ones determine how much room frames need
 PROFILED = 20  # iterations
@@ -170,7 +171,7 @@ def iteration_times(count: int | None, what: Planned, megapixels: float, where: 
 
 def choose_rules(where: torch.device) -> AbstractContextManager[None]:
     """Select torch's settings as training does on a device: a fixed order of summation."""
-    return chosen(where).one_order()
+    return chosen(where).deterministic()
 
 
 def chosen(where: torch.device) -> Device:

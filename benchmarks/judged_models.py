@@ -24,11 +24,11 @@ import pycolmap
 from bent_captures import looks_alike
 from tables import Row, print_table
 
-from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.sfm.doubles import RATIO_BAD, RATIO_DOUBT, find_doubles
-from splatpipe.pipeline.sfm.judging import GAIN_BAD, GAIN_DOUBT, judge
-from splatpipe.pipeline.sfm.structure import Structure, cameras_of, make_model, poses_of, read_structure
-from splatpipe.pipeline.sfm.view_graph import read_verified
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.sfm.judging.doubles import RATIO_BAD, RATIO_DOUBT, find_doubles
+from splatpipe.pipeline.sfm.judging.judging import GAIN_BAD, GAIN_DOUBT, judge
+from splatpipe.pipeline.sfm.model.structure import Structure, cameras_of, make_model, poses_of, read_structure
+from splatpipe.pipeline.sfm.model.view_graph import read_verified
 from splatpipe.stages.line import LINE, SPARSE
 
 BENDS_DEG = (0.0, 0.1, 0.25, 0.5, 1.0, 4.0)

@@ -18,11 +18,11 @@ import numpy as np
 import pycolmap
 from tables import Row, print_table
 
-from splatpipe.pipeline.photos.photo_list import load_photo_list
+from splatpipe.pipeline.photos.files.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.ladder import run_ladder
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
+from splatpipe.pipeline.sfm.recovery.ladder import run_ladder
 
 COLUMNS = {
     "capture": "capture:",

@@ -27,14 +27,14 @@ from tiled_site import Tiling, middle_and_edge, write_coarse, write_site
 from splatpipe.pipeline.app.preflight.start import blocks_text
 from splatpipe.pipeline.engine.config import load_preset, parse_set, resolve
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.executor import Executor
-from splatpipe.pipeline.engine.needs import Need, whole
 from splatpipe.pipeline.engine.quantities import parse_bytes
+from splatpipe.pipeline.engine.runs.executor import Executor
+from splatpipe.pipeline.engine.runs.needs import Need, whole
+from splatpipe.pipeline.engine.runs.worker import Task
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Shard
-from splatpipe.pipeline.engine.worker import Task
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
+from splatpipe.pipeline.train.blocks.cells.site_plan import SitePlan
 from splatpipe.pipeline.train.blocks.layout import COARSE, PROSPECTS, lay_out
-from splatpipe.pipeline.train.blocks.site_plan import SitePlan
 from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.forecast import machine_speed, needs_of, needs_of_blocks
 from splatpipe.stages.line import TRAIN

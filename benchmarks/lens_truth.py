@@ -27,7 +27,7 @@ from tables import Row, print_table
 
 from splatpipe.demo import CAPTURE
 from splatpipe.demo.cameras import BrownLens, brown_lens
-from splatpipe.pipeline.sfm.lens_model import apart_px, simplest
+from splatpipe.pipeline.sfm.lenses.lens_model import apart_px, simplest
 
 BORDER_PX = 8.0  # marks nearer to the edge are dropped
 QUALITY = 95
@@ -153,7 +153,7 @@ def main() -> None:
             capture = CAPTURE
         elif not (capture / "gcp_list.txt").exists():
             make_capture(capture, lenses[name], source)
-        command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture / "photos"), str(out)]
+        command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "run", str(capture / "photos"), str(out)]
         command += ["--preset", arguments.preset, "--until", "georef", "--threads", "1"]
         command += [word for each in arguments.set for word in ("--set", each)]
         subprocess.run(command, check=True, stdout=sys.stderr)

@@ -30,10 +30,10 @@ from torch import Tensor
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.splat.formats import plain_ply
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import MAX_PER_NODE, LevelNode, box_distance, build_levels, select_nodes
-from splatpipe.pipeline.splat.reduction import reduce_to
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.levels.levels import MAX_PER_NODE, LevelNode, box_distance, build_levels, select_nodes
+from splatpipe.pipeline.splat.levels.reduction import reduce_to
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene
 
 SHARES = (50, 25, 10, 5)  # percent
 ERROR_PX = 16.0

@@ -26,13 +26,13 @@ from jaxtyping import Float64
 from tables import Row
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.photo_list import PhotoList
+from splatpipe.pipeline.photos.files.photo_list import PhotoList
 from splatpipe.pipeline.sfm.capture import MappingInput
-from splatpipe.pipeline.sfm.mapping import MappingOptions, map_global, map_incremental
+from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, map_global, map_incremental
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.pairs import connect, nearest
+from splatpipe.pipeline.sfm.pairing.pairs import connect, nearest
+from splatpipe.pipeline.sfm.pairing.retrieval import PER_PHOTO, look_alike_costs
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
-from splatpipe.pipeline.sfm.retrieval import PER_PHOTO, look_alike_costs
 
 NEIGHBOURS = 20  # the pipeline's default
 

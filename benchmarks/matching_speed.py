@@ -22,10 +22,10 @@ import pycolmap
 from sfm_speed import database_of
 from tables import Row, print_table
 
-from splatpipe.pipeline.engine.children import ONE_THREAD
 from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.sfm.matching_process import match_listed
-from splatpipe.pipeline.sfm.reduction import copy_photos
+from splatpipe.pipeline.engine.runs.children import ONE_THREAD
+from splatpipe.pipeline.sfm.matching.matching_process import match_listed
+from splatpipe.pipeline.sfm.matching.reduction import copy_photos
 
 HOWS = ("COLMAP", "ours")
 BLOCK_PAIRS = 64  # COLMAP keeps as many photos' search trees in memory

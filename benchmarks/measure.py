@@ -28,26 +28,26 @@ from ceilings import measure_ceilings
 from rasterizing import contributing_pairs, raster_alone
 from tables import Row, console, print_table
 
-from splatpipe.pipeline.engine.runner import versions
+from splatpipe.pipeline.engine.runs.runner import versions
+from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.native import _native
-from splatpipe.pipeline.photos.dataset import IMAGES, MODEL, Split, View, load_views, mask_path
-from splatpipe.pipeline.photos.images import load_colour, load_mask
+from splatpipe.pipeline.photos.pixels.dataset import IMAGES, MODEL, Split, View, load_views, mask_path
+from splatpipe.pipeline.photos.pixels.images import load_colour, load_mask
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.train import iteration
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.photos.stream import PhotoStream
+from splatpipe.pipeline.train.plan.plan import make_plan
+from splatpipe.pipeline.train.plan.windows import TrainingSize
 from splatpipe.pipeline.train.random_numbers import permutation
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.techniques import make_techniques
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import make_techniques
 from splatpipe.stages import initialize
 
 PUBLISHED_ITERATIONS = 30_000  # learning rates of a long run, so the measured iterations hardly change the model

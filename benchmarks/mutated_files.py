@@ -28,8 +28,8 @@ from mutations import mutated
 from tables import Row, print_table
 
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
 SLOW_S = 5.0  # of CPU time
 WORKER = Path(__file__).with_name("read_worker.py")

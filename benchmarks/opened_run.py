@@ -11,15 +11,15 @@ import torch
 from jaxtyping import Float32
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.engine.store import Part
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.store import Part
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
-from splatpipe.pipeline.photos.images import Pixels, reduced_camera
+from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.pixels.images import Pixels, reduced_camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import Model, as_trained, render_pixels
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
 from splatpipe.stages.line import CLEAN, EXPORT, LINE, TRAIN
 
 

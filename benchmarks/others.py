@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.scene import Axes, Scene, SceneFacts
 
 READERS = Path(__file__).resolve().parent / "readers"
 THEIR_AXES: Axes = "y down"

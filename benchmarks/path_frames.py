@@ -41,8 +41,8 @@ from splatpipe.pipeline.film.camera_path import (
 from splatpipe.pipeline.film.filming import open_scene
 from splatpipe.pipeline.film.photo_route import PhotoTrack, followed_photos
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks
-from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks
+from splatpipe.pipeline.photos.pixels.images import Pixels
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.consistency import AGREEMENT

@@ -20,14 +20,14 @@ from jaxtyping import Bool
 from opened_run import OpenedRun, open_run
 from tables import Row, print_table
 
-from splatpipe.pipeline.edit.cleaning import clean_scene
+from splatpipe.pipeline.edit.floaters.cleaning import clean_scene
+from splatpipe.pipeline.edit.floaters.visibility import TrainingPhotos
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
-from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.photos.pixels.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.render.rendering import Model, render_pixels
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.metrics import psnr, psnr_cc
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality.metrics import psnr, psnr_cc
 
 ASKED_FOUND, MAX_LOST, MAX_LOSS_DB = 0.95, 0.005, 0.05
 DEPTH_MEGAPIXELS = 0.07  # of the renders that locate surfaces

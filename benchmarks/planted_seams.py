@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool
 
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import C0
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import C0
 
 STRIP = 20.0  # width of a doubled wall, pixels: the overlap of two blocks whose margins are kept
 

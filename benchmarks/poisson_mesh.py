@@ -18,7 +18,7 @@ from jaxtyping import Float64, Int64
 from surface_products import frames_of
 from surface_truth import CRS
 
-from splatpipe.pipeline.surface.tsdf import open3d
+from splatpipe.pipeline.surface.shapes.tsdf import open3d
 
 Points = Float64[np.ndarray, "n 3"]
 SPARSEST = 0.02  # share of the vertices, those with the lowest density: the skin that Poisson spans over holes

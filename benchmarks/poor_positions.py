@@ -25,13 +25,13 @@ from tables import Row, print_table
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity, rotation_from_vector, turn_between
-from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.gps import georeference
-from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.photos.files.photo_list import Photo
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.placing.gps import georeference
+from splatpipe.pipeline.survey.placing.level import Positions
+from splatpipe.pipeline.survey.placing.model import SparseModel
 
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
 PLACE = Origin(**TRUTH["frame"]["origin"])
@@ -100,7 +100,7 @@ def true_scene(run: Path | None) -> SimulatedCameras:
         places = MODEL_FROM_WORLD.apply(np.random.default_rng(1).uniform(-12.0, 12.0, (500, 3)) * [1.0, 1.0, 0.3])
         model = SparseModel(list(truth), source, rotations, places, (), pycolmap.Reconstruction())
         return SimulatedCameras(model, MODEL_FROM_WORLD.inverse(), centres, turns)
-    from splatpipe.pipeline.survey.model import model_of
+    from splatpipe.pipeline.survey.placing.model import model_of
 
     folder = next(run.glob("stages/sparse-*/sparse/0"))
     model = model_of(pycolmap.Reconstruction(str(folder)), list(truth))

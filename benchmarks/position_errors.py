@@ -14,8 +14,8 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 from tables import Row
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene
 
 SITE_M = 3000.0
 MAX_POINTS = 30_000  # number that are matched

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.geometry.similarity import rotation_from_vector
-from splatpipe.pipeline.survey.block import Block
-from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens
-from splatpipe.pipeline.survey.position_noise import StatedPositions
-from splatpipe.pipeline.survey.tie_points import intersected
+from splatpipe.pipeline.survey.adjustment.block import Block
+from splatpipe.pipeline.survey.adjustment.position_adjustment import LensKnowledge, prior_lens
+from splatpipe.pipeline.survey.adjustment.position_noise import StatedPositions
+from splatpipe.pipeline.survey.adjustment.tie_points import intersected
 
 SCENES = ("flat", "relief", "alternating", "one heading", "demo")
 FAULTS = ("none", "wrong", "no fix", "datum", "too small", "too large")

@@ -27,12 +27,12 @@ from position_scenes import COMMON_M, DRIFT, DRIFT_M, FAULTS, SCENES, STATED_M, 
 from tables import Row, print_table
 
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
-from splatpipe.pipeline.survey.block import Block
-from splatpipe.pipeline.survey.block_accuracy import BlockAccuracy, accuracy_of
-from splatpipe.pipeline.survey.block_adjustment import PositionObservations, adjust_block
-from splatpipe.pipeline.survey.position_adjustment import SIMPLE, LensKnowledge, converge, prior_lens
-from splatpipe.pipeline.survey.position_noise import PositionNoise, as_stated
-from splatpipe.pipeline.survey.uncertainty import NORMAL_95
+from splatpipe.pipeline.survey.adjustment.block import Block
+from splatpipe.pipeline.survey.adjustment.block_accuracy import BlockAccuracy, accuracy_of
+from splatpipe.pipeline.survey.adjustment.block_adjustment import PositionObservations, adjust_block
+from splatpipe.pipeline.survey.adjustment.position_adjustment import SIMPLE, LensKnowledge, converge, prior_lens
+from splatpipe.pipeline.survey.adjustment.position_noise import PositionNoise, as_stated
+from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
 CONTROL_M = np.array([0.02, 0.02, 0.03])
 MARK_PX = 0.5

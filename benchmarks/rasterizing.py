@@ -13,10 +13,10 @@ import torch
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.iteration import render_options
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.state import TrainState
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.state.state import TrainState
 
 WARMUP = 3  # renders that are not measured
 

@@ -13,7 +13,7 @@ ELSEWHERE = ("tests/slow/captures", "tests/slow/device")
 PLAIN = ("tests", "tests/scenes", "tests/harness", "tests/lines", "tests/records", "benchmarks")
 NATIVE = "pipeline/native"
 HARNESS = ("tests/harness/building.py", "tests/harness/on_cpu.py")  # a test that imports these runs CUDA's sources
-RUNS_ALL = ("demo_run", "demo_copy", "splatpipe.pipeline.app.cli", "from command import")
+RUNS_ALL = ("demo_run", "demo_copy", "splatpipe.pipeline.app.cli.main", "from command import")
 WHOLE_LINE = "stages/line.py"  # what starts the command, or reads its finished run, runs all stages
 
 

@@ -22,7 +22,7 @@ import torch
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.scene import Scene
 
 SPARE_BYTES = 2 << 30  # of address space above current use: reserved but unused memory does not count, up to a limit
 STATUS = Path("/proc/self/status")

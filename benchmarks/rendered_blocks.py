@@ -36,8 +36,8 @@ from splatpipe.demo.render import Renderer
 from splatpipe.demo.scene import DemoScene
 from splatpipe.demo.surroundings import GRAVEL, LAWN, SOIL, TERRACE
 from splatpipe.pipeline.engine.python_module import python_module
-from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.uncertainty import NORMAL_95
+from splatpipe.pipeline.survey.crs.frames import load_frame
+from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
 BLOCKS = ("flat", "alternating")
 HALF_M, TEXEL_M = 62.0, 0.0165  # of the painted ground
@@ -138,7 +138,7 @@ def write_photos(scene: Scene, work: Path, seed: int) -> Path:
 
 def run_to_georef(photos: Path, out: Path, *options: str) -> None:
     """Run the line up to georef."""
-    command = python_module("splatpipe.pipeline.app.cli", "run", str(photos), str(out), "--preset", "preview")
+    command = python_module("splatpipe.pipeline.app.cli.main", "run", str(photos), str(out), "--preset", "preview")
     subprocess.run([*command, "--until", "georef", *options], check=True)
 
 

@@ -26,10 +26,10 @@ from position_errors import position_row, site_of
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.containers.ply import write_splat
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
 from splatpipe.pipeline.splat.formats.files import write_scene
-from splatpipe.pipeline.splat.ply import write_splat
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.scene import Scene
 
 ASKED_DB = {"ply": math.inf, "model": math.inf, "glb": 70.0, "spz": 38.0, "sog": 38.0, "compressed-ply": 38.0}
 MAX_LOSS_DB = 0.3  # splat-transform's

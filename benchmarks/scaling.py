@@ -38,19 +38,19 @@ from measure import (
     time_case,
 )
 
+from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import Split, load_views
+from splatpipe.pipeline.photos.pixels.dataset import Split, load_views
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train import plan as planned
-from splatpipe.pipeline.train.lengths import PhotoSizes
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.schedule import UNKNOWN, Schedule, resolve_schedule
+from splatpipe.pipeline.train.plan import plan as planned
+from splatpipe.pipeline.train.plan.lengths import PhotoSizes
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.schedule import UNKNOWN, Schedule, resolve_schedule
 from splatpipe.stages import train
 
 COLUMNS = {

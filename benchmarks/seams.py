@@ -22,15 +22,15 @@ from tables import Row, print_table
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.seams import Seam, border_cameras, find_seams
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.train.blocks.cutting import cut, site, work_map
-from splatpipe.pipeline.train.blocks.partition import Border, Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import photo_coverages
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.survey.crs.frames import load_frame
+from splatpipe.pipeline.train.blocks.cells.cutting import cut, site, work_map
+from splatpipe.pipeline.train.blocks.cells.partition import Border, Partition
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import photo_coverages
 
 GRADES = {  # what is planted: pixels empty, pixels higher, of the colour's range
     "gap": (1.0, 2.0, 4.0, 8.0),

@@ -17,7 +17,7 @@ from commands import run_all, splatpipe
 from finished import ResultLog
 from tables import Row, print_table
 
-from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.stages.line import EVALUATE, LINE, TRAIN
 
 COLUMNS = {

@@ -20,8 +20,8 @@ from splatpipe.demo import CAPTURE
 from splatpipe.demo.orthographic import AHEAD_M, MARGIN_M, facade_view, top_view, wall_planes
 from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED
 from splatpipe.demo.relief import relief_in
-from splatpipe.demo.visibility import FEWEST, photos_that_see
-from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
+from splatpipe.demo.visibility import MIN_VIEWS, photos_that_see
+from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
 
 TOLERANCE_GSD = 2.0  # for clouds and meshes
 SAMPLES = 100_000  # of the true surface and of a product: the standard deviation of a share is below 0.002
@@ -168,7 +168,7 @@ def measure_facades(truth: SceneTruth, facades: list[Facade]) -> list[Row]:
         row, column = np.nonzero(np.isin(parts, WALL_PARTS) & near & clear & (relief.cosine > 0.0))
         points = view.from_grid(np.column_stack([column + 0.5, row + 0.5, -relief.height[row, column]]))
         normals = truth.normals[relief.triangle[row, column]]
-        seen = photos_that_see(points, normals, truth.true_views) >= FEWEST
+        seen = photos_that_see(points, normals, truth.true_views) >= MIN_VIEWS
         within = (points[seen] - wall.origin) @ wall.u
         assert within.size == 0 or (within.min() > -2.0 * MARGIN_M and within.max() < span + 2.0 * MARGIN_M)
         facade = matching(facades, name)
@@ -229,7 +229,7 @@ def seen_places(truth: SceneTruth, rng: np.random.Generator) -> Points:
     places, of = spread(truth.triangles[rows], 3 * SAMPLES, rng)
     below = truth.flown_over(places)
     places, of = places[below][:SAMPLES], rows[of[below]][:SAMPLES]
-    return places[photos_that_see(places, truth.normals[of], truth.true_views) >= FEWEST]
+    return places[photos_that_see(places, truth.normals[of], truth.true_views) >= MIN_VIEWS]
 
 
 def true_surface_of(truth: SceneTruth) -> Surface:

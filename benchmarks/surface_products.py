@@ -26,10 +26,10 @@ from jaxtyping import Bool, Float64, UInt8
 from splatpipe.demo import CAPTURE
 from splatpipe.demo.truth import truth_from_model
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.survey.frames import Frame, Origin, load_frame
-from splatpipe.pipeline.survey.world import World, open_world
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin, load_frame
+from splatpipe.pipeline.survey.crs.world import World, open_world
 from splatpipe.stages.line import EVALUATE, EXPORT, GEOREF, LINE, TRAIN
 
 Points = Float64[np.ndarray, "n 3"]

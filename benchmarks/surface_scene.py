@@ -15,11 +15,11 @@ from scipy.spatial import Delaunay
 from surface_measures import near_steps
 from surface_products import Points, Raster
 
-from splatpipe.demo.orthographic import ParallelView
+from splatpipe.demo.parallel_view import ParallelView
 from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED, parts_of, unit_normals
 from splatpipe.demo.relief import Relief, surface_model
 from splatpipe.demo.truth import Triangles, centre, true_poses, true_surface
-from splatpipe.demo.visibility import FEWEST, TrueView, photos_that_see, true_views
+from splatpipe.demo.visibility import MIN_VIEWS, TrueView, photos_that_see, true_views
 
 GSD_M = 0.028  # of the original photos, at the house
 STEP_M = 4.0 * GSD_M  # more than roofs (slope 0.9) rise between cells of 2 GSD; chimneys, dormers and walls are higher
@@ -210,7 +210,7 @@ def _seen(
     below = truth.flown_over(places) & (hit >= 0)
     count = np.zeros(len(places), np.uint8)
     count[below] = photos_that_see(places[below], truth.normals[hit[below]], truth.true_views)
-    pair = ((count >= FEWEST).reshape(row.shape), below.reshape(row.shape))
+    pair = ((count >= MIN_VIEWS).reshape(row.shape), below.reshape(row.shape))
     seen, flown = (np.kron(each, np.ones((every, every), bool))[:height, :width] for each in pair)
     return seen, flown
 

@@ -18,14 +18,14 @@ import numpy as np
 from tables import Row, print_table
 
 from splatpipe.demo.depth_maps import load
-from splatpipe.pipeline.surface.exposures import exposure_levels
-from splatpipe.pipeline.surface.height_field import HeightField
-from splatpipe.pipeline.surface.heights import TILE as HEIGHTS_TILE
-from splatpipe.pipeline.surface.heights import HeightInput, surface_heights
-from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.orthophoto import TILE, OrthoInput, orthophotos
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, MetricMap
+from splatpipe.pipeline.surface.depths.exposures import exposure_levels
+from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache, MetricMap
+from splatpipe.pipeline.surface.heights.height_field import HeightField
+from splatpipe.pipeline.surface.heights.heights import TILE as HEIGHTS_TILE
+from splatpipe.pipeline.surface.heights.heights import HeightInput, surface_heights
+from splatpipe.pipeline.surface.ortho.orthophoto import TILE, OrthoInput, orthophotos
+from splatpipe.pipeline.surface.rasters.lattice import Lattice
 
 GSD_M = 0.028  # of the original photos, at the house
 HALF_M = 9.0  # half the side of the part

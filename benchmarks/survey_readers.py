@@ -12,7 +12,7 @@ import pycolmap
 import pyproj
 from jaxtyping import Float64
 
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.scene import Scene
 
 Check = tuple[str, str, str, str, bool]
 """Reader, format, what is checked, figure, and whether the requirement is met."""

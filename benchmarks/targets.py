@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from target_scenes import Pattern, RenderedTarget, TargetAppearance, bow_tie, coded, disc, quadrants, render
 
-from splatpipe.pipeline.photos.coded_targets import DICTIONARIES, find_coded_targets
-from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
+from splatpipe.pipeline.photos.targets.coded_targets import DICTIONARIES, find_coded_targets
+from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
 
 SIZES_PX = (12.0, 20.0, 30.0, 45.0)
 NEAR_PX = 2.0  # a detection farther from the truth is another one

@@ -23,7 +23,7 @@ from splatpipe.demo.house import BRICK, SLATE, TILES
 from splatpipe.demo.scene import building_corners
 from splatpipe.demo.truth import depth_map, true_surface, truth_from_model
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import Pixels, reduced_view
+from splatpipe.pipeline.photos.pixels.images import Pixels, reduced_view
 from splatpipe.pipeline.raster.threads import same_bits
 
 TEXTURES = {"bricks": BRICK, "tiles": TILES, "slates": SLATE}

@@ -16,17 +16,17 @@ from jaxtyping import Float64
 from opened_run import OpenedRun
 
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
-from splatpipe.pipeline.photos.dataset import MODEL, load_points_and_tracks, split_views
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.photos.pixels.dataset import MODEL, load_points_and_tracks, split_views
+from splatpipe.pipeline.splat.containers.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.appearance.sky import SkyModel
+from splatpipe.pipeline.train.appearance.sky_file import write_skies
+from splatpipe.pipeline.train.blocks.cells.cutting import site
+from splatpipe.pipeline.train.blocks.cells.partition import Cell
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import photo_coverages
+from splatpipe.pipeline.train.blocks.cells.thinning import thinned
 from splatpipe.pipeline.train.blocks.coarse import SKIES
-from splatpipe.pipeline.train.blocks.cutting import site
 from splatpipe.pipeline.train.blocks.layout import upward
-from splatpipe.pipeline.train.blocks.partition import Cell
-from splatpipe.pipeline.train.blocks.photo_coverage import photo_coverages
-from splatpipe.pipeline.train.blocks.thinning import thinned
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.sky_file import write_skies
 
 LOOSER = 1.2  # factor between voxel sizes tried, until all tiles' splats together match the coarse pass's count
 

@@ -28,25 +28,25 @@ from measure import (
 )
 
 from splatpipe.pipeline.engine.config import parse_set, resolve
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
-from splatpipe.pipeline.photos.dataset import load_views, split_views
-from splatpipe.pipeline.photos.images import load_colour, load_mask
+from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
+from splatpipe.pipeline.photos.pixels.dataset import load_views, split_views
+from splatpipe.pipeline.photos.pixels.images import load_colour, load_mask
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import render_pixels
 from splatpipe.pipeline.render.view_measures import measure
-from splatpipe.pipeline.train.brightness import decided_exposure
+from splatpipe.pipeline.train.appearance.brightness import decided_exposure
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.flatness import ends_at
-from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.loop import training_sizes
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.start import read_start
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
-from splatpipe.pipeline.train.training_order import PhotoOrder
+from splatpipe.pipeline.train.photos.stream import PhotoStream
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.start import read_start
+from splatpipe.pipeline.train.plan.training_order import PhotoOrder
+from splatpipe.pipeline.train.state.history import History
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import begin_sky, make_techniques
 from splatpipe.stages.options import LineConfig
 
 COLUMNS = {

@@ -23,8 +23,8 @@ from surface_truth import PRODUCTS, measure
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.engine.store import Artifact
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.store import Artifact
 from splatpipe.stages.line import LINE
 
 SHARED = ("ingest", "features", "matches", "sparse", "control", "targets", "georef", "undistort")

@@ -20,9 +20,9 @@ import torch
 from opened_run import OpenedRun, open_run
 from playwright.sync_api import Page, sync_playwright
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.handover import in_world
+from splatpipe.pipeline.delivery.delivery_frame import in_world
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

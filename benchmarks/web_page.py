@@ -23,10 +23,10 @@ from opened_run import OpenedRun, open_run
 from playwright.sync_api import Browser, CDPSession, Page, sync_playwright
 from viewer_page import FLAGS, multiplied
 
-from splatpipe.pipeline.splat.levels import build_levels
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts
-from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.handover import in_world
+from splatpipe.pipeline.delivery.delivery_frame import in_world
+from splatpipe.pipeline.splat.levels.levels import build_levels
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts
+from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 

@@ -31,17 +31,17 @@ from measure import (
 from rasterizing import contributing_pairs
 from tables import Row
 
-from splatpipe.pipeline.photos.dataset import Split, load_views
+from splatpipe.pipeline.photos.pixels.dataset import Split, load_views
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.techniques import begin_sky, make_techniques
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.photos.stream import PhotoStream
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import begin_sky, make_techniques
 
 WARMUP = 4  # iterations of each that are not measured
 ROUNDING = 1.01  # sides are whole pixels, so a quarter of 4 MP is slightly more than 1 MP

@@ -24,8 +24,8 @@ from splatpipe.demo import capture_path
 from splatpipe.demo.cameras import BrownLens
 from splatpipe.demo.truth import depth_map, true_poses, true_surface
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.resampling import resample
-from splatpipe.pipeline.photos.undistortion import pinhole_camera
+from splatpipe.pipeline.photos.pixels.resampling import resample
+from splatpipe.pipeline.photos.pixels.undistortion import pinhole_camera
 
 SEED = 20261123
 BLOCK = 4  # pixels a side that share a confidence

@@ -25,11 +25,10 @@ from .mesh import Array
 from .metadata import GpsPosition, build_exif, build_xmp, position_attributes, with_metadata
 from .render import Renderer
 from .scene import PLOT_YAW_DEG, DemoScene, build_scene, surface_of
+from .sensor import GAIN, WHITE_BALANCE, coded
 from .survey import gcp_list, sightings
 
 SEED = 2026
-GAIN = 3.6  # radiance to sensor, at 0 EV
-WHITE_BALANCE = np.array([0.93, 1.0, 1.10])
 EXPOSURE_SIGMA_EV = 0.1
 SHOT_NOISE, READ_NOISE = 2.0e-5, 1.0e-6  # variance per unit of light, and in the dark
 GPS_SIGMA_M = (1.5, 1.5, 3.0)
@@ -61,14 +60,6 @@ def develop(radiance: Array, exposure_ev: float, rng: np.random.Generator) -> ND
     light = radiance * GAIN * 2**exposure_ev * WHITE_BALANCE
     light = light + rng.standard_normal(light.shape) * np.sqrt(SHOT_NOISE * light + READ_NOISE)
     return coded(light)
-
-
-def coded(light: Array) -> NDArray[np.uint8]:
-    """Encode light on the sensor (h, w, 3) as 8-bit sRGB, with soft highlights."""
-    light = np.where(light < 0.7, light, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.3))
-    light = np.clip(light, 0, 1)
-    values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.asarray(values * 255 + 0.5, np.uint8)
 
 
 def compress(photos: list[NDArray[np.uint8]], budget: float) -> list[bytes]:

@@ -206,7 +206,7 @@ def _hash(cell: NDArray[np.uint32], seed: int) -> Array:
 
 
 @dataclass(frozen=True)
-class Lump:
+class Superellipsoid:
     """A rounded solid: trees, hedges, bushes.
 
     Attributes:

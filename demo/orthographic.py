@@ -10,15 +10,17 @@ run resumes.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from .house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE
-from .mesh import Array, Plane
+from .mesh import Plane
+from .parallel_view import ParallelView
 from .scene import build_scene, turned
+from .sensor import GAIN, WHITE_BALANCE, coded
 
 PIXEL_M = 0.014  # half of the photos' GSD
 TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # of the top view; nothing in it is higher
@@ -27,49 +29,6 @@ AHEAD_M = {"south": 4.0, "north": 5.5, "west": 5.5, "east": 5.5}
 MARGIN_M = 0.3  # around a wall
 STRIP_ROWS = 512
 SEED = 20261123
-
-
-@dataclass(frozen=True, eq=False)
-class ParallelView:
-    """An orthographic view: an image by parallel rays.
-
-    Attributes:
-        name: Name of its files.
-        origin: Of the first pixel's first corner, from where rays start; east, north, up in metres.
-        right: Unit vector along the rows.
-        down: Unit vector along the columns.
-        pixel_m: A pixel's side.
-        width: Pixels.
-        height: Pixels.
-    """
-
-    name: str
-    origin: Array
-    right: Array
-    down: Array
-    pixel_m: float
-    width: int
-    height: int
-
-    @property
-    def ahead(self) -> Array:
-        """Direction of the rays, a unit vector."""
-        return np.asarray(np.cross(self.right, self.down))
-
-    def to_grid(self, points: Array) -> Array:
-        """World points (..., 3) to column, row (pixels; the first pixel's centre is (0.5, 0.5)) and metres ahead."""
-        axes = np.stack([self.right / self.pixel_m, self.down / self.pixel_m, self.ahead])
-        return np.asarray((points - self.origin) @ axes.T)
-
-    def from_grid(self, places: Array) -> Array:
-        """Column, row and metres ahead (..., 3) to world points."""
-        axes = np.stack([self.right * self.pixel_m, self.down * self.pixel_m, self.ahead])
-        return np.asarray(places @ axes + self.origin)
-
-    def resampled(self, pixel_m: float) -> ParallelView:
-        """The same view with another pixel size."""
-        width, height = (round(count * self.pixel_m / pixel_m) for count in (self.width, self.height))
-        return replace(self, pixel_m=pixel_m, width=width, height=height)
 
 
 def top_view(pixel_m: float = PIXEL_M) -> ParallelView:
@@ -112,8 +71,7 @@ def views(pixel_m: float = PIXEL_M) -> list[ParallelView]:
 
 
 def main() -> None:
-    from .generate import GAIN, WHITE_BALANCE, coded
-    from .render import Renderer
+    from .render import Renderer  # takes mitsuba, which only rendering needs
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for the pictures")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from splatpipe.demo.orthographic import ParallelView
+from splatpipe.demo.parallel_view import ParallelView
 from splatpipe.demo.truth import Triangles
 
 Places = Float64[np.ndarray, "*n 3"]

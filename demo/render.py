@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .cameras import BrownLens, Pose
 from .mesh import Array
-from .orthographic import ParallelView
+from .parallel_view import ParallelView
 from .scene import DemoScene
 
 SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG = 46.0, 222.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from .mesh import WORLD, Array, Builder, Face, Lump, Plane
+from .mesh import WORLD, Array, Builder, Face, Plane, Superellipsoid
 from .textures import (
     Image,
     Painter,
@@ -292,7 +292,7 @@ def _lump(
 ) -> None:
     texel = 0.02 if max(radii) < 4 and np.hypot(*centre[:2]) < 25 else 0.06
     palette = tuple(colour(c) for c in LEAVES[leaves])
-    for face in Lump(np.array(centre), np.array(radii), seed, n, squareness, palette, texel).faces():
+    for face in Superellipsoid(np.array(centre), np.array(radii), seed, n, squareness, palette, texel).faces():
         b.add(face)
 
 

@@ -17,7 +17,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 BEHIND_M = 0.03  # tolerance by which a photo's depth may be less than a visible place's: less than half a pixel's slant
 MIN_COSINE = 0.087  # of 85°: at flatter angles, a surface is seen as a line
 HALF = 2  # divisor of the photos' size for computed depths
-FEWEST = 3  # photos that determine a place's position with redundancy
+MIN_VIEWS = 3  # photos that determine a place's position with redundancy
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from splatpipe.pipeline.train.blocks.division import Division
-from splatpipe.pipeline.train.blocks.needs import (
+from splatpipe.pipeline.train.blocks.cells.division import Division
+from splatpipe.pipeline.train.blocks.cells.needs import (
     MARGIN_GROWTH,
     SPLAT_BYTES,
     frozen_bytes,
@@ -14,8 +14,8 @@ from splatpipe.pipeline.train.blocks.needs import (
     round_pixels,
     work_bytes,
 )
-from splatpipe.pipeline.train.lengths import Length, PhotoSizes, growth_until, stretches
-from splatpipe.pipeline.train.limits import PIXEL_BYTES, bytes_per_gaussian
+from splatpipe.pipeline.train.plan.lengths import Length, PhotoSizes, growth_until, stretches
+from splatpipe.pipeline.train.plan.limits import PIXEL_BYTES, bytes_per_gaussian
 
 PHOTOS_PER_POINT = 35.0  # photos that show a point: about 12 in a nadir flight, 60 in the tiled demo, which has orbits
 VISIBLE_SHARE = 3.0  # of the site that a block sees, over its share of the photos: 3.6 and 2.4 in the tiled demo

@@ -14,19 +14,19 @@ from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.machine import available_memory_bytes
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.dataset import load_split, load_views
 from splatpipe.pipeline.photos.options import UndistortConfig
+from splatpipe.pipeline.photos.pixels.dataset import load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
-from splatpipe.pipeline.splat.ply import read_splat_header
+from splatpipe.pipeline.splat.containers.ply import read_splat_header
+from splatpipe.pipeline.train.blocks.cells.division import Division, SceneSize, divided, memory_limit
+from splatpipe.pipeline.train.blocks.cells.site_plan import whole_json
 from splatpipe.pipeline.train.blocks.coarse import TrainingLimits, train_coarse
-from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divided, memory_limit
 from splatpipe.pipeline.train.blocks.layout import COARSE, PROSPECTS, lay_out
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
-from splatpipe.pipeline.train.blocks.site_plan import whole_json
-from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
-from splatpipe.pipeline.train.limits import LIBRARIES_BYTES
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.plan.limits import LIBRARIES_BYTES
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
 from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import MEGA, CaptureSize, CaptureWork

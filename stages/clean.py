@@ -11,21 +11,21 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatpipe.pipeline.edit.cleaning import CleaningResult, clean_scene, removals_in_words
+from splatpipe.pipeline.edit.floaters.cleaning import CleaningResult, clean_scene, removals_in_words
+from splatpipe.pipeline.edit.floaters.visibility import TrainingPhotos
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS, CleanConfig
-from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.covering import covering_photos
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_split, load_views
-from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.photos.pixels.covering import covering_photos
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_split, load_views
+from splatpipe.pipeline.photos.pixels.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import as_trained
-from splatpipe.pipeline.splat.archives import open_archive
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat_parts
+from splatpipe.pipeline.splat.containers.archives import open_archive
+from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header, write_splat_parts
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
 
 FEW_PHOTOS = 12  # up to this many, floaters are compared with all, of more, with some: most photos show a floater
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.surface.dense_cloud import CloudTask, make_cloud
+from splatpipe.pipeline.surface.depths.run_sources import open_surveyed
 from splatpipe.pipeline.surface.options import CloudConfig
-from splatpipe.pipeline.surface.run_sources import open_surveyed
+from splatpipe.pipeline.surface.shapes.dense_cloud import CloudTask, make_cloud
 
 
 def run(config: CloudConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

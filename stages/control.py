@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.survey.control_file import read_control_file
-from splatpipe.pipeline.survey.crs import parse_crs
+from splatpipe.pipeline.survey.crs.crs import parse_crs
+from splatpipe.pipeline.survey.files.control_file import read_control_file
+from splatpipe.pipeline.survey.files.scale_bars import ScaleBar, read_scale_bars
 from splatpipe.pipeline.survey.options import ControlConfig
-from splatpipe.pipeline.survey.scale_bars import ScaleBar, read_scale_bars
-from splatpipe.pipeline.survey.target_finds import WantedTargets, save_wanted
+from splatpipe.pipeline.survey.targets.target_finds import WantedTargets, save_wanted
 
 
 def run(config: ControlConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

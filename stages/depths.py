@@ -8,7 +8,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.mvs.depth_maps import find_depth_maps, save_depth_maps
 from splatpipe.pipeline.mvs.options import DepthsConfig
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 
 
 def run(config: DepthsConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
+from splatpipe.pipeline.surface.depths.run_sources import open_run_surface
+from splatpipe.pipeline.surface.depths.site_extent import measure_extent, save_site
+from splatpipe.pipeline.surface.heights.dsm import DsmTask, make_dsm
 from splatpipe.pipeline.surface.options import DsmConfig
-from splatpipe.pipeline.surface.run_sources import open_run_surface
-from splatpipe.pipeline.surface.site_extent import measure_extent, save_site
 
 CELL_GSD = 2.0  # times the photos' GSD: heights are known less finely than colours, and no more finely than depths
 

@@ -12,8 +12,8 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import read_model_area
-from splatpipe.pipeline.photos.dataset import load_split, load_views
-from splatpipe.pipeline.photos.images import Mask, Pixels, reduced_camera, reduced_view
+from splatpipe.pipeline.photos.pixels.dataset import load_split, load_views
+from splatpipe.pipeline.photos.pixels.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.floaters import measure_floaters
@@ -28,8 +28,8 @@ from splatpipe.pipeline.render.view_measures import (
     mean_megapixels,
     shows_inside,
 )
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
 
 Pictures = tuple[tuple[Camera, Pixels, Mask | None], Pixels, Path, Mask | None]  # view, render, stem, inside mask
 

@@ -12,23 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
-from splatpipe.pipeline.engine.output_file import write_file
-from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.geometry.plan_area import read_world_area
-from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
-from splatpipe.pipeline.photos.dataset import Points, load_points, load_views
-from splatpipe.pipeline.render.rendering import as_trained, load_rendering
-from splatpipe.pipeline.splat.dome import sky_dome
-from splatpipe.pipeline.splat.formats import plain_ply
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.scene import Scene
-from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.georeference import accuracy_line, scene_box
-from splatpipe.pipeline.survey.handover import (
+from splatpipe.pipeline.delivery.delivery_frame import (
     bounded_comments,
     cameras_json,
     facts_of,
@@ -37,7 +21,23 @@ from splatpipe.pipeline.survey.handover import (
     inside_first,
     pose_in_world,
 )
-from splatpipe.pipeline.survey.sparse_scene import sparse_glb
+from splatpipe.pipeline.delivery.sparse_scene import sparse_glb
+from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.geometry.plan_area import read_world_area
+from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
+from splatpipe.pipeline.photos.pixels.dataset import Points, load_points, load_views
+from splatpipe.pipeline.render.rendering import as_trained, load_rendering
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.formats import plain_ply
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene
+from splatpipe.pipeline.splat.sky.dome import sky_dome
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
+from splatpipe.pipeline.survey.crs.frames import load_frame
+from splatpipe.pipeline.survey.crs.georeference import accuracy_line, scene_box
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
 from splatpipe.pipeline.web.options import ExportConfig, parse_formats
 from splatpipe.pipeline.web.viewer import ViewerScene

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.surface.facades import FacadesTask, make_facades, parse_lines
+from splatpipe.pipeline.surface.depths.run_sources import open_surveyed
+from splatpipe.pipeline.surface.facades.facades import FacadesTask, make_facades, parse_lines
 from splatpipe.pipeline.surface.options import FacadesConfig
-from splatpipe.pipeline.surface.run_sources import open_surveyed
 
 
 def run(config: FacadesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

@@ -16,11 +16,11 @@ from splatpipe.pipeline.engine.machine import available_memory_bytes, resident_b
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Reporter, Summary
-from splatpipe.pipeline.photos.names import list_names
-from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list
-from splatpipe.pipeline.sfm.keypoints import Bytes, extract, extraction_bytes, single_threaded_opencv
+from splatpipe.pipeline.photos.files.names import list_names
+from splatpipe.pipeline.photos.files.photo_list import PhotoList, load_photo_list
+from splatpipe.pipeline.sfm.matching.keypoints import Bytes, extract, extraction_bytes, single_threaded_opencv
 from splatpipe.pipeline.sfm.options import FeaturesConfig
-from splatpipe.pipeline.sfm.refusal import little_texture, texture_hint
+from splatpipe.pipeline.sfm.recovery.refusal import little_texture, texture_hint
 
 MIN_KEYPOINTS = 16  # COLMAP needs 15 inliers per pair; a photo with fewer keypoints can never be placed
 

@@ -15,13 +15,13 @@ from functools import cached_property
 from typing import Any
 
 from splatpipe.pipeline.engine.machine import available_memory_bytes
-from splatpipe.pipeline.engine.needs import Need
-from splatpipe.pipeline.engine.needs import whole as whole
-from splatpipe.pipeline.engine.source import RunSource
+from splatpipe.pipeline.engine.runs.needs import Need
+from splatpipe.pipeline.engine.runs.needs import whole as whole
+from splatpipe.pipeline.engine.runs.source import RunSource
 from splatpipe.pipeline.engine.stage import Summary
-from splatpipe.pipeline.train.blocks.division import Division
-from splatpipe.pipeline.train.blocks.needs import MARGIN_GROWTH, grown_from
-from splatpipe.pipeline.train.limits import (
+from splatpipe.pipeline.train.blocks.cells.division import Division
+from splatpipe.pipeline.train.blocks.cells.needs import MARGIN_GROWTH, grown_from
+from splatpipe.pipeline.train.plan.limits import (
     FIXED_BYTES,
     LIBRARIES_BYTES,
     PIXEL_BYTES,

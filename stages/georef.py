@@ -14,36 +14,37 @@ from threadpoolctl import threadpool_limits
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json, write_json
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
-from splatpipe.pipeline.sfm.lens_model import named_params, stated_lenses
-from splatpipe.pipeline.sfm.sparse_model import write_model
-from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json, control_json, no_control
-from splatpipe.pipeline.survey.adjusted_positions import (
+from splatpipe.pipeline.photos.files.photo_list import Photo, load_photo_list
+from splatpipe.pipeline.sfm.lenses.lens_model import named_params, stated_lenses
+from splatpipe.pipeline.sfm.model.sparse_model import write_model
+from splatpipe.pipeline.survey.adjustment.adjusted_positions import (
     adjust_model,
     adjusted_frame,
     adjustment_json,
     with_adjustment,
 )
-from splatpipe.pipeline.survey.assumed_heights import with_assumed_heights
-from splatpipe.pipeline.survey.blunders import gsd_m
-from splatpipe.pipeline.survey.boundary import lay_boundary
-from splatpipe.pipeline.survey.control import ControlResult, place_by_control
-from splatpipe.pipeline.survey.crs import parse_vertical
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.frames import Frame, Undetermined, save_frame
-from splatpipe.pipeline.survey.georef_input import GeorefInput
-from splatpipe.pipeline.survey.gps import georeference, read_positions, report_fit, report_frame
-from splatpipe.pipeline.survey.last_look import Placed, report_contradictions
-from splatpipe.pipeline.survey.level import Positions, arbitrary_frame
-from splatpipe.pipeline.survey.local_survey import LocalSurvey, Targets, stations_of
-from splatpipe.pipeline.survey.model import SparseModel, copy_model, model_of, read_model, report_unmatched
+from splatpipe.pipeline.survey.adjustment.georef_input import GeorefInput
+from splatpipe.pipeline.survey.adjustment.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE, LensKnowledge
+from splatpipe.pipeline.survey.boundary import write_boundary
+from splatpipe.pipeline.survey.control.accuracy import GeoreferencedModel, accuracy_json, control_json, no_control
+from splatpipe.pipeline.survey.control.blunders import gsd_m
+from splatpipe.pipeline.survey.control.control import ControlResult, place_by_control
+from splatpipe.pipeline.survey.control.local_survey import LocalSurvey, Targets, stations_of
+from splatpipe.pipeline.survey.crs.crs import parse_vertical
+from splatpipe.pipeline.survey.crs.frames import Frame, Undetermined, save_frame
+from splatpipe.pipeline.survey.crs.world import in_crs, report_map_crs
+from splatpipe.pipeline.survey.files.scale_bars import ModelScale, scale_by
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE, LensKnowledge
-from splatpipe.pipeline.survey.scale_bars import ModelScale, scale_by
-from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
-from splatpipe.pipeline.survey.target_finds import load_finds, load_wanted
-from splatpipe.pipeline.survey.target_marks import TargetMarks
-from splatpipe.pipeline.survey.target_survey import (
+from splatpipe.pipeline.survey.placing.assumed_heights import with_assumed_heights
+from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.placing.gps import georeference, read_positions, report_fit, report_frame
+from splatpipe.pipeline.survey.placing.level import Positions, arbitrary_frame
+from splatpipe.pipeline.survey.placing.model import SparseModel, copy_model, model_of, read_model, report_unmatched
+from splatpipe.pipeline.survey.plausibility.last_look import Placed, report_contradictions
+from splatpipe.pipeline.survey.points.surveyed_points import Survey, load_survey
+from splatpipe.pipeline.survey.targets.target_finds import load_finds, load_wanted
+from splatpipe.pipeline.survey.targets.target_marks import TargetMarks
+from splatpipe.pipeline.survey.targets.target_survey import (
     FoundBars,
     TargetSurvey,
     compare,
@@ -53,7 +54,6 @@ from splatpipe.pipeline.survey.target_survey import (
     scale_summary,
     scaled,
 )
-from splatpipe.pipeline.survey.world import in_crs, report_map_crs
 
 DATUM_STEP_M = 1.0  # least offset that suggests another vertical datum; less may be the receiver's error
 
@@ -118,7 +118,7 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
         frame = arbitrary_frame(model, positions, frame.why)
     frame = _declared(frame, config, controlled, report)
     placed_points = (controlled.placed.model if controlled is not None else model).points
-    bounded = lay_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
+    bounded = write_boundary(inputs["source.boundary"], frame, placed_points, out / "boundary.json", report)
     control, accuracy = _accuracy(config, controlled, (model, positions, frame), photos, report)
     adjustment = {} if found is None else adjustment_json(found, accuracy["gsd_m"])
     if controlled is not None and controlled.block is not None:

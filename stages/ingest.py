@@ -11,22 +11,10 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
-from splatpipe.pipeline.engine.source import find_model, is_film
+from splatpipe.pipeline.engine.runs.source import find_model, is_film
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.bands import ALL, AUTO
-from splatpipe.pipeline.photos.camera_groups import (
-    CameraGroup,
-    cameras_json,
-    describe_cameras,
-    group_cameras,
-    refused_calibrations,
-    report_cameras,
-)
-from splatpipe.pipeline.photos.capture_issues import CaptureIssue
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.names import NAMES_SHOWN, list_names, printable
-from splatpipe.pipeline.photos.options import IngestConfig
-from splatpipe.pipeline.photos.photo_list import (
+from splatpipe.pipeline.photos.files.names import NAMES_SHOWN, list_names, printable
+from splatpipe.pipeline.photos.files.photo_list import (
     MASK_DIR,
     SKY_DIR,
     Photo,
@@ -34,7 +22,19 @@ from splatpipe.pipeline.photos.photo_list import (
     photo_root,
     save_photo_list,
 )
-from splatpipe.pipeline.photos.preparation import (
+from splatpipe.pipeline.photos.files.scan import by_reason, with_reason
+from splatpipe.pipeline.photos.intake.bands import ALL, AUTO
+from splatpipe.pipeline.photos.intake.camera_groups import (
+    CameraGroup,
+    cameras_json,
+    describe_cameras,
+    group_cameras,
+    refused_calibrations,
+    report_cameras,
+)
+from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.photos.intake.preparation import (
     MASKS,
     SKIES,
     Preparation,
@@ -45,14 +45,14 @@ from splatpipe.pipeline.photos.preparation import (
     prepare_masks,
     select_photos,
 )
-from splatpipe.pipeline.photos.scan import by_reason, with_reason
+from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.video.frames import FRAMES_DIR, extract_frames
-from splatpipe.pipeline.sfm.known_lenses import lenses_json, state_lenses
-from splatpipe.pipeline.sfm.lens_model import StatedLens
-from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
-from splatpipe.pipeline.survey.position_issues import find_position_issues
-from splatpipe.pipeline.survey.position_sources import stated_places
-from splatpipe.pipeline.survey.stated_positions import FilePlaces, read_places
+from splatpipe.pipeline.sfm.lenses.known_lenses import lenses_json, state_lenses
+from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens
+from splatpipe.pipeline.survey.plausibility.position_issues import find_position_issues
+from splatpipe.pipeline.survey.positions.photo_positions import PositionList, positions_json, read_positions
+from splatpipe.pipeline.survey.positions.position_sources import stated_places
+from splatpipe.pipeline.survey.positions.stated_positions import FilePlaces, read_places
 
 MIN_PHOTOS = 2
 

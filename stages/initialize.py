@@ -14,12 +14,12 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area
 from splatpipe.pipeline.mvs.dense import DensePoints, PointBudget, covering_views, dense_points
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import Points, View, load_points, load_split, load_views
-from splatpipe.pipeline.splat.backdrop import coarse_start
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import write_splat
-from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.splat.sparse_count import sparse_comment
+from splatpipe.pipeline.photos.pixels.dataset import Points, View, load_points, load_split, load_views
+from splatpipe.pipeline.splat.containers.ply import write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.splat.model.sparse_count import sparse_comment
+from splatpipe.pipeline.splat.sky.backdrop import coarse_start
 
 Doubles = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]

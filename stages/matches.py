@@ -15,11 +15,11 @@ from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.machine import threads_within
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.sfm.layout import half_sizes, make_layout, make_views
-from splatpipe.pipeline.sfm.matching import PROCESS_BYTES, look_alike, match_pairs, write_verified
+from splatpipe.pipeline.photos.files.photo_list import load_photo_list
+from splatpipe.pipeline.sfm.matching.matching import PROCESS_BYTES, look_alike, match_pairs, write_verified
 from splatpipe.pipeline.sfm.options import MatchesConfig
-from splatpipe.pipeline.sfm.pairs import choose_pairing, components, select_pairs
+from splatpipe.pipeline.sfm.pairing.layout import half_sizes, make_layout, make_views
+from splatpipe.pipeline.sfm.pairing.pairs import choose_pairing, components, select_pairs
 
 
 def run(config: MatchesConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

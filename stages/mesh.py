@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.surface.depths.run_sources import open_surveyed
 from splatpipe.pipeline.surface.options import MeshConfig
-from splatpipe.pipeline.surface.run_sources import open_surveyed
-from splatpipe.pipeline.surface.surface_mesh import MeshTask, make_mesh
+from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, make_mesh
 
 VOXEL_GSD = 2.0  # voxel size over the photos' GSD
 

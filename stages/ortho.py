@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
+from splatpipe.pipeline.surface.depths.run_sources import open_surveyed
 from splatpipe.pipeline.surface.options import OrthoConfig
-from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
-from splatpipe.pipeline.surface.run_sources import open_surveyed
+from splatpipe.pipeline.surface.ortho.ortho import OrthoTask, make_ortho
 
 
 def run(config: OrthoConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

@@ -16,21 +16,21 @@ import pycolmap
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.names import list_names
-from splatpipe.pipeline.photos.photo_list import load_photo_list
+from splatpipe.pipeline.photos.files.names import list_names
+from splatpipe.pipeline.photos.files.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, report_cameras
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.doubles import doubles_reasons, find_doubles
-from splatpipe.pipeline.sfm.external_evidence import outside_reasons
-from splatpipe.pipeline.sfm.judging import FEW_PAIRS, judge
-from splatpipe.pipeline.sfm.ladder import run_ladder
-from splatpipe.pipeline.sfm.ladder_pairs import tried_pairs
-from splatpipe.pipeline.sfm.lens_model import stated_lenses
-from splatpipe.pipeline.sfm.lenses import calibrate, report_lenses
+from splatpipe.pipeline.sfm.judging.doubles import doubles_reasons, find_doubles
+from splatpipe.pipeline.sfm.judging.external_evidence import outside_reasons
+from splatpipe.pipeline.sfm.judging.judging import FEW_PAIRS, judge
+from splatpipe.pipeline.sfm.lenses.lens_model import stated_lenses
+from splatpipe.pipeline.sfm.lenses.lenses import calibrate, report_lenses
+from splatpipe.pipeline.sfm.model.sparse_model import write_model
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
-from splatpipe.pipeline.sfm.sparse_model import write_model
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.recovery.ladder import run_ladder
+from splatpipe.pipeline.sfm.recovery.ladder_pairs import tried_pairs
 
 Model: TypeAlias = pycolmap.Reconstruction
 

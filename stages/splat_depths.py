@@ -13,15 +13,15 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_maps import save_depth_maps
 from splatpipe.pipeline.mvs.rendered_depths import rendered_depth_maps
-from splatpipe.pipeline.photos.dataset import load_views
-from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.photos.pixels.dataset import load_views
+from splatpipe.pipeline.photos.pixels.images import reduced_camera
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import as_trained, render_depth, render_mean_depth
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train.blocks.site_plan import is_in_blocks
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.cells.site_plan import is_in_blocks
 from splatpipe.pipeline.train.flattening import FLATTENED, TrainedParts, flatten
 from splatpipe.pipeline.train.options import SplatDepthsConfig
 

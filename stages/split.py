@@ -6,8 +6,8 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.dataset import load_views, split_views
 from splatpipe.pipeline.photos.options import SplitConfig
+from splatpipe.pipeline.photos.pixels.dataset import load_views, split_views
 
 
 def run(config: SplitConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

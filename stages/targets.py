@@ -7,15 +7,15 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.coded_targets import find_coded_targets
-from splatpipe.pipeline.photos.photo_list import Photo, decode, load_photo_list
-from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
-from splatpipe.pipeline.sfm.keypoints import single_threaded_opencv
-from splatpipe.pipeline.survey.expected_places import Window, expected_windows
-from splatpipe.pipeline.survey.gps import read_positions
-from splatpipe.pipeline.survey.model import read_model
+from splatpipe.pipeline.photos.files.photo_list import Photo, decode, load_photo_list
+from splatpipe.pipeline.photos.targets.coded_targets import find_coded_targets
+from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
+from splatpipe.pipeline.sfm.matching.keypoints import single_threaded_opencv
 from splatpipe.pipeline.survey.options import TargetsConfig
-from splatpipe.pipeline.survey.target_finds import QUADRANT, TargetFind, load_wanted, save_finds
+from splatpipe.pipeline.survey.placing.gps import read_positions
+from splatpipe.pipeline.survey.placing.model import read_model
+from splatpipe.pipeline.survey.targets.expected_places import Window, expected_windows
+from splatpipe.pipeline.survey.targets.target_finds import QUADRANT, TargetFind, load_wanted, save_finds
 
 COVERED = 0.8  # radius around a coded target, over its size, in which quadrants are ignored
 

@@ -8,7 +8,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shard, Summary
 from splatpipe.pipeline.geometry.plan_area import read_model_area
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.blocks.assembly import assemble
-from splatpipe.pipeline.train.blocks.site_plan import limit_of_whole, load_site_plan
+from splatpipe.pipeline.train.blocks.cells.site_plan import limit_of_whole, load_site_plan
 from splatpipe.pipeline.train.blocks.training import BlockTask, SiteParts, train_block
 from splatpipe.pipeline.train.options import TrainConfig
 

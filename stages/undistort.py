@@ -8,19 +8,19 @@ import cv2
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
-from splatpipe.pipeline.photos.dataset import MODEL
+from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
+from splatpipe.pipeline.photos.files.photo_list import load_photo_list
 from splatpipe.pipeline.photos.options import UndistortConfig
-from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.photos.resampling import Places
-from splatpipe.pipeline.photos.undistortion import (
+from splatpipe.pipeline.photos.pixels.dataset import MODEL
+from splatpipe.pipeline.photos.pixels.resampling import Places
+from splatpipe.pipeline.photos.pixels.undistortion import (
     RegisteredPhoto,
     pinhole_model,
     plan_views,
     with_places,
     write_view,
 )
-from splatpipe.pipeline.sfm.sparse_model import write_model
+from splatpipe.pipeline.sfm.model.sparse_model import write_model
 
 
 def run(config: UndistortConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
-from splatpipe.pipeline.engine.needs import Need
+from splatpipe.pipeline.engine.runs.needs import Need
 from splatpipe.pipeline.film.options import MAX_FILM_MEGAPIXELS
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
-from splatpipe.pipeline.train.blocks.division import Division, SceneSize, divided, memory_limit
+from splatpipe.pipeline.train.blocks.cells.division import Division, SceneSize, divided, memory_limit
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths, finer_lengths
-from splatpipe.pipeline.train.lengths import (
+from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
+from splatpipe.pipeline.train.plan.lengths import (
     WINDOW_PIXELS,
     Length,
     PhotoSizes,
@@ -21,7 +22,7 @@ from splatpipe.pipeline.train.lengths import (
     lengths_of,
     stretches,
 )
-from splatpipe.pipeline.train.limits import (
+from splatpipe.pipeline.train.plan.limits import (
     FIXED_BYTES,
     LIBRARIES_BYTES,
     PIXEL_BYTES,
@@ -29,7 +30,6 @@ from splatpipe.pipeline.train.limits import (
     window_within,
     worthwhile_iterations,
 )
-from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
 from splatpipe.pipeline.web.options import parse_formats
 from splatpipe.stages.block_work import LAYOUT_S, START_S, BlockLoad, BlockWork
 from splatpipe.stages.costs import FORMAT_COSTS, IN_LEVELS, LEVELS_CPU, WITH_PHOTOS, Costs

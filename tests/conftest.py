@@ -22,7 +22,7 @@ from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
 from timeouts import TIMEOUT_S
 
-from splatpipe.pipeline.engine.heap import importing
+from splatpipe.pipeline.engine.heap import imports_outside_gc
 
 DEMO = (
     "features.extractor=opencv-sift",
@@ -67,7 +67,7 @@ def pytest_configure() -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Import the tests' modules and what they test without garbage collection; later collections leave them out."""
-    with importing():
+    with imports_outside_gc():
         result = yield
         gc.freeze()
     return result
@@ -128,7 +128,15 @@ def demo_run(demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) 
     from splatpipe.demo import capture_path
 
     out = shared_folder(tmp_path_factory) / "demo_run"
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out), *demo_options]
+    command = [
+        sys.executable,
+        "-m",
+        "splatpipe.pipeline.app.cli.main",
+        "run",
+        str(capture_path()),
+        str(out),
+        *demo_options,
+    ]
     with (out.parent / "demo_run.lock").open("a+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the first worker makes it, the others wait
         if not os.fstat(lock.fileno()).st_size:

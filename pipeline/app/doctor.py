@@ -8,9 +8,9 @@ import platform
 import shutil
 from pathlib import Path
 
-from splatpipe.pipeline.engine.lock import is_locked, running_shards
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes, mount_of
-from splatpipe.pipeline.engine.runner import versions
+from splatpipe.pipeline.engine.runs.lock import is_locked, running_shards
+from splatpipe.pipeline.engine.runs.runner import versions
 from splatpipe.pipeline.engine.stage import JSON
 
 SHARED_MEMORY = Path("/dev/shm")
@@ -44,9 +44,9 @@ def examine(place: Path) -> dict[str, JSON]:
 
 def _cuda() -> str:
     """Whether training uses CUDA here; if not, why not and what to do about it."""
-    from splatpipe.pipeline.raster.cuda_library import cannot_compute, load, why_not
+    from splatpipe.pipeline.raster.cuda.cuda_library import cannot_compute, load, unavailable_reason
 
-    if missing := why_not() or cannot_compute():
+    if missing := unavailable_reason() or cannot_compute():
         return f"not used. {missing.reason} {missing.hint}"
     _, device = load().device(0)
     return f"used: {device.described()}"

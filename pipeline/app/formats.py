@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.web.options import FORMATS, parse_formats
 from splatpipe.stages.line import GEOREF, LINE
 from splatpipe.stages.options import LineConfig
@@ -34,7 +34,7 @@ def check_possible(out: Path, formats: str) -> None:
     Raises:
         SplatpipeError: if the run has no scale or is not georeferenced, and a format needs it.
     """
-    from splatpipe.pipeline.survey.frames import load_frame
+    from splatpipe.pipeline.survey.crs.frames import load_frame
 
     part = open_run_folder(out, LINE).lineage(GEOREF).get("georef.frame")
     if part is None:
@@ -89,8 +89,8 @@ def convert_file(source: Path, target: Path, kind: SplatFormat) -> dict[str, Any
 
 def show_precision(facts: Mapping[str, Any]) -> None:
     """Print the origin taken off a splat's coordinates, the steps of its positions, and warnings, from a summary."""
-    from splatpipe.pipeline.app.console import print_line
-    from splatpipe.pipeline.splat.position_cost import two_digits
+    from splatpipe.pipeline.app.commands.console import print_line
+    from splatpipe.pipeline.splat.model.position_cost import two_digits
 
     unit = " m" if facts["metres"] else ""
     if facts["origin"] is not None:

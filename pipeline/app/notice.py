@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 
 State = Literal["done", "failed", "stopped"]
 TIME_LIMIT_S = 30.0  # a message to a server takes a second, and the next capture or the shell waits for it
-LONGEST = 8192  # characters of a command: far below what Linux takes as one argument, 128 KiB
+MAX_COMMAND_CHARS = 8192  # characters of a command: far below what Linux takes as one argument, 128 KiB
 SHELL = "/bin/sh"
 STDERR = 2  # for the command's output: stdout is reserved for the JSON object
 
@@ -28,7 +28,7 @@ def check_command(command: str) -> None:
     Raises:
         UsageError: if it is empty, too long, or contains a character that no command can.
     """
-    if not command.strip() or len(command) > LONGEST or "\0" in command:
+    if not command.strip() or len(command) > MAX_COMMAND_CHARS or "\0" in command:
         raise UsageError(
             "--notify has no command.",
             hint="Give a shell command, e.g. --notify 'mail -s \"$SPLATPIPE_CAPTURE: $SPLATPIPE_STATE\" me'.",

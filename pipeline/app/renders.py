@@ -12,11 +12,11 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 
-from splatpipe.pipeline.app.console import RunConsole
+from splatpipe.pipeline.app.commands.console import RunConsole
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.output_file import own_folder, write_file
-from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import FilmCamera, Route, cameras_along
 from splatpipe.pipeline.film.filming import (
@@ -39,7 +39,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.view_measures import flat_stems
-from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.stages.line import CLEAN, EXPORT, FLYTHROUGH, LINE, TRAIN
 
 ORBIT_STILLS = 12

@@ -14,16 +14,16 @@ from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, Items, write_
 from splatpipe.pipeline.engine.durable import sync_folder
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.output_file import own_folder
-from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.engine.store import Part
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.store import Part
 from splatpipe.stages.line import DEPTHS, DSM, GEOREF, LINE, UNDISTORT
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.products import NO_PRODUCTS
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.surface.map_crs import MapCrs
-    from splatpipe.pipeline.surface.surface_file import SurfaceFile
-    from splatpipe.pipeline.survey.frames import Frame
+    from splatpipe.pipeline.surface.heights.surface_file import SurfaceFile
+    from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
+    from splatpipe.pipeline.survey.crs.frames import Frame
 
 MAX_SECTIONS = 100
 UNFINISHED = ".sections.making"
@@ -124,7 +124,7 @@ def check_possible(out: Path, *tables: dict[str, Any]) -> None:
         SplatpipeError: if the run has no scale.
         MachineError: if a mesh is requested and open3d is not installed.
     """
-    from splatpipe.pipeline.survey.frames import load_frame
+    from splatpipe.pipeline.survey.crs.frames import load_frame
 
     changed, run = {stage for table in tables for stage in table}, open_run_folder(out, LINE)
     georeferenced_again = not {*NO_PRODUCTS, "splat_depths"}.issuperset(changed)
@@ -136,7 +136,7 @@ def check_possible(out: Path, *tables: dict[str, Any]) -> None:
         )
 
     if "mesh" in changed and run.config(LineConfig, *tables)[1].mesh.enabled:
-        from splatpipe.pipeline.surface.tsdf import open3d
+        from splatpipe.pipeline.surface.shapes.tsdf import open3d
 
         open3d()
 
@@ -178,7 +178,7 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
         SplatpipeError: if there is no surface model, or a line or a polygon misses it.
         OSError: if the disk is full or not writable.
     """
-    from splatpipe.pipeline.surface.volume_file import write_volumes
+    from splatpipe.pipeline.surface.measuring.volume_file import write_volumes
 
     surface = _open_surface(out)
     measured: dict[str, Any] = {}
@@ -204,9 +204,9 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
 
 
 def _open_surface(out: Path) -> _SurfaceModel:
-    from splatpipe.pipeline.surface.map_crs import open_map
-    from splatpipe.pipeline.surface.surface_file import open_surface
-    from splatpipe.pipeline.survey.frames import load_frame
+    from splatpipe.pipeline.surface.heights.surface_file import open_surface
+    from splatpipe.pipeline.surface.rasters.map_crs import open_map
+    from splatpipe.pipeline.survey.crs.frames import load_frame
 
     parts = open_run_folder(out, LINE).lineage(DSM, DEPTHS, UNDISTORT, GEOREF)
     files = parts["dsm.files"].path if "dsm.files" in parts else None
@@ -219,11 +219,11 @@ def _open_surface(out: Path) -> _SurfaceModel:
 def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threads: int) -> Items:
     """Cut all sections, and write their files into a folder."""
     from splatpipe.pipeline.mvs.depth_maps import list_depth_maps
-    from splatpipe.pipeline.photos.dataset import load_views
-    from splatpipe.pipeline.surface.run_sources import metric_depths
-    from splatpipe.pipeline.surface.section_files import write_section
-    from splatpipe.pipeline.surface.sections import cut_section
-    from splatpipe.pipeline.surface.traces import section_trace
+    from splatpipe.pipeline.photos.pixels.dataset import load_views
+    from splatpipe.pipeline.surface.depths.run_sources import metric_depths
+    from splatpipe.pipeline.surface.measuring.section_files import write_section
+    from splatpipe.pipeline.surface.measuring.sections import cut_section
+    from splatpipe.pipeline.surface.measuring.traces import section_trace
 
     if not lines:
         return []
@@ -251,11 +251,11 @@ def _publish(aside: Path, folder: Path) -> None:
 
 def _volumes(surface: _SurfaceModel, wanted: MeasurementRequest) -> Items:
     from splatpipe.pipeline.geometry.plan_area import PlanArea
-    from splatpipe.pipeline.surface.traces import polygon_trace
-    from splatpipe.pipeline.surface.volume_file import volume_facts
-    from splatpipe.pipeline.surface.volumes import measure_volume
+    from splatpipe.pipeline.surface.measuring.traces import polygon_trace
+    from splatpipe.pipeline.surface.measuring.volume_file import volume_facts
+    from splatpipe.pipeline.surface.measuring.volumes import measure_volume
     from splatpipe.pipeline.survey.boundary import placed_area
-    from splatpipe.pipeline.survey.boundary_file import read_boundary
+    from splatpipe.pipeline.survey.files.boundary_file import read_boundary
 
     if wanted.polygons is None:
         return []

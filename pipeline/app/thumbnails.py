@@ -14,7 +14,7 @@ from markupsafe import Markup
 from PIL import Image, ImageOps
 
 from splatpipe.pipeline.engine.small_file import open_regular
-from splatpipe.pipeline.photos.picture_file import open_picture, turn_to_decode, why_hollow
+from splatpipe.pipeline.photos.files.picture_file import open_picture, turn_to_decode, why_hollow
 
 MAX_BYTES = 512 << 20  # of a file
 MAX_PIXELS = 300_000_000  # of a photo that cannot be reduced while decoding: about a gigabyte of memory

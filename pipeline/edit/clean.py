@@ -6,20 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from splatpipe.pipeline.edit.cleaning import clean_scene
+from splatpipe.pipeline.edit.floaters.cleaning import clean_scene
+from splatpipe.pipeline.edit.floaters.visibility import TrainingPhotos
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
-from splatpipe.pipeline.edit.visibility import TrainingPhotos
 from splatpipe.pipeline.edit.workpiece import Workpiece
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.photos.pixels.images import reduced_camera
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.scene import turn_of
+from splatpipe.pipeline.splat.model.scene import turn_of
 
 
 @dataclass(frozen=True)
 class Clean:
-    """Removes what is not part of the scene; see ``edit.cleaning``.
+    """Removes what is not part of the scene; see ``edit.floaters.cleaning``.
 
     Attributes:
         cameras: Cameras of the training photos, in the splat's frame as read, z up; empty if unknown.

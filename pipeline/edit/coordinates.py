@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.splat.scene import NO_OFFSET, SceneFacts, turn_of
-from splatpipe.pipeline.survey.handover import frame_of
-from splatpipe.pipeline.survey.world import World, open_world
+from splatpipe.pipeline.splat.model.scene import NO_OFFSET, SceneFacts, turn_of
+from splatpipe.pipeline.survey.crs.world import World, open_world
 
 LARGEST = 1e9  # of a coordinate: no place on the earth has a larger one
 OWN, LOCAL = "own", "local"

@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.digests import file_digest
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.survey.boundary import WITHOUT, placed, placed_area
-from splatpipe.pipeline.survey.boundary_file import BoundaryFile, read_boundary
+from splatpipe.pipeline.survey.files.boundary_file import BoundaryFile, read_boundary
 
 DIGEST_CHARACTERS = 16  # of a polygon file's digest in a splat's record: enough to identify it
 SHOWN_DIGITS = 3  # of coordinates in messages

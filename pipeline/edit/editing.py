@@ -21,11 +21,11 @@ from splatpipe.pipeline.engine.durable import beside
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.photos.images import Pixels
-from splatpipe.pipeline.splat.formats.bounded import keep_unusable, usable
+from splatpipe.pipeline.photos.pixels.images import Pixels
+from splatpipe.pipeline.splat.containers.bounded import keep_unusable, usable
 from splatpipe.pipeline.splat.formats.files import write_scene
-from splatpipe.pipeline.splat.position_cost import PositionCost
-from splatpipe.pipeline.splat.scene import Scene, SplatOrigin
+from splatpipe.pipeline.splat.model.position_cost import PositionCost
+from splatpipe.pipeline.splat.model.scene import Scene, SplatOrigin
 
 RECORD, PICTURE = ".edits.json", ".edit.png"
 

@@ -14,10 +14,10 @@ from splatpipe.pipeline.edit.sources import open_source
 from splatpipe.pipeline.edit.workpiece import Workpiece, between
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import NO_OFFSET, Scene, SceneFacts, SplatOrigin, turn_of
-from splatpipe.pipeline.survey.crs import UNKNOWN, describe_vertical, parse_vertical, same_datum
-from splatpipe.pipeline.survey.frames import Origin
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import NO_OFFSET, Scene, SceneFacts, SplatOrigin, turn_of
+from splatpipe.pipeline.survey.crs.crs import UNKNOWN, describe_vertical, parse_vertical, same_datum
+from splatpipe.pipeline.survey.crs.frames import Origin
 
 MAX_DISTANCE_M = 30_000.0  # between two splats in one file: float32 has steps of 2 mm there
 

@@ -19,7 +19,7 @@ from splatpipe.pipeline.edit.workpiece import FAR_M, Workpiece, between, facts_w
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_length
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.survey.frames import Origin
+from splatpipe.pipeline.survey.crs.frames import Origin
 
 MAX_DEGREES = 36_000.0  # a hundred turns
 FACTORS = (1e-6, 1e6)  # from micrometres to metres and back

@@ -15,9 +15,9 @@ from jaxtyping import Float64
 from splatpipe.pipeline.edit.workpiece import MIDDLE
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.photos.pixels.images import Pixels
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.scene import Scene, turn_of
+from splatpipe.pipeline.splat.model.scene import Scene, turn_of
 
 WIDTH, HEIGHT = 960, 720  # pixels of one image
 FIELD_DEG = 45.0  # vertical field of view of an oblique view

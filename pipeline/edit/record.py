@@ -11,7 +11,7 @@ from typing import Any
 from splatpipe.pipeline.edit.sources import SplatSource
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.json_file import json_text
-from splatpipe.pipeline.splat.scene import MAX_EDITS, SceneFacts
+from splatpipe.pipeline.splat.model.scene import MAX_EDITS, SceneFacts
 
 FORMAT = 1
 EARLIER = "earlier edits"

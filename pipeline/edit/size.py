@@ -15,9 +15,9 @@ from splatpipe.pipeline.edit.workpiece import Workpiece
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.splat.formats import SplatFormat
 from splatpipe.pipeline.splat.formats.files import write_scene
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.reduction import Reduction, reduce_further, reduce_to
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.levels.reduction import Reduction, reduce_further, reduce_to
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene
 
 MAX_GAUSSIANS = 10**10  # Gaussians: more than any machine holds
 UNITS = {"KB": 10**3, "MB": 10**6, "GB": 10**9}

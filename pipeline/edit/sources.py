@@ -13,9 +13,9 @@ from splatpipe.pipeline.engine.digests import part_digest, tree_entries
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values
+from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.scene import Scene
 
 SPLAT, CAMERAS, METRICS, STAGES = "splat.ply", "cameras.json", "metrics.json", "stages"
 LARGEST_CAMERAS = 64 << 20  # bytes: enough for about 100,000 photos

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import NO_OFFSET, Scene, SceneFacts, turn_of
-from splatpipe.pipeline.survey.frames import Frame, Origin
-from splatpipe.pipeline.survey.handover import frame_of
-from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import NO_OFFSET, Scene, SceneFacts, turn_of
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
+from splatpipe.pipeline.survey.crs.world import open_world
 
 ROWS = 1 << 18  # Gaussians at a time: their float64 coordinates, in a CRS and intermediate, take 50 MB
 FAR_M = 10_000.0  # at this distance float32 coordinates have steps of a millimetre: the origin is moved nearer

@@ -15,7 +15,7 @@ def return_free_heap() -> None:
 
 
 @contextlib.contextmanager
-def importing() -> Iterator[None]:
+def imports_outside_gc() -> Iterator[None]:
     """Pause garbage collection while large libraries are imported: what they create stays, uncollected."""
     gc.disable()
     try:

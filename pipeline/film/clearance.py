@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 OPAQUE = 0.5  # minimum opacity of Gaussians that a camera must not fly through
 MAX_POINTS = 400_000  # used for distances: more do not help at the scale of metres

@@ -19,15 +19,15 @@ from splatpipe.pipeline.film.options import MAX_FILM_MEGAPIXELS
 from splatpipe.pipeline.film.photo_route import PhotoTrack
 from splatpipe.pipeline.film.video import VideoWriter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_views
-from splatpipe.pipeline.photos.images import Pixels, reduced_camera
-from splatpipe.pipeline.photos.small_views import small_view
+from splatpipe.pipeline.photos.pixels.dataset import View, load_points_and_tracks, load_views
+from splatpipe.pipeline.photos.pixels.images import Pixels, reduced_camera
+from splatpipe.pipeline.photos.pixels.small_views import small_view
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.render.rendering import Model, as_trained, placed, render_depth, render_normals, render_pixels
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
+from splatpipe.pipeline.splat.sky.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
 
 What = Literal["colour", "depth", "normals"]
 ASPECT = 16.0 / 9.0

@@ -30,7 +30,7 @@ from splatpipe.pipeline.film.camera_path import (
     spline,
     towards,
 )
-from splatpipe.pipeline.survey.survey_text import (
+from splatpipe.pipeline.survey.files.survey_text import (
     LARGEST,
     UNKNOWN,
     LineError,

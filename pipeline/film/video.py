@@ -19,7 +19,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.output_file import open_own, token, write_file
-from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.photos.pixels.images import Pixels
 
 CODECS = {".webm": "VP80", ".mp4": "vp09"}
 HEADER_BYTES = 4096  # start of a WebM that contains its track number

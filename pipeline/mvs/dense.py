@@ -17,8 +17,8 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch, SearchPlan
 from splatpipe.pipeline.mvs.neighbours import load_tracks
 from splatpipe.pipeline.mvs.options import DENSE_MEGAPIXELS
-from splatpipe.pipeline.photos.covering import covering_photos
-from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.pixels.covering import covering_photos
+from splatpipe.pipeline.photos.pixels.dataset import View
 
 WIDER = 1.25  # search this many times nearer than the sparse points: thin places have no points yet
 NEIGHBOURS = 8  # photos that a photo is matched with, and whose depths may confirm its own

@@ -23,8 +23,8 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_search import AGREEING, ConfirmedDepths, DepthSearch, SearchPlan
 from splatpipe.pipeline.mvs.edges import pixels_behind
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.splat.archives import open_archive
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.splat.containers.archives import open_archive
 
 LIST = "maps.json"
 COMPARED = 16  # neighbours that a photo is matched with: few photos, and not the nearest, see behind hedges

@@ -22,12 +22,12 @@ from splatpipe.pipeline.mvs.neighbours import SparseVisibility, inverse_depths, 
 from splatpipe.pipeline.mvs.patch_match import DepthEstimate, find_depths
 from splatpipe.pipeline.mvs.picture import Picture
 from splatpipe.pipeline.native import _native
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.photos.images import reduced_camera
-from splatpipe.pipeline.photos.small_views import small_view
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.photos.pixels.images import reduced_camera
+from splatpipe.pipeline.photos.pixels.small_views import small_view
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.archives import open_archive
+from splatpipe.pipeline.splat.containers.archives import open_archive
 
 AGREEING = 2  # other photos that have to agree, at least
 TOLERANCE = 0.01  # share of the depth within which two photos agree;

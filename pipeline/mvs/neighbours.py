@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks
 
 BEST_ANGLE_DEG = 10.0  # between two rays: smaller angles are imprecise, and at larger ones appearance differs too much
 NARROW_DEG = 4.0  # spread of the weight below the best angle

@@ -17,7 +17,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
 from splatpipe.pipeline.raster.gradients import GradientBuffers, add_gradients, can_wait
 from splatpipe.pipeline.raster.isa import _native
-from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 _LOGITS = PARAMETERS.index("opacity_logits")
 

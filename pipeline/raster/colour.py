@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.isa import _native
 
 

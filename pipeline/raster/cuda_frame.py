@@ -15,18 +15,18 @@ from torch.autograd.function import once_differentiable
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera, Window
-from splatpipe.pipeline.raster.cuda import CudaKernels
-from splatpipe.pipeline.raster.cuda_api import (
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels
+from splatpipe.pipeline.raster.cuda.cuda_api import (
     SplatFrame,
     SplatPictureGradients,
     SplatPictures,
     SplatShot,
     SplatStep,
 )
-from splatpipe.pipeline.raster.cuda_forecast import FrameSize
+from splatpipe.pipeline.raster.cuda.cuda_forecast import FrameSize
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
 from splatpipe.pipeline.raster.gradients import GradientBuffers, add_gradients, can_wait
-from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 TILE_PX = 16  # a tile's side
 

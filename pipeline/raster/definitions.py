@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 ALPHA_MAX = 0.99
 """Cap on a pixel's alpha, so that division by 1 - alpha is safe."""

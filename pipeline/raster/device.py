@@ -13,9 +13,10 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.raster import cuda_driver, cuda_library, rasterizer
-from splatpipe.pipeline.raster.cuda import kernels_of
-from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
+from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.cuda import cuda_driver, cuda_library
+from splatpipe.pipeline.raster.cuda.cuda import kernels_of
+from splatpipe.pipeline.raster.cuda.cuda_forecast import most_pairs_of
 
 DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")
@@ -82,7 +83,7 @@ class Device:
                 torch.cuda.set_per_process_memory_fraction(1.0, self.tensors)
 
     @contextmanager
-    def one_order(self) -> Iterator[None]:
+    def deterministic(self) -> Iterator[None]:
         """Make torch reject nondeterministic operations; on the CPU none that are used are nondeterministic."""
         if self.tensors.type != "cuda":
             yield
@@ -135,7 +136,7 @@ def choose_device(wanted: str, unfit: str = "", note: Note | None = None) -> Dev
 def _why_not(unfit: str) -> cuda_library.NoCuda | None:
     if unfit:
         return cuda_library.NoCuda(unfit, "")
-    return cuda_library.why_not() or cuda_library.cannot_compute()
+    return cuda_library.unavailable_reason() or cuda_library.cannot_compute()
 
 
 def free_bytes(tensors: torch.device) -> int | None:

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from torch import Tensor
 
-from splatpipe.pipeline.splat.gaussians import PARAMETERS
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 
-if TYPE_CHECKING:
-    from splatpipe.pipeline.raster.autograd import UnfinishedRender
-    from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward
+
+class Unfinished(Protocol):
+    """A backward pass that stopped at the screen; each backend has its own step that finishes it."""
+
+    def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
+        """Whether the pass can be fused with a step."""
+
+    def finish(self, parameters: Mapping[str, Tensor]) -> None:
+        """Finish the pass: add its gradients to those of the parameters, as any backward pass does."""
 
 
 class GradientBuffers:
@@ -26,9 +32,9 @@ class GradientBuffers:
     """
 
     def __init__(self) -> None:
-        self.unfinished: UnfinishedBackward | UnfinishedRender | None = None
+        self.unfinished: Unfinished | None = None
 
-    def take_unfinished(self) -> UnfinishedBackward | UnfinishedRender | None:
+    def take_unfinished(self) -> Unfinished | None:
         """Return the unfinished pass and forget it."""
         unfinished, self.unfinished = self.unfinished, None
         return unfinished

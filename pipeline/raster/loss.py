@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.isa import _native
-from splatpipe.pipeline.splat.metrics import SSIM_WINDOW
+from splatpipe.pipeline.splat.quality.metrics import SSIM_WINDOW
 
 Rectangle = tuple[int, int, int, int]
 """Left, top, right, bottom, pixels: columns left to right - 1 of rows top to bottom - 1."""

@@ -11,14 +11,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatpipe.pipeline.raster.autograd import UnfinishedRender
-from splatpipe.pipeline.raster.cuda import AdamRows, kernels_of
-from splatpipe.pipeline.raster.cuda_api import SplatStep
+from splatpipe.pipeline.raster.cuda.cuda import AdamRows, kernels_of
+from splatpipe.pipeline.raster.cuda.cuda_api import SplatStep
 from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward
 from splatpipe.pipeline.raster.device import take_rows
 from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.raster.step_lengths import FarSteps
-from splatpipe.pipeline.splat.gaussians import PARAMETERS
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 
 _MEAN = "mean."
 _SQUARE = "square."

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.autograd import render_native
-from splatpipe.pipeline.raster.cuda import kernels_of
+from splatpipe.pipeline.raster.cuda.cuda import kernels_of
 from splatpipe.pipeline.raster.cuda_frame import render_cuda
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions, check
 from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.isa import _native, isa_name, isa_names
 from splatpipe.pipeline.raster.reference import render_reference
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 __all__ = [
     "GradientBuffers",

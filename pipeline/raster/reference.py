@@ -35,8 +35,8 @@ from splatpipe.pipeline.raster.definitions import (
     Render,
     RenderOptions,
 )
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import eval_sh
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import eval_sh
 
 _PAIRS_AT_ONCE = 1 << 22
 """Pixel-Gaussian pairs in memory at a time: about ten tensors of 32 MB each in float64."""

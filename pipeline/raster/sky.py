@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
-from splatpipe.pipeline.raster.cuda_api import SplatSky
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
+from splatpipe.pipeline.raster.cuda.cuda_api import SplatSky
 from splatpipe.pipeline.raster.isa import _native
-from splatpipe.pipeline.splat.panorama import STEP_PX, between_nodes, composite_over
+from splatpipe.pipeline.splat.sky.panorama import STEP_PX, between_nodes, composite_over
 
 
 @dataclass(frozen=True, eq=False)
 class SkyLayer:
-    """The layer behind a render, interpolated from nodes as in ``splat.panorama.between_nodes``.
+    """The layer behind a render, interpolated from nodes as in ``splat.sky.panorama.between_nodes``.
 
     Attributes:
         background: Background that the render was made with.

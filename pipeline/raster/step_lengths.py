@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import kernels_of
+from splatpipe.pipeline.raster.cuda.cuda import kernels_of
 
 NO_DISTANCE = 1e-30  # keeps the direction of a Gaussian in the camera's centre finite
 

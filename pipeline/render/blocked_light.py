@@ -1,9 +1,10 @@
 """The veil in front of points that held-out photos see: a floater metric independent of training.
 
-Training removes Gaussians in the free space of its own photos (``splat.free_space``), one by one, by the smallest depth
-of a cell's points. Here the rays of photos that were never trained on decide: nothing should stop the light between a
-held-out photo's camera and each sparse point that it observes. Whatever does is a floater, solid or a haze of many,
-even where no cell of a training photo shows free space. If no photo is held out, training photos are used.
+Training removes Gaussians in the free space of its own photos (``splat.quality.free_space``), one by one, by the
+smallest depth of a cell's points. Here the rays of photos that were never trained on decide: nothing should stop the
+light between a held-out photo's camera and each sparse point that it observes. Whatever does is a floater, solid or a
+haze of many, even where no cell of a training photo shows free space. If no photo is held out, training photos are
+used.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ import torch
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.photos.pixels.images import reduced_camera
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.free_space import MARGIN, SUPPORT_TRACK, spread_along
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality.free_space import MARGIN, SUPPORT_TRACK, spread_along
 
 LARGEST_MEGAPIXELS = 0.5  # of the renders: floaters are larger than their pixels
 SLICES = 8  # of a photo's points by depth, each with a render of everything nearer than its first: 8 renders a photo

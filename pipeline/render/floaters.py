@@ -14,14 +14,14 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks
-from splatpipe.pipeline.photos.images import reduced_camera
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks
+from splatpipe.pipeline.photos.pixels.images import reduced_camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.blocked_light import measure_blocked_light
 from splatpipe.pipeline.render.consistency import depth_differences, depth_disagreement, neighbouring_pairs
-from splatpipe.pipeline.splat.free_space import free_space, near_or_free, share_of_opacity
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.splat.quality.free_space import free_space, near_or_free, share_of_opacity
 
 LARGEST_MEGAPIXELS = 0.5  # of a depth map: floaters are larger than its pixels, and results of all sizes compare
 

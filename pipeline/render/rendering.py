@@ -14,13 +14,13 @@ from jaxtyping import Float
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import Pixels
+from splatpipe.pipeline.photos.pixels.images import Pixels
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import Device
 from splatpipe.pipeline.raster.reference import project
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import STEP_PX, Panorama, composite_over
-from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.splat.sky.panorama import STEP_PX, Panorama, composite_over
 
 Model = tuple[Gaussians, Panorama | None]
 SURFACE = 0.5  # minimum alpha of a pixel that shows a surface, as for the median depth

@@ -30,7 +30,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 KINDS = {"alpha": "gap", "hole": "gap", "bump": "doubled", "spread": "doubled", "line": "colour", "step": "colour"}
 WIDTHS = (2, 4, 8, 16)  # half widths of a strip, pixels: of a gap, or of a step made by Gaussians of several pixels

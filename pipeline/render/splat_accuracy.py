@@ -20,9 +20,9 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import read_world_area
-from splatpipe.pipeline.photos.names import NameFinder
-from splatpipe.pipeline.survey.frames import Frame, load_frame
-from splatpipe.pipeline.survey.residuals import accuracy_table
+from splatpipe.pipeline.photos.files.names import NameFinder
+from splatpipe.pipeline.survey.control.residuals import accuracy_table
+from splatpipe.pipeline.survey.crs.frames import Frame, load_frame
 
 ONE_SURFACE = 0.02  # of the depth, between neighbouring pixels: sloping ground has less, an edge far more
 ENOUGH = 3  # held-out photos of a point: with two, a single floater moves the median by half of its distance

@@ -17,8 +17,8 @@ from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.photos.images import Mask, Pixels
-from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
+from splatpipe.pipeline.splat.quality import metrics
 
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels shown as the brightest colour, in every image
 EQUAL_DB = 100.0  # stands for the infinite PSNR of identical images: JSON has no infinity

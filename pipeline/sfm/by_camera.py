@@ -11,9 +11,9 @@ import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
-from splatpipe.pipeline.sfm.focal import adjust_within
-from splatpipe.pipeline.sfm.judging import TRUSTED_SOURCES
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.judging.judging import TRUSTED_SOURCES
+from splatpipe.pipeline.sfm.lenses.focal import adjust_within
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 MAX_CAMERAS_REPORTED = 10  # on the console; the report lists them all
 FEW_PHOTOS = 3  # of a camera: with fewer, focal length and distance are not separable

@@ -11,8 +11,8 @@ import pycolmap
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.photo_list import PhotoList
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.photos.files.photo_list import PhotoList
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,16 @@ import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.coarseness import coarseness
-from splatpipe.pipeline.sfm.completion import complete
-from splatpipe.pipeline.sfm.focal import UNOBSERVED, adjust_within, focal_sigmas
-from splatpipe.pipeline.sfm.judging import Judgement, judge
-from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options, map_global, map_incremental
+from splatpipe.pipeline.sfm.judging.judging import Judgement, judge
+from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, adjust_within, focal_sigmas
+from splatpipe.pipeline.sfm.mapping.completion import complete
+from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options, map_global, map_incremental
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
+from splatpipe.pipeline.sfm.model.structure import Structure, cameras_of, make_model, poses_of
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.probing import FILL, PROBES, THIN, pairs_a_photo, probe
-from splatpipe.pipeline.sfm.refusal import refusal
-from splatpipe.pipeline.sfm.structure import Structure, cameras_of, make_model, poses_of
-from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
+from splatpipe.pipeline.sfm.recovery.probing import FILL, PROBES, THIN, pairs_a_photo, probe
+from splatpipe.pipeline.sfm.recovery.refusal import refusal
 
 Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]
@@ -80,8 +80,10 @@ class Reconstructor:
     def map(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:
         """Run one mapper and judge its largest model."""
         began = time.process_time()
-        wide = coarseness(self.verified.cameras.values())
-        chosen = replace(MappingOptions(self.config.seed, self.config.min_model_size, coarseness=wide), **options)
+        wide = pixel_tolerance_scale(self.verified.cameras.values())
+        chosen = replace(
+            MappingOptions(self.config.seed, self.config.min_model_size, pixel_tolerance_scale=wide), **options
+        )
         work = map_incremental if mapper == "incremental" else map_global
         found = work(self.database, self.capture.scratch, chosen, self.report.progress)
         self.report.progress(len(self.verified.names), len(self.verified.names), "placing photos", "photos")

@@ -13,9 +13,9 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring
-from splatpipe.pipeline.survey.boundary_file import WGS84, BoundaryFile, read_boundary
-from splatpipe.pipeline.survey.crs import parse_crs, to_geodetic
-from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.survey.crs.crs import parse_crs, to_geodetic
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.files.boundary_file import WGS84, BoundaryFile, read_boundary
 
 FORMAT = 1
 WITHOUT = "Or run without a boundary: --set georef.boundary=none."
@@ -40,7 +40,7 @@ class Boundary:
     share: float
 
 
-def lay_boundary(
+def write_boundary(
     path: Path, frame: Frame, points: Float64[np.ndarray, "n 3"], out: Path, report: Reporter
 ) -> dict[str, JSON]:
     """Write the part `georef.boundary`: the polygons in the world and the model frame; null without a boundary.

@@ -65,6 +65,6 @@ class GeorefConfig(StageConfig):
         """Reject an unknown name at once, not hours into a run; PROJ is loaded only if a name is given."""
         if text.strip().lower() == "auto":
             return "auto"
-        from splatpipe.pipeline.survey.crs_names import checked
+        from splatpipe.pipeline.survey.crs.crs_names import checked
 
         return checked(text, str(field.field_name))

@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import kernels_of
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.morton import morton_keys
+from splatpipe.pipeline.raster.cuda.cuda import kernels_of
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.morton import morton_keys
 from splatpipe.pipeline.train.random_numbers import SPLIT_POSITION, normal
 
 MIN_AFTER_PRUNE = 1  # a model is never emptied: there would be nothing left to learn from

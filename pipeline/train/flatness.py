@@ -15,9 +15,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatpipe.pipeline.train.history import History
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.schedule import Schedule, tail_of
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.schedule import Schedule, tail_of
+from splatpipe.pipeline.train.state.history import History
 
 WINDOW_SHARE = 0.25  # of the iterations done: the line is fitted to these
 FEWEST_EPOCHS = 8  # in the window, so that their scatter can be estimated

@@ -15,25 +15,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Machine, Reporter
-from splatpipe.pipeline.photos.dataset import Split, View, load_split, load_views
+from splatpipe.pipeline.photos.pixels.dataset import Split, View, load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import Rendering, load_rendering
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat, write_splat
-from splatpipe.pipeline.train.distortion_loss import DistortionLoss
-from splatpipe.pipeline.train.exposure import Exposure, read_exposures
-from splatpipe.pipeline.train.lengths import WINDOW_PIXELS, Stretch
+from splatpipe.pipeline.splat.containers.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
+from splatpipe.pipeline.train.appearance.exposure import Exposure, read_exposures
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.loop import CHECKPOINT, TrainingSetup, go_through
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.rates import Rates
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.smoothness_loss import SmoothnessLoss
-from splatpipe.pipeline.train.techniques import Techniques, make_techniques
-from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS, Stretch
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.rates import Rates
+from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrder
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.techniques.distortion_loss import DistortionLoss
+from splatpipe.pipeline.train.techniques.smoothness_loss import SmoothnessLoss
+from splatpipe.pipeline.train.techniques.techniques import Techniques, make_techniques
 
 VISITS = 8  # of every photo
 MIN_ITERATIONS = 300  # if there are few photos
@@ -85,9 +85,9 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
     path = out / FLATTENED
     if not path.is_file():
         device = choose_device(machine.device, note=report.note)
-        with same_bits(machine.threads), device.one_order():
-            course = _course(trained, device, machine.threads)
-            state = go_through(course, out, report)
+        with same_bits(machine.threads), device.deterministic():
+            setup = _course(trained, device, machine.threads)
+            state = go_through(setup, out, report)
             aside = path.with_suffix(".part")
             write_splat(aside, state.finished())
             aside.replace(path)
@@ -106,8 +106,8 @@ def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetu
     trained_on = [view for view in views if view.camera.name in kept]
     sky = _sky(trained, trained_on, threads)
 
-    def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
-        return PhotoOrder([view.camera for view in trained_on], looks, options.seed, plan.megapixels)
+    def order_of(sizes: Sequence[TrainingSize]) -> TrainingOrder:
+        return PhotoOrder([view.camera for view in trained_on], sizes, options.seed, plan.megapixels)
 
     def techniques() -> Techniques:
         made = make_techniques(plan, sky, device=device.tensors)

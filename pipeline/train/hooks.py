@@ -12,14 +12,14 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import DensitySchedule
-from splatpipe.pipeline.train.schedule import ScheduleStep
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderedView:
     """A photo and its rendered view.
 
     Attributes:
@@ -57,11 +57,11 @@ class Technique:
         """Return the model as rendered in this iteration."""
         return model
 
-    def shown(self, picture: Float[Tensor, "h w 3"], shot: Shot) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> Float[Tensor, "h w 3"]:
         """Return the render as the photo would show it."""
         return picture
 
-    def counted(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: Shot) -> TrainingPhoto:
+    def mask_pixels(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> TrainingPhoto:
         """Return the photo, masked to the pixels that count.
 
         Args:
@@ -71,26 +71,26 @@ class Technique:
         """
         return photo
 
-    def penalty(self, shot: Shot) -> Float[Tensor, ""] | None:
+    def penalty(self, shot: RenderedView) -> Float[Tensor, ""] | None:
         """Return a loss term or None; a penalty on the Gaussians themselves must keep the model of `before_render`."""
         return None
 
-    def begin_again(self) -> None:
+    def roll_back(self) -> None:
         """Undo what the hooks changed: the iteration restarts because memory ran out before its step."""
 
-    def after_step(self, shot: Shot) -> None:
+    def after_step(self, shot: RenderedView) -> None:
         """Take an optimizer step for the technique's own parameters."""
 
     def after_epoch(self, iteration: int) -> None:
         """Called when every photo, with all of its windows, has been trained on once more."""
 
-    def ranked(
+    def adjust_scores(
         self, score: Float[Tensor, " n"], gaussians: Gaussians, schedule: DensitySchedule
     ) -> Float[Tensor, " n"]:
         """Return the score by which density control ranks Gaussians; 0 for one that must not be cloned or split."""
         return score
 
-    def unwanted(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
+    def prune_mask(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:
         """Return the Gaussians to remove after an iteration; None if this iteration does not check."""
         return None
 

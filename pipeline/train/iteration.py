@@ -13,12 +13,12 @@ import torch
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.train.flatness import end_epoch, ends_at
-from splatpipe.pipeline.train.hooks import Shot
-from splatpipe.pipeline.train.memory import over_memory
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.schedule import ScheduleStep
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.hooks import RenderedView
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep
+from splatpipe.pipeline.train.state.memory import over_memory
+from splatpipe.pipeline.train.state.state import TrainState
 
 SSIM_WEIGHT = 0.2  # weight of 1 - SSIM in the loss, the rest is L1; published
 
@@ -33,7 +33,7 @@ def iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None
     """
     now = plan.schedule.at(state.iteration + 1, state.history.flat_at)
     if not photo.is_empty:
-        learn(state, plan, photo, now)
+        optimise_step(state, plan, photo, now)
     # Density.
     if photo.round:
         state.techniques.after_epoch(now.iteration)
@@ -41,7 +41,7 @@ def iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None
     close(state, plan, photo, now)
 
 
-def learn(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: ScheduleStep) -> None:
+def optimise_step(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: ScheduleStep) -> None:
     """Render, compare, step; all intermediate tensors are freed on return, because density control needs the memory.
 
     Args:
@@ -58,10 +58,10 @@ def learn(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, now: Sche
     model = techniques.before_render(state.drawn, now)
     rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     # Show.
-    shot = Shot(photo, rendered, settings, now)
-    picture = techniques.shown(shot)
+    shot = RenderedView(photo, rendered, settings, now)
+    picture = techniques.apply_appearance(shot)
     # Loss.
-    counted = techniques.counted(picture, shot)
+    counted = techniques.mask_pixels(picture, shot)
     measure = photo_loss if plan.options.loss == "native" else photo_loss_reference
     photometric = measure(picture, counted.colour, SSIM_WEIGHT, counted.mask, counted.inner)
     loss = techniques.with_penalties(photometric, shot)

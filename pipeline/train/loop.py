@@ -10,35 +10,35 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.plan_area import read_model_area
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
-from splatpipe.pipeline.train.brightness import decided_exposure
-from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
-from splatpipe.pipeline.train.exposure import Exposure, exposures_json
+from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import write_panorama
+from splatpipe.pipeline.train.appearance.brightness import decided_exposure
+from splatpipe.pipeline.train.appearance.exposure import Exposure, exposures_json
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.flatness import ends_at
-from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
 from splatpipe.pipeline.train.iteration import curve_facts, iterate
-from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
-from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, load_or_write_plan, make_plan
-from splatpipe.pipeline.train.planning import PlanningInput, under_budgets
-from splatpipe.pipeline.train.shortage import iterate_within_memory
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.start import read_start
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.techniques import Techniques, begin_sky, make_techniques
-from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.photos.stream import PhotoStream, TrainingPhoto
+from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, load_or_write_plan, make_plan
+from splatpipe.pipeline.train.plan.start import read_start
+from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrder
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.planning.measure import Step
+from splatpipe.pipeline.train.planning.planning import PlanningInput, under_budgets
+from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
+from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
+from splatpipe.pipeline.train.state.history import History
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import Techniques, begin_sky, make_techniques
 
 CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # minimum time between checkpoints: what a kill may cost
@@ -128,18 +128,18 @@ def train_whole(
         return fit(free.of(decided), replace(scene, config=decided, sky=sky), step, report)
 
     limit = device.memory_limit(config.max_memory_bytes)
-    with same_bits(inputs.machine.threads), device.one_order(), limit:
+    with same_bits(inputs.machine.threads), device.deterministic(), limit:
         sky = begin_sky(config, trained_on, dataset, inputs.machine.threads, report)
         plan = load_or_write_plan(out / "plan.json", make)
         write_durably(out / "rendering.json", plan.rendering().to_json())
         if budgeted(plan) or plan.options.iterations == "auto":
             report.note(plan.described())
 
-        def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
+        def order_of(sizes: Sequence[TrainingSize]) -> TrainingOrder:
             cameras = [view.camera for view in trained_on]
-            return PhotoOrder(cameras, looks, plan.options.seed, plan.megapixels)
+            return PhotoOrder(cameras, sizes, plan.options.seed, plan.megapixels)
 
-        course = TrainingSetup(
+        setup = TrainingSetup(
             plan,
             device,
             trained_on,
@@ -147,7 +147,7 @@ def train_whole(
             techniques=lambda: make_techniques(plan, sky, trained_on, dataset, device.tensors, area),
             start=lambda: start.within(plan.options.max_gaussians),
         )
-        state = go_through(course, out, report)
+        state = go_through(setup, out, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     write_file(out / "history.json", state.whole_history().to_json())
@@ -155,7 +155,7 @@ def train_whole(
     return state, {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
 
 
-def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState:
+def go_through(setup: TrainingSetup, out: Path, report: Reporter) -> TrainState:
     """Train to the end, from the start or from a killed run's checkpoint, and return the final state.
 
     Args:
@@ -166,19 +166,19 @@ def go_through(course: TrainingSetup, out: Path, report: Reporter) -> TrainState
     Raises:
         MachineError, KeyboardInterrupt: as ``run``.
     """
-    plan, device = course.plan, course.device
-    state = resume(out / CHECKPOINT, course, report)
+    plan, device = setup.plan, setup.device
+    state = resume(out / CHECKPOINT, setup, report)
     first, history, seconds = 1, History(), 0.0
     if state is not None:
         first, history, seconds = state.iteration + 1, state.history, state.seconds
-    clock, order = Clock(seconds), course.order_of(training_sizes(plan, history))
-    with PhotoStream(course.views, order, first, out).to(device.tensors) as photos:
+    clock, order = Clock(seconds), setup.order_of(training_sizes(plan, history))
+    with PhotoStream(setup.views, order, first, out).to(device.tensors) as photos:
         photos.warn_if_disk_full(report)
         photos.fill(report)  # before the model exists, unless it was resumed: both need memory
         if state is None:
-            begun = course.start().to(device.tensors)
-            state = TrainState.begin(begun, plan, course.techniques(), course.placed_frozen())
-        optimise(Training(state, course, out / CHECKPOINT, clock), photos, report)
+            begun = setup.start().to(device.tensors)
+            state = TrainState.begin(begun, plan, setup.techniques(), setup.placed_frozen())
+        optimise(Training(state, setup, out / CHECKPOINT, clock), photos, report)
     if (flat_at := state.history.flat_at) > 0:
         planned = plan.after(state.history.sizes_ended).schedule.iterations
         report.note(f"flat after {flat_at:,} iterations: finished at {state.iteration:,} of {planned:,}")
@@ -273,18 +273,18 @@ class Training:
     """
 
     state: TrainState
-    course: TrainingSetup
+    setup: TrainingSetup
     path: Path
     clock: Clock
 
     def save(self) -> None:
         """Write a checkpoint."""
-        save_checkpoint(self.path, self.course.plan.digest(), self.state.checkpoint(self.course.device.kernels))
+        save_checkpoint(self.path, self.setup.plan.digest(), self.state.checkpoint(self.setup.device.kernels))
 
     @property
     def now(self) -> TrainingPlan:
         """The current plan."""
-        return self.course.plan.after(self.state.history.sizes_ended)
+        return self.setup.plan.after(self.state.history.sizes_ended)
 
     @property
     def last(self) -> int:
@@ -293,11 +293,11 @@ class Training:
 
     def report_due(self) -> bool:
         """Whether progress is reported after this iteration."""
-        every = REPORT_EVERY if self.course.device.name == "cpu" else CUDA_REPORT_EVERY
+        every = REPORT_EVERY if self.setup.device.name == "cpu" else CUDA_REPORT_EVERY
         return self.state.iteration % every == 0 or self.state.iteration == self.last
 
 
-def resume(path: Path, course: TrainingSetup, report: Reporter) -> TrainState | None:
+def resume(path: Path, setup: TrainingSetup, report: Reporter) -> TrainState | None:
     """The state that a killed run left, or None; a broken checkpoint is reported and ignored.
 
     Args:
@@ -305,11 +305,11 @@ def resume(path: Path, course: TrainingSetup, report: Reporter) -> TrainState | 
         course: The training setup; training resumes on its device, whichever device it began on.
         report: Receives warnings.
     """
-    device = course.device
+    device = setup.device
     try:
-        checkpoint = load_checkpoint(path, course.plan.digest())
-        frozen = course.placed_frozen()
-        state = TrainState.restore(checkpoint, course.plan, course.techniques(), device.tensors, frozen)
+        checkpoint = load_checkpoint(path, setup.plan.digest())
+        frozen = setup.placed_frozen()
+        state = TrainState.restore(checkpoint, setup.plan, setup.techniques(), device.tensors, frozen)
     except FileNotFoundError:
         return None
     except BrokenCheckpointError as error:
@@ -343,7 +343,7 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
                 report_growth_ended(state, plan, report)
             if state.iteration in state.history.sizes_ended[-1:]:
                 plan = training.now
-                order = training.course.order_of(training_sizes(training.course.plan, state.history))
+                order = training.setup.order_of(training_sizes(training.setup.plan, state.history))
                 photos.go_on(order, state.iteration + 1)
                 report_larger_photos(state, plan, report)
             if interrupt.requested:

@@ -9,24 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
+from splatpipe.pipeline.delivery.delivery_frame import cameras_json
+from splatpipe.pipeline.delivery.ecef_tiles import write_tiles_on_globe
+from splatpipe.pipeline.delivery.trainer_dataset import write_colmap, write_points_ply, write_transforms
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import Points
+from splatpipe.pipeline.photos.pixels.dataset import Points
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import write_scene
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import LevelNode, build_levels
-from splatpipe.pipeline.splat.scene import Scene
-from splatpipe.pipeline.splat.sh import C0
-from splatpipe.pipeline.splat.streamed_sog import write_streamed_sog
-from splatpipe.pipeline.surface.map_crs import open_map
-from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.globe import write_tiles_on_globe
-from splatpipe.pipeline.survey.handover import cameras_json
-from splatpipe.pipeline.survey.trainer_dataset import write_colmap, write_points_ply, write_transforms
+from splatpipe.pipeline.splat.levels.levels import LevelNode, build_levels
+from splatpipe.pipeline.splat.levels.streamed_sog import write_streamed_sog
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene
+from splatpipe.pipeline.splat.model.sh import C0
+from splatpipe.pipeline.surface.rasters.map_crs import open_map
+from splatpipe.pipeline.surface.shapes.point_cloud import CloudChunk, CloudFrame, write_cloud
+from splatpipe.pipeline.survey.crs.frames import Frame
 from splatpipe.pipeline.web.options import EXPORT, WEB
 from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer import ViewerScene

@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.output_file import write_file
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import LevelNode
-from splatpipe.pipeline.splat.scene import Axes, Scene, turn_of
-from splatpipe.pipeline.splat.spz import spz_bytes
+from splatpipe.pipeline.splat.containers.spz_encoder import spz_bytes
+from splatpipe.pipeline.splat.levels.levels import LevelNode
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Axes, Scene, turn_of
 from splatpipe.pipeline.web import asset
 from splatpipe.pipeline.web.viewer import PageParts, ViewerCamera, ViewerScene, page_points, render_page, scene_facts
 

@@ -15,9 +15,9 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.panorama import FULL_FROM_DEG, NOTHING_UP_TO_DEG
-from splatpipe.pipeline.survey.crs import UNKNOWN
-from splatpipe.pipeline.survey.local_crs import LocalCrs
+from splatpipe.pipeline.splat.sky.panorama import FULL_FROM_DEG, NOTHING_UP_TO_DEG
+from splatpipe.pipeline.survey.crs.crs import UNKNOWN
+from splatpipe.pipeline.survey.crs.local_crs import LocalCrs
 from splatpipe.pipeline.web import asset, script_safe
 
 TEMPLATE = Path(__file__).resolve().parent / "viewer.html"

@@ -15,17 +15,17 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, load_points, load_views
-from splatpipe.pipeline.photos.images import Pixels
-from splatpipe.pipeline.photos.small_views import read_small
+from splatpipe.pipeline.photos.pixels.dataset import View, load_points, load_views
+from splatpipe.pipeline.photos.pixels.images import Pixels
+from splatpipe.pipeline.photos.pixels.small_views import read_small
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import Panorama
-from splatpipe.pipeline.splat.spz import SPZ_FROM_Z_UP, spz_bytes
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.georeference import scene_box
-from splatpipe.pipeline.survey.local_crs import local_crs
-from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.splat.containers.spz_encoder import SPZ_FROM_Z_UP, spz_bytes
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import Panorama
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.crs.georeference import scene_box
+from splatpipe.pipeline.survey.crs.local_crs import local_crs
+from splatpipe.pipeline.survey.crs.world import open_world
 from splatpipe.pipeline.web.measured_page import PAGE
 from splatpipe.pipeline.web.viewer import ViewerCamera, ViewerScene, ViewerSky, viewer_page
 

@@ -25,7 +25,7 @@ from splatpipe.demo import capture_path
 
 ROOT = Path(__file__).resolve().parents[2]
 PROFILE = ROOT / "configs" / "batch" / "slurm"
-SPLATPIPE = (sys.executable, "-m", "splatpipe.pipeline.app.cli")
+SPLATPIPE = (sys.executable, "-m", "splatpipe.pipeline.app.cli.main")
 # The plugin, its second part, and what else it imports that the environment lacks.
 PLUGINS = (
     "snakemake-executor-plugin-slurm==2.8.0",

@@ -20,7 +20,7 @@ from frames import ORDERS, RenderCase, RenderOutcome, controls, run
 from training import Draws, Loss, step_complaints
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 
 TIMEOUT_S = 60
 """Far longer than all checks of one fault: detects endless loops."""

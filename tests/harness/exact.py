@@ -10,7 +10,7 @@ from frames import GREY, PARAMETERS, RenderCase, RenderOutcome
 
 from splatpipe.pipeline.geometry.camera import Camera, Window
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 
 def case_of(scene: Gaussians, camera: Camera, seed: int = 5, **settings: object) -> RenderCase:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from building import FORWARD, REVERSE, SHUFFLED
 
-from splatpipe.pipeline.raster.cuda_api import (
+from splatpipe.pipeline.raster.cuda.cuda_api import (
     SplatFrame,
     SplatFrameFacts,
     SplatPictureGradients,
@@ -17,7 +17,7 @@ from splatpipe.pipeline.raster.cuda_api import (
     SplatRows,
     SplatShot,
 )
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 
 ORDERS = ((FORWARD, 0), (REVERSE, 0), (SHUFFLED, 1))
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh")

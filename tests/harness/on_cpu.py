@@ -7,9 +7,9 @@ import functools
 import torch
 from building import build_on_cpu
 
-from splatpipe.pipeline.raster.cuda import CudaKernels
-from splatpipe.pipeline.raster.cuda_api import SplatShot
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels
+from splatpipe.pipeline.raster.cuda.cuda_api import SplatShot
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 
 
 @functools.cache

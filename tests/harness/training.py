@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from frames import PARAMETERS, DeviceFrame, Memory, RenderCase, RenderOutcome, pointer, rows_of
 
-from splatpipe.pipeline.raster.cuda_api import SplatRectangle, SplatStep
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda_api import SplatRectangle, SplatStep
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 
 LOSS = 1e-5
 LOSS_GRADIENT = 5e-5

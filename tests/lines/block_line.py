@@ -11,12 +11,12 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.executor import Executor
-from splatpipe.pipeline.engine.line import Line
-from splatpipe.pipeline.engine.lock import locked, locked_shard
-from splatpipe.pipeline.engine.runner import Outcome, Runner
+from splatpipe.pipeline.engine.runs.executor import Executor
+from splatpipe.pipeline.engine.runs.line import Line
+from splatpipe.pipeline.engine.runs.lock import locked, locked_shard
+from splatpipe.pipeline.engine.runs.runner import Outcome, Runner
+from splatpipe.pipeline.engine.runs.store import Part, open_store
 from splatpipe.pipeline.engine.stage import Machine
-from splatpipe.pipeline.engine.store import Part, open_store
 from splatpipe.stages.line import BLOCKS, TRAIN
 from splatpipe.stages.options import LineConfig
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from arithmetic import READ, ReadConfig
 
-from splatpipe.pipeline.engine.needs import Need
+from splatpipe.pipeline.engine.runs.needs import Need
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Shards, Stage, StageConfig, Summary
 
 KILL_VARIABLE = "SHARDED_KILL"  # names the shard whose process dies of SIGKILL halfway

@@ -19,10 +19,10 @@ from typing import Any
 from splatpipe.pipeline.engine.config import current_options, load_file, resolve
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.runner import Outcome, Runner
-from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.runs.runner import Outcome, Runner
+from splatpipe.pipeline.engine.runs.session import Request, open_session
+from splatpipe.pipeline.engine.runs.store import Artifact, Part
 from splatpipe.pipeline.engine.stage import Machine, Stage
-from splatpipe.pipeline.engine.store import Artifact, Part
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 

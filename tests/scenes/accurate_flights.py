@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.photo_positions import Position
-from splatpipe.pipeline.survey.predicted_flight import FlightCamera
+from splatpipe.pipeline.survey.adjustment.predicted_flight import FlightCamera
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.positions.photo_positions import Position
 
 CAMERA = FlightCamera(1600, 1300, 1950.0, 0.01)
 PLACE = Origin(47.0, 13.0, 400.0)

@@ -9,19 +9,19 @@ import tiny_scene
 
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_split, load_views
-from splatpipe.pipeline.splat.free_space import free_space
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_split, load_views
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.quality.free_space import free_space
 from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks.cells.partition import Cell, Partition
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
 from splatpipe.pipeline.train.blocks.forecast import WindowScheme, block_forecasts, coarse_coverages, footage_on
-from splatpipe.pipeline.train.blocks.partition import Cell, Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 from splatpipe.pipeline.train.blocks.scope import BlockScope, write_free_space
 from splatpipe.pipeline.train.blocks.training import BlockTask, SiteParts, train_block
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.state.state import TrainState
 
 WINDOW = 1000  # of 72 × 54 pixels: four windows a photo, and one at half the size
 

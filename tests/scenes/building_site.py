@@ -14,10 +14,10 @@ from jaxtyping import Float32, Float64, Int64
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.rendering import render_depth
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, photo_coverages
-from splatpipe.pipeline.train.blocks.visibility import Windows
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, photo_coverages
+from splatpipe.pipeline.train.blocks.cells.visibility import Windows
 
 LENGTH, WIDTH = 48.0, 24.0  # of the ground, metres, its corner at the origin, up is +z
 SPACING = 0.25  # of the Gaussians

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, load_photo_list, save_photo_list
+from splatpipe.pipeline.photos.files.photo_list import Photo, PhotoList, load_photo_list, save_photo_list
 
 WIDTH, HEIGHT, FOCAL, RADIAL = 480, 360, 420.0, -0.08
 ROOM_M = 3.0

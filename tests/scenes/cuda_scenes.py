@@ -6,14 +6,14 @@ import torch
 from random_scene import random_camera, random_scene
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_forecast import (
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_forecast import (
     FrameFacts,
     FrameSize,
 )
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, RenderOptions, render
-from splatpipe.pipeline.train.dropout import _DropoutLogits
+from splatpipe.pipeline.train.techniques.dropout import _DropoutLogits
 
 # A step is the rate times a quotient of moments, and Adam divides by small ones: what differs in the tenth place of a
 # gradient near zero differs in the third of its first step.

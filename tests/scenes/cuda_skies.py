@@ -8,9 +8,9 @@ from waiting import never_waiting
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.rasterizer import Render
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
-from splatpipe.pipeline.train.photo_sky import PhotoSky
-from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS
+from splatpipe.pipeline.train.appearance.photo_sky import PhotoSky
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 
 CPU = torch.device("cpu")
 

@@ -8,8 +8,8 @@ import arithmetic
 
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.runner import Outcome
-from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.runs.runner import Outcome
+from splatpipe.pipeline.engine.runs.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine
 
 
@@ -28,7 +28,7 @@ def run_in_background(numbers: Path, out: Path, **count: object) -> subprocess.P
     code = (
         "import arithmetic, sys; from pathlib import Path\n"
         "from splatpipe.pipeline.engine.config import resolve\n"
-        "from splatpipe.pipeline.engine.session import Request, open_session\n"
+        "from splatpipe.pipeline.engine.runs.session import Request, open_session\n"
         "from splatpipe.pipeline.engine.stage import Machine\n"
         f"config = resolve(arithmetic.LineConfig, [{{'count': {count!r}}}])\n"
         f"request = Request(arithmetic.LINE, config, Path({str(numbers)!r}), Path({str(out)!r}), Machine('cpu', 1))\n"

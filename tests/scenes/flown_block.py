@@ -8,11 +8,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from splatpipe.pipeline.survey.block import Block
-from splatpipe.pipeline.survey.block_lens import Lens
-from splatpipe.pipeline.survey.position_adjustment import LensKnowledge, prior_lens
-from splatpipe.pipeline.survey.position_noise import StatedPositions
-from splatpipe.pipeline.survey.tie_points import intersected
+from splatpipe.pipeline.survey.adjustment.block import Block
+from splatpipe.pipeline.survey.adjustment.block_lens import Lens
+from splatpipe.pipeline.survey.adjustment.position_adjustment import LensKnowledge, prior_lens
+from splatpipe.pipeline.survey.adjustment.position_noise import StatedPositions
+from splatpipe.pipeline.survey.adjustment.tie_points import intersected
 
 WIDTH, HEIGHT, FOCAL = 800, 600, 900.0
 SIGMAS_M = (0.014, 0.014, 0.021)

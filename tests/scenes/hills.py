@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface.geotiff import HEIGHTS, raster_file
-from splatpipe.pipeline.surface.grid import Grid, make_grid
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.rasters.geotiff import HEIGHTS, raster_file
+from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 Array = NDArray[np.float64]
 GERMANY = Origin(52.2, 9.97, 110.0)

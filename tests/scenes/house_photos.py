@@ -9,11 +9,11 @@ from house_site import RIDGE_M, ROOF, TREE, WALLS, Array, ExactDepths, cameras, 
 from numpy.typing import NDArray
 
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.run_sources import RunSurface
-from splatpipe.pipeline.surface.site_extent import SiteExtent
-from splatpipe.pipeline.surface.sources import DepthSource
-from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.depths.run_sources import RunSurface
+from splatpipe.pipeline.surface.depths.site_extent import SiteExtent
+from splatpipe.pipeline.surface.depths.sources import DepthSource
+from splatpipe.pipeline.survey.crs.frames import Frame
 
 GSD_M = 0.1
 SIDE_M = 10.0  # of the area made into clouds and meshes: the house, and lawn around it

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pycolmap
 
-from splatpipe.pipeline.sfm.lens_model import simplest
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.lenses.lens_model import simplest
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 WIDTH, HEIGHT = 1200, 900
 TRACK = 9  # photos that would observe a point if it were in view of all

@@ -7,7 +7,7 @@ import pycolmap
 from lens_scene import HEIGHT, WIDTH, look_from, make_lens
 from view_graph import FOCAL, NOISE_PX, Ring, add_points, model_of, moved, turn_up
 
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 FACING = np.cos(np.radians(70.0))  # a side is seen by photos within this angle of its normal
 

@@ -10,7 +10,7 @@ from command import answered
 from finished_run import linked_copy
 
 from splatpipe.demo import CAPTURE, capture_path
-from splatpipe.pipeline.survey.control_file import read_control_file
+from splatpipe.pipeline.survey.files.control_file import read_control_file
 
 TRUTH = {point["name"]: point for point in json.loads((CAPTURE / "truth.json").read_text())["points"]}
 

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.geometry.upright import display_from_stored, enu_from_gimbal
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.exif import Exif, Gps
-from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.assumed_heights import with_assumed_heights
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.gps import georeference
-from splatpipe.pipeline.survey.last_look import Contradiction, Placed, report_contradictions
-from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.photo_positions import positions_json, read_positions
-from splatpipe.pipeline.survey.position_issues import find_position_issues
-from splatpipe.pipeline.survey.world import in_crs
+from splatpipe.pipeline.photos.files.photo_list import Photo
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.photos.metadata.exif import Exif, Gps
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.crs.world import in_crs
+from splatpipe.pipeline.survey.placing.assumed_heights import with_assumed_heights
+from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.placing.gps import georeference
+from splatpipe.pipeline.survey.placing.level import Positions
+from splatpipe.pipeline.survey.placing.model import SparseModel
+from splatpipe.pipeline.survey.plausibility.last_look import Contradiction, Placed, report_contradictions
+from splatpipe.pipeline.survey.plausibility.position_issues import find_position_issues
+from splatpipe.pipeline.survey.positions.photo_positions import positions_json, read_positions
 
 Array = NDArray[np.float64]
 WORLD_FROM_MODEL = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))

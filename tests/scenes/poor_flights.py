@@ -9,12 +9,12 @@ import pycolmap
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector, turn_between
-from splatpipe.pipeline.survey.fitting import PositionFit
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.gps import georeference
-from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import SparseModel
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.placing.fitting import PositionFit
+from splatpipe.pipeline.survey.placing.gps import georeference
+from splatpipe.pipeline.survey.placing.level import Positions
+from splatpipe.pipeline.survey.placing.model import SparseModel
 
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
 

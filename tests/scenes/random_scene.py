@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 
 def random_scene(seed: int, n: int = 60, sh_degree: int = 3, size: float = -1.5) -> Gaussians:

@@ -140,7 +140,15 @@ def reserved_port() -> int:
 @contextlib.contextmanager
 def serving(out: Path, *options: object, environment: Mapping[str, str] | None = None) -> Iterator[Served]:
     """Run ``splatpipe view OUT`` while the context lasts, with some more environment variables."""
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", str(out), "--no-browser", *map(str, options)]
+    command = [
+        sys.executable,
+        "-m",
+        "splatpipe.pipeline.app.cli.main",
+        "view",
+        str(out),
+        "--no-browser",
+        *map(str, options),
+    ]
     env = {**os.environ, **(environment or {})}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
     try:

@@ -6,9 +6,9 @@ import sharded
 
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.line import StageStatus, line_status
-from splatpipe.pipeline.engine.runner import Outcome
-from splatpipe.pipeline.engine.session import Request, open_session, status_of
+from splatpipe.pipeline.engine.runs.line import StageStatus, line_status
+from splatpipe.pipeline.engine.runs.runner import Outcome
+from splatpipe.pipeline.engine.runs.session import Request, open_session, status_of
 from splatpipe.pipeline.engine.stage import Machine
 
 NUMBERS = (3, 14, 15, 92, 65, 35)

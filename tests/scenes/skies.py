@@ -11,7 +11,7 @@ import numpy as np
 import tiny_scene
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.sky_mask import SkyPhoto, directions
+from splatpipe.pipeline.splat.sky.sky_mask import SkyPhoto, directions
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
 EYE = 2.0  # world units above the plain

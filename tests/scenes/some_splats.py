@@ -2,7 +2,7 @@
 
 import torch
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 
 def some_gaussians(count: int = 50, degree: int = 3, seed: int = 1, spread: float = 20.0) -> Gaussians:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from splatpipe.demo import CAPTURE
 from splatpipe.demo.truth import true_surface
-from splatpipe.pipeline.engine.source import ABSENT
+from splatpipe.pipeline.engine.runs.source import ABSENT
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
-from splatpipe.pipeline.sfm.sparse_model import write_model
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.target_finds import WantedTargets, save_finds, save_wanted
+from splatpipe.pipeline.photos.files.photo_list import Photo, PhotoList, save_photo_list
+from splatpipe.pipeline.sfm.model.sparse_model import write_model
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.targets.target_finds import WantedTargets, save_finds, save_wanted
 
 Array = NDArray[np.float64]
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))

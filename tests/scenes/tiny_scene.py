@@ -12,13 +12,13 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import Split, View, load_views, split_views
+from splatpipe.pipeline.photos.pixels.dataset import Split, View, load_views, split_views
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import C0, rgb_to_dc
-from splatpipe.pipeline.train.lengths import PhotoSizes
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import C0, rgb_to_dc
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.schedule import UNKNOWN, Schedule, resolve_schedule
+from splatpipe.pipeline.train.plan.lengths import PhotoSizes
+from splatpipe.pipeline.train.plan.schedule import UNKNOWN, Schedule, resolve_schedule
 
 WIDTH, HEIGHT, FOCAL = 72, 54, 70.0
 CAMERAS = 9

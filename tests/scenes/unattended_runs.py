@@ -9,8 +9,8 @@ import arithmetic
 
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.events import Event, parse_event
-from splatpipe.pipeline.engine.runner import Outcome
-from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.runs.runner import Outcome
+from splatpipe.pipeline.engine.runs.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine
 
 LINE = ["read", "add", "count", "tell"]

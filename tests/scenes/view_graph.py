@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from lens_scene import HEIGHT, WIDTH, look_from, make_lens
 
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 FOCAL = 1000.0
 NOISE_PX = 0.5

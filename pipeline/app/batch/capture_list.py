@@ -13,8 +13,8 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.names import is_photo
-from splatpipe.pipeline.survey.survey_text import TableKind, delimiter_of, read_lines, written_lines
+from splatpipe.pipeline.photos.files.names import is_photo
+from splatpipe.pipeline.survey.files.survey_text import TableKind, delimiter_of, read_lines, written_lines
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 

@@ -32,11 +32,11 @@ from splatpipe.pipeline.app.report.wording import roughly
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, StopSignal, UsageError, exit_code
 from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.engine.lock import locked
 from splatpipe.pipeline.engine.output_file import own_folder, require_own_files
 from splatpipe.pipeline.engine.python_module import python_module
+from splatpipe.pipeline.engine.runs.lock import locked
+from splatpipe.pipeline.engine.runs.store import write_error
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.engine.store import write_error
 from splatpipe.stages.line import LINE
 
 POLL_S = 1.0

@@ -24,18 +24,18 @@ from types import FrameType
 from splatpipe.pipeline.app.batch.attempts import PERMANENT_FAILURES, AttemptLog, AttemptResult, read_attempts, spent_s
 from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob, workflow_jobs
 from splatpipe.pipeline.app.batch.shards import counts_shards, store_shard_jobs
-from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE
-from splatpipe.pipeline.app.command_summary import PART_VARIABLE
+from splatpipe.pipeline.app.commands.runs import SPENT_VARIABLE
+from splatpipe.pipeline.app.commands.summary import PART_VARIABLE
 from splatpipe.pipeline.app.report.run_history import read_history
-from splatpipe.pipeline.engine.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
 from splatpipe.pipeline.engine.output_file import appended_file, write_file
 from splatpipe.pipeline.engine.python_module import python_module
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
+from splatpipe.pipeline.engine.runs.children import PR_SET_PDEATHSIG
+from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, shard_events
 from splatpipe.pipeline.engine.stage import JSON, stage_name
 from splatpipe.stages.line import LINE
 
-SPLATPIPE = tuple(python_module("splatpipe.pipeline.app.cli"))
+SPLATPIPE = tuple(python_module("splatpipe.pipeline.app.cli.main"))
 FOLLOW_S = 0.5
 RESERVE_BYTES = 256 << 20  # of the disk, reserved for what other captures' stages write at the same time
 

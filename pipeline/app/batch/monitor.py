@@ -22,7 +22,7 @@ from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, SplatpipeError
 from splatpipe.pipeline.engine.machine import available_cores
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
+from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, shard_events
 from splatpipe.pipeline.engine.stage import stage_name
 
 VIEWER_FILE = "viewer.html"

@@ -12,8 +12,8 @@ from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.thumbnails import thumbnail
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.names import PHOTO_SUFFIXES
-from splatpipe.pipeline.photos.photo_list import photo_root
+from splatpipe.pipeline.photos.files.names import PHOTO_SUFFIXES
+from splatpipe.pipeline.photos.files.photo_list import photo_root
 
 SIDE = 480  # pixels, of a card on a good display
 POOR_DB = 12.0  # PSNR without exposure compensation: a worse render does not show which capture it is

@@ -22,23 +22,23 @@ from splatpipe.pipeline.app.batch.shards import (
     stage_job,
 )
 from splatpipe.pipeline.app.batch.workflow import GPU_STAGES
-from splatpipe.pipeline.app.cli_runs import Overrides, request_of
+from splatpipe.pipeline.app.commands.runs import Overrides, request_of
 from splatpipe.pipeline.app.preflight.sizing import size_of
 from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
 from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
-from splatpipe.pipeline.engine.line import Line, StageStatus, line_status
-from splatpipe.pipeline.engine.lock import is_locked
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
-from splatpipe.pipeline.engine.needs import Need
 from splatpipe.pipeline.engine.output_file import require_own_files
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, shard_events
-from splatpipe.pipeline.engine.session import Request, status_of
-from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.engine.runs.line import Line, StageStatus, line_status
+from splatpipe.pipeline.engine.runs.lock import is_locked
+from splatpipe.pipeline.engine.runs.needs import Need
+from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, shard_events
+from splatpipe.pipeline.engine.runs.session import Request, status_of
+from splatpipe.pipeline.engine.runs.source import open_source
+from splatpipe.pipeline.engine.runs.store import Part, is_copy
 from splatpipe.pipeline.engine.stage import Shard, stage_name
-from splatpipe.pipeline.engine.store import Part, is_copy
 from splatpipe.stages.forecast import forecast, machine_speed
 from splatpipe.stages.line import LINE
 

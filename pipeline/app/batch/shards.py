@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from splatpipe.pipeline.app.batch.plan import Call, StageJob
-from splatpipe.pipeline.app.cli_runs import existing_request
-from splatpipe.pipeline.engine.line import StageStatus, line_status
-from splatpipe.pipeline.engine.needs import Need, of_shard
-from splatpipe.pipeline.engine.session import status_of
+from splatpipe.pipeline.app.commands.runs import existing_request
+from splatpipe.pipeline.engine.runs.line import StageStatus, line_status
+from splatpipe.pipeline.engine.runs.needs import Need, of_shard
+from splatpipe.pipeline.engine.runs.session import status_of
 from splatpipe.pipeline.engine.stage import Shard, Stage, stage_name
 
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used

@@ -13,10 +13,10 @@ from splatpipe.pipeline.app.preflight.places import MIN_REACH_M
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.boundary import placed, placed_area
-from splatpipe.pipeline.survey.boundary_file import read_boundary
-from splatpipe.pipeline.survey.frames import Frame, Origin
-from splatpipe.pipeline.survey.photo_positions import Position
-from splatpipe.pipeline.survey.world import in_crs
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
+from splatpipe.pipeline.survey.crs.world import in_crs
+from splatpipe.pipeline.survey.files.boundary_file import read_boundary
+from splatpipe.pipeline.survey.positions.photo_positions import Position
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.survey.options import GeorefConfig

@@ -48,14 +48,14 @@ from splatpipe.pipeline.app.preflight.places import (
     scale_bar_findings,
 )
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes
-from splatpipe.pipeline.engine.needs import whole
 from splatpipe.pipeline.engine.parallel import ordered_map
-from splatpipe.pipeline.engine.source import RunSource, is_film, open_source
+from splatpipe.pipeline.engine.runs.needs import whole
+from splatpipe.pipeline.engine.runs.source import RunSource, is_film, open_source
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.detail import DIRECTIONS
-from splatpipe.pipeline.sfm.comparison import brighter_ev, duller
-from splatpipe.pipeline.sfm.keypoints import single_threaded_opencv
-from splatpipe.pipeline.sfm.quick_match import QuickFeatures, glimpse
+from splatpipe.pipeline.photos.intake.detail import DIRECTIONS
+from splatpipe.pipeline.sfm.matching.comparison import brighter_ev, duller
+from splatpipe.pipeline.sfm.matching.keypoints import single_threaded_opencv
+from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures, glimpse
 
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.photo_list import photo_root
+from splatpipe.pipeline.photos.files.photo_list import photo_root
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.survey.predicted_flight import PredictedAccuracy
+    from splatpipe.pipeline.survey.adjustment.predicted_flight import PredictedAccuracy
 
 Severity = Literal["error", "warning", "note"]
 RANK: dict[Severity, int] = {"error": 0, "warning": 1, "note": 2}

@@ -10,16 +10,16 @@ from threadpoolctl import threadpool_limits
 from splatpipe.pipeline.app.preflight.findings import Finding, Severity
 from splatpipe.pipeline.app.preflight.intake import Intake
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.source import RunSource
+from splatpipe.pipeline.engine.runs.source import RunSource
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.names import printable
-from splatpipe.pipeline.sfm.known_lenses import state_lenses
-from splatpipe.pipeline.survey.adjusted_positions import MANY_GSDS
-from splatpipe.pipeline.survey.block_accuracy import ninety_five
-from splatpipe.pipeline.survey.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE
-from splatpipe.pipeline.survey.predicted_flight import FlightCamera, PredictedAccuracy, predict_accuracy
-from splatpipe.pipeline.survey.uncertainty import metres_in_words
+from splatpipe.pipeline.photos.files.names import printable
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.sfm.lenses.known_lenses import state_lenses
+from splatpipe.pipeline.survey.adjustment.adjusted_positions import MANY_GSDS
+from splatpipe.pipeline.survey.adjustment.block_accuracy import ninety_five
+from splatpipe.pipeline.survey.adjustment.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE
+from splatpipe.pipeline.survey.adjustment.predicted_flight import FlightCamera, PredictedAccuracy, predict_accuracy
+from splatpipe.pipeline.survey.placing.uncertainty import metres_in_words
 
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig

@@ -13,24 +13,24 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.app.preflight.findings import Finding, LeftOutPhoto
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.source import RunSource, is_film
+from splatpipe.pipeline.engine.runs.source import RunSource, is_film
 from splatpipe.pipeline.engine.stage import JSON, Reporter
-from splatpipe.pipeline.photos.bands import ALL
-from splatpipe.pipeline.photos.camera_groups import CameraGroup, group_cameras
-from splatpipe.pipeline.photos.camera_issues import find_camera_issues
-from splatpipe.pipeline.photos.capture_issues import CaptureIssue
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.names import list_names, printable
-from splatpipe.pipeline.photos.photo_list import Photo, photo_root
-from splatpipe.pipeline.photos.preparation import Preparation, Selection, select_photos
-from splatpipe.pipeline.photos.scan import ExcludedPhoto, by_reason, with_reason
+from splatpipe.pipeline.photos.files.names import list_names, printable
+from splatpipe.pipeline.photos.files.photo_list import Photo, photo_root
+from splatpipe.pipeline.photos.files.scan import ExcludedPhoto, by_reason, with_reason
+from splatpipe.pipeline.photos.intake.bands import ALL
+from splatpipe.pipeline.photos.intake.camera_groups import CameraGroup, group_cameras
+from splatpipe.pipeline.photos.intake.camera_issues import find_camera_issues
+from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.photos.intake.preparation import Preparation, Selection, select_photos
 from splatpipe.pipeline.photos.video.frames import extract_frames
-from splatpipe.pipeline.sfm.layout import make_layout, make_views
-from splatpipe.pipeline.sfm.pairs import Layout
-from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
-from splatpipe.pipeline.survey.position_issues import find_position_issues
-from splatpipe.pipeline.survey.position_sources import stated_places
-from splatpipe.pipeline.survey.stated_positions import FilePlaces, read_places
+from splatpipe.pipeline.sfm.pairing.layout import make_layout, make_views
+from splatpipe.pipeline.sfm.pairing.pairs import Layout
+from splatpipe.pipeline.survey.plausibility.position_issues import find_position_issues
+from splatpipe.pipeline.survey.positions.photo_positions import PositionList, positions_json, read_positions
+from splatpipe.pipeline.survey.positions.position_sources import stated_places
+from splatpipe.pipeline.survey.positions.stated_positions import FilePlaces, read_places
 
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig

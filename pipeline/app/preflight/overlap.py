@@ -10,8 +10,9 @@ import numpy as np
 
 from splatpipe.pipeline.app.preflight.findings import Finding, Gap
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.names import list_names, printable
-from splatpipe.pipeline.sfm.pairs import (
+from splatpipe.pipeline.photos.files.names import list_names, printable
+from splatpipe.pipeline.sfm.matching.quick_match import InlierMatches, QuickFeatures, match_glimpses
+from splatpipe.pipeline.sfm.pairing.pairs import (
     Costs,
     Layout,
     Pair,
@@ -21,10 +22,9 @@ from splatpipe.pipeline.sfm.pairs import (
     nearest,
     select_pairs,
 )
-from splatpipe.pipeline.sfm.quick_match import InlierMatches, QuickFeatures, match_glimpses
-from splatpipe.pipeline.sfm.retrieval import look_alike_costs
-from splatpipe.pipeline.survey.flight_gaps import MissingStrip, find_missing
-from splatpipe.pipeline.survey.swapped_positions import PositionEvidence, find_swapped
+from splatpipe.pipeline.sfm.pairing.retrieval import look_alike_costs
+from splatpipe.pipeline.survey.positions.flight_gaps import MissingStrip, find_missing
+from splatpipe.pipeline.survey.positions.swapped_positions import PositionEvidence, find_swapped
 
 EXHAUSTIVE_UP_TO = 40  # photos: 780 pairs, five seconds
 NEIGHBOURS = 8  # partners per photo by position or sequence; a run uses 20

@@ -17,7 +17,7 @@ from splatpipe.pipeline.app.preflight.coverage import count_footprints, shades
 from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
 from splatpipe.pipeline.app.report.wording import count, length, plural
-from splatpipe.pipeline.survey.control_file import titled
+from splatpipe.pipeline.survey.files.control_file import titled
 
 MAX_PAIRS = 5_000  # lines; if there are more, those of weakly connected photos come first
 STRENGTHS = ((0, "weak"), (25, "fair"), (80, "strong"))  # least number of matches of each class

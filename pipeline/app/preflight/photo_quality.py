@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.app.preflight.findings import Finding
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.names import list_names, printable
-from splatpipe.pipeline.sfm.quick_match import QuickFeatures
-from splatpipe.pipeline.sfm.refusal import texture_hint
+from splatpipe.pipeline.photos.files.names import list_names, printable
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures
+from splatpipe.pipeline.sfm.recovery.refusal import texture_hint
 
 DULL = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
 DULL_SPREADS = 4.0  # times the usual deviation between photos, if a whole capture is blurred

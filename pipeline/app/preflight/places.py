@@ -12,14 +12,14 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.app.preflight.findings import ControlPlace, Finding, Place
 from splatpipe.pipeline.app.preflight.intake import Intake
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.names import NameFinder, list_names
-from splatpipe.pipeline.sfm.footprints import FURTHEST, MIN_HEIGHT_M, StatedPoses
-from splatpipe.pipeline.sfm.layout import EARTH_RADIUS_M
-from splatpipe.pipeline.survey.control_file import ControlFile, read_control_file
-from splatpipe.pipeline.survey.coordinate_readings import nearer_reading
-from splatpipe.pipeline.survey.crs import Crs, parse_crs, to_geodetic
-from splatpipe.pipeline.survey.scale_bars import read_scale_bars
-from splatpipe.pipeline.survey.surveyed_points import eaten_zeros, missing_photos
+from splatpipe.pipeline.photos.files.names import NameFinder, list_names
+from splatpipe.pipeline.sfm.pairing.footprints import FURTHEST, MIN_HEIGHT_M, StatedPoses
+from splatpipe.pipeline.sfm.pairing.layout import EARTH_RADIUS_M
+from splatpipe.pipeline.survey.crs.coordinate_readings import nearer_reading
+from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs, to_geodetic
+from splatpipe.pipeline.survey.files.control_file import ControlFile, read_control_file
+from splatpipe.pipeline.survey.files.scale_bars import read_scale_bars
+from splatpipe.pipeline.survey.points.surveyed_points import eaten_zeros, missing_photos
 
 OUTSIDE_SHARE = 0.3  # of the marks outside their photos: they were made in photos of another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS

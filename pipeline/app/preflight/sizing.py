@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
-from splatpipe.pipeline.engine.source import RunSource
-from splatpipe.pipeline.photos.companions import find_companions
-from splatpipe.pipeline.photos.names import is_photo
+from splatpipe.pipeline.engine.runs.source import RunSource
+from splatpipe.pipeline.photos.files.companions import find_companions
+from splatpipe.pipeline.photos.files.names import is_photo
 from splatpipe.stages.forecast import has_control
 from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
 
@@ -35,7 +35,7 @@ def capture_size(paths: Sequence[Path], *, has_file: bool) -> CaptureSize:
     """
     from PIL import Image
 
-    from splatpipe.pipeline.photos.exif import read_exif
+    from splatpipe.pipeline.photos.metadata.exif import read_exif
 
     sizes, placed = [], 0
     step = max(1, len(paths) // SAMPLED)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.engine.session import Request
+    from splatpipe.pipeline.engine.runs.session import Request
     from splatpipe.stages.block_work import BlockWork
     from splatpipe.stages.options import LineConfig
 
@@ -20,7 +20,7 @@ def require_readable(request: Request) -> None:
     Raises:
         SplatpipeError: if the GCP file, the scale bars or the boundary cannot be read, or a film is truncated or none.
     """
-    from splatpipe.pipeline.engine.source import is_film, open_source
+    from splatpipe.pipeline.engine.runs.source import is_film, open_source
 
     source = open_source(request.photos, request.out, request.stages, request.config)
     if is_film(source.folder):
@@ -75,8 +75,8 @@ def require_memory(request: Request, until: str | None = None, *, here: bool = T
 
 def _will_train(request: Request, until: str | None) -> bool:
     """Whether training is among the stages that a run has yet to do."""
-    from splatpipe.pipeline.engine.line import line_status
-    from splatpipe.pipeline.engine.session import status_of
+    from splatpipe.pipeline.engine.runs.line import line_status
+    from splatpipe.pipeline.engine.runs.session import status_of
 
     names = [stage.name for stage in request.stages]
     if "train" not in names or (until in names and names.index(until) < names.index("blocks")):
@@ -91,8 +91,8 @@ def forecast_text(request: Request) -> str:
     from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.app.report.wording import roughly
     from splatpipe.pipeline.engine.machine import available_memory_bytes
-    from splatpipe.pipeline.engine.needs import whole
-    from splatpipe.pipeline.engine.source import open_source
+    from splatpipe.pipeline.engine.runs.needs import whole
+    from splatpipe.pipeline.engine.runs.source import open_source
     from splatpipe.stages.costs import REFERENCE
     from splatpipe.stages.forecast import machine_speed, needs_of
     from splatpipe.stages.work import CaptureWork
@@ -131,7 +131,7 @@ def shortage_text(request: Request, until: str | None = None) -> str:
     """
     from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.engine.machine import memory_limit_bytes
-    from splatpipe.pipeline.engine.source import open_source
+    from splatpipe.pipeline.engine.runs.source import open_source
     from splatpipe.stages.costs import REFERENCE
     from splatpipe.stages.work import TRAINING, CaptureWork
 
@@ -161,9 +161,9 @@ def blocks_text(blocks: BlockWork) -> str:
 
 def _on_cuda(device: str) -> bool:
     """Whether training will run on a CUDA device, by the device that was asked for."""
-    from splatpipe.pipeline.raster.cuda_library import why_not
+    from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 
-    return device != "cpu" and why_not() is None
+    return device != "cpu" and unavailable_reason() is None
 
 
 def _read_film(path: Path) -> None:
@@ -173,19 +173,19 @@ def _read_film(path: Path) -> None:
 
 
 def _read_control(path: Path) -> None:
-    from splatpipe.pipeline.survey.control_file import read_control_file
-    from splatpipe.pipeline.survey.crs import parse_crs
+    from splatpipe.pipeline.survey.crs.crs import parse_crs
+    from splatpipe.pipeline.survey.files.control_file import read_control_file
 
     parse_crs(read_control_file(path).crs)
 
 
 def _read_scale_bars(path: Path) -> None:
-    from splatpipe.pipeline.survey.scale_bars import read_scale_bars
+    from splatpipe.pipeline.survey.files.scale_bars import read_scale_bars
 
     read_scale_bars(path)
 
 
 def _read_boundary(path: Path) -> None:
-    from splatpipe.pipeline.survey.boundary_file import read_boundary
+    from splatpipe.pipeline.survey.files.boundary_file import read_boundary
 
     read_boundary(path)

@@ -14,7 +14,7 @@ from typing import IO
 
 from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
-from splatpipe.pipeline.engine.heap import importing
+from splatpipe.pipeline.engine.heap import imports_outside_gc
 from splatpipe.pipeline.engine.output_file import appended_file
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.small_file import open_regular
@@ -40,7 +40,7 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
         OSError: if it cannot be written.
         MachineError: if this installation lacks the page's script or style.
     """
-    with importing():
+    with imports_outside_gc():
         from splatpipe.pipeline.app.report.page import report_page
         from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 

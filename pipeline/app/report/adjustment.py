@@ -194,7 +194,7 @@ def _control_places(places: Sequence[tuple[float, float, float]], origin: Mappin
     if places and origin is not None:
         import numpy as np
 
-        from splatpipe.pipeline.survey.geodesy import Origin
+        from splatpipe.pipeline.survey.crs.geodesy import Origin
 
         with suppress(KeyError, TypeError, ValueError):
             at = Origin(*(float(origin[key]) for key in ("latitude", "longitude", "height_m")))

@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.engine.json_file import read_json
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
+from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
 
 BORDER_STEPS = 6  # rays along each side of an image, for its footprint
 GROUND_PERCENTILE = 5.0  # of the sparse points' heights: roofs and walls are above

@@ -128,14 +128,14 @@ def _vertical(datum: str, *, named: bool) -> str:
     """The vertical datum's name, or its text from the frame if there is no time to load pyproj."""
     if not named:
         return datum
-    from splatpipe.pipeline.survey.crs import describe_vertical
+    from splatpipe.pipeline.survey.crs.crs import describe_vertical
 
     return describe_vertical(datum)
 
 
 def _crs(inputs: ReportInputs, frame: Mapping[str, Any]) -> str:
     """The CRS from `georef.json` if written, else from the frame."""
-    from splatpipe.pipeline.survey.georeference import accuracy_in_words
+    from splatpipe.pipeline.survey.crs.georeference import accuracy_in_words
 
     path = inputs.part("export.georef")
     georeference = read_json(path) if path is not None else {}

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from markupsafe import Markup
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.photo_list import Photo, decode, load_photo_list
+from splatpipe.pipeline.photos.files.photo_list import Photo, decode, load_photo_list
 
 VIEW_SIDE = 960  # pixels of the longer side of a held-out photo in the report
 VIEW_QUALITY = 82
@@ -43,7 +43,7 @@ class ViewPictures:
 
 
 @dataclass(frozen=True)
-class Chip:
+class PhotoCrop:
     """A crop of a photo around a mark.
 
     Attributes:
@@ -94,7 +94,7 @@ def chosen_views(views: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 def cut_chips(
     points: Sequence[Mapping[str, Any]], photos_part: Path | None, photos_dir: Path | None
-) -> dict[tuple[int, int], Chip]:
+) -> dict[tuple[int, int], PhotoCrop]:
     """Make a crop for each observation of the surveyed points.
 
     Args:
@@ -109,7 +109,7 @@ def cut_chips(
     by_photo: dict[str, list[tuple[int, int]]] = {}
     for place in _worst_first(points)[:MAX_CHIPS]:
         by_photo.setdefault(str(points[place[0]]["observations"][place[1]]["photo"]), []).append(place)
-    chips: dict[tuple[int, int], Chip] = {}
+    chips: dict[tuple[int, int], PhotoCrop] = {}
     decoded = 0
     for name, places in by_photo.items():  # the photos with the worst marks first
         photo, pixels = photos.get(name), None
@@ -188,7 +188,7 @@ def _size(seen: Mapping[str, Any]) -> float:
     return float(np.hypot(*residual)) if residual else 0.0
 
 
-def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, orientation: int) -> Chip:
+def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, orientation: int) -> PhotoCrop:
     mark = np.array(seen["pixel"], np.float64)
     residual = seen.get("residual_px")
     side = CHIP_SIDE
@@ -206,7 +206,7 @@ def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, or
     if residual:
         x, y = (mark + residual - corner) / side * 100.0
         found = (float(x), float(y)) if 0.0 <= x <= 100.0 and 0.0 <= y <= 100.0 else None
-    return Chip(picture, ROTATIONS_DEG.get(orientation, 0), (float(marked[0]), float(marked[1])), found, side)
+    return PhotoCrop(picture, ROTATIONS_DEG.get(orientation, 0), (float(marked[0]), float(marked[1])), found, side)
 
 
 def _cut(pixels: UInt8[np.ndarray, "h w 3"], left: int, top: int, side: int) -> UInt8[np.ndarray, "side side 3"]:

@@ -14,8 +14,8 @@ from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES
 from splatpipe.pipeline.app.report.run_history import RunHistory, read_history
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, Contents, RunFolder, open_run_folder
-from splatpipe.pipeline.engine.store import Artifact
+from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, Contents, RunFolder, open_run_folder
+from splatpipe.pipeline.engine.runs.store import Artifact
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 

@@ -93,7 +93,7 @@ def _small_picture(path: Path, side: int) -> dict[str, Any]:
 
 def _pictures(inputs: ReportInputs) -> list[dict[str, Any]]:
     from splatpipe.pipeline.app.report.pictures import jpeg
-    from splatpipe.pipeline.surface.pictures import ortho_picture, relief_picture
+    from splatpipe.pipeline.surface.rasters.pictures import ortho_picture, relief_picture
 
     found = []
     path = _file(inputs, "ortho.files", "ortho.tif")

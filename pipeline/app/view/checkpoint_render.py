@@ -12,23 +12,23 @@ import cv2
 import numpy as np
 import torch
 
+from splatpipe.pipeline.delivery.delivery_frame import in_world
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, card_fault
 from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.engine.run_folder import Contents
+from splatpipe.pipeline.engine.runs.run_folder import Contents
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
-from splatpipe.pipeline.photos.images import Pixels, reduced_view
+from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.pixels.images import Pixels, reduced_view
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.render.rendering import as_trained, placed, render_pixels
-from splatpipe.pipeline.splat.archives import open_archive
-from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
-from splatpipe.pipeline.splat.panorama import Panorama, read_panorama
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.handover import in_world
+from splatpipe.pipeline.splat.containers.archives import open_archive
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.sky.panorama import Panorama, read_panorama
+from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.web.viewer import viewer_page
 from splatpipe.pipeline.web.viewer_scene import SPLAT, viewer_rendering, viewer_scene, viewer_splat
 

@@ -17,15 +17,15 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.joint_fit import JointFit
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.survey.accuracy import GeoreferencedModel, accuracy_json
-from splatpipe.pipeline.survey.blunders import require_near
-from splatpipe.pipeline.survey.control_file import ControlFile
-from splatpipe.pipeline.survey.control_fit import fit_control
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.local_survey import LocalSurvey, stations_of
-from splatpipe.pipeline.survey.located_points import Sighting, SurveyPoint, locate, residual_px
-from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.surveyed_points import Survey, with_roles
+from splatpipe.pipeline.survey.control.accuracy import GeoreferencedModel, accuracy_json
+from splatpipe.pipeline.survey.control.blunders import require_near
+from splatpipe.pipeline.survey.control.control_fit import fit_control
+from splatpipe.pipeline.survey.control.local_survey import LocalSurvey, stations_of
+from splatpipe.pipeline.survey.files.control_file import ControlFile
+from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.placing.model import SparseModel
+from splatpipe.pipeline.survey.points.located_points import Sighting, SurveyPoint, locate, residual_px
+from splatpipe.pipeline.survey.points.surveyed_points import Survey, with_roles
 
 Marks = Mapping[str, Mapping[str, tuple[float, float]]]
 UNKNOWN_HEIGHT_M = 5.0  # of a point without a height, or while the vertical datum is unknown

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from splatpipe.pipeline.app.view.log import RunLog, contents_of
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, Contents, RunFolder
+from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, Contents, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.pixels.dataset import View
 
 if TYPE_CHECKING:  # torch takes seconds to load, and marking does not need it
     from splatpipe.pipeline.app.view.checkpoint_render import LoadedModel, ModelSource

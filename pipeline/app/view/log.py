@@ -11,7 +11,7 @@ from pathlib import Path
 from splatpipe.pipeline.app.view.files import FileNotServedError, open_inside
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import parse_event
-from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
+from splatpipe.pipeline.engine.runs.run_folder import Contents, RunFolder
 from splatpipe.pipeline.engine.stage import JSON, shards_first, stage_name
 from splatpipe.stages.options import LineConfig
 

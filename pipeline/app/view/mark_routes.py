@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -12,9 +12,7 @@ from starlette.routing import Route
 
 from splatpipe.pipeline.app.view.marking import Change, Marking, State, WrongRequestError
 from splatpipe.pipeline.app.view.photo import photo_for_browser
-
-if TYPE_CHECKING:
-    from splatpipe.pipeline.app.view.server import Pages
+from splatpipe.pipeline.app.view.run_pages import Pages
 
 ACTIONS = ("mark", "unmark", "hide")
 

@@ -25,9 +25,9 @@ from splatpipe.pipeline.app.view.estimate import (
 )
 from splatpipe.pipeline.app.view.marking_job import MarkingJob
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.photos.names import NameFinder
-from splatpipe.pipeline.survey.control_edit import ControlText
-from splatpipe.pipeline.survey.control_file import SurveyedPoint
+from splatpipe.pipeline.photos.files.names import NameFinder
+from splatpipe.pipeline.survey.files.control_edit import ControlText
+from splatpipe.pipeline.survey.files.control_file import SurveyedPoint
 
 MAX_UNDO = 10_000
 WIDE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing

@@ -11,20 +11,25 @@ from pathlib import Path
 from splatpipe.pipeline.app.view.log import RunLog, contents_of
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.engine.run_folder import EVENTS_FILE, RunFolder
-from splatpipe.pipeline.engine.source import AUTO, NONE, open_source
-from splatpipe.pipeline.photos.names import NameFinder
-from splatpipe.pipeline.photos.photo_list import Photo, load_photo_list
-from splatpipe.pipeline.survey.assumed_heights import with_assumed_heights
-from splatpipe.pipeline.survey.control_edit import ControlText
-from splatpipe.pipeline.survey.control_file import SAME_PLACE_M, SurveyedPoint, read_control_file, read_points_file
-from splatpipe.pipeline.survey.crs import Crs, parse_crs
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.gps import georeference, read_positions
-from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import SparseModel, read_model
+from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, RunFolder
+from splatpipe.pipeline.engine.runs.source import AUTO, NONE, open_source
+from splatpipe.pipeline.photos.files.names import NameFinder
+from splatpipe.pipeline.photos.files.photo_list import Photo, load_photo_list
+from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.files.control_edit import ControlText
+from splatpipe.pipeline.survey.files.control_file import (
+    SAME_PLACE_M,
+    SurveyedPoint,
+    read_control_file,
+    read_points_file,
+)
 from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.placing.assumed_heights import with_assumed_heights
+from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.placing.gps import georeference, read_positions
+from splatpipe.pipeline.survey.placing.level import Positions
+from splatpipe.pipeline.survey.placing.model import SparseModel, read_model
 from splatpipe.stages.line import GEOREF, LINE
 from splatpipe.stages.options import LineConfig
 

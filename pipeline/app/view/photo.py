@@ -11,8 +11,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from splatpipe.pipeline.photos.photo_list import Photo, decode, photo_bytes
-from splatpipe.pipeline.photos.picture_file import open_picture
+from splatpipe.pipeline.photos.files.photo_list import Photo, decode, photo_bytes
+from splatpipe.pipeline.photos.files.picture_file import open_picture
 
 LARGEST_BYTES = 256 << 20
 SOI, SOS, APP0, APP1, APP15, COMMENT, APP2, APP14 = 0xD8, 0xDA, 0xE0, 0xE1, 0xEF, 0xFE, 0xE2, 0xEE

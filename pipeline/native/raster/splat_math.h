@@ -122,7 +122,7 @@ SPLAT_INLINE Projection project_lanes(const View& view, const Lanes& in) {
     return p;
 }
 
-// The basis of splat/sh.py at unit directions, degree 0..3. With slopes: its derivatives by x, y, z.
+// The basis of splat/model/sh.py at unit directions, degree 0..3. With slopes: its derivatives by x, y, z.
 constexpr float kSh0 = 0.28209479177387814f;
 constexpr float kSh1 = 0.4886025119029199f;
 SPLAT_TABLE float kSh2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};

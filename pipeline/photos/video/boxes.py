@@ -22,7 +22,7 @@ from jaxtyping import Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.small_file import open_regular
-from splatpipe.pipeline.photos.names import printable
+from splatpipe.pipeline.photos.files.names import printable
 
 MAX_TOP_BOXES = 10_000  # a camera writes some ten
 MAX_CHILDREN = 10_000

@@ -18,10 +18,10 @@ from PIL.TiffImagePlugin import IFDRational
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
-from splatpipe.pipeline.engine.source import subtitles_beside
+from splatpipe.pipeline.engine.runs.source import subtitles_beside
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.capture_issues import CaptureIssue
-from splatpipe.pipeline.photos.names import is_plain, printable
+from splatpipe.pipeline.photos.files.names import is_plain, printable
+from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.video.boxes import REFILM, Container, read_container
 from splatpipe.pipeline.photos.video.choice import Choice, choose
@@ -29,7 +29,7 @@ from splatpipe.pipeline.photos.video.motion import Measures, joined, measure
 from splatpipe.pipeline.photos.video.telemetry import FlightPath, Place, read_fixes, read_subtitles
 
 FRAMES_DIR = "frames"  # in the part `photos`
-FEWEST = 3  # a reconstruction needs as many
+MIN_FRAMES = 3  # a reconstruction needs as many
 MEASURED_FPS = 15.0  # of a film with more, every second, third or further frame is measured
 QUALITY = 97  # of the JPEGs, without subsampled colours: the film's own losses are larger
 MAX_STEM_BYTES = 200  # of a name, which a number, masks and conversions make longer
@@ -86,7 +86,7 @@ def extract_frames(
     flight = _flight(film, container)
     measures = _measure(film, container, threads, report)
     choice = choose(measures, config.max_frames)
-    if len(choice.chosen) < FEWEST:
+    if len(choice.chosen) < MIN_FRAMES:
         raise SplatpipeError(
             f"{name} shows too little: only {len(choice.chosen)} of its {container.frames:,} frames differ.",
             hint="A reconstruction needs a camera that moves past its subject.",

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-from splatpipe.pipeline.photos.images import reduced
+from splatpipe.pipeline.photos.pixels.images import reduced
 
 SHARP_SIDE, TRACKED_SIDE = 1920, 480  # pixels: the longer sides at which sharpness and motion are measured
 POINTS, QUALITY, APART = 300, 0.01, 8  # corners that are followed: at most, of the best one's strength, pixels

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 from splatpipe.pipeline.engine.errors import UsageError
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.splat.formats.bounded import CheckValues
-    from splatpipe.pipeline.splat.position_cost import PositionCost
-    from splatpipe.pipeline.splat.scene import Scene
+    from splatpipe.pipeline.splat.containers.bounded import CheckValues
+    from splatpipe.pipeline.splat.model.position_cost import PositionCost
+    from splatpipe.pipeline.splat.model.scene import Scene
 
 
 @dataclass(frozen=True)

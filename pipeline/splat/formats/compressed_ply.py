@@ -20,15 +20,21 @@ from jaxtyping import Float32, Float64, UInt8, UInt32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
-from splatpipe.pipeline.splat.formats.bounded import CheckValues, all_finite, check_values, open_file, read_exactly
+from splatpipe.pipeline.splat.containers.bounded import CheckValues, all_finite, check_values, open_file, read_exactly
+from splatpipe.pipeline.splat.containers.ply_header import (
+    PLY_HINT,
+    PlyElement,
+    PlyHeader,
+    ply_header_bytes,
+    read_ply_header,
+)
 from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.formats.plain_ply import facts_of_comments, header_comments
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.neighbourhoods import in_neighbourhoods, reordered
-from splatpipe.pipeline.splat.ply_header import PLY_HINT, PlyElement, PlyHeader, ply_header_bytes, read_ply_header
-from splatpipe.pipeline.splat.position_cost import PositionCost, sizes_of
-from splatpipe.pipeline.splat.scene import Scene, turn_of
-from splatpipe.pipeline.splat.sh import C0, MAX_DEGREE, coefficient_count
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.neighbourhoods import in_neighbourhoods, reordered
+from splatpipe.pipeline.splat.model.position_cost import PositionCost, sizes_of
+from splatpipe.pipeline.splat.model.scene import Scene, turn_of
+from splatpipe.pipeline.splat.model.sh import C0, MAX_DEGREE, coefficient_count
 
 CHUNK = 256
 _ROWS = 256 * CHUNK  # at a time

@@ -8,10 +8,10 @@ from pathlib import Path
 from splatpipe.pipeline.engine.durable import beside
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
-from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values
-from splatpipe.pipeline.splat.position_cost import PositionCost, two_digits
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.position_cost import PositionCost, two_digits
+from splatpipe.pipeline.splat.model.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 16
 _MAX_HEADER_BYTES = 65_536  # of a PLY, in which it says whether it is compressed

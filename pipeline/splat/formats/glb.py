@@ -18,14 +18,21 @@ from jaxtyping import Float32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
-from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values, open_file
+from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values, open_file
+from splatpipe.pipeline.splat.containers.glb_container import FLOAT, UNSIGNED_BYTE, open_container, write_head
+from splatpipe.pipeline.splat.formats.glb_splats import (
+    EXTENSION,
+    KERNEL,
+    RECORD,
+    ROWS_AT_ONCE,
+    harmonics_names,
+    read_splats,
+)
 from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.glb_container import FLOAT, UNSIGNED_BYTE, open_container, write_head
-from splatpipe.pipeline.splat.glb_splats import EXTENSION, KERNEL, RECORD, ROWS_AT_ONCE, harmonics_names, read_splats
-from splatpipe.pipeline.splat.position_cost import PositionCost, float32_cost
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, facts_of_record, turn_of
-from splatpipe.pipeline.splat.sh import C0, multiply_rows
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.position_cost import PositionCost, float32_cost
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, facts_of_record, turn_of
+from splatpipe.pipeline.splat.model.sh import C0, multiply_rows
 
 _ARRAY_BUFFER, _POINTS = 34962, 0
 

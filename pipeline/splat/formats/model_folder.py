@@ -11,10 +11,10 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.formats import plain_ply
-from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values
-from splatpipe.pipeline.splat.position_cost import PositionCost
-from splatpipe.pipeline.splat.scene import Scene
+from splatpipe.pipeline.splat.model.position_cost import PositionCost
+from splatpipe.pipeline.splat.model.scene import Scene
 
 POINT_CLOUD, PLY = "point_cloud", "point_cloud.ply"
 ITERATION = 30_000  # of the reference's trainings: some viewers look nowhere else

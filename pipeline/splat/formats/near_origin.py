@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.splat.formats.bounded import usable
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.position_cost import sizes_of, two_digits
-from splatpipe.pipeline.splat.scene import MAX_OFFSET, Scene, SceneFacts
+from splatpipe.pipeline.splat.containers.bounded import usable
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.position_cost import sizes_of, two_digits
+from splatpipe.pipeline.splat.model.scene import MAX_OFFSET, Scene, SceneFacts
 
 STEPS_PER_SIZE = 16.0  # of float32 in a Gaussian: finer ones are not seen
 STEPS_ACROSS = 4096.0  # of float32 in the extent of a splat whose Gaussians' sizes are in another unit

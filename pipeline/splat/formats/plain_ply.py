@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values
+from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
+from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, read_stored_splat, write_splat
 from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_stored_splat, write_splat
-from splatpipe.pipeline.splat.position_cost import PositionCost, float32_cost
-from splatpipe.pipeline.splat.scene import NO_OFFSET, Axes, Scene, SceneFacts, facts_of_record
+from splatpipe.pipeline.splat.model.position_cost import PositionCost, float32_cost
+from splatpipe.pipeline.splat.model.scene import NO_OFFSET, Axes, Scene, SceneFacts, facts_of_record
 
 RECORD = "splatpipe "
 """Prefix of the comment with the record."""

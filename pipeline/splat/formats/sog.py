@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.splat.formats.bounded import CheckValues, check_values, open_file
+from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values, open_file
 from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.formats.sog_decoder import SogDecoder
 from splatpipe.pipeline.splat.formats.sog_images import META, RECORD, SogImages, encode_sog, position_cost
-from splatpipe.pipeline.splat.position_cost import PositionCost
-from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record, turn_of
+from splatpipe.pipeline.splat.model.position_cost import PositionCost
+from splatpipe.pipeline.splat.model.scene import Axes, Scene, SceneFacts, facts_of_record, turn_of
 
 __all__ = ["AXES", "SogImages", "encode_sog", "read", "write"]
 

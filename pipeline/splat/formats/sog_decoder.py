@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.splat.codebooks import CODEBOOK_SIZE
-from splatpipe.pipeline.splat.formats.bounded import check_expansion
-from splatpipe.pipeline.splat.formats.lossless_pictures import pixels_of_picture
+from splatpipe.pipeline.splat.containers.bounded import check_expansion
+from splatpipe.pipeline.splat.containers.codebooks import CODEBOOK_SIZE
+from splatpipe.pipeline.splat.containers.lossless_pictures import pixels_of_picture
 from splatpipe.pipeline.splat.formats.sog_images import ENTRIES_A_ROW, FIRST_MODE, LEVELS, MAX_ENTRIES, VERSION
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import MAX_DEGREE, coefficient_count
 
 MAX_EXPANSION = 40.0
 """With SH of degree 3 a Gaussian takes 15 of 236 bytes, in simple scenes half as many."""

@@ -12,14 +12,14 @@ import torch
 from jaxtyping import Float, Float32, Float64, Int64, UInt8, UInt16
 from torch import Tensor
 
-from splatpipe.pipeline.splat.codebooks import fit_codebook, nearest_codes
-from splatpipe.pipeline.splat.formats.lossless_pictures import webp_of_pixels
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.morton import morton_keys
-from splatpipe.pipeline.splat.neighbourhoods import reordered
-from splatpipe.pipeline.splat.palettes import fit_palette, nearest_entries
-from splatpipe.pipeline.splat.position_cost import PositionCost, sizes_of
-from splatpipe.pipeline.splat.sh import multiply_rows
+from splatpipe.pipeline.splat.containers.codebooks import fit_codebook, nearest_codes
+from splatpipe.pipeline.splat.containers.lossless_pictures import webp_of_pixels
+from splatpipe.pipeline.splat.containers.palettes import fit_palette, nearest_entries
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.morton import morton_keys
+from splatpipe.pipeline.splat.model.neighbourhoods import reordered
+from splatpipe.pipeline.splat.model.position_cost import PositionCost, sizes_of
+from splatpipe.pipeline.splat.model.sh import multiply_rows
 
 VERSION = 2
 META = "meta.json"

@@ -1,7 +1,7 @@
-"""SPZ: reads versions 1 to 3 (a gzip stream) and 4 (a header and zstd streams), writes 3 and 2; see ``splat.spz``.
+"""SPZ: reads versions 1 to 3 (a gzip stream) and 4 (a header and zstd streams), writes 3 and 2.
 
-Specification: README.md and src/cc/load-spz.cc of github.com/nianticlabs/spz. Our record is in gzip's extra field,
-which SPZ readers do not see.
+The numbers are those of ``splat.containers.spz_encoder``. Specification: README.md and src/cc/load-spz.cc of
+github.com/nianticlabs/spz. Our record is in gzip's extra field, which SPZ readers do not see.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import Float32, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import write_file
-from splatpipe.pipeline.splat.formats.bounded import (
+from splatpipe.pipeline.splat.containers.bounded import (
     CheckValues,
     InflatedFile,
     check_expansion,
@@ -28,12 +28,7 @@ from splatpipe.pipeline.splat.formats.bounded import (
     open_file,
     read_exactly,
 )
-from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.position_cost import PositionCost
-from splatpipe.pipeline.splat.scene import Axes, Scene, SceneFacts, facts_of_record, turn_of
-from splatpipe.pipeline.splat.sh import MAX_DEGREE, coefficient_count
-from splatpipe.pipeline.splat.spz import (
+from splatpipe.pipeline.splat.containers.spz_encoder import (
     ANTIALIASED,
     ARRAYS,
     COLOUR_SCALE,
@@ -48,6 +43,11 @@ from splatpipe.pipeline.splat.spz import (
     position_cost,
     spz_bytes,
 )
+from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.position_cost import PositionCost
+from splatpipe.pipeline.splat.model.scene import Axes, Scene, SceneFacts, facts_of_record, turn_of
+from splatpipe.pipeline.splat.model.sh import MAX_DEGREE, coefficient_count
 
 AXES: Axes = "y up"
 HALF_VERSION, ZSTD_VERSION = 1, 4  # positions in half floats; zstd streams
@@ -318,7 +318,7 @@ def _first_three(data: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
 
 
 def _smallest_three(data: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
-    """Unit quaternions (w, x, y, z) from the three smallest of x, y, z, w: see ``splat.spz``."""
+    """Unit quaternions (w, x, y, z) from the three smallest of x, y, z, w: see ``splat.containers.spz_encoder``."""
     words = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
     parts = words[:, None] >> np.array([20, 10, 0])
     size = (parts & ROTATION_STEPS) * (np.sqrt(0.5) / ROTATION_STEPS)

@@ -14,10 +14,10 @@ from splatpipe.pipeline.engine.json_file import json_text, read_json
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.render.rendering import load_rendering
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, read_splat, write_splat_parts
+from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, read_splat, write_splat_parts
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.cells.site_plan import SitePlan, load_site_plan
 from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
-from splatpipe.pipeline.train.blocks.site_plan import SitePlan, load_site_plan
 
 OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # copied from the coarse pass, which covers the whole scene
 FROM_COARSE = ("sky_photos", "device", "instruction_set", "mode")

@@ -12,18 +12,18 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.train.appearance.sky import SkyModel
+from splatpipe.pipeline.train.appearance.sky_file import write_skies
 from splatpipe.pipeline.train.blocks.forecast import footage_on
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths
 from splatpipe.pipeline.train.blocks.schedules import coarse_schedule
 from splatpipe.pipeline.train.loop import train_whole
-from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.planning import PlanningInput
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.sky_file import write_skies
-from splatpipe.pipeline.train.start import started
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.start import started
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.planning.measure import Step
+from splatpipe.pipeline.train.planning.planning import PlanningInput
 
 SKIES = "skies.npz"
 

@@ -12,23 +12,23 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.photos.images import Mask, load_mask, reduced_camera, reduced_mask
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.photos.pixels.images import Mask, load_mask, reduced_camera, reduced_mask
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import load_rendering, render_depth
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, photo_coverages
+from splatpipe.pipeline.train.blocks.cells.visibility import Windows, block_views
 from splatpipe.pipeline.train.blocks.lengths import finer_lengths
-from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.schedules import block_lengths, block_schedule
-from splatpipe.pipeline.train.blocks.visibility import Windows, block_views
-from splatpipe.pipeline.train.lengths import PhotoSizes
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.photo_cache import stored_bytes
-from splatpipe.pipeline.train.plan import footage_of, sizes_of
-from splatpipe.pipeline.train.windows import PixelRectangle, windows_of
+from splatpipe.pipeline.train.photos.photo_cache import stored_bytes
+from splatpipe.pipeline.train.plan.lengths import PhotoSizes
+from splatpipe.pipeline.train.plan.plan import footage_of, sizes_of
+from splatpipe.pipeline.train.plan.windows import PixelRectangle, windows_of
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def coarse_coverages(
         MachineError: if the requested device is not available.
     """
     device = choose_device(machine.device)
-    with same_bits(machine.threads), device.one_order():
+    with same_bits(machine.threads), device.deterministic():
         return list(iterate_coverages(coarse, read_splat(coarse / "model.ply"), views, observed, device))
 
 

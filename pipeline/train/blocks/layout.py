@@ -11,15 +11,18 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.geometry.plan_area import read_model_area
-from splatpipe.pipeline.photos.dataset import View, load_points_and_tracks, load_split, load_views
-from splatpipe.pipeline.photos.small_views import small_view
+from splatpipe.pipeline.photos.pixels.dataset import View, load_points_and_tracks, load_split, load_views
+from splatpipe.pipeline.photos.pixels.small_views import small_view
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.free_space import free_space
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
-from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
-from splatpipe.pipeline.train.blocks.division import Division
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality.free_space import free_space
+from splatpipe.pipeline.splat.sky.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
+from splatpipe.pipeline.train.blocks.cells.cutting import cut, shares, site, work_map
+from splatpipe.pipeline.train.blocks.cells.division import Division
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
+from splatpipe.pipeline.train.blocks.cells.site_plan import SitePlan, block_limits
 from splatpipe.pipeline.train.blocks.forecast import (
     BlockForecast,
     WindowScheme,
@@ -27,10 +30,7 @@ from splatpipe.pipeline.train.blocks.forecast import (
     coarse_coverages,
     footage_on,
 )
-from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
 from splatpipe.pipeline.train.blocks.scope import BlockScope, write_free_space
-from splatpipe.pipeline.train.blocks.site_plan import SitePlan, block_limits
 from splatpipe.pipeline.train.options import TrainConfig
 
 COARSE, PROSPECTS = "coarse", "prospects"  # folders in the stage's output

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from splatpipe.pipeline.train.lengths import Length, PhotoSizes, lengths_of
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan.lengths import Length, PhotoSizes, lengths_of
 
 COARSE_PART = 0.5  # of the iterations if there is only one size
 

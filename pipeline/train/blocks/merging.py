@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.blocks.partition import Partition
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
 
 
 def owned(partition: Partition, block: int, gaussians: Gaussians) -> Gaussians:

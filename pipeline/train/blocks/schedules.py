@@ -16,10 +16,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths, finer_lengths
-from splatpipe.pipeline.train.lengths import Length, PhotoSizes, lengths_of
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.rates import Rates
-from splatpipe.pipeline.train.schedule import Schedule, schedule_of
+from splatpipe.pipeline.train.plan.lengths import Length, PhotoSizes, lengths_of
+from splatpipe.pipeline.train.plan.rates import Rates
+from splatpipe.pipeline.train.plan.schedule import Schedule, schedule_of
 
 
 def block_lengths(config: TrainConfig, footage: PhotoSizes, parts: Mapping[int, int]) -> list[Length]:

@@ -19,17 +19,17 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.splat.archives import read_archive
-from splatpipe.pipeline.splat.free_space import FreeSpace, PhotoBounds
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.splat.containers.archives import read_archive
+from splatpipe.pipeline.splat.containers.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality.free_space import FreeSpace, PhotoBounds
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
+from splatpipe.pipeline.train.blocks.cells.sample_mask import SampleMask, counted_samples
+from splatpipe.pipeline.train.blocks.cells.surroundings import BlockSurroundings, visible_around
+from splatpipe.pipeline.train.blocks.cells.visibility import BlockPhoto, BlockViews
 from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
-from splatpipe.pipeline.train.blocks.partition import Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage
-from splatpipe.pipeline.train.blocks.sample_mask import SampleMask, counted_samples
-from splatpipe.pipeline.train.blocks.surroundings import BlockSurroundings, visible_around
-from splatpipe.pipeline.train.blocks.visibility import BlockPhoto, BlockViews
 
 FROZEN = "frozen.ply"
 FREE = "free_space.npz"

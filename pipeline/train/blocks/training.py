@@ -13,30 +13,30 @@ from pathlib import Path
 from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Machine, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import PlanArea
-from splatpipe.pipeline.photos.dataset import View, load_split, load_views
+from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import MIP_COMMENT, write_splat
+from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
+from splatpipe.pipeline.train.appearance.exposure import Exposure, read_exposures
+from splatpipe.pipeline.train.appearance.sky import SkyModel
+from splatpipe.pipeline.train.appearance.sky_file import read_skies
+from splatpipe.pipeline.train.blocks.cells.fence import Fence
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.coarse import SKIES
-from splatpipe.pipeline.train.blocks.fence import Fence
 from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
-from splatpipe.pipeline.train.blocks.partition import Partition
 from splatpipe.pipeline.train.blocks.schedules import block_schedule
 from splatpipe.pipeline.train.blocks.scope import BlockScope, ScopeReader, read_free_space, rows_of
-from splatpipe.pipeline.train.exposure import Exposure, read_exposures
-from splatpipe.pipeline.train.floater_pruning import FloaterPruning
-from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.hooks import Technique
 from splatpipe.pipeline.train.loop import TrainingSetup, go_through, summary_of
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, footage_of, load_or_write_plan, make_plan, sizes_of
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.sky_file import read_skies
-from splatpipe.pipeline.train.techniques import Techniques, make_techniques
-from splatpipe.pipeline.train.training_order import TrainingOrder, WindowOrder
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of, load_or_write_plan, make_plan, sizes_of
+from splatpipe.pipeline.train.plan.training_order import TrainingOrder, WindowOrder
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.state.history import History
+from splatpipe.pipeline.train.techniques.floater_pruning import FloaterPruning
+from splatpipe.pipeline.train.techniques.techniques import Techniques, make_techniques
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def train_block(
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
     device = choose_device(machine.device, config.unfit_for_cuda(), report.note)
-    with same_bits(machine.threads), device.one_order(), device.memory_limit(config.max_memory_bytes):
+    with same_bits(machine.threads), device.deterministic(), device.memory_limit(config.max_memory_bytes):
         block = Block.of(config, parts, task, device)
         scope = block.scope_reader.scope()
         windows = scope.windows
@@ -107,7 +107,7 @@ def train_block(
             report.note("there is nothing to train")
             return _leave(block, plan, out, (block.start(), History())) | device.facts()
         report.note(f"{len(plan.train_views)} photos, {plan.described()}")
-        state = go_through(block.course(plan, scope, out), out, report)
+        state = go_through(block.setup(plan, scope, out), out, report)
         left = _leave(block, plan, out, (state.finished(), state.whole_history()))
     return summary_of(state, plan) | left | device.facts()
 
@@ -186,7 +186,7 @@ class Block:
         size = round(1e-6 * seen.pixels(TrainingSize(schedule.finest.level)), 4)
         return replace(planned, schedule=schedule, last_iteration=schedule.iterations, train_megapixels=size)
 
-    def course(self, plan: TrainingPlan, scope: BlockScope, out: Path) -> TrainingSetup:
+    def setup(self, plan: TrainingPlan, scope: BlockScope, out: Path) -> TrainingSetup:
         """The block's training setup.
 
         Args:
@@ -203,9 +203,9 @@ class Block:
             for level, pairs in windows.items()
         }
 
-        def order_of(looks: Sequence[TrainingSize]) -> TrainingOrder:
+        def order_of(sizes: Sequence[TrainingSize]) -> TrainingOrder:
             cameras = [view.camera for view in views]
-            return WindowOrder(cameras, looks, plan.options.seed, plan.megapixels, pieces, cells)
+            return WindowOrder(cameras, sizes, plan.options.seed, plan.megapixels, pieces, cells)
 
         return TrainingSetup(
             plan,

@@ -8,12 +8,12 @@ import pytest
 from command import splatpipe
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.cli_runs import overrides, request_of
+from splatpipe.pipeline.app.commands.runs import overrides, request_of
 from splatpipe.pipeline.app.preflight.start import COMMAND_BYTES, forecast_text, require_memory, shortage_text
 from splatpipe.pipeline.engine import machine
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.engine.session import Request
+from splatpipe.pipeline.engine.runs.session import Request
 from splatpipe.stages.costs import REFERENCE
 from splatpipe.stages.forecast import forecast, min_memory_bytes
 from splatpipe.stages.options import LineConfig

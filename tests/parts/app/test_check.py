@@ -12,17 +12,17 @@ from command import splatpipe
 from PIL import ExifTags, Image, ImageFilter
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.cli_runs import overrides
+from splatpipe.pipeline.app.commands.runs import overrides
 from splatpipe.pipeline.app.preflight.examination import examine_capture
 from splatpipe.pipeline.app.preflight.findings import Finding, Preflight, as_json
 from splatpipe.pipeline.app.preflight.intake import read_capture
 from splatpipe.pipeline.app.preflight.places import control_findings
 from splatpipe.pipeline.engine.config import load_preset
 from splatpipe.pipeline.engine.events import EventReporter
-from splatpipe.pipeline.engine.source import open_source
-from splatpipe.pipeline.photos.detail import detail_at, levels_at
-from splatpipe.pipeline.survey.flight_gaps import find_missing
-from splatpipe.pipeline.survey.swapped_positions import PositionEvidence, find_swapped
+from splatpipe.pipeline.engine.runs.source import open_source
+from splatpipe.pipeline.photos.intake.detail import detail_at, levels_at
+from splatpipe.pipeline.survey.positions.flight_gaps import find_missing
+from splatpipe.pipeline.survey.positions.swapped_positions import PositionEvidence, find_swapped
 from splatpipe.stages.line import LINE
 
 RING = range(1, 17)  # photos of the demo's lower orbit

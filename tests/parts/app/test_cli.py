@@ -14,7 +14,7 @@ from splatpipe.pipeline.raster.isa import choose_isa, isa_names
 
 
 def in_a_process(*arguments: object, **variables: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **variables})
 
 

@@ -14,7 +14,7 @@ from splatpipe.pipeline.app.formats import check_possible, with_formats
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts
 
 
 def splatpipe(*arguments: str) -> tuple[int, dict[str, Any]]:

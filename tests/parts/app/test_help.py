@@ -12,8 +12,8 @@ import typer
 from command import splatpipe
 from repository import ROOT
 
-from splatpipe.pipeline.app.cli import app
-from splatpipe.pipeline.app.cli_help import PAGES
+from splatpipe.pipeline.app.cli.help import PAGES
+from splatpipe.pipeline.app.cli.main import app
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 SCREENS = 100  # lines: two screens of a terminal, 80 columns wide
@@ -64,7 +64,7 @@ def home(tmp_path: Path) -> Path:
     """A home folder without completion, and a ``splatpipe`` in its ``bin``."""
     program = tmp_path / "bin" / "splatpipe"
     program.parent.mkdir()
-    program.write_text(f"#!{sys.executable}\nfrom splatpipe.pipeline.app.cli import main\nmain()\n")
+    program.write_text(f"#!{sys.executable}\nfrom splatpipe.pipeline.app.cli.main import main\nmain()\n")
     program.chmod(0o755)
     return tmp_path
 

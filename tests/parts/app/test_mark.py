@@ -10,10 +10,10 @@ from marked_points import POINTS, TRUTH, by_gps_alone, marks_in, read_points
 from splatpipe.pipeline.app.view.marking import Marking, WrongRequestError
 from splatpipe.pipeline.app.view.marking_job import open_job
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.photos.names import NameFinder
-from splatpipe.pipeline.survey.control_edit import ControlText
-from splatpipe.pipeline.survey.level import Positions
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.photos.files.names import NameFinder
+from splatpipe.pipeline.survey.files.control_edit import ControlText
+from splatpipe.pipeline.survey.placing.level import Positions
 from splatpipe.stages.line import LINE
 
 

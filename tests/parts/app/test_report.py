@@ -20,7 +20,7 @@ from finished_run import linked_copy, write_apart
 from PIL import Image
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.console import show_bad_cameras
+from splatpipe.pipeline.app.commands.console import show_bad_cameras
 from splatpipe.pipeline.app.report import is_current, make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter

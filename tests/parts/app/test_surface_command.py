@@ -12,8 +12,8 @@ from finished_run import write_apart
 from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measurement_lines
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.quantities import parse_length
-from splatpipe.pipeline.surface import tsdf
-from splatpipe.pipeline.surface.facades import parse_lines
+from splatpipe.pipeline.surface.facades.facades import parse_lines
+from splatpipe.pipeline.surface.shapes import tsdf
 from splatpipe.stages.products import options_for
 
 

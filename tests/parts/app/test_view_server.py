@@ -392,7 +392,14 @@ def test_it_listens_on_the_loopback_address_only(served: Served) -> None:
 
 def test_invalid_calls_are_reported(demo_run: Path, tmp_path: Path) -> None:
     def view(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "view", *map(str, arguments), "--no-browser"]
+        command = [
+            sys.executable,
+            "-m",
+            "splatpipe.pipeline.app.cli.main",
+            "view",
+            *map(str, arguments),
+            "--no-browser",
+        ]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
 
     done = view(tmp_path)

@@ -13,13 +13,13 @@ from splatpipe.pipeline.app.report.training import removed_in_words
 from splatpipe.pipeline.edit.options import CleanConfig
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.photos.dataset import load_views
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
-from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.photos.pixels.dataset import load_views
+from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.splat.sky.panorama import write_panorama
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.plan.plan import make_plan
 from splatpipe.stages import clean
 from splatpipe.stages.line import CLEAN, LINE
 

@@ -10,14 +10,14 @@ import pytest
 import torch
 from jaxtyping import Bool, Float32, Float64
 
-from splatpipe.pipeline.edit.cleaning import CleaningResult, clean_scene
-from splatpipe.pipeline.edit.depth_islands import without_islands
-from splatpipe.pipeline.edit.visibility import TrainingPhotos, measure_visibility
+from splatpipe.pipeline.edit.floaters.cleaning import CleaningResult, clean_scene
+from splatpipe.pipeline.edit.floaters.depth_islands import without_islands
+from splatpipe.pipeline.edit.floaters.visibility import TrainingPhotos, measure_visibility
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.images import Mask, Pixels
+from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 
 SPACING = 0.1
 OPTIONS = rasterizer.RenderOptions(sh_degree=0)

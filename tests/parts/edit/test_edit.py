@@ -16,7 +16,8 @@ from command import splatpipe
 from pyproj import Transformer
 from tiny_scene import Recorder, cameras, true_model
 
-from splatpipe.pipeline.app.cli_edit import steps_in_order
+from splatpipe.pipeline.app.cli.edit import steps_in_order
+from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.edit.editing import EditTask, edit_splat
 from splatpipe.pipeline.edit.pictures import choose_views, oblique_view
 from splatpipe.pipeline.edit.record import with_edits
@@ -29,13 +30,12 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
+from splatpipe.pipeline.splat.containers.ply import property_names
 from splatpipe.pipeline.splat.formats import format_named, plain_ply
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import property_names
-from splatpipe.pipeline.splat.scene import MAX_EDITS, Scene, SceneFacts, SplatOrigin, turn_of
-from splatpipe.pipeline.survey.frames import Origin
-from splatpipe.pipeline.survey.handover import frame_of
-from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import MAX_EDITS, Scene, SceneFacts, SplatOrigin, turn_of
+from splatpipe.pipeline.survey.crs.frames import Origin
+from splatpipe.pipeline.survey.crs.world import open_world
 
 PLACE = SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
 PLACED = SceneFacts("z up", False, True, PLACE)

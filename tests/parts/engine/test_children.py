@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatpipe.pipeline.engine.children import run_children
+from splatpipe.pipeline.engine.runs.children import run_children
 
 CODE = "timeit"  # runs its arguments as statements; the first of them is our process number, which does no harm
 

@@ -13,10 +13,10 @@ from engine_runs import request_of, run_in_background, walk
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter
-from splatpipe.pipeline.engine.line import Line, line_status
-from splatpipe.pipeline.engine.run_folder import open_run_folder
-from splatpipe.pipeline.engine.session import open_session, status_of
-from splatpipe.pipeline.engine.store import open_store
+from splatpipe.pipeline.engine.runs.line import Line, line_status
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.session import open_session, status_of
+from splatpipe.pipeline.engine.runs.store import open_store
 
 pytestmark = pytest.mark.usefixtures("lines")
 

@@ -10,9 +10,9 @@ from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.digests import HashTable
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import EventReporter
-from splatpipe.pipeline.engine.line import Line
-from splatpipe.pipeline.engine.source import MAX_NAMED_BYTES, RunSource, open_source, with_absolute_files
-from splatpipe.pipeline.engine.store import Part
+from splatpipe.pipeline.engine.runs.line import Line
+from splatpipe.pipeline.engine.runs.source import MAX_NAMED_BYTES, RunSource, open_source, with_absolute_files
+from splatpipe.pipeline.engine.runs.store import Part
 from splatpipe.stages.line import GEOREF, INGEST, LINE
 from splatpipe.stages.options import LineConfig
 

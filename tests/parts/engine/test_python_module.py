@@ -8,7 +8,7 @@ import pytest
 from repository import ROOT
 
 from splatpipe.pipeline.engine.python_module import SAFE_PATH, python_module
-from splatpipe.pipeline.engine.session import _worker_environment
+from splatpipe.pipeline.engine.runs.session import _worker_environment
 
 PLANTED = "open('planted-was-run', 'w').close()\nraise SystemExit(7)\n"
 SOURCES = sorted((ROOT / "pipeline").rglob("*.py")) + sorted((ROOT / "stages").glob("*.py"))
@@ -17,7 +17,7 @@ SOURCES = sorted((ROOT / "pipeline").rglob("*.py")) + sorted((ROOT / "stages").g
 @pytest.mark.parametrize("name", ["numpy", "splatpipe", "json", "torch"])
 def test_a_module_planted_in_the_current_folder_is_not_run(tmp_path: Path, name: str) -> None:
     (tmp_path / f"{name}.py").write_text(PLANTED)
-    command = python_module("splatpipe.pipeline.splat.gaussians")  # imports all of them
+    command = python_module("splatpipe.pipeline.splat.model.gaussians")  # imports all of them
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "planted-was-run").exists()

@@ -14,9 +14,9 @@ from splatpipe.pipeline.app.report.run_history import read_history
 from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.line import line_status
-from splatpipe.pipeline.engine.needs import Need, used_and_forecast
-from splatpipe.pipeline.engine.session import open_session, status_of
+from splatpipe.pipeline.engine.runs.line import line_status
+from splatpipe.pipeline.engine.runs.needs import Need, used_and_forecast
+from splatpipe.pipeline.engine.runs.session import open_session, status_of
 from splatpipe.pipeline.engine.stage import Summary, shards_first
 
 pytestmark = pytest.mark.usefixtures("lines")
@@ -69,7 +69,7 @@ def test_a_killed_shard_costs_only_itself(numbers: Path, out: Path, monkeypatch:
 def test_no_shard_is_made_during_a_run_that_has_exclusive_access(
     numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
+    monkeypatch.setattr("splatpipe.pipeline.engine.runs.lock.PATIENCE_S", 0.2)
     request = request_of(numbers, out)
     walk(request, until="divide")
     with open_session(request, lambda event: None), pytest.raises(UsageError, match="is working in"):

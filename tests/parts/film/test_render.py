@@ -15,7 +15,7 @@ from PIL import Image
 
 from splatpipe.pipeline.app.renders import RenderRequest, RenderTask, render_run
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.film.camera_path import cameras_along
 from splatpipe.pipeline.film.filming import coloured_depth, coloured_normals, open_scene
@@ -24,18 +24,18 @@ from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.film.photo_route import photo_film
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render import rendering
 from splatpipe.pipeline.render.rendering import render_depth, render_normals, render_pixels
-from splatpipe.pipeline.splat.gaussians import Gaussians, quat_from_rotation
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama, write_panorama
-from splatpipe.pipeline.splat.ply import write_splat
-from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.splat.containers.ply import write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians, quat_from_rotation
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, Panorama, write_panorama
+from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.plan.plan import make_plan
 from splatpipe.stages import flythrough
 from splatpipe.stages.line import EXPORT, LINE
 

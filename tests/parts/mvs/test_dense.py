@@ -19,9 +19,9 @@ from splatpipe.pipeline.mvs.neighbours import SparseVisibility, inverse_depths, 
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.mvs.patch_match import find_depths
 from splatpipe.pipeline.mvs.picture import Picture
-from splatpipe.pipeline.photos.dataset import load_points, load_views
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train.start import read_start
+from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.train.plan.start import read_start
 from splatpipe.stages import initialize as stages_initialize
 from splatpipe.stages.initialize import run
 

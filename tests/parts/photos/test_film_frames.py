@@ -16,13 +16,13 @@ from splatpipe.pipeline.app.preflight.start import require_readable
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
-from splatpipe.pipeline.engine.session import Request, open_session, status_of
-from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.engine.runs.session import Request, open_session, status_of
+from splatpipe.pipeline.engine.runs.source import open_source
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.pipeline.film.video import VideoWriter
-from splatpipe.pipeline.photos.exif import read_exif
+from splatpipe.pipeline.photos.files.photo_list import decode, load_photo_list
+from splatpipe.pipeline.photos.metadata.exif import read_exif
 from splatpipe.pipeline.photos.options import IngestConfig
-from splatpipe.pipeline.photos.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.video.frames import extract_frames
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig

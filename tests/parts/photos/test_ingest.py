@@ -19,15 +19,10 @@ from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.session import Request, open_session
-from splatpipe.pipeline.engine.source import open_source
+from splatpipe.pipeline.engine.runs.session import Request, open_session
+from splatpipe.pipeline.engine.runs.source import open_source
 from splatpipe.pipeline.engine.stage import Inputs, Machine, Summary
-from splatpipe.pipeline.photos.camera_groups import focal_prior
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.detail import read_grey
-from splatpipe.pipeline.photos.exif import Exif
-from splatpipe.pipeline.photos.options import IngestConfig
-from splatpipe.pipeline.photos.photo_list import (
+from splatpipe.pipeline.photos.files.photo_list import (
     Photo,
     decode,
     decode_mask,
@@ -35,8 +30,13 @@ from splatpipe.pipeline.photos.photo_list import (
     load_photo_list,
     photo_root,
 )
-from splatpipe.pipeline.photos.picture_file import LARGE_PIXELS
-from splatpipe.pipeline.photos.scan import Candidate
+from splatpipe.pipeline.photos.files.picture_file import LARGE_PIXELS
+from splatpipe.pipeline.photos.files.scan import Candidate
+from splatpipe.pipeline.photos.intake.camera_groups import focal_prior
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.photos.intake.detail import read_grey
+from splatpipe.pipeline.photos.metadata.exif import Exif
+from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.stages.ingest import run
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig

@@ -48,7 +48,7 @@ def slurm(tmp_path: Path, *arguments: object) -> subprocess.Popen[str]:
     """The job's script with this splatpipe on PATH, as Slurm starts it."""
     programs = tmp_path / "bin"
     programs.mkdir()
-    (programs / "splatpipe").write_text(f'#!/bin/sh\nexec {sys.executable} -m splatpipe.pipeline.app.cli "$@"\n')
+    (programs / "splatpipe").write_text(f'#!/bin/sh\nexec {sys.executable} -m splatpipe.pipeline.app.cli.main "$@"\n')
     (programs / "splatpipe").chmod(0o755)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
     (programs / "scontrol").write_text('#!/bin/sh\necho "$@" >> "$SUBMITTED"\n')

@@ -14,9 +14,9 @@ from some_splats import some_gaussians
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.batch.capture_list import read_captures
-from splatpipe.pipeline.app.cli import app
+from splatpipe.pipeline.app.cli.main import app
 from splatpipe.pipeline.engine.config import load_file, load_preset, option_names, parse_set, resolve
-from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.splat.containers.ply import write_splat
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 

@@ -32,7 +32,7 @@ def test_every_version_matches_the_present_sources() -> None:
 
 
 def test_a_changed_result_without_a_raised_version_is_noticed(copy: Path) -> None:
-    replace(copy / "pipeline/splat/free_space.py", r"^CELLS = \d+", "CELLS = 99")
+    replace(copy / "pipeline/splat/quality/free_space.py", r"^CELLS = \d+", "CELLS = 99")
     noticed = complained_of(copy)
     assert "train" in noticed and not noticed & {"ingest", "features", "matches", "sparse", "georef"}
     assert "make versions" in record.complaint(copy)
@@ -43,7 +43,7 @@ def test_the_body_of_a_stages_shards_belongs_to_it(copy: Path) -> None:
     shards = '    shards=Shards("undistort.dataset", {}, entry="splatpipe.stages.train:run"),'
     replace(copy / "stages/line.py", f"^{entry}", f"{entry}\n{shards}")
     record.write(copy, record.present(copy))
-    replace(copy / "pipeline/splat/free_space.py", r"^CELLS = \d+", "CELLS = 99")
+    replace(copy / "pipeline/splat/quality/free_space.py", r"^CELLS = \d+", "CELLS = 99")
     assert {"split", "train"} <= complained_of(copy)
 
 
@@ -98,5 +98,5 @@ def test_an_upward_import_and_a_stage_that_imports_a_stage_are_noticed(copy: Pat
     )
     assert done.returncode == 1
     assert "2 broken" in done.stdout
-    assert "splatpipe.pipeline.geometry.camera -> splatpipe.pipeline.splat.ply" in done.stdout
+    assert "splatpipe.pipeline.geometry.camera -> splatpipe.pipeline.splat.containers.ply" in done.stdout
     assert "splatpipe.stages.undistort -> splatpipe.stages.sparse" in done.stdout

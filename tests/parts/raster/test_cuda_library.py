@@ -14,8 +14,8 @@ from building import build_on_cpu
 from repository import ROOT
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster import cuda_api, cuda_driver, cuda_library
-from splatpipe.pipeline.raster.cuda_library import CudaDevice, CudaInstallation, CudaLibrary, reason_of
+from splatpipe.pipeline.raster.cuda import cuda_api, cuda_driver, cuda_library
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaDevice, CudaInstallation, CudaLibrary, reason_of
 
 NATIVE = ROOT / "pipeline" / "native"
 API = "".join((NATIVE / name).read_text() for name in ("cuda/api.h", "raster/shot.h"))
@@ -183,7 +183,7 @@ def test_the_systems_state_leads_to_the_reason(fake_driver, version, init, has_k
     library = build_on_cpu() if has_kernels else fake_driver / "libsplat_cuda.so"
     code = f"""
 from pathlib import Path
-from splatpipe.pipeline.raster.cuda_library import why_not
+from splatpipe.pipeline.raster.cuda.cuda_library import why_not
 print(why_not(Path({str(library)!r})).reason)
 """
     environment = os.environ | {
@@ -229,7 +229,7 @@ def test_the_drivers_own_version_is_the_kernels(tmp_path, monkeypatch, content, 
 def test_if_the_kernel_does_not_report_the_version_nvml_does(fake_driver, tmp_path, text, release):
     code = f"""
 from pathlib import Path
-from splatpipe.pipeline.raster.cuda_driver import driver_release
+from splatpipe.pipeline.raster.cuda.cuda_driver import driver_release
 print(repr(driver_release(Path({str(tmp_path)!r}))))
 """
     environment = os.environ | {"LD_LIBRARY_PATH": str(fake_driver), "FAKE_RELEASE": text}

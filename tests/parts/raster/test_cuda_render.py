@@ -8,8 +8,8 @@ from on_cpu import kernels_on_cpu
 from random_scene import random_scene
 
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_forecast import (
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_forecast import (
     FIRST_PASSES,
     MARGIN,
     WINDOW,

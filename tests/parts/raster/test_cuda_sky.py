@@ -8,8 +8,8 @@ import torch
 from cuda_skies import CPU, composed
 from on_cpu import kernels_on_cpu
 
-from splatpipe.pipeline.raster.cuda import use_kernels
-from splatpipe.pipeline.raster.cuda_library import why_not
+from splatpipe.pipeline.raster.cuda.cuda import use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 
 ATOL = 2e-6  # of colours up to 1, and of sums over 15 x 15 pixels with weights up to 1
 
@@ -27,7 +27,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
         with use_kernels(kernels_on_cpu()):
             yield CPU
         return
-    if why_not() is not None:
+    if unavailable_reason() is not None:
         pytest.skip("no CUDA device")
     yield torch.device("cuda", 0)
 

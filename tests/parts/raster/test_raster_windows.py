@@ -11,10 +11,10 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.native import _native
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
-from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 PICTURES = ("colour", "alpha", "depth_sum", "depth_square_sum", "median_depth")
 SIZE = (70, 53)

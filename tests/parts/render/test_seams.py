@@ -11,7 +11,7 @@ from planted_seams import STRIP, colour_step, doubled, gap
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
 from splatpipe.pipeline.render.seams import KINDS, LIMITS, Seam, border_cameras, find_seams
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 PLAN = GroundPlan.across(np.array([0.0, 0.0, 1.0]))
 

@@ -11,14 +11,14 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos.photo_list import load_photo_list
+from splatpipe.pipeline.photos.files.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.ladder import LadderContext, run_ladder, settle, without
-from splatpipe.pipeline.sfm.ladder_joins import join
-from splatpipe.pipeline.sfm.ladder_pairs import match_more, propose_pairs
-from splatpipe.pipeline.sfm.mapping import MappingOptions, map_incremental
+from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, map_incremental
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
+from splatpipe.pipeline.sfm.recovery.ladder import LadderContext, register_until_stable, run_ladder, without
+from splatpipe.pipeline.sfm.recovery.ladder_joins import join
+from splatpipe.pipeline.sfm.recovery.ladder_pairs import match_more, propose_pairs
 from splatpipe.stages import features, matches
 
 COUNT = 8
@@ -213,7 +213,7 @@ def test_a_photo_of_another_place_is_not_placed(
     matches[7, 8] = np.array(poster, np.uint32)
     wrong = replace(before, verified=replace(before.verified, matches=matches))
     work = LadderContext(room, MappingOptions(), corner_photos.Recorder())
-    assert settle(work, wrong).model.num_reg_images() == COUNT - 1
+    assert register_until_stable(work, wrong).model.num_reg_images() == COUNT - 1
 
 
 def test_if_all_photos_are_registered_nothing_changes(

@@ -8,10 +8,10 @@ import pytest
 from lens_scene import HEIGHT, WIDTH, LensScene, make_lens, make_scene, orbit, strips
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.sfm import lens_trial
-from splatpipe.pipeline.sfm.focal import focal_sigmas
-from splatpipe.pipeline.sfm.lens_model import StatedLens, apart_px, named_params, narrow, simplest, widen
-from splatpipe.pipeline.sfm.lenses import calibrate
+from splatpipe.pipeline.sfm.lenses import lens_trial
+from splatpipe.pipeline.sfm.lenses.focal import focal_sigmas
+from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens, apart_px, named_params, narrow, simplest, widen
+from splatpipe.pipeline.sfm.lenses.lenses import calibrate
 
 SIMPLE = (850.0, WIDTH / 2, HEIGHT / 2, -0.05)
 # The P1's distortion (its profile in Pix4D's database) on this wider lens, doubled; the principal point 20 pixels off.

@@ -9,10 +9,10 @@ import pytest
 from flight_scene import FOCAL_PX, GSD_M, SyntheticFlight, make_flight, write_database
 from mapped_apart import centre_errors, centres, oracle
 
-from splatpipe.pipeline.sfm.completion import complete
-from splatpipe.pipeline.sfm.mapping import MappingOptions, incremental_options, map_global, map_incremental
-from splatpipe.pipeline.sfm.reduction import PAIR_FLOOR, best_keypoints, write_reduced
-from splatpipe.pipeline.sfm.view_graph import ViewGraph, read_verified
+from splatpipe.pipeline.sfm.mapping.completion import complete
+from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options, map_global, map_incremental
+from splatpipe.pipeline.sfm.matching.reduction import PAIR_FLOOR, best_keypoints, write_reduced
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 
 PHOTOS, SEED, OBSERVATIONS = 48, 1, 500
 

@@ -7,9 +7,9 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.sfm import matching
-from splatpipe.pipeline.sfm.matching import match_pairs
-from splatpipe.pipeline.sfm.matching_process import match_listed
+from splatpipe.pipeline.sfm.matching import matching
+from splatpipe.pipeline.sfm.matching.matching import match_pairs
+from splatpipe.pipeline.sfm.matching.matching_process import match_listed
 
 PHOTOS = 4  # the last shows something else
 POINTS = 400

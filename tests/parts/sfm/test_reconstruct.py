@@ -10,14 +10,14 @@ import pytest
 from view_graph import Ring, add_points, make_ring, model_of, moved, turn_up, write_database, write_descriptors
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.photo_list import PhotoList
+from splatpipe.pipeline.photos.files.photo_list import PhotoList
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.judging import judge
-from splatpipe.pipeline.sfm.mapping import MappingOptions
+from splatpipe.pipeline.sfm.judging.judging import judge
+from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions
+from splatpipe.pipeline.sfm.model.view_graph import read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.probing import probe
 from splatpipe.pipeline.sfm.reconstruct import MappingAttempt, Reconstructor, reconstruct
-from splatpipe.pipeline.sfm.view_graph import read_verified
+from splatpipe.pipeline.sfm.recovery.probing import probe
 
 
 def capture_of(ring: Ring, folder: Path, reach: int = 99) -> MappingInput:

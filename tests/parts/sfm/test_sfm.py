@@ -11,8 +11,8 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos.images import reduced
-from splatpipe.pipeline.sfm.keypoints import largest
+from splatpipe.pipeline.photos.pixels.images import reduced
+from splatpipe.pipeline.sfm.matching.keypoints import largest
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
 from splatpipe.stages import features, matches, sparse
 

@@ -10,16 +10,16 @@ from house_photos import GSD_M, Recorder, house_site, photos, run_surface, surfa
 
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface import dense_cloud
-from splatpipe.pipeline.surface.dense_cloud import CloudTask, make_cloud, tile_cloud
-from splatpipe.pipeline.surface.fusion import FusedPoints
-from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.photo_gains import PhotoGains
-from splatpipe.pipeline.surface.photo_set import PhotoSet, SurfacePieces
-from splatpipe.pipeline.surface.point_colours import photo_set, point_colours
-from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache
-from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.surface.depths.photo_gains import PhotoGains
+from splatpipe.pipeline.surface.depths.photo_set import PhotoSet, SurfacePieces
+from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache
+from splatpipe.pipeline.surface.rasters.lattice import Lattice
+from splatpipe.pipeline.surface.rasters.tiles import Tile
+from splatpipe.pipeline.surface.shapes import dense_cloud
+from splatpipe.pipeline.surface.shapes.dense_cloud import CloudTask, make_cloud, tile_cloud
+from splatpipe.pipeline.surface.shapes.fusion import FusedPoints
+from splatpipe.pipeline.surface.shapes.point_colours import photo_set, point_colours
+from splatpipe.pipeline.survey.crs.frames import Frame
 
 FRAME = Frame("arbitrary", Similarity.identity(), metres=True)
 LATTICE = Lattice(-5.0, 5.0, GSD_M, 100, 100)

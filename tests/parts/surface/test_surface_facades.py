@@ -19,18 +19,18 @@ from PIL import Image
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface import elevation as elevation_module
-from splatpipe.pipeline.surface.elevation import Elevation, ElevationPhotos, draw_elevation, wall_sheet
-from splatpipe.pipeline.surface.facades import FacadesTask, make_facades
-from splatpipe.pipeline.surface.facets import Facets, facets_of, upright_facets
-from splatpipe.pipeline.surface.holes import fill_holes
-from splatpipe.pipeline.surface.map_crs import MapCrs, open_map
-from splatpipe.pipeline.surface.openings import outlines, projections, recesses
-from splatpipe.pipeline.surface.photo_gains import PhotoGains
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.sources import DepthSource
-from splatpipe.pipeline.surface.walls import MIN_HEIGHT_M, Wall, find_walls
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.depths.photo_gains import PhotoGains
+from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.depths.sources import DepthSource
+from splatpipe.pipeline.surface.facades import elevation as elevation_module
+from splatpipe.pipeline.surface.facades.elevation import Elevation, ElevationPhotos, draw_elevation, wall_sheet
+from splatpipe.pipeline.surface.facades.facades import FacadesTask, make_facades
+from splatpipe.pipeline.surface.facades.facets import Facets, facets_of, upright_facets
+from splatpipe.pipeline.surface.facades.openings import outlines, projections, recesses
+from splatpipe.pipeline.surface.facades.walls import MIN_HEIGHT_M, Wall, find_walls
+from splatpipe.pipeline.surface.heights.holes import fill_holes
+from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, open_map
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 PIXEL_M = 0.04
 FRAME = Frame("enu", Similarity.identity(), Origin(47.83, 13.51, 512.0), "ellipsoidal", crs="EPSG:32633")

@@ -16,13 +16,13 @@ from house_site import true_height
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface.blocks import SIDE, blocks_of, keys_of, surface_blocks
-from splatpipe.pipeline.surface.mesh_files import write_mesh
-from splatpipe.pipeline.surface.photo_set import PhotoSet
-from splatpipe.pipeline.surface.point_colours import photo_set
-from splatpipe.pipeline.surface.surface_mesh import MeshTask, decimate, make_mesh, vertex_colours
-from splatpipe.pipeline.surface.triangles import ColouredMesh, TriangleMesh, in_order, without_crumbs
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.depths.photo_set import PhotoSet
+from splatpipe.pipeline.surface.shapes.blocks import SIDE, blocks_of, keys_of, surface_blocks
+from splatpipe.pipeline.surface.shapes.mesh_files import write_mesh
+from splatpipe.pipeline.surface.shapes.point_colours import photo_set
+from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, decimate, make_mesh, vertex_colours
+from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, in_order, remove_small_components
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 FRAME = Frame("enu", Similarity.identity(), Origin(47.8412, 13.5127, 512.0), "ellipsoidal", crs="EPSG:32633")
 BOX = house_site().box
@@ -69,10 +69,10 @@ def test_the_same_mesh_has_one_order() -> None:
 
 def test_crumbs_are_removed_and_large_pieces_kept() -> None:
     mesh = together(sheet(0.0, 8), sheet(10.0, 2), sheet(20.0, 4))
-    assert without_crumbs(mesh, 0.9).areas().sum() == pytest.approx(4.0 + 1.0)
-    kept = without_crumbs(mesh, 1.1)
+    assert remove_small_components(mesh, 0.9).areas().sum() == pytest.approx(4.0 + 1.0)
+    kept = remove_small_components(mesh, 1.1)
     assert len(kept.vertices) == 81 and kept.vertices[:, 0].max() <= 2.0
-    assert not len(without_crumbs(mesh, 10.0).triangles)
+    assert not len(remove_small_components(mesh, 10.0).triangles)
 
 
 def test_blocks_have_numbers_of_their_own() -> None:

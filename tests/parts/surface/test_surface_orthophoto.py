@@ -9,16 +9,28 @@ import pytest
 from house_site import cameras, depths_of, edge_distance, photo_of, true_height, true_orthophoto
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.surface import mosaic
-from splatpipe.pipeline.surface.exposures import exposure_levels
-from splatpipe.pipeline.surface.height_field import HeightField
-from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.orthophoto import EXTENDED_CELLS, OrthoInput, Orthophoto, orthophotos, tile_orthophoto
-from splatpipe.pipeline.surface.photo_gains import GAMMA, OFFSET, PhotoGains
-from splatpipe.pipeline.surface.photo_samples import PLAIN_TONE, DistortionGrid, PhotoSource, sample_colours, tone_curve
-from splatpipe.pipeline.surface.point_visibility import contiguous, project_points
-from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache
-from splatpipe.pipeline.surface.tiles import Tile
+from splatpipe.pipeline.surface.depths.exposures import exposure_levels
+from splatpipe.pipeline.surface.depths.photo_gains import GAMMA, OFFSET, PhotoGains
+from splatpipe.pipeline.surface.depths.photo_samples import (
+    PLAIN_TONE,
+    DistortionGrid,
+    PhotoSource,
+    sample_colours,
+    tone_curve,
+)
+from splatpipe.pipeline.surface.depths.point_visibility import contiguous, project_points
+from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache
+from splatpipe.pipeline.surface.heights.height_field import HeightField
+from splatpipe.pipeline.surface.ortho import mosaic
+from splatpipe.pipeline.surface.ortho.orthophoto import (
+    EXTENDED_CELLS,
+    OrthoInput,
+    Orthophoto,
+    orthophotos,
+    tile_orthophoto,
+)
+from splatpipe.pipeline.surface.rasters.lattice import Lattice
+from splatpipe.pipeline.surface.rasters.tiles import Tile
 
 HEIGHTS = Lattice(-11.04, 8.07, 0.1, 220, 160)
 FINE = Lattice(-11.04, 8.07, 0.1, 220, 160)

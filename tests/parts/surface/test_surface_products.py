@@ -17,20 +17,20 @@ from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface import ortho as ortho_file
-from splatpipe.pipeline.surface import site_extent as site_survey
-from splatpipe.pipeline.surface.dsm import DsmTask, make_dsm
-from splatpipe.pipeline.surface.grid import make_grid
-from splatpipe.pipeline.surface.heights import HeightInput, tile_heights
-from splatpipe.pipeline.surface.known_cells import known_cells
+from splatpipe.pipeline.surface.depths import site_extent as site_survey
+from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource
+from splatpipe.pipeline.surface.depths.site_extent import SiteExtent, load_site, measure_extent, save_site
+from splatpipe.pipeline.surface.depths.sources import DepthSource, LruCache, MetricMap
+from splatpipe.pipeline.surface.heights.dsm import DsmTask, make_dsm
+from splatpipe.pipeline.surface.heights.heights import HeightInput, tile_heights
 from splatpipe.pipeline.surface.options import DsmConfig
-from splatpipe.pipeline.surface.ortho import OrthoTask, make_ortho
-from splatpipe.pipeline.surface.photo_samples import PhotoSource
-from splatpipe.pipeline.surface.sheet import grid_sheets
-from splatpipe.pipeline.surface.site_extent import SiteExtent, load_site, measure_extent, save_site
-from splatpipe.pipeline.surface.sources import DepthSource, LruCache, MetricMap
-from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.ortho import ortho as ortho_file
+from splatpipe.pipeline.surface.ortho.known_cells import known_cells
+from splatpipe.pipeline.surface.ortho.ortho import OrthoTask, make_ortho
+from splatpipe.pipeline.surface.rasters.grid import make_grid
+from splatpipe.pipeline.surface.rasters.tiles import Tile
+from splatpipe.pipeline.surface.sheets.raster_plane import grid_sheets
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 from splatpipe.stages import dsm as dsm_stage
 
 FRAME = Frame("arbitrary", Similarity.identity(), metres=True)

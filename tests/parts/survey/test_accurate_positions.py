@@ -8,7 +8,7 @@ import pytest
 from surveyed import LENS, NADIR, adjusted, capture_parts, gcp_list, positions, rows, true_model
 from threadpoolctl import threadpool_limits
 
-from splatpipe.pipeline.engine.source import ABSENT
+from splatpipe.pipeline.engine.runs.source import ABSENT
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.stages.georef import run

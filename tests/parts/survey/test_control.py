@@ -27,12 +27,12 @@ from surveyed import (
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Summary
-from splatpipe.pipeline.sfm.focal import UNOBSERVED, focal_sigmas
-from splatpipe.pipeline.survey.confidence import chi_squared_quantile, rmse_interval
-from splatpipe.pipeline.survey.frames import load_frame
+from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
+from splatpipe.pipeline.survey.control.confidence import chi_squared_quantile, rmse_interval
+from splatpipe.pipeline.survey.crs.frames import load_frame
+from splatpipe.pipeline.survey.files.scale_bars import ScaleBar
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.scale_bars import ScaleBar
-from splatpipe.pipeline.survey.target_finds import WantedTargets, save_wanted
+from splatpipe.pipeline.survey.targets.target_finds import WantedTargets, save_wanted
 from splatpipe.stages.georef import run
 
 GROUND_AND_ROOF = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08", "P15", "P16", "P17", "P18")

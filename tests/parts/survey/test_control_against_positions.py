@@ -11,7 +11,7 @@ from surveyed import Row, capture_parts, gcp_list, positions, rows, true_model
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.survey.crs import from_geodetic, open_operation, parse_crs
+from splatpipe.pipeline.survey.crs.crs import from_geodetic, open_operation, parse_crs
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.stages.georef import run
 
@@ -93,7 +93,7 @@ def test_the_other_foot_is_named_where_the_positions_show_it(tmp_path: Path, sta
     ratio = US_OVER_INTERNATIONAL if stated == "us-ft" else 1.0 / US_OVER_INTERNATIONAL
 
     def written(place: Coordinates) -> Coordinates:
-        from splatpipe.pipeline.survey.crs import to_geodetic
+        from splatpipe.pipeline.survey.crs.crs import to_geodetic
 
         geodetic = to_geodetic(np.array([place]), utm).geodetic
         there = from_geodetic(open_operation(crs, *geodetic[0, :2].tolist(), True), crs, geodetic)[0]

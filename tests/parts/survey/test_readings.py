@@ -10,14 +10,14 @@ from surveyed import HEIGHT, POINTS, TRUTH, WIDTH, Row, capture_parts, gcp_list,
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.sfm.sparse_model import write_model
-from splatpipe.pipeline.survey.coordinate_readings import SHAPES, nearer_reading, shape_reading
-from splatpipe.pipeline.survey.crs import parse_crs
-from splatpipe.pipeline.survey.model import SparseModel, read_model
+from splatpipe.pipeline.photos.files.photo_list import Photo
+from splatpipe.pipeline.sfm.model.sparse_model import write_model
+from splatpipe.pipeline.survey.crs.coordinate_readings import SHAPES, nearer_reading, shape_reading
+from splatpipe.pipeline.survey.crs.crs import parse_crs
+from splatpipe.pipeline.survey.crs.readings import Evidence, Reading, plausible
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.readings import Evidence, Reading, plausible
-from splatpipe.pipeline.survey.surveyed_points import Survey, load_survey
+from splatpipe.pipeline.survey.placing.model import SparseModel, read_model
+from splatpipe.pipeline.survey.points.surveyed_points import Survey, load_survey
 from splatpipe.stages.georef import run
 
 PHOTOS = {photo["name"]: Photo(photo["name"], "0" * 64, WIDTH, HEIGHT, 0) for photo in TRUTH["photos"]}
@@ -189,7 +189,7 @@ def test_a_reading_is_named_only_if_it_explains_nearly_all_and_the_stated_one_li
 
 def test_swapped_file_in_a_datum_apart_is_told_of_its_place() -> None:
     """Not that PROJ knew no transformation, which it does where the points should be."""
-    from splatpipe.pipeline.survey.crs import from_geodetic, open_operation, to_geodetic
+    from splatpipe.pipeline.survey.crs.crs import from_geodetic, open_operation, to_geodetic
 
     crs = parse_crs("EPSG:31255")
     place = from_geodetic(open_operation(crs, *STATED[0, :2].tolist(), True), crs, STATED)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from odd_sites import Site, flat, joined, orbit, place, strips
 
-from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.survey.crs.geodesy import Origin
 
 BARE = ("place",)
 FALSE_ALARMS = {"position-mirrored", "position-contradiction", "position-far", "position-impossible"}

@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
+from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.train.photos.stream import PhotoStream
+from splatpipe.pipeline.train.plan.windows import TrainingSize
 
 
 def main(picture: str, cache: str, few: str, many: str, epochs: str) -> None:

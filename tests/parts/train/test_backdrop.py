@@ -14,20 +14,20 @@ from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.render.view_measures import shows_inside
-from splatpipe.pipeline.splat import backdrop as counted
-from splatpipe.pipeline.splat.backdrop import backdrop_limit, coarse_start
-from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import read_splat, read_splat_header, write_splat
-from splatpipe.pipeline.train import schedule as scheduled
-from splatpipe.pipeline.train.backdrop import Backdrop
+from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header, write_splat
+from splatpipe.pipeline.splat.sky import backdrop as counted
+from splatpipe.pipeline.splat.sky.backdrop import backdrop_limit, coarse_start
+from splatpipe.pipeline.splat.sky.panorama import write_panorama
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.start import read_start
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.plan import schedule as scheduled
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.start import read_start
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.backdrop import Backdrop
+from splatpipe.pipeline.train.techniques.techniques import make_techniques
 from splatpipe.pipeline.web.options import ExportConfig
 from splatpipe.stages import evaluate, export, initialize
 
@@ -42,7 +42,7 @@ AREA = PlanArea(AXES, ((HALF,),))
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tiny scene's backdrop is also part of its inside."""
-    monkeypatch.setattr(counted, "FEWEST", 5)
+    monkeypatch.setattr(counted, "MIN_OUTSIDE", 5)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_without_a_boundary_nothing_is_ranked_or_removed() -> None:
     plan = TrainingPlan(config, schedule, 4.0, 0.04, tuple(view.name for view in views), (), 0.004, 150, 40)
     techniques, score = make_techniques(plan), torch.rand(150)
     assert techniques.find(Backdrop) is None
-    assert techniques.ranked(score, tiny_scene.true_model(), schedule.density) is score
+    assert techniques.adjust_scores(score, tiny_scene.true_model(), schedule.density) is score
 
 
 def test_pixels_are_inside_or_outside_by_their_surface() -> None:

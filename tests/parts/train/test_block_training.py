@@ -20,31 +20,32 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_split, load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_split, load_views
 from splatpipe.pipeline.raster.device import cpu
-from splatpipe.pipeline.splat.backdrop import backdrop_limit
-from splatpipe.pipeline.splat.free_space import free_space
-from splatpipe.pipeline.splat.gaussians import PARAMETERS
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop, memory
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
+from splatpipe.pipeline.splat.quality.free_space import free_space
+from splatpipe.pipeline.splat.sky.backdrop import backdrop_limit
+from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks.cells.needs import block_need
+from splatpipe.pipeline.train.blocks.cells.partition import Cell, Partition
+from splatpipe.pipeline.train.blocks.cells.sample_mask import MARGINS, counted_samples
 from splatpipe.pipeline.train.blocks.coarse import TrainingLimits, train_coarse
 from splatpipe.pipeline.train.blocks.forecast import block_forecasts
-from splatpipe.pipeline.train.blocks.needs import block_need
-from splatpipe.pipeline.train.blocks.partition import Cell, Partition
-from splatpipe.pipeline.train.blocks.sample_mask import MARGINS, counted_samples
 from splatpipe.pipeline.train.blocks.schedules import block_schedule, share_at
 from splatpipe.pipeline.train.blocks.scope import BlockScope, read_free_space, rows_of
 from splatpipe.pipeline.train.blocks.training import Block, SiteParts, train_block
-from splatpipe.pipeline.train.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.lengths import PART_VISITS, PhotoSizes
-from splatpipe.pipeline.train.limits import FIXED_BYTES, PIXEL_BYTES
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.windows import windows_of
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.lengths import PART_VISITS, PhotoSizes
+from splatpipe.pipeline.train.plan.limits import FIXED_BYTES, PIXEL_BYTES
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.plan.windows import windows_of
+from splatpipe.pipeline.train.state import memory
+from splatpipe.pipeline.train.state.checkpoint import load_checkpoint
+from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize
 
 
@@ -139,7 +140,7 @@ def test_windows_that_show_the_cell_are_each_used_as_often_as_without_blocks(sit
         block = Block.of(config, other, replace(TASK, number=number, window_pixels=400), cpu())
         scope = block.scope_reader.scope()
         plan = block.plan(scope.windows)
-        order = block.course(plan, scope, tmp_path).order_of(plan.schedule.training_sizes_until(plan.last_iteration))
+        order = block.setup(plan, scope, tmp_path).order_of(plan.schedule.training_sizes_until(plan.last_iteration))
         each = [order.at(iteration) for iteration in range(1, len(order) + 1)]
         times = Counter((visit.view, visit.level, visit.window) for visit in each)
         assert {level for _, level, _ in times} == {0, 1} and set(times.values()) == {PART_VISITS}  # coarse had level 2

@@ -15,11 +15,10 @@ from jaxtyping import Float64
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.raster.rasterizer import render
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import write_splat, write_splat_parts
-from splatpipe.pipeline.train.blocks.cutting import BINS, cut, shares, site, work_map
-from splatpipe.pipeline.train.blocks.merging import counted, own_pieces, owned
-from splatpipe.pipeline.train.blocks.needs import (
+from splatpipe.pipeline.splat.containers.ply import write_splat, write_splat_parts
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.cells.cutting import BINS, cut, shares, site, work_map
+from splatpipe.pipeline.train.blocks.cells.needs import (
     BlockNeed,
     block_need,
     fewest_blocks,
@@ -28,12 +27,13 @@ from splatpipe.pipeline.train.blocks.needs import (
     shared_cap,
     with_margin,
 )
-from splatpipe.pipeline.train.blocks.partition import NOBODY, Cell, Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import PhotoCoverage, photo_coverages
-from splatpipe.pipeline.train.blocks.surroundings import visible_around
-from splatpipe.pipeline.train.blocks.thinning import thinned
-from splatpipe.pipeline.train.blocks.visibility import block_views, windows
-from splatpipe.pipeline.train.limits import FIXED_BYTES
+from splatpipe.pipeline.train.blocks.cells.partition import NOBODY, Cell, Partition
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, photo_coverages
+from splatpipe.pipeline.train.blocks.cells.surroundings import visible_around
+from splatpipe.pipeline.train.blocks.cells.thinning import thinned
+from splatpipe.pipeline.train.blocks.cells.visibility import block_views, windows
+from splatpipe.pipeline.train.blocks.merging import counted, own_pieces, owned
+from splatpipe.pipeline.train.plan.limits import FIXED_BYTES
 
 UP = np.array([0.0, 0.0, 1.0])
 

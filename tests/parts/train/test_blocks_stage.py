@@ -16,19 +16,19 @@ from block_scene import OPTIONS, QUICK, SHARDS, prepared
 
 from splatpipe.pipeline.app.report import training
 from splatpipe.pipeline.engine.errors import StageError, UsageError
-from splatpipe.pipeline.engine.lock import locked_shard
+from splatpipe.pipeline.engine.runs.lock import locked_shard
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.panorama import read_panorama
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.sky.panorama import read_panorama
 from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.blocks import assembly
 from splatpipe.pipeline.train.blocks.assembly import joint_history
-from splatpipe.pipeline.train.blocks.division import PHOTOS_A_BLOCK, Division, SceneSize, divided, memory_limit
-from splatpipe.pipeline.train.blocks.needs import need_of_blocks
+from splatpipe.pipeline.train.blocks.cells.division import PHOTOS_A_BLOCK, Division, SceneSize, divided, memory_limit
+from splatpipe.pipeline.train.blocks.cells.needs import need_of_blocks
+from splatpipe.pipeline.train.blocks.cells.site_plan import block_limits, capped_shares, load_site_plan
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
-from splatpipe.pipeline.train.blocks.site_plan import block_limits, capped_shares, load_site_plan
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.stages import blocks, train
 
@@ -271,7 +271,7 @@ def test_too_few_photos_for_blocks_are_trained_within_the_machines_memory(
 def test_two_processes_may_train_two_blocks_but_not_the_same_one(
     scene: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
+    monkeypatch.setattr("splatpipe.pipeline.engine.runs.lock.PATIENCE_S", 0.2)
     with locked_shard(undisturbed, "train.2"):
         with pytest.raises(UsageError, match=r"is running train\.2 in"):
             block_line.make(scene, undisturbed, OPTIONS, "train.2")

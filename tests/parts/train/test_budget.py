@@ -19,12 +19,15 @@ from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.render.options import EvaluateConfig
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import iteration, loop, memory, planning
-from splatpipe.pipeline.train import plan as planning_of_schedule
-from splatpipe.pipeline.train.budget import (
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.train import iteration, loop
+from splatpipe.pipeline.train.densify import room_at
+from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan import plan as planning_of_schedule
+from splatpipe.pipeline.train.plan.budget import (
     FEWEST_GAUSSIANS,
     SCHEDULE_SHARE,
     SMALLEST_MEGAPIXELS,
@@ -36,24 +39,23 @@ from splatpipe.pipeline.train.budget import (
     fit_speed,
     forecast,
 )
-from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, PhotoSizes, lengths_of
-from splatpipe.pipeline.train.limits import (
-    FEWEST,
+from splatpipe.pipeline.train.plan.lengths import PART_VISITS, WHOLE_VISITS, PhotoSizes, lengths_of
+from splatpipe.pipeline.train.plan.limits import (
     FIXED_BYTES,
-    LONGEST,
+    MAX_ITERATIONS,
+    MIN_ITERATIONS,
     PIXEL_BYTES,
     SMALLEST_WINDOW,
     bytes_per_gaussian,
 )
-from splatpipe.pipeline.train.measure import MachineSpeed, middle_of
-from splatpipe.pipeline.train.memory import resident_bytes
-from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, duration, make_plan
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.start import InitialGaussians
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, duration, make_plan
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.plan.start import InitialGaussians
+from splatpipe.pipeline.train.planning import planning
+from splatpipe.pipeline.train.planning.measure import MachineSpeed, middle_of
+from splatpipe.pipeline.train.state import memory
+from splatpipe.pipeline.train.state.memory import resident_bytes
+from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import evaluate, initialize, train
 
 SPEED = Speed(base_s=2e-3, gaussian_s=3e-7, pixel_s=3e-8, pair_s=2e-13)
@@ -218,13 +220,13 @@ def test_more_time_never_plans_less() -> None:
 
 def test_no_limit_is_exceeded_however_much_time_there_is() -> None:
     choice = plan_for(1e6, cap=20_000)
-    assert choice.options.max_gaussians == 20_000 and choice.iterations == choice.last_iteration == LONGEST
+    assert choice.options.max_gaussians == 20_000 and choice.iterations == choice.last_iteration == MAX_ITERATIONS
     assert choice.options.max_megapixels == 0.0
 
 
 def test_too_little_time_still_plans_the_smallest_training() -> None:
     choice = choose(replace(task_of(0.01, size=2.0), sparse=500_000))
-    assert choice.options.iterations == FEWEST and choice.options.max_gaussians == FEWEST_GAUSSIANS
+    assert choice.options.iterations == MIN_ITERATIONS and choice.options.max_gaussians == FEWEST_GAUSSIANS
     assert choice.options.max_megapixels == SMALLEST_MEGAPIXELS
 
 
@@ -429,13 +431,13 @@ import json, sys
 from pathlib import Path
 import tiny_scene
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.engine.worker import peak_memory_bytes
+from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.stages import train
 from splatpipe.pipeline.train import plan
-from splatpipe.pipeline.train.measure import middle_of
-from splatpipe.pipeline.train.lengths import PART_VISITS, WHOLE_VISITS, lengths_of
-from splatpipe.pipeline.train.limits import FIXED_BYTES
-from splatpipe.pipeline.train.memory import resident_bytes
+from splatpipe.pipeline.train.planning.measure import middle_of
+from splatpipe.pipeline.train.plan.lengths import PART_VISITS, WHOLE_VISITS, lengths_of
+from splatpipe.pipeline.train.plan.limits import FIXED_BYTES
+from splatpipe.pipeline.train.state.memory import resident_bytes
 
 scene, out = Path(sys.argv[1]), Path(sys.argv[2])
 limit = resident_bytes() + FIXED_BYTES + int(sys.argv[3])

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_views
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.rendering import render_depth
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train.blocks.cutting import cut, shares, site, work_map
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.cells.cutting import cut, shares, site, work_map
+from splatpipe.pipeline.train.blocks.cells.partition import Border, Partition
+from splatpipe.pipeline.train.blocks.cells.photo_coverage import photo_coverages
+from splatpipe.pipeline.train.blocks.cells.visibility import block_views, windows
 from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
-from splatpipe.pipeline.train.blocks.partition import Border, Partition
-from splatpipe.pipeline.train.blocks.photo_coverage import photo_coverages
-from splatpipe.pipeline.train.blocks.visibility import block_views, windows
 
 
 def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:

@@ -11,11 +11,14 @@ import torch
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.photos.pixels.dataset import View, load_views
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train.distortion_loss import (
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan.plan import make_plan
+from splatpipe.pipeline.train.plan.schedule import Schedule, resolve_schedule
+from splatpipe.pipeline.train.techniques.distortion_loss import (
     CENTRE_EVERY,
     FREE_PX,
     HALF_PX,
@@ -23,10 +26,7 @@ from splatpipe.pipeline.train.distortion_loss import (
     depth_origin,
     spread_loss,
 )
-from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
-from splatpipe.pipeline.train.schedule import Schedule, resolve_schedule
-from splatpipe.pipeline.train.techniques import make_techniques
+from splatpipe.pipeline.train.techniques.techniques import make_techniques
 from splatpipe.stages import initialize, train
 
 FRONT = Camera("front", 24, 16, 30.0, 30.0, 12.0, 8.0, np.eye(4))

@@ -14,13 +14,14 @@ import torch
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import brightness, techniques
-from splatpipe.pipeline.train.brightness import DIFFERING, decided_exposure, exposure_spread, log_gains
-from splatpipe.pipeline.train.exposure import Exposure
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.train.appearance import brightness
+from splatpipe.pipeline.train.appearance.brightness import DIFFERING, decided_exposure, exposure_spread, log_gains
+from splatpipe.pipeline.train.appearance.exposure import Exposure
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.techniques import techniques
 from splatpipe.stages import initialize, train
 
 GAINS = np.linspace(0.7, 1.0, tiny_scene.CAMERAS)  # of the photos in the arc's order: every other one is turned round

@@ -12,13 +12,13 @@ import torch
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.train import flatness, loop
-from splatpipe.pipeline.train.history import History
-from splatpipe.pipeline.train.lengths import Stretch
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.lengths import Stretch
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.state.history import History
+from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
 
 FEW = tiny_scene.plain(iterations=200, densify=False, exposure="affine", dropout=0.1)

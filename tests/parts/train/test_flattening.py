@@ -16,20 +16,20 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.depth_maps import list_depth_maps
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.definitions import Render
 from splatpipe.pipeline.render.rendering import Rendering
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import write_panorama
 from splatpipe.pipeline.train import flattening, loop
-from splatpipe.pipeline.train.distortion_loss import FREE_PX, HALF_PX, depth_origin, spread_loss
-from splatpipe.pipeline.train.exposure import Exposure, exposures_json, read_exposures
+from splatpipe.pipeline.train.appearance.exposure import Exposure, exposures_json, read_exposures
 from splatpipe.pipeline.train.flattening import MIN_ITERATIONS, TrainedParts, flatten, flattening_plan, options_of
-from splatpipe.pipeline.train.lengths import WINDOW_PIXELS
 from splatpipe.pipeline.train.options import SplatDepthsConfig
-from splatpipe.pipeline.train.smoothness_loss import unevenness
+from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.techniques.distortion_loss import FREE_PX, HALF_PX, depth_origin, spread_loss
+from splatpipe.pipeline.train.techniques.smoothness_loss import unevenness
 from splatpipe.stages import splat_depths
 
 FRONT = Camera("front", 24, 16, 30.0, 30.0, 12.0, 8.0, np.eye(4))

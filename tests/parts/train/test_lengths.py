@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import tiny_scene
 
-from splatpipe.pipeline.train.lengths import (
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan.lengths import (
     FEWEST_VISITS,
     MAX_FIRST_ITERATIONS,
     PART_VISITS,
@@ -23,11 +24,10 @@ from splatpipe.pipeline.train.lengths import (
     lengths_of,
     stretches,
 )
-from splatpipe.pipeline.train.limits import PIXEL_BYTES, SMALLEST_WINDOW, window_within
-from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.plan.limits import PIXEL_BYTES, SMALLEST_WINDOW, window_within
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.plan.windows import TrainingSize
 
 WINDOW = 500_000
 PHOTOS = (11, 50, 167, 500, 1000)
@@ -152,7 +152,7 @@ def test_many_photos_lengthen_the_phases_and_not_the_steps() -> None:
 def views_of(size: float, count: int = 50) -> list:
     from dataclasses import replace
 
-    from splatpipe.pipeline.photos.dataset import View
+    from splatpipe.pipeline.photos.pixels.dataset import View
 
     width, height = SIZES[size]
     camera = tiny_scene.cameras()[0]
@@ -192,6 +192,6 @@ def test_windows_shrink_with_the_memory_but_not_below_a_useful_size() -> None:
 
 
 def test_lengths_import_nothing_heavy() -> None:
-    code = "import sys, splatpipe.pipeline.train.lengths; print({'numpy', 'torch', 'cv2'} & set(sys.modules))"
+    code = "import sys, splatpipe.pipeline.train.plan.lengths; print({'numpy', 'torch', 'cv2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

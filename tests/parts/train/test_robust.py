@@ -13,11 +13,10 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
-from splatpipe.pipeline.splat import metrics
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.quality import metrics
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.robust import (
+from splatpipe.pipeline.train.appearance.robust import (
     GRID,
     MAX_SHARE_OF_PHOTO,
     MIN_RESIDUAL,
@@ -26,9 +25,10 @@ from splatpipe.pipeline.train.robust import (
     cell_residuals,
     share_at,
 )
-from splatpipe.pipeline.train.schedule import ScheduleStep
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep
+from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
 
 SCALE = 2  # of the tiny photos: so that cells of four pixels average something
@@ -105,7 +105,9 @@ def test_a_device_that_processes_all_cells_leaves_out_the_same(
     other.watch(cameras())
     an_epoch(robust), an_epoch(other)
     photos = an_epoch(robust)
-    monkeypatch.setattr("splatpipe.pipeline.train.robust._worth_asking", lambda asked: torch.arange(len(asked)))
+    monkeypatch.setattr(
+        "splatpipe.pipeline.train.appearance.robust._worth_asking", lambda asked: torch.arange(len(asked))
+    )
     for number, photo in an_epoch(other).items():
         expected = photos[number].mask
         assert (photo.mask is None) == (expected is None)
@@ -200,11 +202,11 @@ def test_a_repeated_visit_counts_once(robust: RobustMask) -> None:
     for number, colour in enumerate((true_photo(camera), painted(true_photo(camera), CARS[2]))):
         before = {name: tensor.clone() for name, tensor in robust.to_arrays().items()}
         robust.settings(plain, model, camera, now)
-        robust.begin_again()  # memory ran out before the photo was processed
+        robust.roll_back()  # memory ran out before the photo was processed
         assert all(torch.equal(tensor, before[name]) for name, tensor in robust.to_arrays().items()), number
         looked(robust, camera, colour)
         assert not torch.equal(robust.scores, before["scores"]), number
-        robust.begin_again()
+        robust.roll_back()
         assert all(torch.equal(tensor, before[name]) for name, tensor in robust.to_arrays().items()), number
         looked(robust, camera, colour)
 

@@ -8,13 +8,13 @@ import tiny_scene
 import torch
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import write_splat
-from splatpipe.pipeline.splat.sparse_count import sparse_comment
-from splatpipe.pipeline.train import plan as planned
+from splatpipe.pipeline.splat.containers.ply import write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sparse_count import sparse_comment
 from splatpipe.pipeline.train.densify import room_at
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.start import InitialGaussians, read_start, started
+from splatpipe.pipeline.train.plan import plan as planned
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.plan.start import InitialGaussians, read_start, started
 from splatpipe.stages import train
 
 SPARSE, SWEPT = 40, 100

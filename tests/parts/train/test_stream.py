@@ -18,12 +18,12 @@ import torch
 
 from splatpipe.pipeline.engine.errors import MachineError, StageError
 from splatpipe.pipeline.geometry.camera import Camera, reduced_size
-from splatpipe.pipeline.photos.dataset import View, load_views
-from splatpipe.pipeline.photos.images import load_colour, load_mask, reduced_camera, reduced_view
-from splatpipe.pipeline.train import photo_cache
-from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.training_order import PhotoOrder
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.photos.pixels.dataset import View, load_views
+from splatpipe.pipeline.photos.pixels.images import load_colour, load_mask, reduced_camera, reduced_view
+from splatpipe.pipeline.train.photos import photo_cache
+from splatpipe.pipeline.train.photos.stream import PhotoStream, TrainingPhoto
+from splatpipe.pipeline.train.plan.training_order import PhotoOrder
+from splatpipe.pipeline.train.plan.windows import TrainingSize
 
 EPOCHS = 4
 MASKED = "flight 1/photo_5.png"

@@ -15,19 +15,19 @@ import torch
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import load_views
-from splatpipe.pipeline.photos.images import load_colour
+from splatpipe.pipeline.photos.pixels.dataset import load_views
+from splatpipe.pipeline.photos.pixels.images import load_colour
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import load_rendering
-from splatpipe.pipeline.splat import metrics
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.quality import metrics
 from splatpipe.pipeline.train import iteration, loop
-from splatpipe.pipeline.train import plan as planned
-from splatpipe.pipeline.train.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan import plan as planned
+from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.state.checkpoint import load_checkpoint
+from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
 
 PARTS = ["exposures.json", "history.json", "model.ply", "plan.json", "rendering.json", "sky.npz"]

@@ -12,28 +12,35 @@ import torch
 from on_cpu import kernels_on_cpu
 from torch import Tensor
 
-from splatpipe.pipeline.app.command_summary import for_the_user
+from splatpipe.pipeline.app.commands.summary import for_the_user
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, MachineError, UsageError, card_fault, exit_code
+from splatpipe.pipeline.engine.runs.worker import as_splatpipe_error
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.engine.worker import as_splatpipe_error
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.raster import cuda_driver, cuda_library
+from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.raster import device as devices
-from splatpipe.pipeline.raster.cuda import use_kernels
+from splatpipe.pipeline.raster.cuda import cuda_driver, cuda_library
+from splatpipe.pipeline.raster.cuda.cuda import use_kernels
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows, taken_in_place
-from splatpipe.pipeline.train import limits, memory, planning, state
-from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, HostArrays, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.densify import DensifiedGaussians, along_curve
-from splatpipe.pipeline.train.history import History
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.planning import PlanningInput, pilot
-from splatpipe.pipeline.train.start import InitialGaussians
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.techniques import Techniques
-from splatpipe.pipeline.train.upload import QUEUED, Upload, Uploader, colours_of
+from splatpipe.pipeline.train.photos.upload import QUEUED, Upload, Uploader, colours_of
+from splatpipe.pipeline.train.plan import limits
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.start import InitialGaussians
+from splatpipe.pipeline.train.planning import planning
+from splatpipe.pipeline.train.planning.planning import PlanningInput, pilot
+from splatpipe.pipeline.train.state import memory, state
+from splatpipe.pipeline.train.state.checkpoint import (
+    BrokenCheckpointError,
+    HostArrays,
+    load_checkpoint,
+    save_checkpoint,
+)
+from splatpipe.pipeline.train.state.history import History
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import Techniques
 from splatpipe.stages import initialize, train
 
 ALL = tiny_scene.plain(iterations=20, max_gaussians=250)
@@ -313,7 +320,9 @@ def test_rows_lie_along_a_curve_after_density_control() -> None:
 
 
 def test_an_unused_card_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
+    monkeypatch.setattr(
+        cuda_library, "unavailable_reason", lambda: cuda_library.NoCuda("The driver is old.", "Install another.")
+    )
     notes: list[str] = []
     monkeypatch.setattr(cuda_driver, "has_card", lambda: False)
     assert choose_device("auto", "", notes.append).name == "cpu" and not notes
@@ -326,7 +335,9 @@ def test_an_unused_card_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_training_reports_a_card_that_it_does_not_use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("The driver is old.", "Install another."))
+    monkeypatch.setattr(
+        cuda_library, "unavailable_reason", lambda: cuda_library.NoCuda("The driver is old.", "Install another.")
+    )
     monkeypatch.setattr(cuda_driver, "has_card", lambda: True)
     tiny_scene.write_dataset(tmp_path / "dataset")
     parts = {"undistort.dataset": tmp_path / "dataset"}
@@ -341,14 +352,14 @@ def test_a_training_reports_a_card_that_it_does_not_use(monkeypatch: pytest.Monk
 def test_the_device_is_chosen_or_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     kornia = TrainConfig(loss="kornia").unfit_for_cuda()
     assert "kornia" in kornia and not TrainConfig().unfit_for_cuda()
-    monkeypatch.setattr(cuda_library, "why_not", lambda: cuda_library.NoCuda("There is none.", "Buy one."))
+    monkeypatch.setattr(cuda_library, "unavailable_reason", lambda: cuda_library.NoCuda("There is none.", "Buy one."))
     assert choose_device("cpu").name == choose_device("auto").name == "cpu"
     with pytest.raises(UsageError, match='no device "gpu"'):
         choose_device("gpu")
     with pytest.raises(MachineError, match="There is none") as failure:
         choose_device("cuda")
     assert failure.value.hint == "Buy one."
-    monkeypatch.setattr(cuda_library, "why_not", lambda: None)
+    monkeypatch.setattr(cuda_library, "unavailable_reason", lambda: None)
     monkeypatch.setattr(cuda_library, "cannot_compute", lambda: cuda_library.NoCuda("It is full.", "Wait."))
     assert choose_device("auto").name == "cpu"
     with pytest.raises(MachineError, match="It is full"):

@@ -17,23 +17,23 @@ from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.render.options import EvaluateConfig
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, read_panorama
-from splatpipe.pipeline.splat.ply import read_splat, write_splat
-from splatpipe.pipeline.splat.sky_mask import SkyMask, directions
+from splatpipe.pipeline.splat.containers.ply import read_splat, write_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, read_panorama
+from splatpipe.pipeline.splat.sky.sky_mask import SkyMask, directions
 from splatpipe.pipeline.train import loop
-from splatpipe.pipeline.train.measure import MeasuringBudget, TimedScene, measure
+from splatpipe.pipeline.train.appearance.sky import SkyModel, filled
+from splatpipe.pipeline.train.appearance.sky_file import read_skies, write_skies
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.sky import SkyModel, filled
-from splatpipe.pipeline.train.sky_file import read_skies, write_skies
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.planning.measure import MeasuringBudget, TimedScene, measure
+from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import evaluate, initialize, train
 
 QUICK = TrainConfig(iterations=40, sky="model", sh_degree=1)

@@ -12,13 +12,13 @@ import tiny_scene
 import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View, load_views
-from splatpipe.pipeline.splat.metrics import SSIM_WINDOW
-from splatpipe.pipeline.splat.panorama import STEP_PX
-from splatpipe.pipeline.train import windows
-from splatpipe.pipeline.train.stream import PhotoStream, TrainingPhoto
-from splatpipe.pipeline.train.training_order import PhotoOrder, TrainingOrder, WindowOrder
-from splatpipe.pipeline.train.windows import PixelRectangle, TrainingSize, windows_of
+from splatpipe.pipeline.photos.pixels.dataset import View, load_views
+from splatpipe.pipeline.splat.quality.metrics import SSIM_WINDOW
+from splatpipe.pipeline.splat.sky.panorama import STEP_PX
+from splatpipe.pipeline.train.photos.stream import PhotoStream, TrainingPhoto
+from splatpipe.pipeline.train.plan import windows
+from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrder, WindowOrder
+from splatpipe.pipeline.train.plan.windows import PixelRectangle, TrainingSize, windows_of
 
 MASKED = "flight 1/photo_5.png"
 PIXELS = 800  # of a window: six in a tiny photo

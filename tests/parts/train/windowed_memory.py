@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.train.photos.stream import PhotoStream
+from splatpipe.pipeline.train.plan.windows import TrainingSize
 
 FIRST = 6  # photos, halved often, without a limit: threads and allocators take what they need once
 MORE = 30

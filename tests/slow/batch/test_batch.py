@@ -28,7 +28,7 @@ SLOW = ("--until", "features", "--set", "features.extractor=sift")
 
 
 def command(captures: Path, out: Path, *more: str) -> list[str]:
-    return [sys.executable, "-m", "splatpipe.pipeline.app.cli", "batch", str(captures), str(out), *more, "--json"]
+    return [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "batch", str(captures), str(out), *more, "--json"]
 
 
 def batch(captures: Path, out: Path, *more: str) -> dict[str, object]:

@@ -18,7 +18,7 @@ TOTALS = {name: sum(number**2 for number in numbers) for name, numbers in (("nor
 def batch(listed: Path, out: Path, *more: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """The whole program with the pipeline of `sharded`."""
     path = os.pathsep.join([str(LINES / "sharded_site"), str(LINES), os.environ.get("PYTHONPATH", "")])
-    words = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "batch", str(listed), str(out), *more]
+    words = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "batch", str(listed), str(out), *more]
     return subprocess.run(
         words, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path, **variables}
     )

@@ -29,7 +29,7 @@ from splatpipe.demo.truth import Triangles, depth_map, true_surface
 from splatpipe.demo.visibility import TrueView, photos_that_see
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.survey.crs.world import open_world
 
 CRS = "EPSG:32633"
 

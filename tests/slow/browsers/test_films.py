@@ -8,7 +8,7 @@ from decoded import decoded, psnr
 from film_commands import SECONDS, rendered
 from playwright.sync_api import Browser
 
-from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.film.camera_path import cameras_along
 from splatpipe.pipeline.film.filming import open_scene
 from splatpipe.pipeline.film.photo_route import photo_film

@@ -25,7 +25,7 @@ from splatpipe.demo import capture_path
 def training(demo_run: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
     """The demo, trained again and for longer; the stages before training are reused."""
     out = linked_copy(demo_run, tmp_path / "out")
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", str(capture_path()), str(out)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "run", str(capture_path()), str(out)]
     command += ["--threads", "1", "--config", str(demo_run / "config.toml"), "--set", "train.iterations=20000"]
     nothing = subprocess.DEVNULL
     process = subprocess.Popen(command, stdout=nothing, stderr=nothing, start_new_session=True)

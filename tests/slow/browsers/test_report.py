@@ -148,7 +148,7 @@ def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_positions(
 def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open_page: Callable[..., object]) -> None:
     """Ctrl-C in a longer training: its progress, its curve, and a note that the other files are from an earlier run."""
     before = len((copy_of_run / "events.jsonl").read_text())
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "stage", "train", str(copy_of_run)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "stage", "train", str(copy_of_run)]
     command += sets("train.iterations=100000")
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
         events = copy_of_run / "events.jsonl"

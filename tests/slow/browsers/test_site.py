@@ -20,10 +20,10 @@ from web_sites import COUNT, MAX_PER_NODE, UP_FROM_DOWN, nodes_of
 
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import render_pixels
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import LevelNode, build_levels
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts
-from splatpipe.pipeline.survey.frames import Frame, Similarity
+from splatpipe.pipeline.splat.levels.levels import LevelNode, build_levels
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts
+from splatpipe.pipeline.survey.crs.frames import Frame, Similarity
 from splatpipe.pipeline.web.measured_page import with_measurements
 from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer import ViewerScene

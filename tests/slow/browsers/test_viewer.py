@@ -20,15 +20,15 @@ from playwright.sync_api import Browser, Page
 from timeouts import wait_until
 
 from splatpipe.demo import CAPTURE
-from splatpipe.pipeline.engine.store import open_store
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.engine.runs.store import open_store
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.rendering import as_trained, render_pixels
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, read_panorama
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.survey.frames import Frame, Origin, Similarity, load_frame
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, panorama_of, read_panorama
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin, Similarity, load_frame
 from splatpipe.pipeline.web.measured_page import with_measurements
 from splatpipe.pipeline.web.viewer_scene import ViewerRendering, upright, viewer_scene, write_viewer
 

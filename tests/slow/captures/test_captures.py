@@ -11,7 +11,7 @@ pytestmark = pytest.mark.captures
 
 
 def splatpipe(*arguments: object) -> dict[str, object]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments), "--json"]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", *map(str, arguments), "--json"]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     output: dict[str, object] = json.loads(done.stdout)
     assert done.returncode == 0, output

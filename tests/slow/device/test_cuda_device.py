@@ -13,16 +13,17 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import cuda, cuda_library, rasterizer
+from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.colour import affine_colour
+from splatpipe.pipeline.raster.cuda import cuda, cuda_library
 from splatpipe.pipeline.raster.loss import SSIM_REACH_PX, Rectangle, photo_loss
 from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions
-from splatpipe.pipeline.splat import metrics
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import coefficient_count
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import coefficient_count
+from splatpipe.pipeline.splat.quality import metrics
 
-MISSING = cuda_library.why_not()
+MISSING = cuda_library.unavailable_reason()
 pytestmark = [
     pytest.mark.cuda,
     pytest.mark.skipif(MISSING is not None, reason="" if MISSING is None else MISSING.reason),

@@ -10,19 +10,19 @@ import torch
 from random_scene import random_camera, random_scene
 from waiting import never_waiting
 
-from splatpipe.pipeline.photos.dataset import Split, View
-from splatpipe.pipeline.raster import cuda, cuda_library
+from splatpipe.pipeline.photos.pixels.dataset import Split, View
+from splatpipe.pipeline.raster.cuda import cuda, cuda_library
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, free_bytes, take_rows
 from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.shortage import iterate_within_memory
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.techniques import make_techniques
-from splatpipe.pipeline.train.upload import Uploader
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.upload import Uploader
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import make_techniques
 
-MISSING = cuda_library.why_not()
+MISSING = cuda_library.unavailable_reason()
 pytestmark = [
     pytest.mark.cuda,
     pytest.mark.skipif(MISSING is not None, reason="" if MISSING is None else MISSING.reason),
@@ -92,7 +92,7 @@ def test_a_training_has_the_same_bits_twice_and_the_cpus_loss(device: Device, op
     found = []
     for place in (device, device, cpu()):
         training, plan = make_training(options, place)
-        with place.one_order():
+        with place.deterministic():
             for photo in photos(place, options.iterations):
                 iterate(training, plan, photo)
         found.append((training.whole_history().last_loss(), training.finished().tensors()))

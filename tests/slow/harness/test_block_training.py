@@ -11,14 +11,14 @@ from on_cpu import kernels_on_cpu
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.device import cpu
-from splatpipe.pipeline.splat.gaussians import PARAMETERS
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 from splatpipe.pipeline.train.blocks.coarse import TrainingLimits, train_coarse
 from splatpipe.pipeline.train.blocks.training import Block, SiteParts
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize
 
 STEP_SHARE = 1e-3  # L2 of the parameters' displacements, as for windows without blocks

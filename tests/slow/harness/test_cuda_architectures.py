@@ -7,7 +7,7 @@ import ctypes
 import pytest
 from building import NATIVE, build_on_cpu, load
 
-from splatpipe.pipeline.raster.cuda_api import NO_KERNEL, SplatDevice
+from splatpipe.pipeline.raster.cuda.cuda_api import NO_KERNEL, SplatDevice
 
 
 def open_library(built_for: str) -> tuple[int, SplatDevice]:

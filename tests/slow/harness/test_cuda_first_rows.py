@@ -10,11 +10,11 @@ from on_cpu import kernels_on_cpu
 from random_scene import random_camera, random_scene
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.dropout import _DropoutLogits
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.techniques.dropout import _DropoutLogits
 
 RATES = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": sh_rates(16, 2.5e-3, 1e-4)}
 OPTIONS = RenderOptions(3, background=(0.2, 0.3, 0.4), depth=False)

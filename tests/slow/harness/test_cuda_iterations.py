@@ -13,12 +13,12 @@ from waiting import never_waiting
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of, use_kernels
-from splatpipe.pipeline.raster.cuda_library import why_not
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, kernels_name, render
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 MIN_PSNR = 60.0  # of a device's render beside the CPU's, dB: an eighth of a step of eight bits
 GRADIENT_RTOL = 1e-3  # L2; the device's exponential and reciprocals are faster and less exact
@@ -50,7 +50,7 @@ def place(request: pytest.FixtureRequest) -> Iterator[DeviceSetup]:
     if request.param == "cuda":
         if not torch.cuda.is_available():
             pytest.skip("no CUDA device")
-        reason = why_not()
+        reason = unavailable_reason()
         assert reason is None, reason
         scene = random_scene(1, n=50_000, size=-4.0)
         yield DeviceSetup(None, torch.device("cuda", 0), scene, random_camera(1, 801, 499))

@@ -18,8 +18,8 @@ from exact import case_of, exact_outcome
 from frames import DeviceFrame, RenderCase, RenderOutcome, controls, run
 from random_scene import random_camera, random_scene
 
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 TILE = 16
 

@@ -9,17 +9,17 @@ import torch
 from building import FORWARD, NATIVE, REVERSE, SHUFFLED, build_on_cpu, load
 from torch import Tensor
 
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_api import SplatRectangle
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_api import SplatRectangle
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 from splatpipe.pipeline.raster.loss import Rectangle, photo_loss, photo_loss_reference
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.morton import morton_keys
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.morton import morton_keys
 from splatpipe.pipeline.train.densify import _split_offsets
-from splatpipe.pipeline.train.dropout import dropped
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
 from splatpipe.pipeline.train.random_numbers import DROPOUT, SPLIT_POSITION, uniform
-from splatpipe.pipeline.train.schedule import resolve_schedule
+from splatpipe.pipeline.train.techniques.dropout import dropped
 
 # Relative, the gradient in L2, against float64: those of the CPU's kernel, for the reason given in test_loss.py.
 LOSS_RTOL = 1e-5

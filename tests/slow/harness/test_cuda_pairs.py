@@ -10,12 +10,12 @@ from on_cpu import kernels_on_cpu
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster.cuda import CudaKernels, kernels_of
-from splatpipe.pipeline.raster.cuda_forecast import Forecast, FrameFacts, FrameSize
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
+from splatpipe.pipeline.raster.cuda.cuda_forecast import Forecast, FrameFacts, FrameSize
+from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 from splatpipe.pipeline.raster.cuda_frame import CudaFrame, shot_of
-from splatpipe.pipeline.raster.cuda_library import why_not
 from splatpipe.pipeline.raster.definitions import RenderOptions
-from splatpipe.pipeline.splat.gaussians import PARAMETERS
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 
 TILE_PX = 16
 OPACITY = 0.05
@@ -51,7 +51,7 @@ def place(request: pytest.FixtureRequest) -> DeviceSetup:
         return DeviceSetup(kernels_on_cpu(), (60, 40), 500, 1100)
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    reason = why_not()
+    reason = unavailable_reason()
     assert reason is None, reason
     kernels = kernels_of(torch.device("cuda", 0))
     assert kernels is not None
@@ -88,7 +88,7 @@ def rendered(place: DeviceSetup, parameters: tuple[Tensor, ...]) -> PairsResult:
     try:
         pairs = count * place.tiles
         size = FrameSize(count, place.tiles)
-        kernels.forecast.learn(FrameFacts(size, place.capacity, pairs, math.ceil(pairs / place.capacity)))
+        kernels.forecast.update(FrameFacts(size, place.capacity, pairs, math.ceil(pairs / place.capacity)))
         outputs = (colour, alpha, None, None, None, radii, visible)
         shot = shot_of(camera, RenderOptions(0, depth=False), 1)
         frame = CudaFrame.render(kernels, shot, tuple(p.to(device) for p in parameters), outputs)

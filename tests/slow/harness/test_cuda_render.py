@@ -17,8 +17,8 @@ from random_scene import random_scene
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_forecast import (
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_forecast import (
     FIRST_PASSES,
     Forecast,
     FrameFacts,
@@ -30,7 +30,7 @@ from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, isa_name, kernels_name, render
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ def test_what_was_not_forecast_is_still_rendered(kernels):
     whole, gradients = backward_of(RenderOptions(3), kernels)
     blind = kernels_on_cpu()
     blind.forecast.most_pairs = 1
-    blind.forecast.learn(FrameFacts(FrameSize(60, 20), 60, pairs=10, chunks=1))  # far too few
+    blind.forecast.update(FrameFacts(FrameSize(60, 20), 60, pairs=10, chunks=1))  # far too few
     assert blind.forecast.room(FrameSize(60, 20)).passes == 1
     chunked, ours = backward_of(RenderOptions(3), blind)
     assert all(torch.equal(getattr(chunked, name), picture) for name, picture in vars(whole).items())
@@ -144,7 +144,7 @@ def test_a_memory_limit_acts_like_a_smaller_device_while_it_lasts(kernels):
 
 
 def test_forecast_never_waits(kernels, monkeypatch):
-    monkeypatch.setattr("splatpipe.pipeline.raster.cuda_forecast.PendingFacts.arrived", lambda self: False)
+    monkeypatch.setattr("splatpipe.pipeline.raster.cuda.cuda_forecast.PendingFacts.arrived", lambda self: False)
     for _ in range(2):
         backward_of(OPTIONS, kernels)
     assert kernels.forecast.room(FrameSize(60, 20)).passes == FIRST_PASSES  # nothing is known yet

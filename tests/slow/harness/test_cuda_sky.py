@@ -8,12 +8,12 @@ from building import FORWARD, REVERSE, SHUFFLED, build_on_cpu, load
 from cuda_skies import BACKGROUND, ELSEWHERE, composed
 from on_cpu import kernels_on_cpu
 
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
-from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS
+from splatpipe.pipeline.splat.sky.sky_mask import SkyMask
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 
 
 @pytest.fixture(scope="module")

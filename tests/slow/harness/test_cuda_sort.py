@@ -11,8 +11,8 @@ import pytest
 from building import FORWARD, HARNESS, build_on_cpu, kernel_sources
 from frames import ORDERS, DeviceFrame, Memory, RenderCase, controls, pointer, run
 
-from splatpipe.pipeline.raster.cuda_api import SplatPictures
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda_api import SplatPictures
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 
 BAD, TOO_LITTLE = -1, -2
 CULLED = 0xFFFFFFFF

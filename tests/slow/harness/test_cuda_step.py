@@ -15,8 +15,8 @@ from frames import ORDERS, PARAMETERS, DeviceFrame, Memory, RenderCase, controls
 from random_scene import random_camera, random_scene
 
 from splatpipe.pipeline.native import _native
-from splatpipe.pipeline.raster.cuda_api import SplatAdam, SplatStep
-from splatpipe.pipeline.raster.cuda_library import CudaLibrary
+from splatpipe.pipeline.raster.cuda.cuda_api import SplatAdam, SplatStep
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 
 STEP = 2e-6
 """Relative, of values and moments after a step from the same gradients: the same operations, but for fused ones."""

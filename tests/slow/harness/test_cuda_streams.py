@@ -13,11 +13,11 @@ from on_cpu import kernels_on_cpu
 from random_scene import random_camera, random_scene
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.raster import cuda, cuda_forecast
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_api import CALLS, SplatFrameFacts
-from splatpipe.pipeline.raster.cuda_forecast import FrameSize, PendingFacts
+from splatpipe.pipeline.raster.cuda import cuda, cuda_forecast
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_api import CALLS, SplatFrameFacts
+from splatpipe.pipeline.raster.cuda.cuda_forecast import FrameSize, PendingFacts
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render

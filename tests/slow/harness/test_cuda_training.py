@@ -19,24 +19,26 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
-from splatpipe.pipeline.raster.cuda_forecast import most_pairs_of
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.cuda.cuda_forecast import most_pairs_of
 from splatpipe.pipeline.raster.cuda_frame import shot_of
 from splatpipe.pipeline.raster.device import Device, cpu
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.render.options import EvaluateConfig
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.train import loop, shortage, state
-from splatpipe.pipeline.train.checkpoint import load_checkpoint, save_checkpoint
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.measure import Step
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.planning import PlanningInput
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.techniques import Techniques, make_techniques
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.planning import shortage
+from splatpipe.pipeline.train.planning.measure import Step
+from splatpipe.pipeline.train.planning.planning import PlanningInput
+from splatpipe.pipeline.train.state import state
+from splatpipe.pipeline.train.state.checkpoint import load_checkpoint, save_checkpoint
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import Techniques, make_techniques
 from splatpipe.stages import evaluate, initialize, train
 
 ON_CUDA = Device("cuda", torch.device("cpu"))  # as long as kernels of the harness are used

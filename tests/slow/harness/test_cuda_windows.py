@@ -11,15 +11,15 @@ from building import FORWARD, SHUFFLED, build_on_cpu, load
 from on_cpu import kernels_on_cpu
 from torch import Tensor
 
-from splatpipe.pipeline.photos.dataset import View, load_views
-from splatpipe.pipeline.raster.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.photos.pixels.dataset import View, load_views
+from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.plan import make_plan
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import PhotoStream
-from splatpipe.pipeline.train.techniques import make_techniques
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.photos.stream import PhotoStream
+from splatpipe.pipeline.train.plan.plan import make_plan
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import make_techniques
 
 OPTIONS = tiny_scene.plain(
     iterations=400, exposure="affine", antialias=True, robust=0.1, distortion_weight=0.05, dropout=0.2

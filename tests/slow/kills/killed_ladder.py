@@ -13,7 +13,7 @@ import leftovers
 
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.runs.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.config import load_preset, parse_set, resolve
 from splatpipe.pipeline.engine.events import Event
-from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.runs.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig

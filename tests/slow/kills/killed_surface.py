@@ -14,11 +14,11 @@ import numpy as np
 from hills import hill_grid
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.surface.contour_files import write_dxf, write_geojson
-from splatpipe.pipeline.surface.contours import Contour, Contours
-from splatpipe.pipeline.surface.geotiff import COLOURS, CONFIDENCE, HEIGHTS, RasterForm, raster_file
-from splatpipe.pipeline.surface.grid import Grid
-from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
+from splatpipe.pipeline.surface.heights.contour_files import write_dxf, write_geojson
+from splatpipe.pipeline.surface.heights.contours import Contour, Contours
+from splatpipe.pipeline.surface.rasters.geotiff import COLOURS, CONFIDENCE, HEIGHTS, RasterForm, raster_file
+from splatpipe.pipeline.surface.rasters.grid import Grid
+from splatpipe.pipeline.surface.shapes.point_cloud import CloudChunk, CloudFrame, write_cloud
 
 DISK_BYTES = 100_000
 Halfway = Callable[[], None]

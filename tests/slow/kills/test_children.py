@@ -11,13 +11,16 @@ from pathlib import Path
 import pytest
 from timeouts import wait_until
 
-from splatpipe.pipeline.engine.children import run_children
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.runs.children import run_children
 
 CODE = "timeit"  # runs its arguments as statements; the first of them is our process number, which does no harm
 
 
-SLEEP = (CODE, "import time, splatpipe.pipeline.engine.children as c; c.die_with_parent({parent}); time.sleep(300)")
+SLEEP = (
+    CODE,
+    "import time, splatpipe.pipeline.engine.runs.children as c; c.die_with_parent({parent}); time.sleep(300)",
+)
 
 
 def sleeping() -> tuple[str, ...]:
@@ -60,7 +63,7 @@ def test_they_die_with_the_process_that_started_them(tmp_path: Path, platform: s
     statement = SLEEP[1].format(parent="os.getppid()").replace("time.sleep", f"open({str(asked)!r}, 'w'); time.sleep")
     statement = statement.replace("c.die", f"import os; c.sys.platform = '{platform}'; c.die")
     script = (
-        "from splatpipe.pipeline.engine.children import run_children\n"
+        "from splatpipe.pipeline.engine.runs.children import run_children\n"
         f"run_children([('{CODE}', {statement!r})], lambda: None, '')"
     )
     parent = subprocess.Popen([sys.executable, "-c", script])

@@ -12,8 +12,8 @@ import pytest
 from engine_runs import request_of, run_in_background, walk
 
 from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.runs.worker import Task
 from splatpipe.pipeline.engine.stage import Machine
-from splatpipe.pipeline.engine.worker import Task
 
 pytestmark = pytest.mark.usefixtures("lines")
 
@@ -46,7 +46,7 @@ def test_a_worker_that_is_asked_to_end_is_not_waited_for(numbers: Path, tmp_path
     machine, config = asdict(Machine("cpu", 1)), {"steps": 3000, "step_s": 0.1}
     fields = {"parts": {}, "photos_dir": str(numbers), "out": str(tmp_path), "settings": {}, "summaries": {}}
     task = Task("count", "arithmetic:count", "arithmetic:CountConfig", config, machine=machine, **fields)
-    command = [sys.executable, "-m", "splatpipe.pipeline.engine.worker", str(os.getpid())]
+    command = [sys.executable, "-m", "splatpipe.pipeline.engine.runs.worker", str(os.getpid())]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
         assert worker.stdin is not None and worker.stdout is not None
         worker.stdin.write(json.dumps({"task": asdict(task)}) + "\n")
@@ -60,7 +60,7 @@ def test_a_worker_that_is_asked_to_end_is_not_waited_for(numbers: Path, tmp_path
 def test_a_second_process_is_refused_and_the_message_names_the_first(
     numbers: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
+    monkeypatch.setattr("splatpipe.pipeline.engine.runs.lock.PATIENCE_S", 0.2)
     with run_in_background(numbers, out, steps=600, step_s=0.1) as process:
         assert process.stdout is not None
         process.stdout.readline()

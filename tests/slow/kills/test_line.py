@@ -49,7 +49,7 @@ def test_kill_9_in_every_stage_loses_nothing(photos: Path, undisturbed: Path, tm
 def test_a_stopped_command_says_so_and_goes_on_later(
     photos: Path, copy_of_run: Path, number: signal.Signals, code: int
 ) -> None:
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", photos, copy_of_run]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "run", photos, copy_of_run]
     longer = sets(*QUICK, "train.iterations=100000")
     told_before = len((copy_of_run / "events.jsonl").read_text())
     pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

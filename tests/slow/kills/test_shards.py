@@ -12,8 +12,8 @@ import sharded
 from sharded_runs import NUMBERS, SHARDS, make_shard, request_of, statuses, walk
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.lock import is_locked
-from splatpipe.pipeline.engine.run_folder import shard_events
+from splatpipe.pipeline.engine.runs.lock import is_locked
+from splatpipe.pipeline.engine.runs.run_folder import shard_events
 
 pytestmark = pytest.mark.usefixtures("lines")
 
@@ -23,7 +23,7 @@ import json, sys
 from pathlib import Path
 import sharded
 from splatpipe.pipeline.engine.config import resolve
-from splatpipe.pipeline.engine.session import Request, open_session
+from splatpipe.pipeline.engine.runs.session import Request, open_session
 from splatpipe.pipeline.engine.stage import Machine
 numbers, out, shard, options = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4])
 request = Request(sharded.LINE, resolve(sharded.LineConfig, [options]), numbers, out, Machine("cpu", 1))
@@ -119,7 +119,7 @@ def test_a_run_killed_in_a_shard_keeps_those_before_it(numbers: Path, out: Path,
 def test_two_processes_may_write_two_artifacts_but_not_the_same_one(
     numbers: Path, out: Path, hold: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatpipe.pipeline.engine.lock.PATIENCE_S", 0.2)
+    monkeypatch.setattr("splatpipe.pipeline.engine.runs.lock.PATIENCE_S", 0.2)
     slow = {"sum": {"step_s": 0.4}}
     walk(request_of(numbers, out, **slow), until="divide")
     (hold / "2").touch()

@@ -82,7 +82,7 @@ def test_a_read_only_disk_is_reported(numbers: Path, tmp_path: Path) -> None:
 
 
 def splatpipe(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
 
 
@@ -99,9 +99,9 @@ def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> 
     """Docker kills ten seconds after SIGTERM: the notice ends before, though it would sleep for longer than allowed."""
     (tmp_path / "out" / "stages").mkdir(parents=True)
     (tmp_path / "photos").mkdir()
-    holds = "import sys; from pathlib import Path; from splatpipe.pipeline.engine.lock import locked\n"
+    holds = "import sys; from pathlib import Path; from splatpipe.pipeline.engine.runs.lock import locked\n"
     holds += "with locked(Path('out')): print('held', flush=True); sys.stdin.readline()"
-    waits = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", "photos", "out", "--wait", "--notify"]
+    waits = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "run", "photos", "out", "--wait", "--notify"]
     with (
         subprocess.Popen([sys.executable, "-c", holds], stdin=-1, stdout=-1, text=True, cwd=tmp_path) as holder,
         subprocess.Popen(
@@ -124,7 +124,7 @@ def test_a_stopped_run_does_not_wait_for_a_notice_that_hangs(tmp_path: Path) -> 
 
 def test_home_is_not_needed(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "HOME"}
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", "~nobody-of-that-name/x", "out"]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "run", "~nobody-of-that-name/x", "out"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
     assert done.returncode == 2 and "no home folder" in done.stderr
 

@@ -27,7 +27,7 @@ def test_each_stage_is_compared_on_earlier_outputs(tmp_path: Path) -> None:
     git = ["git", "-c", "user.name=t", "-c", "user.email=t@t", "-C", str(checkout)]
     for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "right"]):
         subprocess.run([*git, *arguments], check=True)
-    replace(checkout / "pipeline/photos/camera_groups.py", r"^ZOOM_TOLERANCE = \S+", "ZOOM_TOLERANCE = 0.5")
+    replace(checkout / "pipeline/photos/intake/camera_groups.py", r"^ZOOM_TOLERANCE = \S+", "ZOOM_TOLERANCE = 0.5")
     append(checkout / "stages/features.py", "\nPLANTED = 1\n")
     subprocess.run([*git, "commit", "-qam", "wrong"], check=True)
     comparison = Comparison(checkout, tmp_path / "work", lambda text: None)

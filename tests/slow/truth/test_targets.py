@@ -10,12 +10,12 @@ from measure import SilentReporter
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos.photo_list import load_photo_list
-from splatpipe.pipeline.survey.gps import georeference, read_positions
-from splatpipe.pipeline.survey.model import read_model
+from splatpipe.pipeline.photos.files.photo_list import load_photo_list
 from splatpipe.pipeline.survey.options import ControlConfig, TargetsConfig
-from splatpipe.pipeline.survey.target_finds import load_finds, load_wanted
-from splatpipe.pipeline.survey.target_survey import TargetSurvey
+from splatpipe.pipeline.survey.placing.gps import georeference, read_positions
+from splatpipe.pipeline.survey.placing.model import read_model
+from splatpipe.pipeline.survey.targets.target_finds import load_finds, load_wanted
+from splatpipe.pipeline.survey.targets.target_survey import TargetSurvey
 from splatpipe.stages.control import run as read_control
 from splatpipe.stages.targets import run as find_targets
 

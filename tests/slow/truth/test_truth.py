@@ -22,11 +22,11 @@ from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.demo.scene import building_corners
 from splatpipe.demo.truth import Poses, centre, depth_map, true_poses, true_surface, truth_from_model
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.photos.dataset import load_points_and_tracks, load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_views
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
-from splatpipe.pipeline.splat.free_space import free_space, near_or_free
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
+from splatpipe.pipeline.splat.containers.ply import read_splat
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality.free_space import free_space, near_or_free
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def out(demo_run: Path, demo_options: list[str], tmp_path_factory: pytest.TempPa
     """The demo's run, placed by the photos' positions alone, up to its short training."""
     folder = linked_copy(demo_run, tmp_path_factory.mktemp("truth") / "out")
     options = [*demo_options, "--set", "georef.control=none", "--until", "train"]
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli", "run", capture_path(), folder, *options]
+    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "run", capture_path(), folder, *options]
     subprocess.run(command, check=True)
     return folder
 

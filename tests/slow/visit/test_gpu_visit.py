@@ -28,8 +28,8 @@ from building import NATIVE, build_on_cpu
 from gpu_parts import Row
 from repository import ROOT
 
-from splatpipe.pipeline.raster import cuda, cuda_api
-from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.raster.cuda import cuda, cuda_api
+from splatpipe.pipeline.splat.containers.ply import write_splat
 
 BARE = ROOT / "tests" / "bare"
 CARRIED = ("pydantic", "pydantic_core", "annotated_types", "typing_inspection", "tomli_w")

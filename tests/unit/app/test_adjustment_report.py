@@ -20,10 +20,10 @@ from splatpipe.pipeline.app.report.page import TEMPLATES
 from splatpipe.pipeline.app.report.run_history import RunHistory, StageHistory, StageMessages
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.app.report.wording import two_digits
-from splatpipe.pipeline.survey.adjusted_positions import height_sentence
-from splatpipe.pipeline.survey.block_accuracy import CONTROL_SIGMAS_M, MARK_SIGMA_PX, OTHER_HEIGHT
-from splatpipe.pipeline.survey.position_adjustment import ALL, ALL_FISHEYE
-from splatpipe.pipeline.survey.uncertainty import NORMAL_95, metres_in_words
+from splatpipe.pipeline.survey.adjustment.adjusted_positions import height_sentence
+from splatpipe.pipeline.survey.adjustment.block_accuracy import CONTROL_SIGMAS_M, MARK_SIGMA_PX, OTHER_HEIGHT
+from splatpipe.pipeline.survey.adjustment.position_adjustment import ALL, ALL_FISHEYE
+from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95, metres_in_words
 
 HOSTILE = '<script>alert("x")</script>'
 ORIGIN = {"latitude": 45.0315, "longitude": 7.62064, "height_m": 350.0}

@@ -18,7 +18,7 @@ from splatpipe.pipeline.app.batch.planning import Settings, make_plan
 from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
 from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
 from splatpipe.pipeline.app.batch.workflow import workflow_text
-from splatpipe.pipeline.app.cli_runs import SPENT_VARIABLE, spent_s
+from splatpipe.pipeline.app.commands.runs import SPENT_VARIABLE, spent_s
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, UsageError
 from splatpipe.stages.line import LINE
 

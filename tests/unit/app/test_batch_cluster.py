@@ -28,7 +28,7 @@ from splatpipe.pipeline.app.batch.snakemake_process import Profile, open_profile
 from splatpipe.pipeline.app.batch.state import CaptureState
 from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, EXIT_TERMINATED, MachineError
-from splatpipe.pipeline.engine.needs import Need
+from splatpipe.pipeline.engine.runs.needs import Need
 from splatpipe.stages.line import LINE
 
 TERMINATED = AttemptResult(EXIT_TERMINATED, "Stopped. Finished work is kept.")

@@ -11,9 +11,9 @@ import pytest
 from forecast_fit import compared, fit, left_out, scene_of
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
-from splatpipe.pipeline.engine.needs import Need, whole
-from splatpipe.pipeline.train.blocks.division import Division, SceneSize
-from splatpipe.pipeline.train.limits import bytes_per_gaussian
+from splatpipe.pipeline.engine.runs.needs import Need, whole
+from splatpipe.pipeline.train.blocks.cells.division import Division, SceneSize
+from splatpipe.pipeline.train.plan.limits import bytes_per_gaussian
 from splatpipe.pipeline.web.options import FORMATS
 from splatpipe.stages import work as work_module
 from splatpipe.stages.block_work import START_S

@@ -9,9 +9,9 @@ from accurate_flights import CAMERA, SINGLE_M, flight
 from splatpipe.pipeline.app.preflight.findings import Finding
 from splatpipe.pipeline.app.preflight.heights import height_findings
 from splatpipe.pipeline.app.preflight.intake import Intake
-from splatpipe.pipeline.sfm.layout import make_layout
-from splatpipe.pipeline.survey.photo_positions import Position, PositionList
-from splatpipe.pipeline.survey.predicted_flight import predict_accuracy
+from splatpipe.pipeline.sfm.pairing.layout import make_layout
+from splatpipe.pipeline.survey.adjustment.predicted_flight import predict_accuracy
+from splatpipe.pipeline.survey.positions.photo_positions import Position, PositionList
 
 
 def said(photos: Sequence[Position], controlled: bool = False) -> list[Finding]:

@@ -18,9 +18,9 @@ from splatpipe.pipeline.app.view.checkpoint_render import (
     pictures,
 )
 from splatpipe.pipeline.app.view.live import Live
-from splatpipe.pipeline.engine.run_folder import Contents, RunFolder
-from splatpipe.pipeline.engine.store import Artifact
-from splatpipe.pipeline.photos.dataset import View, load_views
+from splatpipe.pipeline.engine.runs.run_folder import Contents, RunFolder
+from splatpipe.pipeline.engine.runs.store import Artifact
+from splatpipe.pipeline.photos.pixels.dataset import View, load_views
 from splatpipe.pipeline.raster.device import Device, cpu
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.render.rendering import Model, placed

@@ -12,9 +12,9 @@ from splatpipe.pipeline.app.measured_viewer import update_viewer
 from splatpipe.pipeline.app.measurements import MEASURED, outdated, read_measurements, write_measurements
 from splatpipe.pipeline.app.report.measures import measures
 from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
-from splatpipe.pipeline.engine.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.store import Artifact, StageInputs, Store, open_store
 from splatpipe.pipeline.engine.stage import Stage
-from splatpipe.pipeline.engine.store import Artifact, StageInputs, Store, open_store
 from splatpipe.pipeline.web.measured_page import BEGIN, END, with_measurements
 from splatpipe.stages.line import DSM, EXPORT, GEOREF, LINE
 

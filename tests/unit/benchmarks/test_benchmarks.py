@@ -12,12 +12,12 @@ import torch
 import window_speed
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster.definitions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.raster.reference import project, visible_splats
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.plan.plan import make_plan
 
 MEGAPIXELS = 1e-6 * tiny_scene.WIDTH * tiny_scene.HEIGHT
 

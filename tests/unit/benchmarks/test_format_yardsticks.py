@@ -13,9 +13,9 @@ from floater_planting import KINDS, SEEN_ALPHA, plant, render_depths
 from position_errors import SITE_M, position_row, site_of
 
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts
-from splatpipe.pipeline.splat.spz import spz_bytes
+from splatpipe.pipeline.splat.containers.spz_encoder import spz_bytes
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts
 
 UP_FROM_DOWN = SceneFacts("y down")  # the tiny scene's −y is up
 

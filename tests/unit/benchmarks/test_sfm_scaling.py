@@ -9,7 +9,7 @@ import pytest
 from mapped_apart import centre_errors, pairs_by_look
 from sfm_scaling import exponent
 
-from splatpipe.pipeline.sfm.view_graph import read_verified
+from splatpipe.pipeline.sfm.model.view_graph import read_verified
 
 COUNT = 30
 

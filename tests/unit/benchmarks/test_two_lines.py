@@ -4,7 +4,7 @@ from pathlib import Path
 
 from two_lines import product_rows, stage_rows
 
-from splatpipe.pipeline.engine.store import Artifact
+from splatpipe.pipeline.engine.runs.store import Artifact
 
 MACHINE = {"processor": "x86_64", "threads": 2, "device": "cpu"}
 

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.engine import lock as engine_lock
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
-from splatpipe.pipeline.engine.lock import LOCK_FILE, is_locked, locked, locked_shard, running_shards
 from splatpipe.pipeline.engine.machine import Mount
+from splatpipe.pipeline.engine.runs import lock as engine_lock
+from splatpipe.pipeline.engine.runs.lock import LOCK_FILE, is_locked, locked, locked_shard, running_shards
 
 ELSEWHERE = {"process": 4711, "host": "node7", "boot": "another", "turn": "first"}
 
@@ -30,7 +30,7 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An OUT's folder; silence expires a signature soon."""
     monkeypatch.setattr(engine_lock, "PATIENCE_S", 0.2)
     monkeypatch.setattr(engine_lock, "SILENCE_S", 1.5)
-    monkeypatch.setattr(engine_lock, "BEAT_S", 0.1)
+    monkeypatch.setattr(engine_lock, "HEARTBEAT_S", 0.1)
     monkeypatch.setattr(engine_lock, "POLL_S", 0.02)
     (tmp_path / "stages").mkdir()
     return tmp_path

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.run_folder import RunFolder
+from splatpipe.pipeline.engine.runs.run_folder import RunFolder
+from splatpipe.pipeline.engine.runs.store import Artifact, StageInputs, Store, open_store
 from splatpipe.pipeline.engine.stage import Stage, StageConfig
-from splatpipe.pipeline.engine.store import Artifact, StageInputs, Store, open_store
 
 SECRET = "key " * 10
 STAGE = Stage(

@@ -20,8 +20,8 @@ from splatpipe.pipeline.geometry.upright import (
     rotation_to_up,
     up_from_cameras,
 )
-from splatpipe.pipeline.survey.frames import Frame, load_frame, save_frame
-from splatpipe.pipeline.survey.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
+from splatpipe.pipeline.survey.crs.frames import Frame, load_frame, save_frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef
 
 EXACT = 1e-12  # float64, a few products of numbers near one
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splatpipe.pipeline.geometry.joint_fit import JointFit, JointObservations, Priors, find_blunders, fit_jointly
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.geometry.triangulation import Rays, triangulate
-from splatpipe.pipeline.survey.model import ModelView
+from splatpipe.pipeline.survey.placing.model import ModelView
 
 Array = NDArray[np.float64]
 TRUTH = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))

@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.bands import bands_of, choose_band
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.scan import Candidate
-from splatpipe.pipeline.photos.xmp import parse_xmp
+from splatpipe.pipeline.photos.files.scan import Candidate
+from splatpipe.pipeline.photos.intake.bands import bands_of, choose_band
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.photos.metadata.xmp import parse_xmp
 
 LIMITS = PictureLimits(min_side=100, max_pixels=10_000_000)
 BANDS = {"Green": 550, "Red": 660, "Red edge": 735, "NIR": 790}

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.colmap_reconstruction import read_reconstruction
+from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
 
 BINARY = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 HUGE = struct.pack("<Q", 1 << 61)

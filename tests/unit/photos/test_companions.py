@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.companions import DEPTH, MASK, PREVIEW, find_companions
-from splatpipe.pipeline.photos.duplicates import split_maps
-from splatpipe.pipeline.photos.scan import Candidate, ExcludedPhoto, scan_folder, with_reason
+from splatpipe.pipeline.photos.files.companions import DEPTH, MASK, PREVIEW, find_companions
+from splatpipe.pipeline.photos.files.scan import Candidate, ExcludedPhoto, scan_folder, with_reason
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.photos.intake.duplicates import split_maps
 
 LIMITS = PictureLimits(min_side=320, max_pixels=10_000_000)
 

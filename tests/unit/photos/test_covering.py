@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.photos.covering import COVERED, covering_photos
+from splatpipe.pipeline.photos.pixels.covering import COVERED, covering_photos
 
 FEW = 12
 

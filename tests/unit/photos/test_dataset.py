@@ -9,7 +9,7 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import (
+from splatpipe.pipeline.photos.pixels.dataset import (
     Split,
     image_path,
     load_points,

@@ -15,9 +15,9 @@ import pytest
 from PIL import Image
 from scenes import raw_photo
 
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.convert import read_8bit
-from splatpipe.pipeline.photos.scan import ExcludedPhoto, scan_folder
+from splatpipe.pipeline.photos.files.scan import ExcludedPhoto, scan_folder
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.photos.intake.convert import read_8bit
 
 HEAD = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"
 LIMITS = PictureLimits(320, 500_000_000)

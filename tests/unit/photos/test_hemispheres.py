@@ -6,7 +6,7 @@ import math
 import pytest
 from PIL import Image
 
-from splatpipe.pipeline.photos.exif import LATITUDE_SIGNS, Gps, _degrees, read_exif
+from splatpipe.pipeline.photos.metadata.exif import LATITUDE_SIGNS, Gps, _degrees, read_exif
 
 
 def gps_of(tags: dict[int, object]) -> Gps:

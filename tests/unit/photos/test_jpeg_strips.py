@@ -10,9 +10,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from splatpipe.pipeline.photos import jpeg_strips, resampling
-from splatpipe.pipeline.photos.jpeg_strips import OPTIONS, write_jpeg
-from splatpipe.pipeline.photos.resampling import resample, resampled_strips
+from splatpipe.pipeline.photos.pixels import jpeg_strips, resampling
+from splatpipe.pipeline.photos.pixels.jpeg_strips import OPTIONS, write_jpeg
+from splatpipe.pipeline.photos.pixels.resampling import resample, resampled_strips
 
 
 def picture(height: int, width: int) -> np.ndarray:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from splatpipe.pipeline.photos.exif import Exif, read_exif
-from splatpipe.pipeline.photos.xmp import MAX_PACKET_BYTES, find_packet, parse_xmp, xmp_number
+from splatpipe.pipeline.photos.metadata.exif import Exif, read_exif
+from splatpipe.pipeline.photos.metadata.xmp import MAX_PACKET_BYTES, find_packet, parse_xmp, xmp_number
 
 DJI = "http://www.dji.com/drone-dji/1.0/"
 RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"

@@ -7,12 +7,12 @@ import pycolmap
 import pytest
 from surveyed import HEIGHT, LENS, TRUTH, WIDTH, true_model
 
-from splatpipe.pipeline.photos import camera_groups as ingest_cameras
-from splatpipe.pipeline.photos.camera_groups import CameraGroup, describe_cameras, group_cameras
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.exif import Exif
+from splatpipe.pipeline.photos.intake import camera_groups as ingest_cameras
+from splatpipe.pipeline.photos.intake.camera_groups import CameraGroup, describe_cameras, group_cameras
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.photos.metadata.exif import Exif
 from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, report_cameras
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 
 class Notes:

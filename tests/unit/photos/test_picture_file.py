@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from splatpipe.pipeline.photos.picture_file import open_picture
+from splatpipe.pipeline.photos.files.picture_file import open_picture
 
 LONG = 4  # the type of a tag
 

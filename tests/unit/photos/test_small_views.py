@@ -8,9 +8,9 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
-from splatpipe.pipeline.photos.images import reduced_view
-from splatpipe.pipeline.photos.small_views import read_small, small_view
+from splatpipe.pipeline.photos.pixels.dataset import View
+from splatpipe.pipeline.photos.pixels.images import reduced_view
+from splatpipe.pipeline.photos.pixels.small_views import read_small, small_view
 
 WIDTH, HEIGHT = 1603, 1205  # nothing divides them
 

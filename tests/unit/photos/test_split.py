@@ -7,8 +7,8 @@ import tiny_scene
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos.dataset import load_split
 from splatpipe.pipeline.photos.options import SplitConfig
+from splatpipe.pipeline.photos.pixels.dataset import load_split
 from splatpipe.stages import split
 from splatpipe.stages.line import LINE
 

@@ -14,11 +14,11 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos import resampling, undistortion
-from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.photos.files.photo_list import PhotoList, load_photo_list, save_photo_list
 from splatpipe.pipeline.photos.options import UndistortConfig
-from splatpipe.pipeline.photos.photo_list import PhotoList, load_photo_list, save_photo_list
-from splatpipe.pipeline.photos.undistortion import pinhole_camera, with_places
+from splatpipe.pipeline.photos.pixels import resampling, undistortion
+from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
+from splatpipe.pipeline.photos.pixels.undistortion import pinhole_camera, with_places
 from splatpipe.stages import undistort
 
 WIDTH, HEIGHT = 960, 720

@@ -20,14 +20,17 @@ def test_colmap_models_are_read_after_a_check() -> None:
     read = {
         path for path, call in calls("pycolmap.Reconstruction") if call.args and ast.unparse(call.args[0]) not in COPIES
     }
-    assert read == {"pipeline/photos/colmap_reconstruction.py", "pipeline/sfm/sparse_model.py"}  # which just wrote it
+    assert read == {
+        "pipeline/photos/colmap/colmap_reconstruction.py",
+        "pipeline/sfm/model/sparse_model.py",
+    }  # which just wrote it
 
 
 def test_pictures_of_users_are_opened_in_one_place() -> None:
     assert {path for path, _ in calls("Image.open")} == {
-        "pipeline/photos/picture_file.py",
+        "pipeline/photos/files/picture_file.py",
         "pipeline/app/preflight/sizing.py",  # reads headers only
-        "pipeline/splat/formats/lossless_pictures.py",  # has limits of its own
+        "pipeline/splat/containers/lossless_pictures.py",  # has limits of its own
     }
 
 
@@ -38,7 +41,7 @@ def test_files_of_users_are_split_at_line_feeds() -> None:
 
 def test_numpy_archives_are_opened_in_one_place() -> None:
     assert {path for path, _ in calls("np.load")} == {
-        "pipeline/splat/archives.py",
+        "pipeline/splat/containers/archives.py",
         "pipeline/mvs/rendered_depths.py",  # single arrays, which are not compressed
         "stages/sparse.py",
     }
@@ -46,4 +49,4 @@ def test_numpy_archives_are_opened_in_one_place() -> None:
 
 def test_rasters_are_read_as_geotiffs_only() -> None:
     read = {path for path, call in calls("rasterio.open") if len(call.args) == 1}
-    assert read == {"pipeline/surface/geotiff.py"}
+    assert read == {"pipeline/surface/rasters/geotiff.py"}

@@ -9,7 +9,7 @@ from torch import Tensor
 from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.rasterizer import set_threads
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes, laid_over_nodes_reference
-from splatpipe.pipeline.splat.panorama import STEP_PX, nodes_along
+from splatpipe.pipeline.splat.sky.panorama import STEP_PX, nodes_along
 
 PICTURE_ATOL = 1e-6  # of colours up to 2 in float32
 GRADIENT_RTOL = 2e-6  # L2; a node's is a sum over up to 15 x 15 pixels

@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render, set_threads
-from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 # Tolerances of float32 against float64.
 COLOUR = 1e-5  # sums of up to 60 rounded terms of size 1

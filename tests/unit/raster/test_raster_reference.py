@@ -13,8 +13,8 @@ from torch import Tensor
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import reference
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
-from splatpipe.pipeline.splat.gaussians import PARAMETERS, Gaussians
-from splatpipe.pipeline.splat.sh import rgb_to_dc
+from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 
 EXACT = 1e-12  # float64 rounding of a few operations
 STEP = 1e-6  # of the finite differences: h² and 1e-16 / h are both small

@@ -12,8 +12,8 @@ from torch import Tensor
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render, set_threads
 from splatpipe.pipeline.raster.step_lengths import FarSteps
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.dropout import _DropoutLogits
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.techniques.dropout import _DropoutLogits
 
 LIMITS = {"log_scales": (-2.5, -1.0)}
 WIDE, TALL = random_camera(0), random_camera(3, 31, 64)

@@ -19,10 +19,10 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render import rendering
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.render.splat_accuracy import depth_at, measure_accuracy
-from splatpipe.pipeline.splat.gaussians import Gaussians, quat_from_rotation
-from splatpipe.pipeline.survey.frames import Frame, save_frame
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.residuals import accuracy_table
+from splatpipe.pipeline.splat.model.gaussians import Gaussians, quat_from_rotation
+from splatpipe.pipeline.survey.control.residuals import accuracy_table
+from splatpipe.pipeline.survey.crs.frames import Frame, save_frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
 from splatpipe.stages import evaluate
 
 TURN = rotation_from_vector(np.array([0.25, -0.2, 0.1]))  # of the wall, in the model's frame: seen at a slant
@@ -188,11 +188,11 @@ def test_a_broken_control_json_says_what_to_do(parts: dict[str, Path], text: str
 
 
 def test_evaluate_writes_it_to_its_metrics(parts: dict[str, Path], tmp_path: Path) -> None:
-    from splatpipe.pipeline.photos.dataset import load_views
-    from splatpipe.pipeline.splat.panorama import write_panorama
-    from splatpipe.pipeline.splat.ply import write_splat
+    from splatpipe.pipeline.photos.pixels.dataset import load_views
+    from splatpipe.pipeline.splat.containers.ply import write_splat
+    from splatpipe.pipeline.splat.sky.panorama import write_panorama
     from splatpipe.pipeline.train.options import TrainConfig
-    from splatpipe.pipeline.train.plan import make_plan
+    from splatpipe.pipeline.train.plan.plan import make_plan
 
     dataset = tiny_scene.write_dataset(tmp_path / "dataset")
     write_splat(tmp_path / "model.ply", wall())
@@ -260,7 +260,7 @@ def test_the_tables_figures_match_their_definitions() -> None:
 
 
 def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixture[str]) -> None:
-    from splatpipe.pipeline.app.console import show_accuracy
+    from splatpipe.pipeline.app.commands.console import show_accuracy
 
     check = accuracy_table(np.array([[0.012, -0.034, 0.056], [0.01, 0.02, np.nan]]))
     report = {"gsd_m": 0.0312, "tables": {"gps": None, "control": None, "check": check}, "splat": None}

@@ -14,13 +14,13 @@ import torch
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.stage import Inputs
-from splatpipe.pipeline.photos.dataset import load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.render import view_measures
 from splatpipe.pipeline.render.options import EvaluateConfig
-from splatpipe.pipeline.splat.panorama import write_panorama
-from splatpipe.pipeline.splat.ply import write_splat
+from splatpipe.pipeline.splat.containers.ply import write_splat
+from splatpipe.pipeline.splat.sky.panorama import write_panorama
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.plan.plan import make_plan
 from splatpipe.stages import evaluate
 
 MASKED = "flight 1/photo_4.png"

@@ -8,13 +8,13 @@ import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.geometry.upright import enu_from_gimbal
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.photos.scan import Candidate
-from splatpipe.pipeline.sfm.footprints import StatedPoses, crossing_distances, overlaps
-from splatpipe.pipeline.sfm.layout import make_layout, make_views
-from splatpipe.pipeline.sfm.pairs import Costs, Layout, choose_pairing, components, select_pairs
-from splatpipe.pipeline.survey.photo_positions import positions_json, read_positions
+from splatpipe.pipeline.photos.files.photo_list import Photo
+from splatpipe.pipeline.photos.files.scan import Candidate
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.sfm.pairing.footprints import StatedPoses, crossing_distances, overlaps
+from splatpipe.pipeline.sfm.pairing.layout import make_layout, make_views
+from splatpipe.pipeline.sfm.pairing.pairs import Costs, Layout, choose_pairing, components, select_pairs
+from splatpipe.pipeline.survey.positions.photo_positions import positions_json, read_positions
 
 HALF_SIZE = (0.6, 0.45)
 

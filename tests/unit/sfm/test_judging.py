@@ -9,11 +9,11 @@ from lens_scene import HEIGHT, WIDTH
 from like_sides import folded, make_sides, unfolded
 from view_graph import FOCAL, Ring, make_ring, model_of, moved, turn_up, with_matches, with_shifted_matches
 
-from splatpipe.pipeline.sfm.agreement import compare, contradicting, epipolar_errors
-from splatpipe.pipeline.sfm.cuts import find_cut
-from splatpipe.pipeline.sfm.doubles import doubles_reasons, find_doubles
-from splatpipe.pipeline.sfm.external_evidence import disagreement
-from splatpipe.pipeline.sfm.judging import judge
+from splatpipe.pipeline.sfm.judging.agreement import compare, contradicting, epipolar_errors
+from splatpipe.pipeline.sfm.judging.cuts import find_cut
+from splatpipe.pipeline.sfm.judging.doubles import doubles_reasons, find_doubles
+from splatpipe.pipeline.sfm.judging.external_evidence import disagreement
+from splatpipe.pipeline.sfm.judging.judging import judge
 
 TRUSTED = [{"has_prior": True, "focal_source": "sensor-table"}]
 ROUGH = [{"has_prior": True, "focal_source": "35mm-equivalent"}]

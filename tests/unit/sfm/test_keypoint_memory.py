@@ -9,8 +9,8 @@ import pytest
 from splatpipe.pipeline.engine import machine
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Machine
-from splatpipe.pipeline.photos.photo_list import Photo, PhotoList
-from splatpipe.pipeline.sfm.keypoints import extraction_bytes
+from splatpipe.pipeline.photos.files.photo_list import Photo, PhotoList
+from splatpipe.pipeline.sfm.matching.keypoints import extraction_bytes
 from splatpipe.pipeline.sfm.options import FeaturesConfig
 from splatpipe.stages import features
 

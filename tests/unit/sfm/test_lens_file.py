@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.sfm.lens_file import fitted, read_lens_file
-from splatpipe.pipeline.sfm.lens_model import StatedLens, apart_px
+from splatpipe.pipeline.sfm.lenses.lens_file import fitted, read_lens_file
+from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens, apart_px
 
 SIZE = (5472, 3648)
 F, CX, CY = 3676.5, 2741.2, 1839.7

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.sfm.nearest_descriptors import group_descriptors, match_descriptors
+from splatpipe.pipeline.sfm.matching.nearest_descriptors import group_descriptors, match_descriptors
 
 DISTANCE, RATIO = 0.7 * 512, 0.8
 
@@ -100,5 +100,5 @@ def test_descriptors_of_nothing_match_nothing() -> None:
 def test_blocks_do_not_change_matches(monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = two_photos(600)
     whole = matches(first, second)
-    monkeypatch.setattr("splatpipe.pipeline.sfm.nearest_descriptors.BLOCK", 7)
+    monkeypatch.setattr("splatpipe.pipeline.sfm.matching.nearest_descriptors.BLOCK", 7)
     assert matches(first, second) == whole

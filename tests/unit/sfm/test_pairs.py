@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.sfm.layout import make_layout, viewing_direction
-from splatpipe.pipeline.sfm.pairs import (
+from splatpipe.pipeline.photos.files.photo_list import Photo
+from splatpipe.pipeline.sfm.pairing.layout import make_layout, viewing_direction
+from splatpipe.pipeline.sfm.pairing.pairs import (
     Costs,
     Layout,
     choose_pairing,
@@ -19,7 +19,7 @@ from splatpipe.pipeline.sfm.pairs import (
     select_pairs,
     sequences,
 )
-from splatpipe.pipeline.sfm.retrieval import codebook, look_alike_costs
+from splatpipe.pipeline.sfm.pairing.retrieval import codebook, look_alike_costs
 
 UNKNOWN = float("nan")
 

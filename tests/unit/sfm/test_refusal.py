@@ -4,8 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from splatpipe.pipeline.sfm.refusal import THERMAL, little_texture, refusal, texture_hint
-from splatpipe.pipeline.sfm.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.recovery.refusal import THERMAL, little_texture, refusal, texture_hint
 
 
 def graph(

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from splatpipe.pipeline.sfm.sparse_model import write_model
+from splatpipe.pipeline.sfm.model.sparse_model import write_model
 
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
 

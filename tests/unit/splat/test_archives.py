@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.splat import archives
-from splatpipe.pipeline.splat.archives import open_archive, read_archive
+from splatpipe.pipeline.splat.containers import archives
+from splatpipe.pipeline.splat.containers.archives import open_archive, read_archive
 
 
 def test_arrays_read_back_as_written(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.splat.formats.bounded import (
+from splatpipe.pipeline.splat.containers.bounded import (
     FREE_BYTES,
     InflatedFile,
     check_expansion,
@@ -18,7 +18,7 @@ from splatpipe.pipeline.splat.formats.bounded import (
     read_exactly,
     read_whole,
 )
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 PATH = Path("a.spz")
 CONTENT = bytes(range(256)) * 1000

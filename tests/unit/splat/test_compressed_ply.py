@@ -17,10 +17,10 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import RenderOptions
 from splatpipe.pipeline.raster.rasterizer import render
+from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.formats import compressed_ply
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
 FACTS = SceneFacts("y down", True, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
 SH_C0 = 0.28209479177387814

@@ -8,10 +8,10 @@ import skies
 import torch
 
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.dome import SPACING_RAD, dome_directions, dome_radius, sky_dome
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, Panorama
-from splatpipe.pipeline.splat.sky_mask import directions, elevations_deg
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.dome import SPACING_RAD, dome_directions, dome_radius, sky_dome
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, Panorama
+from splatpipe.pipeline.splat.sky.sky_mask import directions, elevations_deg
 
 TILTED = np.array([0.36, -0.48, 0.8])
 CAMERAS = np.array([[3.0, 0.0, 2.0], [5.0, 0.0, 2.0], [4.0, 1.0, 2.0]])

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat import free_space as module
-from splatpipe.pipeline.splat.free_space import FreeSpace, free_space, near_or_free, share_of_opacity
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality import free_space as module
+from splatpipe.pipeline.splat.quality.free_space import FreeSpace, free_space, near_or_free, share_of_opacity
 
 WALL = 10.0  # depth; every camera looks along z, so that a cell of 20 pixels is half a unit wide there
 WIDTH, HEIGHT, FOCAL = 480, 360, 400.0

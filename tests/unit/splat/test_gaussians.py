@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from splatpipe.pipeline.splat.gaussians import Gaussians, multiply_quats, quat_from_rotation
-from splatpipe.pipeline.splat.sh import eval_sh
+from splatpipe.pipeline.splat.model.gaussians import Gaussians, multiply_quats, quat_from_rotation
+from splatpipe.pipeline.splat.model.sh import eval_sh
 
 
 def random_gaussians(n: int, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float64) -> Gaussians:

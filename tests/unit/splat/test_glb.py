@@ -17,10 +17,10 @@ from some_splats import some_gaussians
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
+from splatpipe.pipeline.splat.containers.glb_container import write_head
 from splatpipe.pipeline.splat.formats import glb
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.glb_container import write_head
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
 FACTS = SceneFacts("z up", True, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"), ({"step": "crop"},))
 SPLATTING = "KHR_gaussian_splatting"

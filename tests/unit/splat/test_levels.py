@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import LevelNode, box_distance, build_levels, select_nodes
+from splatpipe.pipeline.splat.levels.levels import LevelNode, box_distance, build_levels, select_nodes
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 
 def a_wall(count: int = 1500, degree: int = 1, seed: int = 3) -> Gaussians:

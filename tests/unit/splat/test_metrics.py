@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.splat.metrics import METRICS, gmsd, ms_ssim, psnr, psnr_cc, sharpness, ssim
+from splatpipe.pipeline.splat.quality.metrics import METRICS, gmsd, ms_ssim, psnr, psnr_cc, sharpness, ssim
 
 ATOL = 1e-10  # float64 on both sides; sums of some 1e5 terms
 

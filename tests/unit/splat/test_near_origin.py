@@ -9,12 +9,12 @@ import torch
 from some_splats import some_gaussians
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.splat.containers.ply import property_names
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, plain_ply
 from splatpipe.pipeline.splat.formats.files import read_scene, write_scene
 from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import property_names
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
 
 UTM = (388714.5, 5299720.25, 515.0)
 PLACE = SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")

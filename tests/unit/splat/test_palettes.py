@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from splatpipe.pipeline.splat.codebooks import fit_codebook, nearest_codes
-from splatpipe.pipeline.splat.palettes import fit_palette
+from splatpipe.pipeline.splat.containers.codebooks import fit_codebook, nearest_codes
+from splatpipe.pipeline.splat.containers.palettes import fit_palette
 
 
 def test_a_codebook_of_evenly_spread_numbers_is_even() -> None:

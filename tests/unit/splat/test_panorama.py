@@ -8,7 +8,7 @@ import skies
 import torch
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.splat.panorama import (
+from splatpipe.pipeline.splat.sky.panorama import (
     COLUMNS,
     ROWS,
     Panorama,
@@ -17,7 +17,7 @@ from splatpipe.pipeline.splat.panorama import (
     read_panorama,
     write_panorama,
 )
-from splatpipe.pipeline.splat.sky_mask import directions, elevations_deg
+from splatpipe.pipeline.splat.sky.sky_mask import directions, elevations_deg
 
 TILTED = np.array([0.36, -0.48, 0.8])
 BLACK = (0.0, 0.0, 0.0)

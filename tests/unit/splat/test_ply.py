@@ -11,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import (
+from splatpipe.pipeline.splat.containers.ply import (
     MIP_COMMENT,
     property_names,
     read_splat,
@@ -20,6 +19,7 @@ from splatpipe.pipeline.splat.ply import (
     write_splat,
     write_splat_parts,
 )
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 # The order of the 3DGS reference implementation, spelled out.
 LAYOUT = [

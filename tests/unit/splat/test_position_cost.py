@@ -10,8 +10,8 @@ from some_splats import some_gaussians
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import read_scene, write_scene
-from splatpipe.pipeline.splat.position_cost import PositionCost
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts
+from splatpipe.pipeline.splat.model.position_cost import PositionCost
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts
 
 LOSSY = [kind for kind in SPLAT_FORMATS if kind.name in ("compressed-ply", "spz", "spz2", "sog")]
 

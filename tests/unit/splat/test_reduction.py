@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.matching import match_cheapest
-from splatpipe.pipeline.splat.merge_costs import COLOUR_WEIGHT, merge_costs
-from splatpipe.pipeline.splat.moments import Moments, ellipsoid_areas, merge_pairs, moments_of
-from splatpipe.pipeline.splat.reduction import reduce_to
+from splatpipe.pipeline.splat.levels.matching import match_cheapest
+from splatpipe.pipeline.splat.levels.merge_costs import COLOUR_WEIGHT, merge_costs
+from splatpipe.pipeline.splat.levels.reduction import reduce_to
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.moments import Moments, ellipsoid_areas, merge_pairs, moments_of
 
 KEPT = 1e-5
 """Relative: parameters are float32s, and a covariance is a square of some of them."""

@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 import torch
 
+from splatpipe.pipeline.delivery.delivery_frame import facts_of, frame_of
+from splatpipe.pipeline.splat.containers.ply import read_splat_header, write_splat
 from splatpipe.pipeline.splat.formats import plain_ply
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.ply import read_splat_header, write_splat
-from splatpipe.pipeline.splat.scene import MAX_RECORD_BYTES, Scene, SceneFacts, SplatOrigin, facts_of_record, turn_of
-from splatpipe.pipeline.survey.handover import facts_of, frame_of
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import (
+    MAX_RECORD_BYTES,
+    Scene,
+    SceneFacts,
+    SplatOrigin,
+    facts_of_record,
+    turn_of,
+)
 
 PLACE = SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634")
 FACTS = SceneFacts("z up", True, True, PLACE, ({"step": "crop", "box": [0, 1]},))

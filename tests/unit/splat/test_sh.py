@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.splat.sh import C0, eval_sh, rgb_to_dc, rotate_sh, sh_basis
+from splatpipe.pipeline.splat.model.sh import C0, eval_sh, rgb_to_dc, rotate_sh, sh_basis
 
 FLOAT64_ATOL = 1e-12  # sums of at most 16 products of order one
 FLOAT32_ATOL = 2e-6

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 import skies
 
-from splatpipe.pipeline.splat.sky_mask import agreed, find_skies, find_sky, is_open, roofed, up_of, votes_of
+from splatpipe.pipeline.splat.sky.sky_mask import (
+    agreed,
+    below_structure,
+    find_skies,
+    find_sky,
+    is_open,
+    up_of,
+    votes_of,
+)
 
 WHITE = (0.92, 0.92, 0.91)
 
@@ -131,7 +139,7 @@ def test_branch_above_the_sky_and_wrong_points_in_it_do_not_reduce_it() -> None:
     branch = random.uniform([-0.6, 6.0, 7.0], [0.8, 6.5, 8.0], (80, 3))
     birds = random.uniform([-9.0, 5.0, 15.0], [9.0, 9.0, 30.0], (2, 3))
     points = np.concatenate([skies.points_on(), branch, birds])
-    assert not roofed(photo.camera, truth, points, skies.UP).any()
+    assert not below_structure(photo.camera, truth, points, skies.UP).any()
 
 
 def test_points_above_take_memory_in_proportion_to_their_number_only() -> None:
@@ -140,7 +148,7 @@ def test_points_above_take_memory_in_proportion_to_their_number_only() -> None:
     points = np.random.default_rng(9).uniform([-30.0, 4.0, -30.0], [30.0, 30.0, 30.0], (100_000, 3))
     tracemalloc.start()
     try:
-        assert roofed(photo.camera, truth, points, skies.UP).any()
+        assert below_structure(photo.camera, truth, points, skies.UP).any()
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

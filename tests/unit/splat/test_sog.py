@@ -20,8 +20,8 @@ from tiny_scene import cameras, true_model
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.splat.formats.sog import encode_sog, read, write
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
 Table = dict[str, npt.NDArray[np.float64]]
 

@@ -8,6 +8,7 @@ import torch
 from some_splats import some_gaussians
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
+from splatpipe.pipeline.splat.containers.ply import write_splat
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, format_named, model_folder, plain_ply
 from splatpipe.pipeline.splat.formats.files import (
     format_of_content,
@@ -16,8 +17,7 @@ from splatpipe.pipeline.splat.formats.files import (
     read_scene,
     write_scene,
 )
-from splatpipe.pipeline.splat.ply import write_splat
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
 FACTS = SceneFacts("z up", False, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
 

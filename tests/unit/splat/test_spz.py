@@ -18,10 +18,10 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import RenderOptions
 from splatpipe.pipeline.raster.rasterizer import render
+from splatpipe.pipeline.splat.containers.spz_encoder import spz_bytes
 from splatpipe.pipeline.splat.formats import spz
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin
-from splatpipe.pipeline.splat.spz import spz_bytes
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
 QUARTER_TURN = math.sqrt(0.5)
 

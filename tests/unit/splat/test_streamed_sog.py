@@ -10,10 +10,10 @@ import torch
 
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.splat.formats import sog
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import LevelNode, build_levels
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
-from splatpipe.pipeline.splat.streamed_sog import LOD_META, write_streamed_sog
+from splatpipe.pipeline.splat.levels.levels import LevelNode, build_levels
+from splatpipe.pipeline.splat.levels.streamed_sog import LOD_META, write_streamed_sog
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
 
 FACTS = SceneFacts("z up", metres=True, place=SplatOrigin(47.8, 13.5, 515.0, crs="EPSG:32633"))
 

@@ -15,13 +15,13 @@ import torch
 from glb_parts import parts
 from some_splats import some_gaussians
 
+from splatpipe.pipeline.delivery.ecef_tiles import write_tiles_on_globe
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.levels import LevelNode, build_levels
-from splatpipe.pipeline.splat.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
-from splatpipe.pipeline.splat.tiles import write_tiles
-from splatpipe.pipeline.survey.globe import write_tiles_on_globe
+from splatpipe.pipeline.splat.levels.levels import LevelNode, build_levels
+from splatpipe.pipeline.splat.levels.tiles import write_tiles
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin, facts_of_record
 
 PLACE = SplatOrigin(52.2, 21.0, 113.25, "ellipsoidal", "EPSG:32634")
 FACTS = SceneFacts("z up", True, True, PLACE, ({"step": "crop"},))

@@ -10,12 +10,12 @@ import pytest
 from hills import GERMANY, IDENTITY, box, from_middle, hill, hill_grid, placed, write_hill
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface import contours as tracing
-from splatpipe.pipeline.surface.contour_files import INDEX_LAYER, LAYER, write_dxf, write_geojson
-from splatpipe.pipeline.surface.contours import Contour, Contours, neat_interval, trace_contours
-from splatpipe.pipeline.surface.geotiff import HEIGHTS, raster_file
-from splatpipe.pipeline.surface.grid import Grid, make_grid
-from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.surface.heights import contours as tracing
+from splatpipe.pipeline.surface.heights.contour_files import INDEX_LAYER, LAYER, write_dxf, write_geojson
+from splatpipe.pipeline.surface.heights.contours import Contour, Contours, neat_interval, trace_contours
+from splatpipe.pipeline.surface.rasters.geotiff import HEIGHTS, raster_file
+from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
+from splatpipe.pipeline.survey.crs.frames import Frame
 
 LINE_STRING, HAS_Z = 2, 0x80000000  # of WKB
 

@@ -13,7 +13,8 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rio_cogeo.cogeo import cog_info, cog_validate
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface.geotiff import (
+from splatpipe.pipeline.surface.heights.surface_file import open_surface
+from splatpipe.pipeline.surface.rasters.geotiff import (
     COLOURS,
     COLOURS_AS_JPEG,
     CONFIDENCE,
@@ -22,9 +23,8 @@ from splatpipe.pipeline.surface.geotiff import (
     RasterForm,
     raster_file,
 )
-from splatpipe.pipeline.surface.grid import Grid, make_grid
-from splatpipe.pipeline.surface.surface_file import open_surface
-from splatpipe.pipeline.survey.frames import Frame
+from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
+from splatpipe.pipeline.survey.crs.frames import Frame
 
 STEP_M = 0.5 / 1024.0  # half of a height's step
 RINGING = 10  # of JPEG beside the black outside, of 90

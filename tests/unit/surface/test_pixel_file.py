@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from house_site import photo_camera
 
-from splatpipe.pipeline.surface.photo_samples import DistortionGrid, PhotoSource
-from splatpipe.pipeline.surface.pixel_file import pixels_on_disk
+from splatpipe.pipeline.surface.depths.photo_samples import DistortionGrid, PhotoSource
+from splatpipe.pipeline.surface.depths.pixel_file import pixels_on_disk
 
 CAMERA = photo_camera("photo", (0.0, 0.0, 20.0), (0.0, 0.0, 0.0))
 

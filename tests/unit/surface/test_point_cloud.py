@@ -12,9 +12,9 @@ import pytest
 from hills import IDENTITY, box, hill_grid, placed
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface.grid import make_grid
-from splatpipe.pipeline.surface.point_cloud import CloudChunk, CloudFrame, write_cloud
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.rasters.grid import make_grid
+from splatpipe.pipeline.surface.shapes.point_cloud import CloudChunk, CloudFrame, write_cloud
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 HALF_STEP_M = 0.0005 + 2e-4  # of a millimetre, and the grid's transformation to the CRS
 NORMAL_DEG = 0.5  # of three signed bytes

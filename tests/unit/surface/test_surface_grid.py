@@ -6,9 +6,9 @@ import pytest
 from hills import GERMANY, IDENTITY, box, hill_grid, placed
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.surface.grid import Grid, cell_size, make_grid
-from splatpipe.pipeline.surface.map_crs import open_map
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.rasters.grid import Grid, cell_size, make_grid
+from splatpipe.pipeline.surface.rasters.map_crs import open_map
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 LATTICE_M = 2e-4  # 0.05 mm a direction by the earth's curvature between nodes, each of two, and as much for projections
 ODD = "+proj=tmerc +lat_0=50 +lon_0=10 +k=1 +ellps=bessel +towgs84=598.1,73.7,418.2,0.202,0.045,-2.455,6.7 +units=m"

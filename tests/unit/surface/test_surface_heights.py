@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from house_site import EAVES_M, ExactDepths, cameras, depths_of, edge_distance, photo_camera, true_height
 
-from splatpipe.pipeline.surface.heights import HeightInput, Heights, surface_heights, tile_heights
-from splatpipe.pipeline.surface.holes import fill_holes
-from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.sheet import Sheet
-from splatpipe.pipeline.surface.sources import DepthSource, HeightRange, LruCache, photos_seeing
-from splatpipe.pipeline.surface.tiles import Tile
+from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache, photos_seeing
+from splatpipe.pipeline.surface.heights.heights import HeightInput, Heights, surface_heights, tile_heights
+from splatpipe.pipeline.surface.heights.holes import fill_holes
+from splatpipe.pipeline.surface.rasters.lattice import Lattice
+from splatpipe.pipeline.surface.rasters.tiles import Tile
+from splatpipe.pipeline.surface.sheets.raster_plane import RasterPlane
 
 CELL_M = 0.2  # two pixels of the cameras that look down
 LATTICE = Lattice(-11.04, 8.07, CELL_M, 110, 80)
@@ -130,7 +130,7 @@ def test_a_turned_sheet_gives_the_same_surface() -> None:
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]
     turn[:3, 3] = [0.5, -0.2, -2.0]
-    sheet = Sheet(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), HeightRange(-3.0, 6.0))
+    sheet = RasterPlane(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), HeightRange(-3.0, 6.0))
     sources = [sheet.transform_depths(DepthSource(found.camera, lambda found=found: found)) for found in exact()]
     made = tile_heights(HeightInput(sources, sheet.lattice, sheet.relief, LruCache(1 << 30)), Tile(0, 0, 50, 60))
     places = np.concatenate([sheet.lattice.centres(made.tile), made.height[..., None]], axis=-1)

@@ -10,19 +10,19 @@ from house_site import cameras, depths_of, photo_of, true_height
 
 from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
-from splatpipe.pipeline.surface.lattice import Lattice
-from splatpipe.pipeline.surface.mosaic import MARGIN, compose_mosaic, keep_best
-from splatpipe.pipeline.surface.photo_samples import (
+from splatpipe.pipeline.surface.depths.photo_samples import (
     PLAIN_TONE,
     DistortionGrid,
     PhotoSource,
     rate_points,
     sample_colours,
 )
-from splatpipe.pipeline.surface.point_visibility import Points, classify_points, project_points
-from splatpipe.pipeline.surface.sources import HeightRange, PhotoWindow, PosedDepthMap, window_of
-from splatpipe.pipeline.surface.tiles import Tile
-from splatpipe.pipeline.surface.votes import HeightVotes
+from splatpipe.pipeline.surface.depths.point_visibility import Points, classify_points, project_points
+from splatpipe.pipeline.surface.depths.sources import HeightRange, PhotoWindow, PosedDepthMap, window_of
+from splatpipe.pipeline.surface.heights.votes import HeightVotes
+from splatpipe.pipeline.surface.ortho.mosaic import MARGIN, compose_mosaic, keep_best
+from splatpipe.pipeline.surface.rasters.lattice import Lattice
+from splatpipe.pipeline.surface.rasters.tiles import Tile
 
 LATTICE = Lattice(-6.02, 5.03, 0.1, 120, 100)
 TILE = Tile(-3, -2, 70, 80)

@@ -13,14 +13,14 @@ from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface import surface_file
-from splatpipe.pipeline.surface.grid import Grid, make_grid
-from splatpipe.pipeline.surface.section_files import unit_key, write_section
-from splatpipe.pipeline.surface.sections import Section, cut_section
-from splatpipe.pipeline.surface.sources import DepthSource
-from splatpipe.pipeline.surface.surface_file import SurfaceFile, open_surface
-from splatpipe.pipeline.surface.traces import polygon_trace, section_trace
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.depths.sources import DepthSource
+from splatpipe.pipeline.surface.heights import surface_file
+from splatpipe.pipeline.surface.heights.surface_file import SurfaceFile, open_surface
+from splatpipe.pipeline.surface.measuring.section_files import unit_key, write_section
+from splatpipe.pipeline.surface.measuring.sections import Section, cut_section
+from splatpipe.pipeline.surface.measuring.traces import polygon_trace, section_trace
+from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 CELL_M = 0.1
 BOX = np.array([[-11.0, -8.0, -1.0], [11.0, 8.0, 8.0]])

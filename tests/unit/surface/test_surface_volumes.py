@@ -13,11 +13,11 @@ import rasterio
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.surface.grid import Grid, make_grid
-from splatpipe.pipeline.surface.surface_file import SurfaceFile, open_surface
-from splatpipe.pipeline.surface.volume_file import volume_facts, write_volumes
-from splatpipe.pipeline.surface.volumes import SHARED_CELLS, measure_volume
-from splatpipe.pipeline.survey.frames import Frame, Origin
+from splatpipe.pipeline.surface.heights.surface_file import SurfaceFile, open_surface
+from splatpipe.pipeline.surface.measuring.volume_file import volume_facts, write_volumes
+from splatpipe.pipeline.surface.measuring.volumes import SHARED_CELLS, measure_volume
+from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 CELL_M = 0.1
 BOX = np.array([[-15.0, -12.0, -5.0], [15.0, 12.0, 10.0]])

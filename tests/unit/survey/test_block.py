@@ -6,16 +6,22 @@ import numpy as np
 import pycolmap
 import pytest
 
-from splatpipe.pipeline.survey import block as block_module
-from splatpipe.pipeline.survey.adjusted_positions import height_sentence
-from splatpipe.pipeline.survey.block import Block, part_of, reduce_block, settle_points
-from splatpipe.pipeline.survey.block_accuracy import accuracy_of, with_control, with_cross_strip
-from splatpipe.pipeline.survey.block_adjustment import adjust_block, joint_system, solve
-from splatpipe.pipeline.survey.block_distances import Distances
-from splatpipe.pipeline.survey.block_lens import free_lens
-from splatpipe.pipeline.survey.position_adjustment import BlockFit, LensKnowledge, converge, parts_of, prior_lens
-from splatpipe.pipeline.survey.position_noise import as_stated, strip_pieces
-from splatpipe.pipeline.survey.tie_points import image_errors, tie_sigma
+from splatpipe.pipeline.survey.adjustment import block as block_module
+from splatpipe.pipeline.survey.adjustment.adjusted_positions import height_sentence
+from splatpipe.pipeline.survey.adjustment.block import Block, part_of, reduce_block, settle_points
+from splatpipe.pipeline.survey.adjustment.block_accuracy import accuracy_of, with_control, with_cross_strip
+from splatpipe.pipeline.survey.adjustment.block_adjustment import adjust_block, joint_system, solve
+from splatpipe.pipeline.survey.adjustment.block_distances import Distances
+from splatpipe.pipeline.survey.adjustment.block_lens import free_lens
+from splatpipe.pipeline.survey.adjustment.position_adjustment import (
+    BlockFit,
+    LensKnowledge,
+    converge,
+    parts_of,
+    prior_lens,
+)
+from splatpipe.pipeline.survey.adjustment.position_noise import as_stated, strip_pieces
+from splatpipe.pipeline.survey.adjustment.tie_points import image_errors, tie_sigma
 from tests.scenes.flown_block import FlownBlock, flown
 
 EVERY = 24
@@ -199,7 +205,7 @@ def test_a_long_flight_is_judged_in_parts(
     monkeypatch: pytest.MonkeyPatch, flight: FlownBlock, fitted: BlockFit
 ) -> None:
 
-    monkeypatch.setattr("splatpipe.pipeline.survey.position_adjustment.PART", 12)
+    monkeypatch.setattr("splatpipe.pipeline.survey.adjustment.position_adjustment.PART", 12)
     parts = list(parts_of(fitted.adjusted, flight.positions))
     assert [int(part.chosen.sum()) for part in parts] == [12, 12]
     assert all(len(part.block) == 12 and len(part.system.gradient) == 36 for part in parts)

@@ -10,20 +10,20 @@ import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.demo.geodesy import Origin as DemoOrigin
-from splatpipe.pipeline.app.cli_runs import overrides, with_boundary
+from splatpipe.pipeline.app.commands.runs import overrides, with_boundary
 from splatpipe.pipeline.app.preflight.boundary import boundary_findings
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.scan import Candidate
-from splatpipe.pipeline.survey import boundary_file
-from splatpipe.pipeline.survey.boundary import lay_boundary
-from splatpipe.pipeline.survey.boundary_file import crossing_of, read_boundary
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.geodesy import Origin
+from splatpipe.pipeline.photos.files.scan import Candidate
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.survey.boundary import write_boundary
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.files import boundary_file
+from splatpipe.pipeline.survey.files.boundary_file import crossing_of, read_boundary
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.photo_positions import Position, read_positions
+from splatpipe.pipeline.survey.positions.photo_positions import Position, read_positions
 
 DEMO = DemoOrigin()
 WORLD_FROM_MODEL = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))
@@ -77,7 +77,7 @@ def laid(folder: Path, value: Any, frame: Frame = FRAME, points: np.ndarray = PO
     """Return the result in the world frame, after checking that the model's frame agrees."""
     notes, out = Notes(), folder / "boundary.json"
     in_model = frame.world_from_model.inverse().apply(points)
-    summary = lay_boundary(written(folder, value), frame, in_model, out, notes)
+    summary = write_boundary(written(folder, value), frame, in_model, out, notes)
     world, model = read_world_area(out), read_model_area(out)
     assert world is not None and model is not None
     np.testing.assert_array_equal(model.contains(in_model), world.contains(points))
@@ -151,7 +151,7 @@ def test_all_forms_and_reference_systems_give_the_same_area(tmp_path: Path, case
 def test_without_a_file_the_part_does_not_depend_on_the_frame(tmp_path: Path) -> None:
     texts = []
     for frame in (FRAME, Frame("arbitrary", Similarity.identity())):
-        assert lay_boundary(tmp_path / "none", frame, POINTS, tmp_path / "out.json", Notes()) == {}
+        assert write_boundary(tmp_path / "none", frame, POINTS, tmp_path / "out.json", Notes()) == {}
         texts.append((tmp_path / "out.json").read_bytes())
     assert texts[0] == texts[1]
     assert read_model_area(tmp_path / "out.json") is read_world_area(tmp_path / "out.json") is None

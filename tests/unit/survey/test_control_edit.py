@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
-from splatpipe.pipeline.photos.names import NameFinder
-from splatpipe.pipeline.survey.control_edit import ControlText
-from splatpipe.pipeline.survey.control_file import SurveyedPoint, read_control_file, read_points_file
+from splatpipe.pipeline.photos.files.names import NameFinder
+from splatpipe.pipeline.survey.files.control_edit import ControlText
+from splatpipe.pipeline.survey.files.control_file import SurveyedPoint, read_control_file, read_points_file
 
 PHOTOS = ("A.JPG", "sub/my photo.JPG", "Ö.jpg")
 find = NameFinder(PHOTOS)

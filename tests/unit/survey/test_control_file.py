@@ -6,7 +6,7 @@ import pytest
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.survey.control_file import ControlFile, Mark, read_control_file, read_points_file, titled
+from splatpipe.pipeline.survey.files.control_file import ControlFile, Mark, read_control_file, read_points_file, titled
 
 
 def read(folder: Path, text: str | bytes, name: str = "gcp_list.txt") -> ControlFile:

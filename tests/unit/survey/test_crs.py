@@ -13,7 +13,7 @@ import pytest
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.survey.crs import (
+from splatpipe.pipeline.survey.crs.crs import (
     from_geodetic,
     open_operation,
     parse_crs,
@@ -23,10 +23,10 @@ from splatpipe.pipeline.survey.crs import (
     undulation,
     utm_of,
 )
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.georeference import georeference, scene_box
-from splatpipe.pipeline.survey.world import in_crs, open_world
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.crs.georeference import georeference, scene_box
+from splatpipe.pipeline.survey.crs.world import in_crs, open_world
 
 MILLIMETRE = 1e-3
 HALLSTATT = Origin(47.8412, 13.5127, 512.0)  # where the demo's house is

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.photos.check import CheckedPhoto, PictureLimits, check_photo
-from splatpipe.pipeline.photos.exif import Gps
-from splatpipe.pipeline.photos.scan import Candidate
-from splatpipe.pipeline.survey.frames import Frame
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.gps import georeference
-from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import read_model
-from splatpipe.pipeline.survey.photo_positions import PositionList, positions_json, read_positions
-from splatpipe.pipeline.survey.stated_positions import read_places
+from splatpipe.pipeline.photos.files.scan import Candidate
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
+from splatpipe.pipeline.photos.metadata.exif import Gps
+from splatpipe.pipeline.survey.crs.frames import Frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.placing.gps import georeference
+from splatpipe.pipeline.survey.placing.level import Positions
+from splatpipe.pipeline.survey.placing.model import read_model
+from splatpipe.pipeline.survey.positions.photo_positions import PositionList, positions_json, read_positions
+from splatpipe.pipeline.survey.positions.stated_positions import read_places
 
 from .test_georef import Survey, georef
 

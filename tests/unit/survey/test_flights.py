@@ -8,7 +8,7 @@ import pytest
 
 from splatpipe.pipeline.geometry.alignment import Correspondences, SharedErrors, robust_similarity
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.survey.flights import Stamp, assign_flights
+from splatpipe.pipeline.survey.positions.flights import Stamp, assign_flights
 
 from .test_georef import Survey, errors_m, georef, grid, survey
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.source import ABSENT
+from splatpipe.pipeline.engine.runs.source import ABSENT
 from splatpipe.pipeline.engine.stage import Inputs, Summary
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
-from splatpipe.pipeline.photos.photo_list import Photo, PhotoList, save_photo_list
-from splatpipe.pipeline.survey.frames import Frame, load_frame
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.georeference import georeference
+from splatpipe.pipeline.photos.files.photo_list import Photo, PhotoList, save_photo_list
+from splatpipe.pipeline.survey.crs.frames import Frame, load_frame
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.crs.georeference import georeference
+from splatpipe.pipeline.survey.files.scale_bars import ScaleBar
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.scale_bars import ScaleBar
-from splatpipe.pipeline.survey.target_finds import TargetFind, WantedTargets, save_finds, save_wanted
+from splatpipe.pipeline.survey.targets.target_finds import TargetFind, WantedTargets, save_finds, save_wanted
 from splatpipe.stages.georef import run
 
 PLACE = Origin(46.84266, -91.994, 199.0)

@@ -9,8 +9,8 @@ from odd_sites import ALPS, Outcome, Site, Warnings, joined, orbit, place, strip
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.survey.geodesy import Origin
-from splatpipe.pipeline.survey.last_look import _agreement, report_contradictions
+from splatpipe.pipeline.survey.crs.geodesy import Origin
+from splatpipe.pipeline.survey.plausibility.last_look import _agreement, report_contradictions
 
 MINNESOTA = Origin(46.84, -91.99, 199.0)
 BARE = ("place",)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.survey.frames import Frame, Origin, Similarity
-from splatpipe.pipeline.survey.local_crs import local_crs
-from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin, Similarity
+from splatpipe.pipeline.survey.crs.local_crs import local_crs
+from splatpipe.pipeline.survey.crs.world import open_world
 
 DEGREE_M = 111_000.0
 NEAR_ENOUGH_M = 1e-3

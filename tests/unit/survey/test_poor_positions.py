@@ -8,11 +8,11 @@ import pytest
 from poor_flights import CENTRES, MODEL_FROM_WORLD, TURNS, cameras, errors_of, placed, stated, stated_of
 
 from splatpipe.pipeline.geometry.correspondences import Correspondences, SharedErrors
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.gps import report_fit
-from splatpipe.pipeline.survey.local_survey import stations_of
-from splatpipe.pipeline.survey.receiver_noise import fit_with_noise
-from splatpipe.pipeline.survey.uncertainty import student_95
+from splatpipe.pipeline.survey.control.local_survey import stations_of
+from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.placing.gps import report_fit
+from splatpipe.pipeline.survey.placing.receiver_noise import fit_with_noise
+from splatpipe.pipeline.survey.placing.uncertainty import student_95
 
 
 def test_gross_errors_are_reported_among_noisy_positions() -> None:

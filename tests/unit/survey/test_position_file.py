@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.survey.position_file import PhotoPlace, PositionFile, read_position_file
-from splatpipe.pipeline.survey.survey_text import MAX_LINE_CHARS
+from splatpipe.pipeline.survey.files.position_file import PhotoPlace, PositionFile, read_position_file
+from splatpipe.pipeline.survey.files.survey_text import MAX_LINE_CHARS
 
 
 def read(tmp_path: Path, text: str | bytes) -> PositionFile:

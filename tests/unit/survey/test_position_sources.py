@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.exif import Exif, Gps
-from splatpipe.pipeline.survey.photo_positions import PositionList, read_positions
-from splatpipe.pipeline.survey.position_issues import find_position_issues
-from splatpipe.pipeline.survey.stated_positions import FilePlace
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.photos.metadata.exif import Exif, Gps
+from splatpipe.pipeline.survey.plausibility.position_issues import find_position_issues
+from splatpipe.pipeline.survey.positions.photo_positions import PositionList, read_positions
+from splatpipe.pipeline.survey.positions.stated_positions import FilePlace
 
 ONE = Gps(47.8412, 13.5127, 520.0)
 

@@ -8,12 +8,12 @@ import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.upright import enu_from_gimbal
-from splatpipe.pipeline.photos.camera_angles import detect_convention, gimbal_from_nadir
-from splatpipe.pipeline.photos.check import CheckedPhoto
-from splatpipe.pipeline.photos.exif import Exif, Gps
-from splatpipe.pipeline.photos.position_outliers import find_misplaced
-from splatpipe.pipeline.survey.photo_positions import Position, PositionList, positions_json, read_positions
-from splatpipe.pipeline.survey.stated_positions import read_places
+from splatpipe.pipeline.photos.intake.check import CheckedPhoto
+from splatpipe.pipeline.photos.metadata.camera_angles import detect_convention, gimbal_from_nadir
+from splatpipe.pipeline.photos.metadata.exif import Exif, Gps
+from splatpipe.pipeline.photos.metadata.position_outliers import find_misplaced
+from splatpipe.pipeline.survey.positions.photo_positions import Position, PositionList, positions_json, read_positions
+from splatpipe.pipeline.survey.positions.stated_positions import read_places
 
 HERE = Gps(47.8412, 13.5127, 512.0)
 

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from accurate_flights import CAMERA, PLACE, SINGLE_M, flight
 
-from splatpipe.pipeline.survey.photo_positions import Position
-from splatpipe.pipeline.survey.predicted_flight import MAX_PHOTOS, FlightCamera, PredictedAccuracy, predict_accuracy
+from splatpipe.pipeline.survey.adjustment.predicted_flight import (
+    MAX_PHOTOS,
+    FlightCamera,
+    PredictedAccuracy,
+    predict_accuracy,
+)
+from splatpipe.pipeline.survey.positions.photo_positions import Position
 
 
 def predicted(photos: Sequence[Position], camera: FlightCamera = CAMERA) -> PredictedAccuracy | None:

@@ -10,10 +10,10 @@ import numpy as np
 from surveyed import HEIGHT, POINTS, TRUTH, WIDTH, true_model
 
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.photos.photo_list import Photo
-from splatpipe.pipeline.survey.model import SparseModel, model_of
-from splatpipe.pipeline.survey.target_finds import QUADRANT, TargetFind
-from splatpipe.pipeline.survey.target_marks import ExpectedPoints, TargetMarks, named_tracks
+from splatpipe.pipeline.photos.files.photo_list import Photo
+from splatpipe.pipeline.survey.placing.model import SparseModel, model_of
+from splatpipe.pipeline.survey.targets.target_finds import QUADRANT, TargetFind
+from splatpipe.pipeline.survey.targets.target_marks import ExpectedPoints, TargetMarks, named_tracks
 
 NAMES = tuple(POINTS)
 PHOTOS = {photo["name"]: Photo(photo["name"], "0" * 64, WIDTH, HEIGHT, 0) for photo in TRUTH["photos"]}

@@ -11,13 +11,13 @@ from target_scenes import TargetAppearance, coded, quadrants, render
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.coded_targets import find_coded_targets
-from splatpipe.pipeline.photos.quadrant_targets import find_quadrant_targets
-from splatpipe.pipeline.survey.constellation import overlay
-from splatpipe.pipeline.survey.control_edit import ControlText
-from splatpipe.pipeline.survey.control_file import read_control_file
-from splatpipe.pipeline.survey.scale_bars import ScaleBar, read_scale_bars, scale_by
-from splatpipe.pipeline.survey.target_marks import number_of
+from splatpipe.pipeline.photos.targets.coded_targets import find_coded_targets
+from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
+from splatpipe.pipeline.survey.files.control_edit import ControlText
+from splatpipe.pipeline.survey.files.control_file import read_control_file
+from splatpipe.pipeline.survey.files.scale_bars import ScaleBar, read_scale_bars, scale_by
+from splatpipe.pipeline.survey.targets.constellation import overlay
+from splatpipe.pipeline.survey.targets.target_marks import number_of
 
 FAMILIES = ("DICT_APRILTAG_36h11", "DICT_4X4_250", "DICT_6X6_250")
 

@@ -9,14 +9,14 @@ import pytest
 
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.geometry.upright import enu_from_gimbal
-from splatpipe.pipeline.survey.assumed_heights import with_assumed_heights
-from splatpipe.pipeline.survey.fitting import FrameUndeterminedError
-from splatpipe.pipeline.survey.frames import Frame, Origin
-from splatpipe.pipeline.survey.gps import georeference
-from splatpipe.pipeline.survey.last_look import Placed, report_contradictions
-from splatpipe.pipeline.survey.level import Positions
-from splatpipe.pipeline.survey.model import SparseModel
-from splatpipe.pipeline.survey.up_witnesses import check_up
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
+from splatpipe.pipeline.survey.placing.assumed_heights import with_assumed_heights
+from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
+from splatpipe.pipeline.survey.placing.gps import georeference
+from splatpipe.pipeline.survey.placing.level import Positions
+from splatpipe.pipeline.survey.placing.model import SparseModel
+from splatpipe.pipeline.survey.placing.up_witnesses import check_up
+from splatpipe.pipeline.survey.plausibility.last_look import Placed, report_contradictions
 
 PLACE = Origin(46.84266, -91.994, 199.0)
 TRUTH = Similarity(6.5, rotation_from_vector(np.array([1.9, -0.7, 0.4])), np.array([12.0, -7.0, 3.0]))

@@ -9,15 +9,15 @@ import pytest
 import tiny_scene
 import torch
 
-from splatpipe.pipeline.photos.dataset import load_views
-from splatpipe.pipeline.splat.free_space import FreeSpace, near_or_free
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.floater_pruning import STEPS_BETWEEN, FloaterPruning, free_space_of
+from splatpipe.pipeline.photos.pixels.dataset import load_views
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.quality.free_space import FreeSpace, near_or_free
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.techniques import Techniques, make_techniques
+from splatpipe.pipeline.train.plan.plan import make_plan
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.floater_pruning import STEPS_BETWEEN, FloaterPruning, free_space_of
+from splatpipe.pipeline.train.techniques.techniques import Techniques, make_techniques
 
 OPTIONS = TrainConfig(prune_free_space=2)
 SCHEDULE = resolve_schedule(OPTIONS)
@@ -55,10 +55,10 @@ def space(dataset: Path) -> FreeSpace:
 
 def test_gaussians_in_front_of_the_wall_are_marked_at_the_scheduled_steps(space: FreeSpace) -> None:
     gaussians, clearing = haze_and_wall(), FloaterPruning(space, SCHEDULE)
-    found = clearing.unwanted(gaussians, LOOKS)
+    found = clearing.prune_mask(gaussians, LOOKS)
     assert found is not None and found.tolist() == [True] * 4 + [False] * 4
     assert torch.equal(found, near_or_free(gaussians, space, 2))
-    assert clearing.unwanted(gaussians, LOOKS + SCHEDULE.density.every) is None
+    assert clearing.prune_mask(gaussians, LOOKS + SCHEDULE.density.every) is None
 
 
 @pytest.mark.parametrize("density", ["published", "absolute"])

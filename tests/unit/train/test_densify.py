@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpipe.pipeline.splat.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import (
     DensityStatistics,
     grow,
@@ -18,8 +18,8 @@ from splatpipe.pipeline.train.densify import (
     room_at,
 )
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
 from splatpipe.pipeline.train.random_numbers import normal, permutation, uniform
-from splatpipe.pipeline.train.schedule import resolve_schedule
 
 SCHEDULE = replace(resolve_schedule(TrainConfig()).density, reset_every=100)
 EXTENT = 10.0  # so that sizes above 0.1 are split, and above 1 pruned

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.train.density import Density, DensityStep
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.state.density import Density, DensityStep
 
 WIDTH, HEIGHT = 40, 30
 CAMERA = Camera("photo.png", WIDTH, HEIGHT, 35.0, 36.0, 20.5, 14.5, np.eye(4))

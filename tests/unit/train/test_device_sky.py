@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, PanoramaView, gather_view, matrix_view
-from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.photo_sky import PhotoSkies, photo_sky_on_cpu, photo_sky_on_device
-from splatpipe.pipeline.train.sky import SkyModel
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, PanoramaView, gather_view, matrix_view
+from splatpipe.pipeline.splat.sky.sky_mask import SkyMask
+from splatpipe.pipeline.train.appearance.photo_sky import PhotoSkies, photo_sky_on_cpu, photo_sky_on_device
+from splatpipe.pipeline.train.appearance.sky import SkyModel
 
 TILTED = np.array([0.36, -0.48, 0.8])
 BACKGROUND = (0.1, 0.7, 0.3)

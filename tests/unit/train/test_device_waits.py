@@ -13,19 +13,19 @@ import skies
 import torch
 
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS
-from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.distortion_loss import CENTRE_EVERY, DistortionLoss
-from splatpipe.pipeline.train.dropout import Dropout
-from splatpipe.pipeline.train.exposure import Exposure
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS
+from splatpipe.pipeline.splat.sky.sky_mask import SkyMask
+from splatpipe.pipeline.train.appearance.exposure import Exposure
+from splatpipe.pipeline.train.appearance.robust import RobustMask
+from splatpipe.pipeline.train.appearance.sky import SkyModel
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep, resolve_schedule
 from splatpipe.pipeline.train.random_numbers import ELSEWHERE
-from splatpipe.pipeline.train.robust import RobustMask
-from splatpipe.pipeline.train.schedule import ScheduleStep, resolve_schedule
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.stream import TrainingPhoto
+from splatpipe.pipeline.train.techniques.distortion_loss import CENTRE_EVERY, DistortionLoss
+from splatpipe.pipeline.train.techniques.dropout import Dropout
 
 META = torch.device("meta")
 CAMERAS = [replace(skies.look(heading_deg=10.0 * number).scaled(160, 120), name=f"{number}.jpg") for number in range(3)]
@@ -36,7 +36,7 @@ def a_moment(iteration: int = CENTRE_EVERY - 1) -> ScheduleStep:
     return resolve_schedule(TrainConfig(iterations=2 * CENTRE_EVERY, dropout=0.3)).at(iteration, 0)
 
 
-def a_shot() -> Shot:
+def a_shot() -> RenderedView:
     camera = CAMERAS[1]
     height, width = camera.height, camera.width
     colour = torch.empty(height, width, 3, device=META, requires_grad=True)
@@ -44,7 +44,7 @@ def a_shot() -> Shot:
     seen = torch.empty(7, device=META)
     photo = TrainingPhoto(camera, torch.empty(height, width, 3, device=META), None)
     settings = RenderOptions(0, background=(0.1, 0.2, 0.3), depth=True, depth_origin=3.0)
-    return Shot(photo, Render(colour, *flat, seen.bool(), seen), settings, a_moment())
+    return RenderedView(photo, Render(colour, *flat, seen.bool(), seen), settings, a_moment())
 
 
 def sky() -> Technique:
@@ -72,8 +72,8 @@ def test_iteration_of_a_technique_reads_nothing_from_the_device(make: Callable[[
     model = Gaussians.empty(7, 0)
     model.means = torch.empty(7, 3, device=META)
     technique.settings(shot.settings, model, shot.photo.camera, shot.now)
-    picture = technique.shown(shot.rendered.colour, shot)
-    counted = technique.counted(shot.photo, picture, shot)
+    picture = technique.apply_appearance(shot.rendered.colour, shot)
+    counted = technique.mask_pixels(shot.photo, picture, shot)
     penalty = technique.penalty(shot)
     loss = (picture - counted.colour).abs().mean()
     (loss if penalty is None else loss + penalty).backward()

@@ -9,10 +9,10 @@ import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.dropout import dropped, share_at
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.schedule import resolve_schedule
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.techniques.dropout import dropped, share_at
 
 FRONT = Camera("front", 32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))
 

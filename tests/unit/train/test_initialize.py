@@ -11,10 +11,10 @@ import torch
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.mvs.options import InitializeConfig
-from splatpipe.pipeline.photos.dataset import Points
-from splatpipe.pipeline.splat.ply import read_splat, read_splat_header
-from splatpipe.pipeline.splat.sh import C0
-from splatpipe.pipeline.splat.sparse_count import sparse_comment
+from splatpipe.pipeline.photos.pixels.dataset import Points
+from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header
+from splatpipe.pipeline.splat.model.sh import C0
+from splatpipe.pipeline.splat.model.sparse_count import sparse_comment
 from splatpipe.stages.initialize import choose_points, point_sizes, run
 
 RNG = np.random.default_rng(7)

@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.train.checkpoint import BrokenCheckpointError, Checkpoint
-from splatpipe.pipeline.train.hooks import Shot, Technique
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.iteration import iterate
-from splatpipe.pipeline.train.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.schedule import ScheduleStep
-from splatpipe.pipeline.train.state import TrainState
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.techniques import Techniques
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep
+from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, Checkpoint
+from splatpipe.pipeline.train.state.state import TrainState
+from splatpipe.pipeline.train.techniques.techniques import Techniques
 
 
 class Tint(Technique):
@@ -40,26 +40,26 @@ class Tint(Technique):
         self.calls.append("before_render")
         return model
 
-    def shown(self, picture: Tensor, shot: Shot) -> Tensor:
+    def apply_appearance(self, picture: Tensor, shot: RenderedView) -> Tensor:
         self.calls.append("shown")
         return picture + self.red * torch.tensor([1.0, 0.0, 0.0])
 
-    def counted(self, photo: TrainingPhoto, picture: Tensor, shot: Shot) -> TrainingPhoto:
+    def mask_pixels(self, photo: TrainingPhoto, picture: Tensor, shot: RenderedView) -> TrainingPhoto:
         self.calls.append("counted")
         return photo
 
-    def penalty(self, shot: Shot) -> Tensor:
+    def penalty(self, shot: RenderedView) -> Tensor:
         self.calls.append("penalty")
         return 0.1 * shot.rendered.alpha.mean()
 
-    def after_step(self, shot: Shot) -> None:
+    def after_step(self, shot: RenderedView) -> None:
         self.calls.append("after_step")
         self.red += 0.25
 
     def after_epoch(self, iteration: int) -> None:
         self.calls.append(f"after_epoch {iteration}")
 
-    def unwanted(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
+    def prune_mask(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
         self.calls.append("unwanted")
         return torch.arange(len(gaussians)) == 0 if iteration == 2 else None
 

@@ -11,24 +11,24 @@ from pydantic import ValidationError
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import View
+from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.render.rendering import Rendering, load_rendering
-from splatpipe.pipeline.train.checkpoint import (
-    BrokenCheckpointError,
-    Checkpoint,
-    load_checkpoint,
-    save_checkpoint,
-)
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import (
+from splatpipe.pipeline.train.plan.plan import (
     TrainingPlan,
     load_or_write_plan,
     make_plan,
     scene_extent,
 )
-from splatpipe.pipeline.train.rates import Rates, rates_of
-from splatpipe.pipeline.train.schedule import resolve_schedule
-from splatpipe.pipeline.train.windows import TrainingSize
+from splatpipe.pipeline.train.plan.rates import Rates, rates_of
+from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.state.checkpoint import (
+    BrokenCheckpointError,
+    Checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 
 
 def camera_at(name: str, centre: tuple[float, float, float]) -> Camera:

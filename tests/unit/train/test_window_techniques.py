@@ -12,24 +12,24 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
-from splatpipe.pipeline.splat.gaussians import Gaussians
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, STEP_PX
-from splatpipe.pipeline.splat.sh import rgb_to_dc
-from splatpipe.pipeline.splat.sky_mask import SkyMask
-from splatpipe.pipeline.train.density import Density
-from splatpipe.pipeline.train.distortion_loss import DistortionLoss
-from splatpipe.pipeline.train.exposure import Exposure
-from splatpipe.pipeline.train.hooks import Shot
+from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.splat.model.sh import rgb_to_dc
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, STEP_PX
+from splatpipe.pipeline.splat.sky.sky_mask import SkyMask
+from splatpipe.pipeline.train.appearance.exposure import Exposure
+from splatpipe.pipeline.train.appearance.photo_cells import PhotoCells
+from splatpipe.pipeline.train.appearance.photo_sky import photo_sky_on_cpu, photo_sky_on_device
+from splatpipe.pipeline.train.appearance.robust import GRID, UNKNOWN, RobustMask
+from splatpipe.pipeline.train.appearance.sky import SkyModel
+from splatpipe.pipeline.train.hooks import RenderedView
 from splatpipe.pipeline.train.iteration import SSIM_WEIGHT
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.photo_cells import PhotoCells
-from splatpipe.pipeline.train.photo_sky import photo_sky_on_cpu, photo_sky_on_device
-from splatpipe.pipeline.train.robust import GRID, UNKNOWN, RobustMask
-from splatpipe.pipeline.train.schedule import ScheduleStep, resolve_schedule
-from splatpipe.pipeline.train.sky import SkyModel
-from splatpipe.pipeline.train.stream import TrainingPhoto
-from splatpipe.pipeline.train.techniques import Techniques
-from splatpipe.pipeline.train.windows import windows_of
+from splatpipe.pipeline.train.photos.stream import TrainingPhoto
+from splatpipe.pipeline.train.plan.schedule import ScheduleStep, resolve_schedule
+from splatpipe.pipeline.train.plan.windows import windows_of
+from splatpipe.pipeline.train.state.density import Density
+from splatpipe.pipeline.train.techniques.distortion_loss import DistortionLoss
+from splatpipe.pipeline.train.techniques.techniques import Techniques
 
 LOOK = skies.look(12.0, roll_deg=4.0)
 CAMERA = LOOK.scaled(331, 247)
@@ -91,8 +91,8 @@ def said(photos: list[TrainingPhoto], weights: list[float], penalties: bool) -> 
         given = RenderOptions(0, background=LATE.background, near=0.5, depth=False)
         settings = techniques.settings(given, model, photo.camera, LATE)
         rendered = rasterizer.render(model, photo.camera, settings)
-        shot = Shot(photo, rendered, settings, LATE)
-        loss = photo_loss(techniques.shown(shot), photo.colour, SSIM_WEIGHT, photo.mask, photo.inner)
+        shot = RenderedView(photo, rendered, settings, LATE)
+        loss = photo_loss(techniques.apply_appearance(shot), photo.colour, SSIM_WEIGHT, photo.mask, photo.inner)
         total = total + weight * techniques.with_penalties(loss, shot)
     total.backward()  # type: ignore[no-untyped-call]
     found = {name: tensor.grad for name, tensor in model.tensors().items()}

@@ -12,14 +12,14 @@ import tiny_scene
 from plyfile import PlyData
 from pydantic import ValidationError
 
+from splatpipe.pipeline.delivery.delivery_frame import facts_of, in_world, pose_in_world
 from splatpipe.pipeline.geometry.similarity import Similarity
-from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.formats.files import read_scene
-from splatpipe.pipeline.splat.scene import Scene
-from splatpipe.pipeline.survey.frames import Frame, Origin
-from splatpipe.pipeline.survey.handover import facts_of, in_world, pose_in_world
-from splatpipe.pipeline.survey.world import open_world
+from splatpipe.pipeline.splat.model.scene import Scene
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin
+from splatpipe.pipeline.survey.crs.world import open_world
 from splatpipe.pipeline.web.deliverables import RunSplat, write_deliverables
 from splatpipe.pipeline.web.options import ExportConfig, parse_formats
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene

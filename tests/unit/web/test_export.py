@@ -12,21 +12,21 @@ import torch
 import trimesh
 from plyfile import PlyData
 
+from splatpipe.pipeline.delivery.delivery_frame import facts_of, in_world
+from splatpipe.pipeline.delivery.sparse_scene import sparse_glb
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.photos.dataset import load_points, load_views
+from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.render.options import EvaluateConfig
-from splatpipe.pipeline.splat import metrics
+from splatpipe.pipeline.splat.containers.ply import read_splat, write_splat
 from splatpipe.pipeline.splat.formats.plain_ply import frame_comments
-from splatpipe.pipeline.splat.panorama import COLUMNS, ROWS, panorama_of, write_panorama
-from splatpipe.pipeline.splat.ply import read_splat, write_splat
-from splatpipe.pipeline.survey.frames import load_frame
-from splatpipe.pipeline.survey.georeference import accuracy_in_words
-from splatpipe.pipeline.survey.handover import facts_of, in_world
-from splatpipe.pipeline.survey.sparse_scene import sparse_glb
+from splatpipe.pipeline.splat.quality import metrics
+from splatpipe.pipeline.splat.sky.panorama import COLUMNS, ROWS, panorama_of, write_panorama
+from splatpipe.pipeline.survey.crs.frames import load_frame
+from splatpipe.pipeline.survey.crs.georeference import accuracy_in_words
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan import make_plan
+from splatpipe.pipeline.train.plan.plan import make_plan
 from splatpipe.pipeline.web.options import ExportConfig
 from splatpipe.stages import evaluate, export
 

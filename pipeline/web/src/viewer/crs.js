@@ -1,4 +1,4 @@
-// From the world's metres to the run's CRS, by the polynomial that pipeline/survey/local_crs.py fitted to PROJ.
+// From the world's metres to the run's CRS, by the polynomial that pipeline/survey/crs/local_crs.py fitted to PROJ.
 
 /**
  * @param {{origin: number[], scale_m: number, powers: number[][], coefficients: number[][]}} crs

@@ -1,0 +1,84 @@
+"""``splatpipe export`` and ``splatpipe convert``: a splat in the formats that other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from splatpipe.pipeline.app.commands.parameters import (
+    DeviceOption,
+    JsonOption,
+    NotifyOption,
+    OutArgument,
+    SetOption,
+    ThreadsOption,
+    WaitOption,
+    expand_user,
+)
+from splatpipe.pipeline.app.commands.runs import RunSession, existing_request, overrides
+from splatpipe.pipeline.app.commands.summary import CommandSummary
+from splatpipe.pipeline.engine.errors import UsageError
+
+FormatsOption = Annotated[
+    str,
+    typer.Option(
+        "--format", "-f", metavar="NAMES", help="Formats to make, separated by commas; existing ones are kept."
+    ),
+]
+FormatOption = Annotated[
+    str | None,
+    typer.Option("--format", "-f", metavar="NAME", help="Format, if OUT's extension does not set it: spz2, model."),
+]
+SplatArgument = Annotated[
+    Path,
+    typer.Argument(metavar="IN", callback=expand_user, help="PLY, SPZ, SOG or GLB, or a trainer's model folder."),
+]
+TargetArgument = Annotated[
+    Path, typer.Argument(metavar="OUT", callback=expand_user, help="Its extension sets the format.")
+]
+
+
+def export(
+    out: OutArgument,
+    formats: FormatsOption,
+    assignments: SetOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 0,
+    wait: WaitOption = False,
+    notify: NotifyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Export a finished run in more formats, to OUT/export; docs/formats.md lists which programs read them."""
+    from splatpipe.pipeline.app.formats import check_possible, with_formats
+
+    with CommandSummary(out, as_json) as done:
+        done.notify_by(notify)
+        tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
+        check_possible(out, formats)
+        with RunSession(existing_request(out, tables, device, threads), wait) as runner:
+            done.outcome = runner.outcome
+            runner.walk()
+
+
+def convert(
+    source: SplatArgument,
+    target: TargetArgument,
+    format_name: FormatOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Convert a splat file to another format; its georeference is kept."""
+    with CommandSummary(target, as_json) as done:
+        from splatpipe.pipeline.app.commands.console import print_line
+        from splatpipe.pipeline.app.formats import convert_file, show_precision
+        from splatpipe.pipeline.app.report.wording import plural, size
+        from splatpipe.pipeline.splat.formats.files import format_of_name
+
+        kind = format_of_name(target, format_name)
+        if target.exists() and target.samefile(source):
+            raise UsageError(f"{target} is the input file.", hint="Choose another output file.")
+        facts: dict[str, Any] = convert_file(source, target, kind)
+        done.details = {"convert": facts}
+        print_line(f"{plural(facts['gaussians'], 'Gaussian')}, {size(facts['bytes'])}: {target}")
+        show_precision(facts)

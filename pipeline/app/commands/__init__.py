@@ -1,0 +1,1 @@
+"""What every command shares: its parameters, preparation, console and summary."""

@@ -1,0 +1,1 @@
+"""What survey teams hand over beside the splat: cameras, points and scenes for other programs."""

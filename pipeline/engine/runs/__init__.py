@@ -1,0 +1,1 @@
+"""A run: its folder, lock, artifacts, workers, and the walk along its stages."""

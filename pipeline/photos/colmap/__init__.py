@@ -1,0 +1,1 @@
+"""COLMAP's binary models, from untrusted bytes."""

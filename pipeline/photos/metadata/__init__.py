@@ -1,0 +1,1 @@
+"""A photo's metadata, from untrusted bytes: EXIF, XMP, sensors, angles, positions."""

@@ -1,0 +1,1 @@
+"""Pixels: the undistorted dataset, its images at any size, resampling."""

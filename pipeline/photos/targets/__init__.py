@@ -1,0 +1,1 @@
+"""Survey targets in one photo, with sub-pixel centres."""

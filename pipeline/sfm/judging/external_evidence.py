@@ -1,0 +1,132 @@
+"""Evidence beyond the verified matches: how well the lens is determined, and the photos' stated positions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.sfm.judging.judging import Reason, is_trusted
+from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
+from splatpipe.pipeline.sfm.pairing.layout import EARTH_RADIUS_M
+
+MIN_POSITIONS = 8  # photos; a similarity fits fewer too easily
+STEPS = 30  # of the reweighted fit
+FAR_SIGMAS, FAR_SHARE = 5.0, 0.04  # of the stated error, and of the flight's size: more than receiver noise
+SMOOTH = 0.5  # difference of neighbouring residuals over their length: about 1.4 for noise, almost 0 for a bend
+
+
+@dataclass(frozen=True)
+class PositionMisfit:
+    """Misfit between a model and stated positions after a robust similarity fit.
+
+    Attributes:
+        median_m: Median length of the residuals.
+        size_m: Root mean square distance of the positions from their mean.
+        smooth: Median difference of a residual from that of the nearest camera, over ``median_m``.
+    """
+
+    median_m: float
+    size_m: float
+    smooth: float
+
+
+def outside_reasons(
+    model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON], positions: Sequence[JSON]
+) -> list[Reason]:
+    """Return reasons for doubt that the matches themselves cannot reveal.
+
+    Args:
+        model: In any frame.
+        verified: Its view graph, with the cameras as they were before mapping.
+        cameras: The camera groups of ``ingest.cameras``.
+        positions: The entries of ``positions.json``.
+    """
+    return [*_uncertain_focal_lengths(model, verified, cameras), *_positions(model, positions)]
+
+
+def _uncertain_focal_lengths(
+    model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]
+) -> list[Reason]:
+    used = sorted({model.images[number].camera_id for number in model.reg_image_ids()})
+    rough = [number for number in used if not is_trusted(cameras[number - 1])]
+    if not rough:
+        return []
+    sigmas = focal_sigmas(model)
+    worst = max(sigmas.get(number, math.inf) for number in rough)
+    if worst <= UNOBSERVED:
+        return []
+    known = all(verified.cameras[number].has_prior_focal_length for number in rough)
+    accuracy = f"to {100.0 * worst:.0f} %" if math.isfinite(worst) else "not at all"
+    text = f"The photos determine the focal length {accuracy}, and "
+    text += "the value in the metadata is only approximate." if known else "it is not in the metadata."
+    return [
+        Reason("doubt", text, "Add oblique photos or a second height, or compare distances with known ones.", "lens")
+    ]
+
+
+def _positions(model: pycolmap.Reconstruction, positions: Sequence[JSON]) -> list[Reason]:
+    known = {entry["name"]: entry for entry in positions if entry["altitude_m"] is not None}
+    images = [model.images[number] for number in sorted(model.reg_image_ids())]
+    images = [image for image in images if image.name in known]
+    if len(images) < MIN_POSITIONS:
+        return []
+    entries = [known[image.name] for image in images]
+    sigma = float(np.median([max(entry["sigma_horizontal_m"], entry["sigma_vertical_m"]) for entry in entries]))
+    off = disagreement(np.array([image.projection_center() for image in images]), _metres(entries))
+    if off.median_m < max(FAR_SIGMAS * sigma, FAR_SHARE * off.size_m) or off.smooth > SMOOTH:
+        return []
+    text = (
+        f"The cameras are {off.median_m:.0f} m (median) from the photos' stated positions, with similar offsets "
+        "for neighbours: "
+    )
+    text += "the model may be bent, or the positions may have drifted."
+    return [Reason("doubt", text, "Add control points, or compare a known distance.", "positions")]
+
+
+def _metres(entries: Sequence[JSON]) -> Float64[np.ndarray, "n 3"]:
+    """Return east, north and up from the first position, on a sphere: accurate enough for residuals of metres."""
+    degrees = np.array([[entry["longitude"], entry["latitude"]] for entry in entries])
+    off = np.radians(np.mod(degrees - degrees[0] + 180.0, 360.0) - 180.0) * EARTH_RADIUS_M
+    up = np.array([entry["altitude_m"] for entry in entries], np.float64)
+    return np.column_stack([off[:, 0] * np.cos(np.radians(degrees[0, 1])), off[:, 1], up - up[0]])
+
+
+def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, "n 3"]) -> PositionMisfit:
+    """Fit a similarity by least absolute distances, and summarise the residuals.
+
+    Args:
+        centres: Camera centres in the model's frame.
+        places: Their stated positions, metres, in the same order.
+    """
+    weights = np.ones(len(centres))
+    for _ in range(STEPS):  # iteratively reweighted least squares
+        residuals = _similar(centres, places, weights) - places
+        lengths = np.linalg.norm(residuals, axis=1)
+        weights = 1.0 / np.maximum(lengths, 0.1 * max(float(np.median(lengths)), 1e-9))
+    median = float(np.median(lengths))
+    distances = np.linalg.norm(places[:, None] - places[None], axis=2)
+    np.fill_diagonal(distances, np.inf)
+    nearest = np.argmin(distances, axis=1)
+    apart = float(np.median(np.linalg.norm(residuals - residuals[nearest], axis=1)))
+    size = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    return PositionMisfit(median, size, apart / max(median, 1e-9))
+
+
+def _similar(
+    one: Float64[np.ndarray, "n 3"], two: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Align the first points to the second by the best weighted similarity (Umeyama, 1991)."""
+    shares = weights / weights.sum()
+    middle = shares @ one, shares @ two
+    a, b = one - middle[0], two - middle[1]
+    u, values, vt = np.linalg.svd(b.T @ (shares[:, None] * a))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    scale = float((values * signs).sum() / (shares[:, None] * a**2).sum())
+    return np.asarray(scale * a @ (u @ np.diag(signs) @ vt).T + middle[1])

@@ -1,0 +1,1 @@
+"""From verified matches to cameras and points: incremental mapping, completion and retriangulation."""

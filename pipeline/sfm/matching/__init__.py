@@ -1,0 +1,1 @@
+"""Keypoints and descriptors of photos, and verified matches of pairs of photos."""

@@ -1,0 +1,94 @@
+"""Convert a model's points and tracks to arrays, and arrays back to a model on a view graph's keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64, Int64
+
+from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
+
+Track = list[tuple[int, int]]
+"""Photo and keypoint of each observation, sorted."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Points in a fixed order, sorted by track.
+
+    Attributes:
+        points: (m, 3), model units.
+        tracks: The observations of each.
+    """
+
+    points: Float64[np.ndarray, "m 3"]
+    tracks: Sequence[Track]
+
+    def rows(self, counts: Mapping[int, int]) -> dict[int, Int64[np.ndarray, " _"]]:
+        """Return, for every photo, the row of the point that each keypoint observes, or -1.
+
+        Args:
+            counts: Number of keypoints of each photo.
+        """
+        found = {number: np.full(count, -1, np.int64) for number, count in counts.items()}
+        for row, track in enumerate(self.tracks):
+            for photo, keypoint in track:
+                found[photo][keypoint] = row
+        return found
+
+
+def read_structure(model: pycolmap.Reconstruction) -> Structure:
+    """Return the points and tracks of a model."""
+    found = sorted(
+        (
+            (sorted((element.image_id, element.point2D_idx) for element in point.track.elements), point.xyz)
+            for point in model.points3D.values()
+        ),
+        key=lambda entry: entry[0],
+    )
+    points = np.array([place for _, place in found], np.float64).reshape(-1, 3)
+    return Structure(points, [track for track, _ in found])
+
+
+def make_model(
+    cameras: Iterable[pycolmap.Camera],
+    poses: Mapping[int, pycolmap.Rigid3d],
+    verified: ViewGraph,
+    structure: Structure,
+) -> pycolmap.Reconstruction:
+    """Build a model whose photos have all keypoints of a view graph, including those added since.
+
+    Args:
+        cameras: The photos' cameras, as calibrated.
+        poses: cam_from_world of the placed photos.
+        verified: Names, cameras and keypoints of the photos.
+        structure: Observations of placed photos only; points of fewer than two are left out.
+    """
+    model = pycolmap.Reconstruction()
+    for camera in sorted(cameras, key=lambda camera: camera.camera_id):
+        model.add_camera_with_trivial_rig(camera)
+    for number in sorted(poses):
+        places = verified.keypoints[number].astype(np.float64)
+        image = pycolmap.Image(verified.names[number], places, verified.camera_of[number], number)
+        model.add_image_with_trivial_frame(image, poses[number])
+    grey = np.zeros(3, np.uint8)  # the keypoints have the colours
+    for place, track in zip(structure.points, structure.tracks, strict=True):
+        if len(track) >= 2:
+            elements = [pycolmap.TrackElement(*element) for element in track]
+            model.add_point3D(place, pycolmap.Track(elements), grey)
+    model.update_point_3d_errors()
+    return model
+
+
+def poses_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Rigid3d]:
+    """Return cam_from_world of every placed photo."""
+    return {number: model.images[number].cam_from_world() for number in sorted(model.reg_image_ids())}
+
+
+def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
+    """Return the cameras of the placed photos, by number."""
+    used = {model.images[number].camera_id for number in model.reg_image_ids()}
+    return {number: model.cameras[number] for number in sorted(used)}

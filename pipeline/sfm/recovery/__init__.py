@@ -1,0 +1,1 @@
+"""More photos into a reconstruction that lacks some: stronger keypoints, further pairs, joins; else the reasons."""

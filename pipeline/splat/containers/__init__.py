@@ -1,0 +1,1 @@
+"""Containers of splat formats, from untrusted bytes: PLY, glTF, SPZ, archives, palettes."""

@@ -1,0 +1,1 @@
+"""A splat in memory: Gaussians, spherical harmonics, the scene and its moments."""

@@ -1,0 +1,1 @@
+"""How good a splat is: image metrics, and free space that must be empty."""

@@ -1,0 +1,1 @@
+"""What lies behind the Gaussians: sky masks, the panorama and its dome."""

@@ -1,0 +1,1 @@
+"""Drawings: their elements, DXF files and pictures."""

@@ -1,0 +1,1 @@
+"""Façades: walls, their openings, elevations and drawings."""

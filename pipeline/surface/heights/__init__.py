@@ -1,0 +1,1 @@
+"""Heights over the ground plan: the surface model and its contours."""

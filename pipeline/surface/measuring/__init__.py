@@ -1,0 +1,1 @@
+"""Sections, volumes and lengths measured on the surface model."""

@@ -1,0 +1,1 @@
+"""The orthophoto: which photo each cell shows, and its colours."""

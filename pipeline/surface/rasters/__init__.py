@@ -1,0 +1,1 @@
+"""Rasters: their grids, tiles and files."""

@@ -1,0 +1,1 @@
+"""Clouds and meshes from depth maps."""

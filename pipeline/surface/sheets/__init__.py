@@ -1,0 +1,1 @@
+"""Sheets: rasters on a plane that are computed tile by tile."""

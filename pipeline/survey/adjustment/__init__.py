@@ -1,0 +1,1 @@
+"""The bundle adjustment of tie points, positions and control: observations, lens, covariances."""

@@ -1,0 +1,50 @@
+"""Statistics of residuals at surveyed points: RMSE, means, and confidence intervals for small samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatpipe.pipeline.survey.control.confidence import rmse_interval
+
+DIGITS = 6  # of lengths in metres
+
+
+def accuracy_table(residuals: Float64[np.ndarray, "n 3"]) -> dict[str, Any] | None:
+    """A group's table in `accuracy.json` and `metrics.json`.
+
+    Args:
+        residuals: East, north, up (metres), estimated less surveyed; NaN where not measured.
+
+    Returns:
+        Root mean squares (``horizontal`` and ``3d``: of the vectors' lengths), means, and the 95 % intervals of the
+        horizontal and the vertical one, assuming independent and normal residuals; None without points. Unknown values
+        are None.
+    """
+    if not len(residuals):
+        return None
+    east, north, up = (residuals[:, axis][np.isfinite(residuals[:, axis])] for axis in range(3))
+    flat, whole = (rows[np.isfinite(rows).all(axis=1)] for rows in (residuals[:, :2], residuals))
+    horizontal, vertical = _rms(np.linalg.norm(flat, axis=1)), _rms(up)
+    return {
+        "count": len(residuals),
+        "rmse_east_m": _rms(east),
+        "rmse_north_m": _rms(north),
+        "rmse_up_m": vertical,
+        "rmse_horizontal_m": horizontal,
+        "rmse_3d_m": _rms(np.linalg.norm(whole, axis=1)),
+        "interval_95_horizontal_m": _interval(horizontal, 2 * len(flat)),
+        "interval_95_vertical_m": _interval(vertical, len(up)),
+        "mean_m": [round(float(each.mean()), DIGITS) if len(each) else None for each in (east, north, up)],
+        "flights": [],
+    }
+
+
+def _rms(values: Float64[np.ndarray, " n"]) -> float | None:
+    return round(float(np.sqrt((values**2).mean())), DIGITS) if len(values) else None
+
+
+def _interval(rmse: float | None, values: int) -> list[float] | None:
+    return None if rmse is None else [round(bound, DIGITS) for bound in rmse_interval(rmse, values)]

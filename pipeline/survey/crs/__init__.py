@@ -1,0 +1,1 @@
+"""Coordinate reference systems, geodesy, and the frames between a model and the earth."""

@@ -1,0 +1,1 @@
+"""What positions, headings, barometers and control say against each other."""

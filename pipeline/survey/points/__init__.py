@@ -1,0 +1,1 @@
+"""Surveyed points and their marks in photos."""

@@ -1,0 +1,1 @@
+"""The photos' stated positions: their sources, flights, gaps and swaps."""

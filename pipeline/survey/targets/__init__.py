@@ -1,0 +1,1 @@
+"""Targets on the ground found in the photos, and which surveyed point each is."""

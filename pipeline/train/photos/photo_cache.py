@@ -1,0 +1,148 @@
+"""Decoded photos in an unnamed file, read through windows that are mapped only while in use."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
+from splatpipe.pipeline.train.plan.windows import PixelRectangle
+
+SHARE_OF_FREE = 0.5  # largest share of the disk's free space: checkpoints and the model need room too
+
+
+@dataclass(frozen=True)
+class _CachedPhoto:
+    offset: int
+    camera: Camera
+    has_mask: bool
+    counted: int
+
+
+def stored_bytes(camera: Camera, has_mask: bool) -> int:
+    """Bytes that a photo takes in the file: three per pixel, one more with a mask, rounded up to whole pages."""
+    used = camera.width * camera.height * (4 if has_mask else 3)
+    return -(-used // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+
+
+class PhotoCache:
+    """8-bit photos, each stored once and read any number of times.
+
+    The file has no name, so the system frees it when it is closed or the process dies in any way; another run never
+    sees it. A window is mapped only while it is in use, because mapped pages count as the process's memory.
+
+    Args:
+        folder: Folder on the disk to use.
+
+    Attributes:
+        room_bytes: Maximum file size, from the disk's free space at creation.
+
+    Raises:
+        MachineError: if the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._slots: dict[tuple[int, int], _CachedPhoto] = {}
+        self._end = 0
+        with self._explained():
+            self.room_bytes = int(SHARE_OF_FREE * shutil.disk_usage(folder).free)
+            self._file = tempfile.TemporaryFile(dir=folder, prefix="photos-", buffering=0)  # noqa: SIM115
+
+    def close(self) -> None:
+        """Free the disk space. Arrays already read stay valid."""
+        self._file.close()
+
+    def put(self, key: tuple[int, int], camera: Camera, colour: Pixels, mask: Mask | None) -> None:
+        """Store a photo if it fits in ``room_bytes``; otherwise nothing happens.
+
+        Args:
+            key: Key of the photo.
+            camera: The photo's camera, at this size.
+            colour: (h, w, 3), contiguous.
+            mask: (h, w), contiguous.
+
+        Raises:
+            MachineError: if the disk is full nevertheless, or fails.
+        """
+        counted = camera.width * camera.height if mask is None else int(np.count_nonzero(mask))
+        slot = _CachedPhoto(self._end, camera, mask is not None, counted)
+        if not self.has_room(camera, slot.has_mask):
+            return
+        with self._explained():
+            self._write(colour, slot.offset)
+            if mask is not None:
+                self._write(mask, slot.offset + colour.nbytes)
+        self._slots[key] = slot
+        self._end = slot.offset + stored_bytes(camera, slot.has_mask)
+
+    def has_room(self, camera: Camera, has_mask: bool) -> bool:
+        """Whether there is room for a photo."""
+        return self._end + stored_bytes(camera, has_mask) <= self.room_bytes
+
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        """Whether a photo is stored."""
+        return key in self._slots
+
+    def counted(self, key: tuple[int, int]) -> int:
+        """How many pixels of a stored photo count."""
+        return self._slots[key].counted
+
+    def get(self, key: tuple[int, int], frame: PixelRectangle) -> tuple[Pixels, Mask | None]:
+        """A window of a stored photo.
+
+        The arrays are read-only views of the file, of which only the window's rows are mapped; the mapping ends with
+        the last of them.
+
+        Args:
+            key: Key of a stored photo.
+            frame: The window, in the photo's pixels.
+
+        Raises:
+            MachineError: if the file cannot be mapped.
+        """
+        slot = self._slots[key]
+        height, width = slot.camera.height, slot.camera.width
+        columns = slice(frame.left, frame.right)
+        colour = self._rows(slot.offset, frame, 3 * width).reshape(frame.height, width, 3)[:, columns]
+        if not slot.has_mask:
+            return colour, None
+        return colour, self._rows(slot.offset + 3 * width * height, frame, width).view(np.bool_)[:, columns]
+
+    def _rows(self, offset: int, frame: PixelRectangle, row_bytes: int) -> npt.NDArray[np.uint8]:
+        """A frame's rows of the plane at ``offset`` in the file."""
+        begin = offset + frame.top * row_bytes
+        before = begin % mmap.ALLOCATIONGRANULARITY
+        length = frame.height * row_bytes
+        with self._explained():
+            mapped = mmap.mmap(
+                self._file.fileno(), before + length, mmap.MAP_SHARED, mmap.PROT_READ, offset=begin - before
+            )
+        return np.frombuffer(mapped, np.uint8, length, before).reshape(frame.height, row_bytes)
+
+    def _write(self, data: Pixels | Mask, offset: int) -> None:
+        rest = data.data.cast("B")
+        while rest:
+            written = os.pwrite(self._file.fileno(), rest, offset)
+            rest, offset = rest[written:], offset + written
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise MachineError(
+                f"The decoded photos cannot be kept in {self._folder}: {error.strerror}.",
+                hint="Free some space or check the permissions, then run again: it resumes from here.",
+            ) from error
