@@ -5,12 +5,13 @@
 # make develop                 editable install: edited sources take effect at once; make test reverts to the wheel
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            generates the tables of docs/options.md from the code
+# make rooms-page              generates the graphs and tables of docs/rooms.md and docs/stages.md from the contracts
 # make release                 checks wheel and sdist in clean environments: licences, SBOM, types, the demo's bits
 # make aarch64                 builds the kernels and their C++ tests for 64-bit Arm, and runs them under QEMU
 # make test-image              builds the container image and runs the demo in it (Linux, root, buildah, runc)
 # make test-docker             builds the image with a Docker daemon of its own, and tries it and the compose file (root)
 # make test-cluster            runs batches on a Slurm of two hosts on this machine (Linux, root, Debian's slurm-wlm)
-# make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/cuda.md
+# make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/gpu_visit.md
 # make sanitize                runs the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    installs torch without CUDA from PyTorch's own CPU index
 # SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or a list: "80;90"
@@ -47,7 +48,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-.PHONY: run test test-all aarch64 gpu-visit release sdist test-image test-docker test-cluster options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-all aarch64 gpu-visit release sdist test-image test-docker test-cluster options-page rooms-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -150,6 +151,10 @@ versions: $(EITHER) .venv/.dev
 # The tables in docs/options.md, from the options' types, defaults and help.
 options-page: $(EITHER)
 	@$(BIN)/python tests/options_page.py
+
+# The graphs and tables in docs/rooms.md and docs/stages.md, from import-linter's contracts, the imports and the line.
+rooms-page: $(EITHER) .venv/.dev
+	@$(BIN)/python tests/rooms_page.py
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

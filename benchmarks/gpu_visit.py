@@ -1,4 +1,4 @@
-"""Prove and measure everything on an NVIDIA GPU within a quarter of an hour on a bare machine; see docs/cuda.md.
+"""Prove and measure everything on an NVIDIA GPU within a quarter of an hour on a bare machine; see docs/gpu_visit.md.
 
 Where the line runs:   ``make gpu-visit``                             packs everything, and prints the commands
 Where the GPU is:      ``gpu_visit.py first --out FOLDER``            420 s: proofs, speed, peers, trainings

@@ -71,7 +71,7 @@ from splatpipe.pipeline.engine.machine import available_cores
 app = typer.Typer(
     name="splatpipe",
     help="From a folder of drone photos to a georeferenced, quality-checked 3D Gaussian splat.",
-    epilog="Details of each command: splatpipe COMMAND --help. See also: README.md, docs/options.md",
+    epilog="Details of each command: splatpipe COMMAND --help. See also: README.md, docs/README.md",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -55,7 +55,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.intake.detail import DIRECTIONS
 from splatpipe.pipeline.sfm.matching.comparison import brighter_ev, duller
 from splatpipe.pipeline.sfm.matching.keypoints import single_threaded_opencv
-from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures, glimpse
+from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures, quick_features
 
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
@@ -143,27 +143,27 @@ def examine_photos(intake: Intake, threads: int, report: Reporter) -> PhotoExami
     if count < MIN_PHOTOS:
         return PhotoExamination((), NOTHING, (), unknown, unknown, (float("nan"),) * count)
     names = [photo.name for photo in intake.photos]
-    glimpses: list[QuickFeatures] = []
+    quick: list[QuickFeatures] = []
     with single_threaded_opencv():
-        for found in ordered_map(glimpse, intake.photos, threads):
-            glimpses.append(found)
-            report.progress(len(glimpses), count, "examining photos", "photos")
-        overlap = match_quickly(intake.layout, glimpses, threads, report)
-    dull = duller(glimpses, overlap.found)
+        for found in ordered_map(quick_features, intake.photos, threads):
+            quick.append(found)
+            report.progress(len(quick), count, "examining photos", "photos")
+        overlap = match_quickly(intake.layout, quick, threads, report)
+    dull = duller(quick, overlap.found)
     assert dull.shape == (count, DIRECTIONS)
-    steps = brighter_ev(glimpses, overlap.found)
+    steps = brighter_ev(quick, overlap.found)
     flight = flight_of(intake.layout, overlap)
     missing, gaps = gap_findings(names, flight)
     findings = [
         *find_blurred(intake.photos, dull),
-        *find_little_texture(glimpses),
-        *find_exposures(intake.photos, glimpses, steps),
-        *find_copies(intake.photos, glimpses),
+        *find_little_texture(quick),
+        *find_exposures(intake.photos, quick, steps),
+        *find_copies(intake.photos, quick),
         *overlap_findings(names, overlap),
         *swap_findings(names, flight),
         *missing,
     ]
-    levels = tuple(found.brightness.mean_level for found in glimpses)
+    levels = tuple(found.brightness.mean_level for found in quick)
     return PhotoExamination(tuple(findings), overlap, tuple(gaps), sharpness(dull), steps, levels)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from splatpipe.pipeline.app.preflight.findings import Finding, Gap
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.files.names import list_names, printable
-from splatpipe.pipeline.sfm.matching.quick_match import InlierMatches, QuickFeatures, match_glimpses
+from splatpipe.pipeline.sfm.matching.quick_match import InlierMatches, QuickFeatures, match_quick_features
 from splatpipe.pipeline.sfm.pairing.pairs import (
     Costs,
     Layout,
@@ -62,13 +62,13 @@ class MatchGraph:
         return own
 
 
-def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: int, report: Reporter) -> MatchGraph:
+def match_quickly(layout: Layout, all_features: Sequence[QuickFeatures], threads: int, report: Reporter) -> MatchGraph:
     """Match neighbours by metadata, similar-looking photos, and more of these for photos still without a match."""
     count = len(layout)
 
     @cache
     def alike() -> Costs:
-        return look_alike_costs([glimpse.rooted() for glimpse in glimpses], seed=0)
+        return look_alike_costs([features.rooted() for features in all_features], seed=0)
 
     pairing = choose_pairing(layout, EXHAUSTIVE_UP_TO)
     if count <= EXHAUSTIVE_UP_TO:
@@ -77,11 +77,11 @@ def match_quickly(layout: Layout, glimpses: Sequence[QuickFeatures], threads: in
     pairs = set(select_pairs(layout, pairing, NEIGHBOURS, alike))
     if pairing != "exhaustive":
         pairs |= nearest(range(count), alike(), LOOK_ALIKES)
-    found = match_glimpses(glimpses, pairs, threads)
+    found = match_quick_features(all_features, pairs, threads)
     unmatched = [k for piece in pieces_of(found, count)[1:] for k in piece]
     if unmatched and pairing != "exhaustive":
         more = nearest(unmatched, alike(), AGAIN) - pairs
-        found |= match_glimpses(glimpses, more, threads)
+        found |= match_quick_features(all_features, more, threads)
     report.progress(1, 1, "matching quickly", "rounds")
     return MatchGraph(found, pieces_of(found, count))
 

@@ -61,17 +61,17 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
     return findings
 
 
-def find_little_texture(glimpses: Sequence[QuickFeatures]) -> list[Finding]:
+def find_little_texture(all_features: Sequence[QuickFeatures]) -> list[Finding]:
     """Find captures that show hardly anything to match, as thermal ones."""
-    usual = float(np.median([len(glimpse.places) for glimpse in glimpses]))
+    usual = float(np.median([len(features.places) for features in all_features]))
     if usual >= LITTLE_TEXTURE:
         return []
-    hint = texture_hint((glimpse.width, glimpse.height) for glimpse in glimpses)
+    hint = texture_hint((features.width, features.height) for features in all_features)
     return [Finding("texture", "warning", "The photos have little texture: few of them will be placed.", hint)]
 
 
 def find_exposures(
-    photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures], brighter_ev: Float64[np.ndarray, " n"]
+    photos: Sequence[CheckedPhoto], all_features: Sequence[QuickFeatures], brighter_ev: Float64[np.ndarray, " n"]
 ) -> list[Finding]:
     """Find photos much brighter or darker than their neighbours in the area both show, and white or black photos."""
     findings = []
@@ -84,8 +84,8 @@ def find_exposures(
         code = "overexposed" if step > 0 else "underexposed"
         findings.append(Finding(code, "warning", text, hint, (name,)))
     reported = set(jumps)
-    means = [glimpse.brightness.mean_level for glimpse in glimpses]
-    whites, blacks = [g.brightness.white for g in glimpses], [g.brightness.black for g in glimpses]
+    means = [features.brightness.mean_level for features in all_features]
+    whites, blacks = [g.brightness.white for g in all_features], [g.brightness.black for g in all_features]
     findings += _empty(photos, "overexposed", whites, [mean > BRIGHT_LEVEL for mean in means], reported)
     findings += _empty(photos, "underexposed", blacks, [mean < DARK_LEVEL for mean in means], reported)
     return findings
@@ -120,11 +120,11 @@ def _by_settings(photos: Sequence[CheckedPhoto], at: int, step: float) -> str:
     return ", as its exposure settings say" if by_settings * step > 0.5 * step * step else ""
 
 
-def find_copies(photos: Sequence[CheckedPhoto], glimpses: Sequence[QuickFeatures]) -> list[Finding]:
+def find_copies(photos: Sequence[CheckedPhoto], all_features: Sequence[QuickFeatures]) -> list[Finding]:
     """Find copies saved again: the same image and time, but different bytes."""
     if len(photos) < 2:
         return []
-    small = np.stack([glimpse.signature.ravel() for glimpse in glimpses])
+    small = np.stack([features.signature.ravel() for features in all_features])
     copies: dict[str, str] = {}
     for k in range(1, len(photos)):
         apart = np.sqrt(((small[:k] - small[k]) ** 2).mean(axis=1))

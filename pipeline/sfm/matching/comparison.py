@@ -25,7 +25,7 @@ ALONE_DETAIL, ALONE_EV = 2.0, 2.0  # for photos that match none, against all oth
 
 
 def duller(
-    glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]
+    all_features: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]
 ) -> Float64[np.ndarray, "n directions"]:
     """Estimate how much less fine detail each photo has than its neighbours where both show the same, by direction.
 
@@ -35,26 +35,28 @@ def duller(
     """
     differences = {}
     for pair, agreed in found.items():
-        value = _detail_difference(glimpses[pair[0]], glimpses[pair[1]], agreed)
+        value = _detail_difference(all_features[pair[0]], all_features[pair[1]], agreed)
         if value is not None:
             differences[pair] = value
-    own = _own_share(differences, len(glimpses), DIRECTIONS, ODD_DETAIL)
-    return _or_alone(own, [-_medians(found.detail, DIRECTIONS) for found in glimpses], ALONE_DETAIL)
+    own = _own_share(differences, len(all_features), DIRECTIONS, ODD_DETAIL)
+    return _or_alone(own, [-_medians(found.detail, DIRECTIONS) for found in all_features], ALONE_DETAIL)
 
 
-def brighter_ev(glimpses: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]) -> Float64[np.ndarray, " n"]:
+def brighter_ev(
+    all_features: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]
+) -> Float64[np.ndarray, " n"]:
     """Estimate by how many EV each photo is brighter than its neighbours where both show the same; NaN if unknown."""
     differences = {}
     for (i, j), agreed in found.items():
-        here, there = glimpses[i].levels[agreed.first], glimpses[j].levels[agreed.second]
+        here, there = all_features[i].levels[agreed.first], all_features[j].levels[agreed.second]
         known = np.isfinite(here) & np.isfinite(there)
         drawn = known & (here < CLIPPED) & (there < CLIPPED)
         rows = drawn if np.count_nonzero(drawn) >= MIN_PLACES else known
         if np.count_nonzero(rows) >= MIN_PLACES:
             value = float(np.median(here[rows] - there[rows]))
             differences[i, j] = np.array([value]), np.array([-value])
-    own = _own_share(differences, len(glimpses), 1, ODD_LEVEL_EV)
-    return _or_alone(own, [_medians(found.levels[:, None], 1) for found in glimpses], ALONE_EV)[:, 0]
+    own = _own_share(differences, len(all_features), 1, ODD_LEVEL_EV)
+    return _or_alone(own, [_medians(found.levels[:, None], 1) for found in all_features], ALONE_EV)[:, 0]
 
 
 def _detail_difference(

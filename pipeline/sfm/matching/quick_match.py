@@ -117,10 +117,12 @@ def quick_features(photo: CheckedPhoto) -> QuickFeatures:
     )
 
 
-def match_glimpses(glimpses: Sequence[QuickFeatures], pairs: Iterable[Pair], threads: int) -> dict[Pair, InlierMatches]:
+def match_quick_features(
+    all_features: Sequence[QuickFeatures], pairs: Iterable[Pair], threads: int
+) -> dict[Pair, InlierMatches]:
     """Match pairs of photos; return the inliers of each pair, which may be empty."""
     listed = sorted(set(pairs))
-    found = ordered_map(lambda pair: agreement(glimpses[pair[0]], glimpses[pair[1]]), listed, threads)
+    found = ordered_map(lambda pair: agreement(all_features[pair[0]], all_features[pair[1]]), listed, threads)
     return dict(zip(listed, found, strict=True))
 
 

@@ -16,9 +16,9 @@ from functools import cache
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.windows import TrainingSize, windows_of
 
-# Judgement, except where docs/lengths.md reports comparisons.
+# Judgement, except where docs/measurements/training.md reports comparisons.
 WHOLE_VISITS = 20  # minimum per photo at the size at which it fits whole
-PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/lengths.md
+PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/measurements/training.md
 FIRST_SHARE = 0.5  # of the minimum iterations are at the first size,
 MAX_FIRST_ITERATIONS = 3500  # but no more than these if 20 visits are fewer: the finest size is worth more
 FEWEST_VISITS = (

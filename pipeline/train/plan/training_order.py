@@ -98,17 +98,17 @@ class PhotoOrder(TrainingOrder):
     def __init__(
         self, cameras: Sequence[Camera], sizes: Sequence[TrainingSize], seed: int, max_megapixels: float | None = None
     ) -> None:
-        self._cameras, self._looks, self._seed, self.max_megapixels = cameras, sizes, seed, max_megapixels
+        self._cameras, self._sizes, self._seed, self.max_megapixels = cameras, sizes, seed, max_megapixels
         photos = len(cameras)
         epochs = [permutation(seed, epoch, photos) for epoch in range(-(-len(sizes) // max(1, photos)))]
         self._views = np.concatenate(epochs)[: len(sizes)] if epochs else np.zeros(0, np.int64)
         self._turns = np.zeros(len(sizes), np.int64)  # earlier visits of the same photo at the same size
-        sizes = {
+        pixel_sizes = {
             (camera.width, camera.height, look.window_pixels)
             for look in set(sizes)
             for camera in (self.camera(view, look.level) for view in range(photos))
         }
-        self._windows = {size: windows_of(*size) for size in sizes}
+        self._windows = {size: windows_of(*size) for size in pixel_sizes}
         self._given = np.full(len(sizes), -1, np.int64)  # windows that do not follow from the turn; -1: they do
         for look in sorted(set(sizes), key=lambda look: (look.level, look.window_pixels)):
             self._mix(look)
@@ -121,7 +121,7 @@ class PhotoOrder(TrainingOrder):
     def _ends(self) -> Iterable[int]:
         """The iterations that end rounds: of photos, or of their windows if they have several."""
         photos = max(1, len(self._cameras))
-        for look, begun, until in runs(self._looks):
+        for look, begun, until in runs(self._sizes):
             counts = {len(self._windows_at(view, look)) for view in range(len(self._cameras))}
             if len(counts) == 1:  # epochs of photos, which a change of size does not restart
                 begun = photos * -(-begun // photos)
@@ -136,7 +136,7 @@ class PhotoOrder(TrainingOrder):
         if len(set(counts)) < 2:
             return
         pairs = np.array([(view, window) for view, count in enumerate(counts) for window in range(count)])
-        places = np.array([place for place, each in enumerate(self._looks) if each == look])
+        places = np.array([place for place, each in enumerate(self._sizes) if each == look])
         rows = in_rounds(self._seed, len(pairs), len(places))
         self._views[places], self._given[places] = pairs[rows].T
 
@@ -146,11 +146,11 @@ class PhotoOrder(TrainingOrder):
 
     def __len__(self) -> int:
         """How many iterations there are."""
-        return len(self._looks)
+        return len(self._sizes)
 
     def at(self, iteration: int) -> TrainingCrop:
         """What an iteration, from 1, trains on."""
-        view, look = int(self._views[iteration - 1]), self._looks[iteration - 1]
+        view, look = int(self._views[iteration - 1]), self._sizes[iteration - 1]
         camera, ended = self.camera(view, look.level), int(self._rounds[iteration - 1])
         windows, given = self._windows_at(view, look), int(self._given[iteration - 1])
         if len(windows) == 1 or given >= 0:
@@ -167,7 +167,7 @@ class PhotoOrder(TrainingOrder):
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
-        return _wanted_again(self._views[first - 1 :].tolist(), self._looks[first - 1 :])
+        return _wanted_again(self._views[first - 1 :].tolist(), self._sizes[first - 1 :])
 
 
 class WindowOrder(TrainingOrder):
@@ -193,7 +193,7 @@ class WindowOrder(TrainingOrder):
         parts: Mapping[int, Sequence[tuple[int, PixelRectangle]]],
         cells: Mapping[int, Bool[np.ndarray, "rows columns"]] | None = None,
     ) -> None:
-        self._cameras, self._looks, self.max_megapixels, self._parts = cameras, sizes, max_megapixels, parts
+        self._cameras, self._sizes, self.max_megapixels, self._parts = cameras, sizes, max_megapixels, parts
         self._cells = cells or {}
         levels = np.array([look.level for look in sizes], np.int64)
         self._rows = np.zeros(len(sizes), np.int64)  # rows of the level's parts
@@ -205,11 +205,11 @@ class WindowOrder(TrainingOrder):
 
     def __len__(self) -> int:
         """How many iterations there are."""
-        return len(self._looks)
+        return len(self._sizes)
 
     def at(self, iteration: int) -> TrainingCrop:
         """What an iteration, from 1, trains on."""
-        level = self._looks[iteration - 1].level
+        level = self._sizes[iteration - 1].level
         view, window = self._parts[level][int(self._rows[iteration - 1])]
         ended = int(self._rounds[iteration - 1])
         return TrainingCrop(view, level, self.camera(view, level), window, self._cells.get(view), ended)
@@ -220,7 +220,7 @@ class WindowOrder(TrainingOrder):
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
-        sizes, rows = self._looks[first - 1 :], self._rows[first - 1 :].tolist()
+        sizes, rows = self._sizes[first - 1 :], self._rows[first - 1 :].tolist()
         return _wanted_again([self._parts[look.level][row][0] for look, row in zip(sizes, rows, strict=True)], sizes)
 
 

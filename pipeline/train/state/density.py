@@ -34,7 +34,7 @@ class DensityStep:
         extent: Scene extent, world units.
         limit: Maximum number of Gaussians after the step, if any are added.
         iteration: The iteration that ends.
-        unwanted: (n,) Gaussians to remove, whatever their size and opacity.
+        prune_mask: (n,) Gaussians to remove, whatever their size and opacity.
         ranked: How techniques modify the score; None for unmodified.
     """
 
@@ -42,7 +42,7 @@ class DensityStep:
     extent: float
     limit: int
     iteration: int
-    unwanted: Bool[Tensor, " n"]
+    prune_mask: Bool[Tensor, " n"]
     ranked: Callable[[Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
 
 

@@ -60,7 +60,7 @@ class Tint(Technique):
         self.calls.append(f"after_epoch {iteration}")
 
     def prune_mask(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
-        self.calls.append("unwanted")
+        self.calls.append("prune_mask")
         return torch.arange(len(gaussians)) == 0 if iteration == 2 else None
 
     def to_arrays(self) -> dict[str, Tensor]:
@@ -87,8 +87,8 @@ def test_an_iteration_calls_every_hook_in_order(plan: TrainingPlan) -> None:
     for photo, ended in zip(photos(), (0, 2), strict=True):
         iterate(state, plan, replace(photo, round=ended))
     once = ["before_render", "shown", "counted", "penalty", "after_step"]
-    assert tint.calls == ["settings 1", *once, "unwanted", "settings 2", *once, "after_epoch 2", "unwanted"]
-    assert len(state.gaussians) == tiny_scene.GAUSSIANS - 1  # the second time one was unwanted
+    assert tint.calls == ["settings 1", *once, "prune_mask", "settings 2", *once, "after_epoch 2", "prune_mask"]
+    assert len(state.gaussians) == tiny_scene.GAUSSIANS - 1  # the second time one was pruned
     assert state.history.density[-1]["pruned"] == 1
 
 
@@ -106,7 +106,7 @@ def test_a_photo_without_counting_pixels_does_not_affect_techniques(plan: Traini
     state = TrainState.begin(tiny_scene.true_model(), plan, Techniques((tint,)))
     nothing = torch.zeros(photo.colour.shape[:2], dtype=torch.bool)
     iterate(state, plan, TrainingPhoto(photo.camera, photo.colour, nothing, is_empty=True))
-    assert tint.calls == ["unwanted"] and state.iteration == 1 and float(tint.red) == 0.0
+    assert tint.calls == ["prune_mask"] and state.iteration == 1 and float(tint.red) == 0.0
 
 
 def test_a_checkpoint_keeps_what_a_technique_learnt_and_one_without_it_is_refused(plan: TrainingPlan) -> None:
