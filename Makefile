@@ -31,7 +31,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' \
   -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' -not -name '*.so' -not -name versions.toml \
   2>/dev/null)
-BUILT := pyproject.toml constraints.txt $(filter pipeline/raster/native/% pipeline/web/%,$(filter-out pipeline/%.py,$(SOURCES)))
+BUILT := pyproject.toml constraints.txt $(filter pipeline/native/% pipeline/web/%,$(filter-out pipeline/%.py pipeline/%.pyi,$(SOURCES)))
 NATIVE := $(filter %.cpp %.h %.cu %.cuh,$(SOURCES)) $(wildcard tests/native/*.cpp tests/native/*.h tests/harness/*.cpp tests/harness/*.h tests/harness/*.cu)
 
 # The index has only torch's own wheels; torch's dependencies come from PyPI like the rest.
@@ -102,7 +102,7 @@ sanitize-thread: SANITIZERS = thread
 # ThreadSanitizer supports few memory layouts; setarch -R, where permitted, provides one of those.
 sanitize-%: .venv/.tested
 	@echo "== native tests under $(SANITIZERS)"
-	@$(BIN)/cmake -S pipeline/raster/native -B build/sanitize/$* -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
+	@$(BIN)/cmake -S pipeline/native -B build/sanitize/$* -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
 	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPLATPIPE_SANITIZE=$(SANITIZERS) > /dev/null
 	@$(BIN)/ninja -j2 --quiet -C build/sanitize/$*
 	@if setarch -R true 2>/dev/null; then setarch -R build/sanitize/$*/native_tests; else build/sanitize/$*/native_tests; fi
@@ -121,7 +121,7 @@ sdist: .venv/.dev .venv/.node
 aarch64: .venv/.dependencies
 	@command -v aarch64-linux-gnu-g++ >/dev/null || { echo "needs apt install g++-aarch64-linux-gnu qemu-user-static"; exit 1; }
 	@echo "== native tests on aarch64"
-	@SPLATPIPE_WERROR=1 $(BIN)/cmake -S pipeline/raster/native -B build/aarch64 -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
+	@SPLATPIPE_WERROR=1 $(BIN)/cmake -S pipeline/native -B build/aarch64 -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
 	  --toolchain $(CURDIR)/tests/native/aarch64.cmake -DSPLATPIPE_NATIVE_TESTS=ON > /dev/null
 	@$(BIN)/ninja -j2 --quiet -C build/aarch64
 	@if command -v qemu-aarch64-static >/dev/null; then qemu-aarch64-static -L /usr/aarch64-linux-gnu build/aarch64/native_tests; \

@@ -40,7 +40,7 @@ SMALL_SMOKE = {"count": 3000, "size": [161, 117]}  # under memcheck, which slows
 BUILT_PEERS = (*TIMED_PEERS, "fused-ssim")
 RED = ("failed", "late", "not begun")
 ROOMS = ("pipeline", "stages", "configs")
-UNUSED = shutil.ignore_patterns("native", "node_modules", "src", "dist", "__pycache__", "*.so")
+UNUSED = shutil.ignore_patterns("node_modules", "src", "dist", "__pycache__", "*.so")
 
 
 @dataclass(frozen=True)
