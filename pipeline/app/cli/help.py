@@ -119,9 +119,9 @@ PAGES = {
         ("report OUT",),
         "docs/products.md",
     ),
-    "clean": HelpPage(
+    "tidy": HelpPage(
         "Reads OUT. Removes artifacts of older options and photos from OUT/stages, and nothing else in OUT.",
-        ("clean OUT",),
+        ("tidy OUT",),
         "docs/stages.md",
     ),
     "options": HelpPage(

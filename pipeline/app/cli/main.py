@@ -354,7 +354,7 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 
 
 @with_help(app)
-def clean(out: OutArgument, as_json: JsonOption = False) -> None:
+def tidy(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the current configuration no longer uses."""
     from splatpipe.pipeline.app.commands.console import print_line
     from splatpipe.pipeline.app.report.wording import plural, size
@@ -369,6 +369,15 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
             removed, freed = store.remove_stale(keep)
         done.details = {"removed": removed, "freed_bytes": freed}
         print_line(f"Removed {plural(removed, 'stale artifact')}, {size(freed)}.")
+
+
+@app.command(hidden=True)
+def clean(out: OutArgument, as_json: JsonOption = False) -> None:
+    """The former name of ``tidy``."""
+    from splatpipe.pipeline.app.commands.console import print_line
+
+    print_line("splatpipe clean is now called splatpipe tidy; the stage clean removes floaters.")
+    tidy(out, as_json)
 
 
 @with_help(app)
