@@ -22,7 +22,7 @@ import pycolmap
 from sfm_speed import database_of
 from tables import Row, print_table
 
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.runs.children import ONE_THREAD
 from splatpipe.pipeline.sfm.matching.matching_process import match_listed
 from splatpipe.pipeline.sfm.matching.reduction import copy_photos

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import torch
 
-from splatpipe.pipeline.engine.durable import sync_tree, write_durably
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.durable import sync_tree, write_durably
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.machine import available_memory_bytes
-from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.pixels.dataset import load_split, load_views

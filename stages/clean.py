@@ -14,7 +14,7 @@ from torch import Tensor
 from splatpipe.pipeline.edit.floaters.cleaning import CleaningResult, clean_scene, removals_in_words
 from splatpipe.pipeline.edit.floaters.visibility import TrainingPhotos
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS, CleanConfig
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.pixels.covering import covering_photos
 from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_split, load_views

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera

@@ -23,8 +23,8 @@ from splatpipe.pipeline.delivery.delivery_frame import (
 )
 from splatpipe.pipeline.delivery.sparse_scene import sparse_glb
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import read_world_area
 from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction

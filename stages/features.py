@@ -11,9 +11,9 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.engine.machine import available_memory_bytes, resident_bytes, threads_within
-from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import list_names

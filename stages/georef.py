@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.json_file import read_json, write_json
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.photo_list import Photo, load_photo_list
 from splatpipe.pipeline.sfm.lenses.lens_model import named_params, stated_lenses

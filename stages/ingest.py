@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.runs.source import find_model, is_film
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import NAMES_SHOWN, list_names, printable

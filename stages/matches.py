@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.machine import threads_within
-from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.photo_list import load_photo_list
 from splatpipe.pipeline.sfm.matching.matching import PROCESS_BYTES, look_alike, match_pairs, write_verified

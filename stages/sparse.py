@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import list_names
 from splatpipe.pipeline.photos.files.photo_list import load_photo_list

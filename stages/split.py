@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.options import SplitConfig
 from splatpipe.pipeline.photos.pixels.dataset import load_views, split_views

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from splatpipe.pipeline.app.measurements import has_measurements, is_number, read_measurements, title_of
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.output_file import is_inside
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.output_file import is_inside
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.web.measured_page import PAGE, SITE_PAGE, with_measurements
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatpipe.pipeline.app.page_file import printable
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import read_json
 
 MEASURED = Path("stages/measured.json")
 SECTIONS = "sections"  # the folder in OUT

@@ -15,7 +15,7 @@ import numpy as np
 from splatpipe.pipeline.app.commands.console import RunConsole
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
-from splatpipe.pipeline.engine.output_file import own_folder, write_file
+from splatpipe.pipeline.engine.files.output_file import own_folder, write_file
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import FilmCamera, Route, cameras_along

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, Items, write_measurements
-from splatpipe.pipeline.engine.durable import sync_folder
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.output_file import own_folder
+from splatpipe.pipeline.engine.files.durable import sync_folder
+from splatpipe.pipeline.engine.files.output_file import own_folder
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.runs.store import Part
 from splatpipe.stages.line import DEPTHS, DSM, GEOREF, LINE, UNDISTORT

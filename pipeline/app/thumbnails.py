@@ -13,7 +13,7 @@ from pathlib import Path
 from markupsafe import Markup
 from PIL import Image, ImageOps
 
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.photos.files.picture_file import open_picture, turn_to_decode, why_hollow
 
 MAX_BYTES = 512 << 20  # of a file

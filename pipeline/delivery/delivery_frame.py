@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_world_area
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

@@ -15,8 +15,8 @@ import numpy as np
 import pycolmap
 
 from splatpipe.pipeline.delivery.delivery_frame import pose_in_world
-from splatpipe.pipeline.engine.json_file import write_json
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.json_file import write_json
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.pixels.dataset import IMAGES, MASKS, MODEL, Points, View, load_points, load_views
 from splatpipe.pipeline.survey.crs.frames import Frame

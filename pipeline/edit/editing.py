@@ -17,8 +17,8 @@ from splatpipe.pipeline.edit.size import OutputFile
 from splatpipe.pipeline.edit.sources import SPLAT, STAGES, SplatSource, is_run, open_source
 from splatpipe.pipeline.edit.workpiece import Workpiece, between
 from splatpipe.pipeline.engine.digests import file_digest
-from splatpipe.pipeline.engine.durable import beside
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
+from splatpipe.pipeline.engine.files.durable import beside
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.pixels.images import Pixels

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.edit.workpiece import MIDDLE
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.images import Pixels
 from splatpipe.pipeline.raster import rasterizer

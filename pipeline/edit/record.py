@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.edit.sources import SplatSource
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import json_text
 from splatpipe.pipeline.splat.model.scene import MAX_EDITS, SceneFacts
 
 FORMAT = 1

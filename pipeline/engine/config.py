@@ -13,7 +13,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON, Stage
 
 Table = dict[str, JSON]

@@ -11,10 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.machine import pseudo_devices
-from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.engine.stage import JSON
 
 BLOCK_BYTES = 1 << 20

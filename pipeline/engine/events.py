@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
-from splatpipe.pipeline.engine.output_file import open_own
+from splatpipe.pipeline.engine.files.output_file import open_own
 from splatpipe.pipeline.engine.stage import JSON
 
 Kind = Literal[

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.engine.output_file import open_own, token, write_file
+from splatpipe.pipeline.engine.files.output_file import open_own, token, write_file
 from splatpipe.pipeline.photos.pixels.images import Pixels
 
 CODECS = {".webm": "VP80", ".mp4": "vp09"}

@@ -7,7 +7,7 @@ from typing import IO
 
 import numpy as np
 
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.files.durable import write_durably
 
 
 def save_arrays(path: Path, **arrays: np.ndarray) -> None:

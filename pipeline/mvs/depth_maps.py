@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera

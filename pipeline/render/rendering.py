@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.images import Pixels
 from splatpipe.pipeline.raster import rasterizer

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import read_world_area
 from splatpipe.pipeline.photos.files.names import NameFinder

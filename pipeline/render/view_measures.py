@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 
 from splatpipe.pipeline.engine.errors import StageError
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.heap import return_free_heap
-from splatpipe.pipeline.engine.output_file import write_file
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring
 from splatpipe.pipeline.survey.crs.crs import parse_crs, to_geodetic

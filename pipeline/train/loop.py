@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import read_model_area

@@ -13,7 +13,7 @@ from splatpipe.pipeline.delivery.delivery_frame import cameras_json
 from splatpipe.pipeline.delivery.ecef_tiles import write_tiles_on_globe
 from splatpipe.pipeline.delivery.trainer_dataset import write_colmap, write_points_ply, write_transforms
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import write_json
+from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import Points

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.splat.containers.spz_encoder import spz_bytes
 from splatpipe.pipeline.splat.levels.levels import LevelNode
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import View, load_points, load_views
 from splatpipe.pipeline.photos.pixels.images import Pixels

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.batch.driver import fresh_call
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, PlannedCapture, StageJob
 
 
 def link(folder: Path, photos: Iterable[Path]) -> Path:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.config import Table, load_file, merge, parse_set, parse_toml
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
-from splatpipe.pipeline.engine.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.files.names import is_photo
 from splatpipe.pipeline.survey.files.survey_text import TableKind, delimiter_of, read_lines, written_lines

@@ -12,11 +12,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.monitor import BatchMonitor
-from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, BatchPlan, Call, PlannedCapture
-from splatpipe.pipeline.app.batch.publication import PAGE_FILE, publish
-from splatpipe.pipeline.app.batch.slurm import ASK_INTERVAL_S, store_queue
-from splatpipe.pipeline.app.batch.snakemake_process import (
+from splatpipe.pipeline.app.batch.jobs.plan import BATCH_FOLDER, BatchPlan, Call, PlannedCapture
+from splatpipe.pipeline.app.batch.jobs.slurm import ASK_INTERVAL_S, store_queue
+from splatpipe.pipeline.app.batch.jobs.snakemake_process import (
     Profile,
     end_group,
     last_error_line,
@@ -24,15 +22,17 @@ from splatpipe.pipeline.app.batch.snakemake_process import (
     snakemake_environment,
     start_snakemake,
 )
-from splatpipe.pipeline.app.batch.state import UPDATE_INTERVAL_S, BatchState, CaptureState
-from splatpipe.pipeline.app.batch.workflow import write_workflow
+from splatpipe.pipeline.app.batch.jobs.workflow import write_workflow
+from splatpipe.pipeline.app.batch.monitor import BatchMonitor
+from splatpipe.pipeline.app.batch.pages.publication import PAGE_FILE, publish
+from splatpipe.pipeline.app.batch.pages.state import UPDATE_INTERVAL_S, BatchState, CaptureState
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, notify
 from splatpipe.pipeline.app.report import REPORT_FILE
-from splatpipe.pipeline.app.report.wording import roughly
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.app.report.facts.wording import roughly
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, MachineError, StopSignal, UsageError, exit_code
-from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.engine.output_file import own_folder, require_own_files
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.output_file import own_folder, require_own_files
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.runs.lock import locked
 from splatpipe.pipeline.engine.runs.store import write_error

@@ -15,7 +15,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.plan import Call
+from splatpipe.pipeline.app.batch.jobs.plan import Call
 
 KILLED = "The batch command itself was killed, by a user or by the system for lack of memory; its jobs were stopped."
 
@@ -35,9 +35,9 @@ def main() -> None:
 
 
 def _clean_up(call: Call, group: int, local: bool) -> None:
+    from splatpipe.pipeline.app.batch.jobs.snakemake_process import end_group, group_has_ended
     from splatpipe.pipeline.app.batch.monitor import BatchMonitor
-    from splatpipe.pipeline.app.batch.publication import publish
-    from splatpipe.pipeline.app.batch.snakemake_process import end_group, group_has_ended
+    from splatpipe.pipeline.app.batch.pages.publication import publish
 
     if group:
         end_group(call, group, local=local, has_ended=lambda: group_has_ended(group))

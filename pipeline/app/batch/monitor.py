@@ -10,15 +10,15 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.attempts import Attempt, as_engine_knows, read_attempts
-from splatpipe.pipeline.app.batch.engine_errors import read_errors
-from splatpipe.pipeline.app.batch.pictures import capture_picture
-from splatpipe.pipeline.app.batch.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob, workflow_jobs
-from splatpipe.pipeline.app.batch.slurm import read_queue
-from splatpipe.pipeline.app.batch.state import BatchState, CaptureState, Level
+from splatpipe.pipeline.app.batch.jobs.attempts import Attempt, as_engine_knows, read_attempts
+from splatpipe.pipeline.app.batch.jobs.engine_errors import read_errors
+from splatpipe.pipeline.app.batch.jobs.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob, workflow_jobs
+from splatpipe.pipeline.app.batch.jobs.slurm import read_queue
+from splatpipe.pipeline.app.batch.pages.pictures import capture_picture
+from splatpipe.pipeline.app.batch.pages.state import BatchState, CaptureState, Level
 from splatpipe.pipeline.app.report import REPORT_FILE
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs, read_report_inputs
-from splatpipe.pipeline.app.report.run_history import read_history
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs, read_report_inputs
+from splatpipe.pipeline.app.report.facts.run_history import read_history
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, SplatpipeError
 from splatpipe.pipeline.engine.machine import available_cores

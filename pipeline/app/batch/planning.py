@@ -12,8 +12,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.capture_list import ListedCapture
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
-from splatpipe.pipeline.app.batch.shards import (
+from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.jobs.shards import (
     MEMORY_MARGIN,
     NOTHING,
     counts_shards,
@@ -21,16 +21,16 @@ from splatpipe.pipeline.app.batch.shards import (
     shard_jobs,
     stage_job,
 )
-from splatpipe.pipeline.app.batch.workflow import GPU_STAGES
+from splatpipe.pipeline.app.batch.jobs.workflow import GPU_STAGES
 from splatpipe.pipeline.app.commands.runs import Overrides, request_of
 from splatpipe.pipeline.app.preflight.sizing import size_of
 from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
-from splatpipe.pipeline.app.report.run_history import read_history
+from splatpipe.pipeline.app.report.facts.run_history import read_history
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
-from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.output_file import require_own_files
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
-from splatpipe.pipeline.engine.output_file import require_own_files
 from splatpipe.pipeline.engine.runs.line import Line, StageStatus, line_status
 from splatpipe.pipeline.engine.runs.lock import is_locked
 from splatpipe.pipeline.engine.runs.needs import Need

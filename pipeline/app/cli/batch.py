@@ -24,9 +24,9 @@ from splatpipe.pipeline.app.commands.summary import print_json
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, exit_code
 
 if TYPE_CHECKING:
+    from splatpipe.pipeline.app.batch.jobs.snakemake_process import Profile
+    from splatpipe.pipeline.app.batch.pages.state import BatchState
     from splatpipe.pipeline.app.batch.planning import Settings
-    from splatpipe.pipeline.app.batch.snakemake_process import Profile
-    from splatpipe.pipeline.app.batch.state import BatchState
 
 RETRIES = 2  # a training that ran out of memory twice gets three times as much on the last try
 
@@ -67,8 +67,8 @@ def batch(
 ) -> None:
     """Run many captures unattended: finished results are reused, and a failed capture does not stop the others."""
     from splatpipe.pipeline.app.batch.capture_list import with_files_from
+    from splatpipe.pipeline.app.batch.jobs.snakemake_process import open_profile, require_snakemake
     from splatpipe.pipeline.app.batch.planning import Settings
-    from splatpipe.pipeline.app.batch.snakemake_process import open_profile, require_snakemake
     from splatpipe.pipeline.app.notice import check_command
     from splatpipe.pipeline.engine.config import load_preset
 
@@ -134,8 +134,8 @@ def _run(captures: Path, out: Path, settings: Settings, profile: Profile, comman
         summary,
         with_unlisted,
     )
+    from splatpipe.pipeline.app.batch.pages.publication import PAGE_FILE
     from splatpipe.pipeline.app.batch.planning import make_plan
-    from splatpipe.pipeline.app.batch.publication import PAGE_FILE
     from splatpipe.pipeline.app.commands.console import print_line
 
     listed = read_captures(captures, out)
@@ -163,7 +163,7 @@ def _dry_run(captures: Path, out: Path, settings: Settings, profile: Profile) ->
 
 
 def _print(out: Path, state: BatchState | None, code: int, error: BaseException | None) -> None:
-    from splatpipe.pipeline.app.batch.state import as_json
+    from splatpipe.pipeline.app.batch.pages.state import as_json
 
     facts: dict[str, Any] = {} if state is None else as_json(state)
     trouble = None if error is None else {"message": str(error), "hint": getattr(error, "hint", "")}

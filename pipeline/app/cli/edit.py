@@ -194,7 +194,7 @@ def _edit(
 def _show(facts: Mapping[str, Any]) -> None:
     from splatpipe.pipeline.app.commands.console import print_line
     from splatpipe.pipeline.app.formats import show_precision
-    from splatpipe.pipeline.app.report.wording import plural
+    from splatpipe.pipeline.app.report.facts.wording import plural
 
     for step in facts["steps"]:
         before, after = step["gaussians"]

@@ -72,7 +72,7 @@ def convert(
     with CommandSummary(target, as_json) as done:
         from splatpipe.pipeline.app.commands.console import print_line
         from splatpipe.pipeline.app.formats import convert_file, show_precision
-        from splatpipe.pipeline.app.report.wording import plural, size
+        from splatpipe.pipeline.app.report.facts.wording import plural, size
         from splatpipe.pipeline.splat.formats.files import format_of_name
 
         kind = format_of_name(target, format_name)

@@ -357,7 +357,7 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 def tidy(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the current configuration no longer uses."""
     from splatpipe.pipeline.app.commands.console import print_line
-    from splatpipe.pipeline.app.report.wording import plural, size
+    from splatpipe.pipeline.app.report.facts.wording import plural, size
     from splatpipe.pipeline.engine.runs.line import line_status
     from splatpipe.pipeline.engine.runs.lock import locked
     from splatpipe.pipeline.engine.runs.session import status_of

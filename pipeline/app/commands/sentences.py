@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from splatpipe.pipeline.app.report.wording import count, judged_of, length, number, plural, share
+from splatpipe.pipeline.app.report.facts.wording import count, judged_of, length, number, plural, share
 from splatpipe.pipeline.engine.stage import Summary, stage_name
 
 Figures = Mapping[str, Any]

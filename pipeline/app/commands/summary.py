@@ -154,7 +154,7 @@ def _interrupted_again(error: BaseException | None) -> bool:
 
 def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The accuracy report, with the splat's own if measured, and the surveyed points; empty if not computed."""
-    from splatpipe.pipeline.engine.json_file import read_json
+    from splatpipe.pipeline.engine.files.json_file import read_json
 
     artifacts = outcome.artifacts.values()
     parts = {name: part.path for artifact in artifacts for name, part in artifact.parts.items()}
@@ -172,7 +172,7 @@ def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 def _verdict(out: Path) -> Verdict | None:
     """The report's verdict; None if the run's record cannot be read, which must not fail the command."""
-    from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
+    from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
     from splatpipe.pipeline.app.report.verdict import judge
 
     try:

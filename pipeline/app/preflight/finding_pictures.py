@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.app.page_file import printable
 from splatpipe.pipeline.app.preflight.findings import Finding, PhotoFacts, Preflight
-from splatpipe.pipeline.app.report.wording import number
+from splatpipe.pipeline.app.report.facts.wording import number
 from splatpipe.pipeline.app.thumbnails import Thumbnail, crop_middle, thumbnail
 
 SIDE = 260  # pixels of a thumbnail's longer side

@@ -16,7 +16,7 @@ from splatpipe.pipeline.app.page_file import one_line, printable
 from splatpipe.pipeline.app.preflight.coverage import count_footprints, shades
 from splatpipe.pipeline.app.preflight.findings import MatchedPair, Preflight
 from splatpipe.pipeline.app.preflight.map_frame import WIDTH, MapFrame, frame_of
-from splatpipe.pipeline.app.report.wording import count, length, plural
+from splatpipe.pipeline.app.report.facts.wording import count, length, plural
 from splatpipe.pipeline.survey.files.control_file import titled
 
 MAX_PAIRS = 5_000  # lines; if there are more, those of weakly connected photos come first

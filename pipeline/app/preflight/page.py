@@ -15,8 +15,8 @@ from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.app.preflight.finding_pictures import FindingPicture, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, PresetForecast, Severity
 from splatpipe.pipeline.app.preflight.overlap_map import overlap_map
-from splatpipe.pipeline.app.report.wording import count, duration, number, plural, roughly, size
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.app.report.facts.wording import count, duration, number, plural, roughly, size
+from splatpipe.pipeline.engine.files.durable import write_durably
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 MAX_FINDINGS = 200

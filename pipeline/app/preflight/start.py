@@ -89,7 +89,7 @@ def _will_train(request: Request, until: str | None) -> bool:
 def forecast_text(request: Request) -> str:
     """The forecast for the whole pipeline on this machine, in a sentence; empty if the capture's size is unknown."""
     from splatpipe.pipeline.app.preflight.sizing import size_of
-    from splatpipe.pipeline.app.report.wording import roughly
+    from splatpipe.pipeline.app.report.facts.wording import roughly
     from splatpipe.pipeline.engine.machine import available_memory_bytes
     from splatpipe.pipeline.engine.runs.needs import whole
     from splatpipe.pipeline.engine.runs.source import open_source

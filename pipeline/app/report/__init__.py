@@ -12,12 +12,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO
 
-from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
+from splatpipe.pipeline.engine.files.durable import remove_unfinished, write_durably
+from splatpipe.pipeline.engine.files.output_file import appended_file
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.heap import imports_outside_gc
-from splatpipe.pipeline.engine.output_file import appended_file
 from splatpipe.pipeline.engine.python_module import python_module
-from splatpipe.pipeline.engine.small_file import open_regular
 
 REPORT_FILE = "report.html"
 HEAD_BYTES = 4096  # of the page, with the digest of its results
@@ -41,8 +41,8 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
         MachineError: if this installation lacks the page's script or style.
     """
     with imports_outside_gc():
+        from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
         from splatpipe.pipeline.app.report.page import report_page
-        from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 
     path = out / REPORT_FILE
     write_durably(path, report_page(read_report_inputs(out), drawn=drawn))
@@ -55,7 +55,7 @@ def is_current(out: Path) -> bool:
     Args:
         out: The run's folder.
     """
-    from splatpipe.pipeline.app.report.report_inputs import read_report_inputs, results_digest
+    from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs, results_digest
 
     try:
         with open_regular(out / REPORT_FILE) as file:

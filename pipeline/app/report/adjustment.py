@@ -8,14 +8,14 @@ from contextlib import suppress
 from itertools import groupby
 from typing import Any
 
-from splatpipe.pipeline.app.report.adjustment_results import (
+from splatpipe.pipeline.app.report.facts.adjustment_results import (
     AdjustmentResults,
     Heights,
     Judgement,
     LensResult,
     PositionResidual,
 )
-from splatpipe.pipeline.app.report.wording import count, number, plural, two_digits
+from splatpipe.pipeline.app.report.facts.wording import count, number, plural, two_digits
 
 Chapter = dict[str, Any]
 CameraPlaces = Mapping[str, Sequence[float]]  # east, north, up by photo, metres
@@ -158,7 +158,7 @@ def _heights(heights: Heights, origin: Mapping[str, Any] | None, cameras: Camera
     control = max((remedy.places_m for remedy in heights.remedies.values()), key=len, default=())
     charts = []
     if cameras is not None and heights.places:
-        from splatpipe.pipeline.app.report.adjustment_charts import heights_map
+        from splatpipe.pipeline.app.report.charts.adjustment_charts import heights_map
 
         caption = "How well the height of the ground is known at some tie points: ±, 95 % (1.96 standard deviations)"
         caption += "; triangles: where control points would help most." if control else "."
@@ -209,7 +209,7 @@ def _control_places(places: Sequence[tuple[float, float, float]], origin: Mappin
 
 
 def _position_charts(positions: Sequence[PositionResidual], places: CameraPlaces) -> list[Chapter]:
-    from splatpipe.pipeline.app.report.adjustment_charts import flight_lines, positions_map
+    from splatpipe.pipeline.app.report.charts.adjustment_charts import flight_lines, positions_map
 
     known = [entry for entry in positions if entry.photo in places]
     if not known:

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.app.report.adjustment_results import adopted_focals_px
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import count, length, number, share
+from splatpipe.pipeline.app.report.facts.adjustment_results import adopted_focals_px
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.wording import count, length, number, share
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-    from splatpipe.pipeline.app.report.geometry import Geometry
+    from splatpipe.pipeline.app.report.charts.geometry import Geometry
 
 Chapter = dict[str, Any]
 MAX_LISTED = 200  # rows of a table of photos
@@ -52,7 +52,7 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
     if geometry is not None:
         chapter |= _map_part(inputs, geometry)
     elif drawn and len(positions) > 1:
-        from splatpipe.pipeline.app.report.charts import stated_map
+        from splatpipe.pipeline.app.report.charts.charts import stated_map
 
         places = [(float(position["latitude"]), float(position["longitude"])) for position in positions]
         text = "Positions from the photos' metadata, joined in name order. Viewing directions are not known yet."
@@ -61,7 +61,7 @@ def capture_chapter(inputs: ReportInputs, geometry: Geometry | None, *, drawn: b
 
 
 def _doubles(inputs: ReportInputs, found: Mapping[str, Any]) -> list[tuple[str, Markup]]:
-    from splatpipe.pipeline.app.report.pictures import double_crops
+    from splatpipe.pipeline.app.report.charts.pictures import double_crops
 
     return double_crops(found, inputs.part("ingest.photos"), inputs.photos_dir)
 
@@ -117,7 +117,7 @@ def held_out(inputs: ReportInputs) -> list[str]:
 
 
 def _map_part(inputs: ReportInputs, geometry: Geometry) -> Chapter:
-    from splatpipe.pipeline.app.report.charts import overlap_map, survey_map
+    from splatpipe.pipeline.app.report.charts.charts import overlap_map, survey_map
 
     unit, shares = unit_of(inputs), geometry.overlap.shares
     gsd = inputs.read("georef.accuracy").get("gsd_m")
@@ -152,7 +152,7 @@ def _map_part(inputs: ReportInputs, geometry: Geometry) -> Chapter:
 
 
 def _registration_charts(inputs: ReportInputs, geometry: Geometry) -> Chapter:
-    from splatpipe.pipeline.app.report import charts
+    from splatpipe.pipeline.app.report.charts import charts
 
     found = inputs.read("matches.pairs")
     pairs = [(str(a), str(b), int(n)) for a, b, n in found.get("pairs", [])]

@@ -8,13 +8,13 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.report.adjustment import adjustment_section
-from splatpipe.pipeline.app.report.adjustment_results import read_adjustment
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import count, interval, length, metres, number
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.app.report.facts.adjustment_results import read_adjustment
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.wording import count, interval, length, metres, number
+from splatpipe.pipeline.engine.files.json_file import read_json
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.app.report.geometry import Geometry
+    from splatpipe.pipeline.app.report.charts.geometry import Geometry
 
 Chapter = dict[str, Any]
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
@@ -214,8 +214,8 @@ def _charts_and_marks(
         photos: Residuals of the photos' own positions.
         placed: Whether the model is georeferenced; otherwise there are no maps.
     """
-    from splatpipe.pipeline.app.report.charts import residual_map
-    from splatpipe.pipeline.app.report.pictures import cut_chips
+    from splatpipe.pipeline.app.report.charts.charts import residual_map
+    from splatpipe.pipeline.app.report.charts.pictures import cut_chips
 
     charts = []
     if placed:

@@ -7,8 +7,8 @@ from typing import Any
 from urllib.parse import quote
 
 from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, outdated, read_measurements, title_of
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import length
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.wording import length
 
 MAX_ROWS = 200  # of volumes; the file has all of them
 BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated"}

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 from splatpipe.pipeline.app.page_file import page_text
 from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.app.report.capture import capture_chapter, registration_chapter
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs, results_digest
+from splatpipe.pipeline.app.report.facts.wording import count, duration, judged_of, judged_size, length, moment, number
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.processing import files_chapter, messages_chapter, processing_chapter
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs, results_digest
 from splatpipe.pipeline.app.report.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.training import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.verdict import judge
-from splatpipe.pipeline.app.report.wording import count, duration, judged_of, judged_size, length, moment, number
 from splatpipe.pipeline.engine.errors import SplatpipeError
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.app.report.geometry import Geometry
+    from splatpipe.pipeline.app.report.charts.geometry import Geometry
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 
@@ -37,7 +37,7 @@ def report_page(inputs: ReportInputs, *, drawn: bool) -> str:
     """
     if not drawn:
         return _render(inputs, None, None, drawn=False)
-    from splatpipe.pipeline.app.report.drawing import styled
+    from splatpipe.pipeline.app.report.charts.drawing import styled
 
     geometry, trouble = _geometry(inputs)
     with styled():
@@ -104,7 +104,7 @@ def _geometry(inputs: ReportInputs) -> tuple[Geometry | None, str | None]:
     path = inputs.part("georef.model") if frame is not None else inputs.part("sparse.model")
     if path is None:
         return None, None
-    from splatpipe.pipeline.app.report.geometry import read_geometry
+    from splatpipe.pipeline.app.report.charts.geometry import read_geometry
 
     try:
         return read_geometry(path, frame), None

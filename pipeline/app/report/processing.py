@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import count, duration, moment, plural, size
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.wording import count, duration, moment, plural, size
 from splatpipe.pipeline.engine.stage import shards_first, stage_name
 from splatpipe.stages.line import LINE
 
@@ -185,7 +185,7 @@ def _options(options: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _charts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    from splatpipe.pipeline.app.report.charts import stage_bars
+    from splatpipe.pipeline.app.report.charts.charts import stage_bars
 
     times = [(row["name"], row["seconds"]) for row in rows if row["seconds"] is not None]
     memory = [(row["name"], row["memory"] / 1e9) for row in rows if row["memory"]]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.wording import count, length
 from splatpipe.pipeline.app.report.measures import measures
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import count, length
 
 PICTURE_SIDE = 960  # pixels
 FACADE_SIDE = 480
@@ -80,7 +80,7 @@ def _small_picture(path: Path, side: int) -> dict[str, Any]:
     import cv2
     import numpy as np
 
-    from splatpipe.pipeline.app.report.pictures import jpeg, shrunk
+    from splatpipe.pipeline.app.report.charts.pictures import jpeg, shrunk
 
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None:
@@ -92,7 +92,7 @@ def _small_picture(path: Path, side: int) -> dict[str, Any]:
 
 
 def _pictures(inputs: ReportInputs) -> list[dict[str, Any]]:
-    from splatpipe.pipeline.app.report.pictures import jpeg
+    from splatpipe.pipeline.app.report.charts.pictures import jpeg
     from splatpipe.pipeline.surface.rasters.pictures import ortho_picture, relief_picture
 
     found = []

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import count, duration, judged_size, number, share, size
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.wording import count, duration, judged_size, number, share, size
 
 Chapter = dict[str, Any]
 MEASURES = {  # metrics of a held-out photo: title with the unit, digits
@@ -113,8 +113,8 @@ def views_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
 def _view_images(
     inputs: ReportInputs, views: Sequence[Mapping[str, Any]], measures: Sequence[tuple[str, str, int]]
 ) -> Chapter:
-    from splatpipe.pipeline.app.report.charts import view_bars
-    from splatpipe.pipeline.app.report.pictures import chosen_views, view_pictures
+    from splatpipe.pipeline.app.report.charts.charts import view_bars
+    from splatpipe.pipeline.app.report.charts.pictures import chosen_views, view_pictures
 
     folder = inputs.part("evaluate.views")
     photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
@@ -171,7 +171,7 @@ def _curves(inputs: ReportInputs, history: Mapping[str, Any]) -> dict[str, dict[
 
 
 def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | None) -> list[dict[str, Any]]:
-    from splatpipe.pipeline.app.report.charts import training_curve
+    from splatpipe.pipeline.app.report.charts.charts import training_curve
 
     labels = {
         "loss": (

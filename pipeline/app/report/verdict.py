@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from splatpipe.pipeline.app.report.adjustment_results import adopted_focals_px, read_adjustment
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
-from splatpipe.pipeline.app.report.wording import (
+from splatpipe.pipeline.app.report.facts.adjustment_results import adopted_focals_px, read_adjustment
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.wording import (
     count,
     duration,
     judged_of,

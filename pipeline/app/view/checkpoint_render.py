@@ -14,7 +14,7 @@ import torch
 
 from splatpipe.pipeline.delivery.delivery_frame import in_world
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, StageError, card_fault
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.runs.run_folder import Contents
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views

@@ -9,7 +9,7 @@ from typing import Any
 
 from splatpipe.pipeline.app.view.files import FileNotServedError, is_inside, open_inside
 from splatpipe.pipeline.app.view.log import RunLog
-from splatpipe.pipeline.engine.json_file import parse_json
+from splatpipe.pipeline.engine.files.json_file import parse_json
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE

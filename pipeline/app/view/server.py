@@ -108,9 +108,9 @@ class _Server(uvicorn.Server):
 
 def _marking(pages: Pages, options: ViewOptions, print_line: Callable[[str], None]) -> list[Route]:
     """The routes for marking."""
-    from splatpipe.pipeline.app.view.mark_routes import MarkPages
-    from splatpipe.pipeline.app.view.marking import Marking
-    from splatpipe.pipeline.app.view.marking_job import open_job
+    from splatpipe.pipeline.app.view.marking.mark_routes import MarkPages
+    from splatpipe.pipeline.app.view.marking.marking import Marking
+    from splatpipe.pipeline.app.view.marking.marking_job import open_job
 
     marking = Marking(open_job(pages.run, options.points))
     pages.marking = True

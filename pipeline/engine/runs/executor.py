@@ -14,7 +14,7 @@ from typing import IO
 
 from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineError, StageError, StopSignal
 from splatpipe.pipeline.engine.events import Event, Sink
-from splatpipe.pipeline.engine.output_file import appended_file
+from splatpipe.pipeline.engine.files.output_file import appended_file
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.runs.worker import Task, peak_memory_of
 from splatpipe.pipeline.engine.stage import JSON

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.config import settings_of
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.runs.lock import is_locked
 from splatpipe.pipeline.engine.runs.store import Artifact, Part, StageInputs, Store
 from splatpipe.pipeline.engine.stage import Shard, Stage, StageConfig, stage_name

@@ -27,9 +27,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.files.output_file import open_own
+from splatpipe.pipeline.engine.files.small_file import open_regular, read_small
 from splatpipe.pipeline.engine.machine import LOCAL_KINDS, mount_of
-from splatpipe.pipeline.engine.output_file import open_own
-from splatpipe.pipeline.engine.small_file import open_regular, read_small
 
 LOCK_FILE = ".lock"  # below stages/; it is never removed, and only its holder works
 PATIENCE_S = 6.0  # a killed run's worker may take a moment to die

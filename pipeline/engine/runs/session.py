@@ -14,8 +14,8 @@ from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.config import dump
 from splatpipe.pipeline.engine.digests import HashTable
-from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
+from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.python_module import SAFE_PATH
 from splatpipe.pipeline.engine.runs.executor import Executor
 from splatpipe.pipeline.engine.runs.line import Line

@@ -13,10 +13,16 @@ from pathlib import Path, PurePosixPath
 from stat import S_ISREG
 
 from splatpipe.pipeline.engine.digests import FileEntry, canonical, digest, part_digest, tree_entries
-from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, sync_folder, sync_tree, write_durably
 from splatpipe.pipeline.engine.errors import MachineError, StageError, UsageError
-from splatpipe.pipeline.engine.json_file import read_json
-from splatpipe.pipeline.engine.output_file import is_inside, own_folder, require_own_files
+from splatpipe.pipeline.engine.files.durable import (
+    copy_durably,
+    remove_unfinished,
+    sync_folder,
+    sync_tree,
+    write_durably,
+)
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.output_file import is_inside, own_folder, require_own_files
 from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
 FORMAT = 1  # of the layout of OUT; raised when older versions could no longer read it

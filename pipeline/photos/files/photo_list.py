@@ -19,9 +19,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.runs.source import find_model
-from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.files.names import is_plain, list_names
 from splatpipe.pipeline.photos.files.picture_file import STRIP_ROWS, open_picture
 

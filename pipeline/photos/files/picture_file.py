@@ -17,7 +17,7 @@ from typing import Any
 
 from PIL import Image
 
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.photos.files.extra_formats import (
     RAW_MODULE,
     is_dng,

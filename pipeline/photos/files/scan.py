@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.machine import pseudo_devices
-from splatpipe.pipeline.engine.small_file import open_regular
 from splatpipe.pipeline.photos.files.companions import MASK, find_companions, other_formats, reason_of
 from splatpipe.pipeline.photos.files.extra_formats import (
     DNG_REASON,

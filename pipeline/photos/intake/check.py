@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Shaped
 from PIL import Image
 
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.photos.files.extra_formats import DNG_REASON, EXTRA_FORMATS, is_dng
 from splatpipe.pipeline.photos.files.picture_file import (
     STRIP_ROWS,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from PIL import Image
 
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.photos.files.photo_list import read_checked
 from splatpipe.pipeline.photos.files.picture_file import STRIP_ROWS, load_stored, open_picture, turn_to_decode
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto, deep_pixels, stored_orientation

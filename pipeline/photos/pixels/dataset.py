@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
-from splatpipe.pipeline.engine.json_file import json_text, read_json
+from splatpipe.pipeline.engine.files.json_file import json_text, read_json
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.colmap.colmap_model import Cloud, ModelPhoto, read_cloud, read_photos
 from splatpipe.pipeline.photos.files.names import NameFinder, list_names

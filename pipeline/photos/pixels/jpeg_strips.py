@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 
 QUALITY = 97  # with full chroma: far above what training reaches, and a third of a PNG's size and decoding time
 OPTIONS = (

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pycolmap
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import Inputs, Reporter
 from splatpipe.pipeline.geometry.camera import reduced_size
 from splatpipe.pipeline.photos.files.names import list_names, match_names

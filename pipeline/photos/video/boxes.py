@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.photos.files.names import printable
 
 MAX_TOP_BOXES = 10_000  # a camera writes some ten

@@ -17,7 +17,7 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.engine.runs.source import subtitles_beside
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.files.names import is_plain, printable

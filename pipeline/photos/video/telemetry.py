@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.photos.video.boxes import MAX_CUE_BYTES, MAX_CUES, Cue
 
 NUMBER = r"([-+]?\d{1,6}(?:\.\d{1,12})?)(?![\d.eE])"

@@ -20,8 +20,8 @@ from xml.parsers import expat
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.small_file import read_small
-from splatpipe.pipeline.engine.text_lines import text_lines
+from splatpipe.pipeline.engine.files.small_file import read_small
+from splatpipe.pipeline.engine.files.text_lines import text_lines
 from splatpipe.pipeline.sfm.lenses.lens_model import GRID, PARAMETERS, StatedLens, is_known
 
 MAX_BYTES = 32 << 20  # Pix4D's parameters take half a kilobyte per photo

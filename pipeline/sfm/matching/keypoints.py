@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.photos.files.photo_list import Photo, decode, decode_mask
 from splatpipe.pipeline.photos.pixels.images import reduced
 from splatpipe.pipeline.sfm.options import FeaturesConfig

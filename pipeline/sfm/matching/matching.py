@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import UInt8
 
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.runs.children import CHILDREN_MEMORY, run_children
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.sfm.matching.reduction import copy_photos

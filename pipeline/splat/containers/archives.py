@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.npyio import NpzFile
 
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 
 MAX_EXPANSION = 20.0  # maps, the only arrays that are stored compressed, have noise
 FREE_BYTES = 1 << 29  # expansion allowed for files of any size: the map of a large photo may be empty

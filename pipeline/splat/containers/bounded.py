@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 MAX_EXPANSION = 10.0

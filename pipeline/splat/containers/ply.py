@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.splat.containers.bounded import check_values, open_file
 from splatpipe.pipeline.splat.containers.ply_header import PLY_HINT, PlyElement, ply_header_bytes, read_ply_header
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

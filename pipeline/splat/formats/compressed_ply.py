@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8, UInt32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, all_finite, check_values, open_file, read_exactly
 from splatpipe.pipeline.splat.containers.ply_header import (
     PLY_HINT,

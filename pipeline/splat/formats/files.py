@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import beside
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.durable import beside
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
 from splatpipe.pipeline.splat.model.position_cost import PositionCost, two_digits

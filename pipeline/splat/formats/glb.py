@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values, open_file
 from splatpipe.pipeline.splat.containers.glb_container import FLOAT, UNSIGNED_BYTE, open_container, write_head
 from splatpipe.pipeline.splat.formats.glb_splats import (

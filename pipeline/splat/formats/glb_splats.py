@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, read_exactly
 from splatpipe.pipeline.splat.containers.glb_container import Accessor, Container
 from splatpipe.pipeline.splat.containers.glb_nodes import drawn_primitives

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.model.position_cost import PositionCost

@@ -18,7 +18,7 @@ import zstandard
 from jaxtyping import Float32, UInt8
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.splat.containers.bounded import (
     CheckValues,
     InflatedFile,

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.engine.output_file import own_folder, write_file
+from splatpipe.pipeline.engine.files.output_file import own_folder, write_file
 from splatpipe.pipeline.splat.formats.sog import AXES, encode_sog
 from splatpipe.pipeline.splat.formats.sog_images import META, RECORD
 from splatpipe.pipeline.splat.levels.levels import LevelNode

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file, own_folder, write_file
+from splatpipe.pipeline.engine.files.output_file import new_file, own_folder, write_file
 from splatpipe.pipeline.splat.containers.glb_container import FLOAT, UNSIGNED_BYTE, padded, write_head
 from splatpipe.pipeline.splat.containers.spz_encoder import FIRST_THREE_VERSION, spz_bytes
 from splatpipe.pipeline.splat.formats.glb_splats import EXTENSION, KERNEL, RECORD, SPZ_EXTENSION, harmonics_names

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.containers.archives import read_archive
 from splatpipe.pipeline.splat.model.upload import rgb_beside, upload

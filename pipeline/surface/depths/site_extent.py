@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.json_file import read_json, write_json
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.depths.sources import MIN_CONFIRMED, DepthSource, PosedDepthMap

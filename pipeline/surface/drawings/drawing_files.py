@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from splatpipe.pipeline.engine.durable import whole_file, write_durably
+from splatpipe.pipeline.engine.files.durable import whole_file, write_durably
 from splatpipe.pipeline.surface.drawings.drawing import (
     EXTENT,
     GRID,

@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from splatpipe.pipeline.engine.durable import whole_file
+from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.surface.drawings.drawing import Drawing
 from splatpipe.pipeline.surface.drawings.drawing_files import LAYERS, MARGIN_MM
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 
 FOLDERS = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")  # variables of where it reads and writes
 NO_FONTS = '{"version": 2, "font-faces": []}'  # of another version, it would search for fonts

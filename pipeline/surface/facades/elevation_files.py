@@ -17,9 +17,9 @@ from affine import Affine
 from jaxtyping import Float64
 from PIL import Image
 
-from splatpipe.pipeline.engine.durable import whole_file, write_durably
 from splatpipe.pipeline.engine.errors import MachineError
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.files.durable import whole_file, write_durably
+from splatpipe.pipeline.engine.files.json_file import json_text
 from splatpipe.pipeline.surface.facades.elevation import Elevation
 from splatpipe.pipeline.surface.rasters.geotiff import GDAL_ERRORS, NODATA_HEIGHT, gdal
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.json_file import json_text, read_json
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import json_text, read_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.surface.depths.exposures import COMPARED_POINTS, exposure_levels

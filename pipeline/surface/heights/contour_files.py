@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.durable import whole_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.surface.drawings.dxf import new_document, reproducible
 from splatpipe.pipeline.surface.heights.contours import Contours
 from splatpipe.pipeline.surface.rasters.grid import Grid

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from splatpipe.pipeline.engine.durable import whole_file
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.durable import whole_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.surface.drawings.drawing import (
     GRID,
     POINTS,

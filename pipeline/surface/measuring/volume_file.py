@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.json_file import json_text
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import json_text
 from splatpipe.pipeline.surface.measuring.volumes import Amount, Volume
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 

@@ -31,8 +31,8 @@ from rasterio.errors import RasterioError, RasterioIOError
 from rasterio.shutil import copy as copy_raster
 from rasterio.windows import Window
 
-from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.surface.rasters.grid import TILE, Grid
 from splatpipe.pipeline.surface.rasters.map_crs import unit_name
 from splatpipe.pipeline.surface.rasters.tiles import Tile

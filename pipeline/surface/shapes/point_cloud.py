@@ -19,9 +19,9 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 
-from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.durable import whole_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.json_file import read_json, write_json
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.survey.crs.geodesy import Origin, ecef_from_geodetic, geodetic_from_ecef

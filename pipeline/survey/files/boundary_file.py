@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.geometry.plan_area import Polygon, Ring, signed_area
 
 LARGEST_FILE = 8 << 20  # bytes: a hundred times the size of a detailed outline

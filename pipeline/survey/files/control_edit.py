@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.survey.files.control_file import (
     COLUMNS,
     TABS,

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.small_file import read_small
-from splatpipe.pipeline.engine.text_lines import text_lines
+from splatpipe.pipeline.engine.files.small_file import read_small
+from splatpipe.pipeline.engine.files.text_lines import text_lines
 from splatpipe.pipeline.photos.files.names import is_photo
 
 MAX_LINE_CHARS = 2000

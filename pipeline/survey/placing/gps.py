@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, DirectionPrior, SimilarityFit, robust_similarity
 from splatpipe.pipeline.photos.files.names import list_names

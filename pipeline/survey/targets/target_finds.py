@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json, write_json
+from splatpipe.pipeline.engine.files.json_file import read_json, write_json
 from splatpipe.pipeline.survey.files.scale_bars import ScaleBar
 
 QUADRANT = "quadrant"

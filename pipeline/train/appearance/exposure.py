@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import json_text, read_json
+from splatpipe.pipeline.engine.files.json_file import json_text, read_json
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.train.appearance.auxiliary_model import AuxiliaryModel
 from splatpipe.pipeline.train.hooks import RenderedView, Technique

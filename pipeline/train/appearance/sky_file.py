@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.output_file import new_file
+from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.splat.containers.archives import read_archive
 from splatpipe.pipeline.splat.sky.sky_mask import SkyMask
 

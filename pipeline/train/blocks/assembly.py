@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import json_text, read_json
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.json_file import json_text, read_json
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, read_splat, write_splat_parts

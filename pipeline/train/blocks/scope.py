@@ -16,8 +16,8 @@ import numpy.typing as npt
 import torch
 from jaxtyping import Float64
 
-from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
+from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.splat.containers.archives import read_archive

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Machine, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views

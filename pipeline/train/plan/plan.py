@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.camera import Camera, reduced_size
 from splatpipe.pipeline.photos.pixels.dataset import Split, View

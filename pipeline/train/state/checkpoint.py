@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.splat.containers.archives import read_archive
 
 CHECKPOINT_FORMAT = 1

@@ -6,7 +6,7 @@ import pytest
 from batch_captures import call_of, planned
 
 from splatpipe.pipeline.app.batch.driver import STOPPED_NOTICE_S, Driver, Notifications
-from splatpipe.pipeline.app.batch.snakemake_process import open_profile
+from splatpipe.pipeline.app.batch.jobs.snakemake_process import open_profile
 from splatpipe.pipeline.engine.errors import EXIT_TERMINATED, StopSignal
 
 

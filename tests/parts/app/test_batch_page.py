@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.batch.page import batch_page
-from splatpipe.pipeline.app.batch.pictures import capture_picture
-from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
+from splatpipe.pipeline.app.batch.pages.page import batch_page
+from splatpipe.pipeline.app.batch.pages.pictures import capture_picture
+from splatpipe.pipeline.app.batch.pages.state import BatchState, CaptureState
 
 
 def batch(*captures: CaptureState, **facts: object) -> BatchState:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from marked_points import POINTS, TRUTH, by_gps_alone, marks_in, read_points
 
-from splatpipe.pipeline.app.view.marking import Marking, WrongRequestError
-from splatpipe.pipeline.app.view.marking_job import open_job
+from splatpipe.pipeline.app.view.marking.marking import Marking, WrongRequestError
+from splatpipe.pipeline.app.view.marking.marking_job import open_job
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.photos.files.names import NameFinder

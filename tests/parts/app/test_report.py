@@ -23,10 +23,10 @@ from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.commands.console import show_bad_cameras
 from splatpipe.pipeline.app.report import is_current, make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
+from splatpipe.pipeline.app.report.charts.pictures import CHIP_SIDE, MAX_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
-from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MAX_CHIPS, chosen_views, cut_chips
-from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.verdict import judge
 
 

@@ -10,7 +10,7 @@ import sharded
 from command import splatpipe
 from sharded_runs import NUMBERS, SHARDS, make_shard, request_of, statuses, walk
 
-from splatpipe.pipeline.app.report.run_history import read_history
+from splatpipe.pipeline.app.report.facts.run_history import read_history
 from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError, UsageError
 from splatpipe.pipeline.engine.events import Event

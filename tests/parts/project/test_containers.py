@@ -14,8 +14,8 @@ from repository import ROOT
 from timeouts import TIMEOUT_S, wait_until
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.batch.plan import Call
-from splatpipe.pipeline.app.batch.snakemake_process import snakemake_environment
+from splatpipe.pipeline.app.batch.jobs.plan import Call
+from splatpipe.pipeline.app.batch.jobs.snakemake_process import snakemake_environment
 
 DOCKER = ROOT / "docker"
 SLURM = DOCKER / "slurm.sh"

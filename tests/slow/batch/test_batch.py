@@ -16,11 +16,11 @@ from batch_captures import call_of, demo, job, link, planned
 from repository import ROOT
 from timeouts import wait_until
 
-from splatpipe.pipeline.app.batch.attempts import NO_MESSAGE, AttemptLog
+from splatpipe.pipeline.app.batch.jobs.attempts import NO_MESSAGE, AttemptLog
+from splatpipe.pipeline.app.batch.jobs.plan import Call, PlannedCapture
+from splatpipe.pipeline.app.batch.jobs.snakemake_process import open_profile, snakemake_command
+from splatpipe.pipeline.app.batch.jobs.workflow import workflow_text
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
-from splatpipe.pipeline.app.batch.plan import Call, PlannedCapture
-from splatpipe.pipeline.app.batch.snakemake_process import open_profile, snakemake_command
-from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE
 from splatpipe.stages.line import LINE
 
@@ -172,7 +172,7 @@ def test_a_job_whose_process_is_gone_does_not_run(tmp_path: Path) -> None:
 
 
 def run_job(call: Call, stage: str) -> int:
-    words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.job", str(call.folder), "0001-house", stage, "1"]
+    words = [sys.executable, "-m", "splatpipe.pipeline.app.batch.jobs.job", str(call.folder), "0001-house", stage, "1"]
     return subprocess.run([*words, str(call.folder / "marker"), "1"], check=False).returncode
 
 

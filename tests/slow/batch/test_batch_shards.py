@@ -9,8 +9,8 @@ from pathlib import Path
 from batch_sites import NORTH, SOUTH, captures
 from repository import LINES
 
-from splatpipe.pipeline.app.batch.attempts import read_attempts
-from splatpipe.pipeline.app.batch.plan import Call
+from splatpipe.pipeline.app.batch.jobs.attempts import read_attempts
+from splatpipe.pipeline.app.batch.jobs.plan import Call
 
 TOTALS = {name: sum(number**2 for number in numbers) for name, numbers in (("north", NORTH), ("south", SOUTH))}
 

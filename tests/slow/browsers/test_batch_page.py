@@ -11,8 +11,8 @@ from PIL import Image
 from playwright.sync_api import Browser, expect
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.batch.page import REFRESH_S, write_page
-from splatpipe.pipeline.app.batch.state import STALE_S, BatchState, CaptureState
+from splatpipe.pipeline.app.batch.pages.page import REFRESH_S, write_page
+from splatpipe.pipeline.app.batch.pages.state import STALE_S, BatchState, CaptureState
 
 SCRIPT = '<script>document.title = "taken"</script><img src="http://example.org/x.png">&"\''
 

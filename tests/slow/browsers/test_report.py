@@ -18,8 +18,8 @@ from timeouts import TIMEOUT_S, wait_until
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.report import write_report
-from splatpipe.pipeline.app.report.pictures import CHIP_SIDE
-from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
+from splatpipe.pipeline.app.report.charts.pictures import CHIP_SIDE
+from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
 from splatpipe.stages.line import LINE
 
 QUICK = (

@@ -4,12 +4,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import remove_unfinished, write_durably
+from splatpipe.pipeline.engine.files.durable import remove_unfinished, write_durably
 
 KILLED = """
 import os, signal
 from pathlib import Path
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.files.durable import write_durably
 
 def half(file):
     file.write(b"half")

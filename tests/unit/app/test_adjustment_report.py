@@ -13,13 +13,13 @@ import pytest
 
 from splatpipe.pipeline.app.report import adjustment
 from splatpipe.pipeline.app.report.adjustment import adjustment_section
-from splatpipe.pipeline.app.report.adjustment_charts import strip_ends
-from splatpipe.pipeline.app.report.adjustment_results import adopted_focals_px, read_adjustment
-from splatpipe.pipeline.app.report.drawing import styled
+from splatpipe.pipeline.app.report.charts.adjustment_charts import strip_ends
+from splatpipe.pipeline.app.report.charts.drawing import styled
+from splatpipe.pipeline.app.report.facts.adjustment_results import adopted_focals_px, read_adjustment
+from splatpipe.pipeline.app.report.facts.run_history import RunHistory, StageHistory, StageMessages
+from splatpipe.pipeline.app.report.facts.wording import two_digits
 from splatpipe.pipeline.app.report.page import TEMPLATES
-from splatpipe.pipeline.app.report.run_history import RunHistory, StageHistory, StageMessages
 from splatpipe.pipeline.app.report.verdict import judge
-from splatpipe.pipeline.app.report.wording import two_digits
 from splatpipe.pipeline.survey.adjustment.adjusted_positions import height_sentence
 from splatpipe.pipeline.survey.adjustment.block_accuracy import CONTROL_SIGMAS_M, MARK_SIGMA_PX, OTHER_HEIGHT
 from splatpipe.pipeline.survey.adjustment.position_adjustment import ALL, ALL_FISHEYE

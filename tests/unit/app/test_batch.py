@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 from batch_captures import call_of, demo, link, planned
 
-from splatpipe.pipeline.app.batch.attempts import AttemptLog, AttemptResult
 from splatpipe.pipeline.app.batch.capture_list import read_captures
 from splatpipe.pipeline.app.batch.driver import fresh_call, lock_folder, with_unlisted
+from splatpipe.pipeline.app.batch.jobs.attempts import AttemptLog, AttemptResult
+from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan
+from splatpipe.pipeline.app.batch.jobs.workflow import workflow_text
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
-from splatpipe.pipeline.app.batch.plan import BatchPlan
+from splatpipe.pipeline.app.batch.pages.publication import COLUMNS, table_text
+from splatpipe.pipeline.app.batch.pages.state import BatchState, CaptureState
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
-from splatpipe.pipeline.app.batch.publication import COLUMNS, table_text
-from splatpipe.pipeline.app.batch.state import BatchState, CaptureState
-from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.app.commands.runs import SPENT_VARIABLE, spent_s
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, UsageError
 from splatpipe.stages.line import LINE

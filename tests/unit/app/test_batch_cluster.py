@@ -14,19 +14,19 @@ import pytest
 from batch_captures import call_of, demo, link, planned
 from repository import ROOT
 
-from splatpipe.pipeline.app.batch import job as job_module
-from splatpipe.pipeline.app.batch import slurm, snakemake_process
-from splatpipe.pipeline.app.batch.attempts import AttemptLog, AttemptResult
 from splatpipe.pipeline.app.batch.capture_list import read_captures
 from splatpipe.pipeline.app.batch.driver import fresh_call
-from splatpipe.pipeline.app.batch.engine_errors import ERRORS_FILE, ErrorRecorder, read_errors
+from splatpipe.pipeline.app.batch.jobs import job as job_module
+from splatpipe.pipeline.app.batch.jobs import slurm, snakemake_process
+from splatpipe.pipeline.app.batch.jobs.attempts import AttemptLog, AttemptResult
+from splatpipe.pipeline.app.batch.jobs.engine_errors import ERRORS_FILE, ErrorRecorder, read_errors
+from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, StageJob, workflow_jobs
+from splatpipe.pipeline.app.batch.jobs.shards import CLUSTER_BYTES, NOTHING, stage_job, useful_threads
+from splatpipe.pipeline.app.batch.jobs.snakemake_process import Profile, open_profile, require_snakemake
+from splatpipe.pipeline.app.batch.jobs.workflow import workflow_text
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, StageJob, workflow_jobs
+from splatpipe.pipeline.app.batch.pages.state import CaptureState
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
-from splatpipe.pipeline.app.batch.shards import CLUSTER_BYTES, NOTHING, stage_job, useful_threads
-from splatpipe.pipeline.app.batch.snakemake_process import Profile, open_profile, require_snakemake
-from splatpipe.pipeline.app.batch.state import CaptureState
-from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, EXIT_TERMINATED, MachineError
 from splatpipe.pipeline.engine.runs.needs import Need
 from splatpipe.stages.line import LINE

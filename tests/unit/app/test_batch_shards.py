@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import sharded
 
-from splatpipe.pipeline.app.batch.attempts import Attempt, AttemptLog, AttemptResult, spent_s
 from splatpipe.pipeline.app.batch.driver import fresh_call
-from splatpipe.pipeline.app.batch.job import command_of
+from splatpipe.pipeline.app.batch.jobs.attempts import Attempt, AttemptLog, AttemptResult, spent_s
+from splatpipe.pipeline.app.batch.jobs.job import command_of
+from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, PlannedCapture, StageJob
+from splatpipe.pipeline.app.batch.jobs.workflow import workflow_text
 from splatpipe.pipeline.app.batch.monitor import BatchMonitor
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob
-from splatpipe.pipeline.app.batch.workflow import workflow_text
 from splatpipe.pipeline.engine.errors import EXIT_STAGE
 
 BAD = AttemptResult(EXIT_STAGE, "The stage sum.2 died.", "See the log.")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.app.report import pictures
+from splatpipe.pipeline.app.report.charts import pictures
 
 FOUND = {"photos": ["a.jpg", "b.jpg"], "places_px": [[300.0, 200.0], [10.0, 390.0]]}
 

@@ -9,7 +9,7 @@ import pytest
 
 from splatpipe.pipeline.app.commands.console import show_verdict
 from splatpipe.pipeline.app.commands.sentences import SENTENCES, sentence
-from splatpipe.pipeline.app.report.run_history import RunHistory, StageHistory, StageMessages
+from splatpipe.pipeline.app.report.facts.run_history import RunHistory, StageHistory, StageMessages
 from splatpipe.pipeline.app.report.verdict import Verdict, VerdictLine, judge
 from splatpipe.stages.line import LINE
 

@@ -6,7 +6,7 @@ from typing import IO
 
 import pytest
 
-from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, write_durably
+from splatpipe.pipeline.engine.files.durable import copy_durably, remove_unfinished, write_durably
 
 
 def test_written_file_has_the_new_content_and_the_old_permissions(tmp_path: Path) -> None:

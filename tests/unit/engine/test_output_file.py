@@ -11,18 +11,25 @@ from pathlib import Path
 import pytest
 from repository import ROOT
 
-from splatpipe.pipeline.engine.durable import copy_durably, remove_unfinished, write_durably
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.events import Event, EventLog
-from splatpipe.pipeline.engine.output_file import appended_file, is_inside, new_file, open_own, own_folder, write_file
+from splatpipe.pipeline.engine.files.durable import copy_durably, remove_unfinished, write_durably
+from splatpipe.pipeline.engine.files.output_file import (
+    appended_file,
+    is_inside,
+    new_file,
+    open_own,
+    own_folder,
+    write_file,
+)
 
 MINE = "alias ll='ls -l'\n"
 
 # What these modules write otherwise, and why it cannot go through a link.
 ALLOWED = {
-    "pipeline/engine/output_file.py": "this is the one way",
-    "pipeline/engine/small_file.py": "only reads",
-    "pipeline/engine/durable.py": "flushes folders; copies into a file that it has just made",
+    "pipeline/engine/files/output_file.py": "this is the one way",
+    "pipeline/engine/files/small_file.py": "only reads",
+    "pipeline/engine/files/durable.py": "flushes folders; copies into a file that it has just made",
     "pipeline/engine/runs/worker.py": "the pipe to its parent, and the kernel's file of its own process",
     "pipeline/app/view/files.py": "only reads",
     "pipeline/film/video.py": "OpenCV writes a file that has just been made; the null device",

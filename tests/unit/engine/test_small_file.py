@@ -10,9 +10,9 @@ import pytest
 from splatpipe.pipeline.engine.config import load_file
 from splatpipe.pipeline.engine.digests import walk_files
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.json_file import parse_json, read_json
+from splatpipe.pipeline.engine.files.json_file import parse_json, read_json
+from splatpipe.pipeline.engine.files.small_file import open_regular, read_end, read_small
 from splatpipe.pipeline.engine.machine import parse_mounts, pseudo_devices
-from splatpipe.pipeline.engine.small_file import open_regular, read_end, read_small
 
 
 def test_a_file_of_exactly_the_limit_is_read_and_one_byte_more_is_not(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.engine.durable import whole_file
+from splatpipe.pipeline.engine.files.durable import whole_file
 
 
 def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_beside_it(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import StageError
-from splatpipe.pipeline.engine.json_file import json_text, read_json
+from splatpipe.pipeline.engine.files.json_file import json_text, read_json
 from splatpipe.pipeline.train.blocks.cells.division import Division
 from splatpipe.pipeline.train.blocks.cells.needs import (
     FROZEN_SHARE,

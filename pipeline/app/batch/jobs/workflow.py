@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.plan import (
+from splatpipe.pipeline.app.batch.jobs.plan import (
     MEGABYTE,
     SHARDS_FOLDER,
     BatchPlan,
@@ -20,8 +20,8 @@ from splatpipe.pipeline.app.batch.plan import (
     resources_of,
     workflow_jobs,
 )
-from splatpipe.pipeline.app.batch.shards import counts_shards
-from splatpipe.pipeline.engine.output_file import write_file
+from splatpipe.pipeline.app.batch.jobs.shards import counts_shards
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.stage import JSON, Stage, stage_name
 
@@ -107,7 +107,7 @@ def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
     largest = plan.node_memory_bytes // MEGABYTE or 'float("inf")'
     done = f"done-{plan.began_s:.3f}"  # storage that outlives the call still has those of earlier calls
     wanted = {name for stages_of in jobs.values() for name in stages_of}
-    words = python_module("splatpipe.pipeline.app.batch.job", str(call.folder))
+    words = python_module("splatpipe.pipeline.app.batch.jobs.job", str(call.folder))
     job = shlex.join(words).encode("unicode_escape").decode("ascii")  # as in a Python string literal
     job = job.replace('"', '\\"').replace("{", "{{").replace("}", "}}")
     rules, divided = [], False

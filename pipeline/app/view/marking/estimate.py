@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from splatpipe.pipeline.app.view.marking_job import MarkingJob
+from splatpipe.pipeline.app.view.marking.marking_job import MarkingJob
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.joint_fit import JointFit

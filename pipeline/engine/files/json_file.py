@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.engine.output_file import write_file
-from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.files.output_file import write_file
+from splatpipe.pipeline.engine.files.small_file import read_small
 
 if TYPE_CHECKING:  # it imports pydantic
     from splatpipe.pipeline.engine.stage import JSON

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.app.view.log import RunLog, contents_of
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.runs.source import AUTO, NONE, open_source
 from splatpipe.pipeline.photos.files.names import NameFinder

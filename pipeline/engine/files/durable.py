@@ -12,8 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from splatpipe.pipeline.engine.output_file import UNFINISHED, new_file, token
-from splatpipe.pipeline.engine.small_file import kind_of
+from splatpipe.pipeline.engine.files.output_file import UNFINISHED, new_file, token
+from splatpipe.pipeline.engine.files.small_file import kind_of
 
 
 def write_durably(path: Path, content: str | Callable[[IO[bytes]], Any]) -> None:

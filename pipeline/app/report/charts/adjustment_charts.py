@@ -14,8 +14,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from splatpipe.pipeline.app.report.adjustment_results import PositionResidual
-from splatpipe.pipeline.app.report.drawing import (
+from splatpipe.pipeline.app.report.charts.drawing import (
     BLUE,
     FAINT,
     GREEN,
@@ -30,6 +29,7 @@ from splatpipe.pipeline.app.report.drawing import (
     new_rows,
     to_svg,
 )
+from splatpipe.pipeline.app.report.facts.adjustment_results import PositionResidual
 
 ARROW_SHARE = 0.12  # length of the longest residual as a share of the map's width
 SCALE_MARGIN = 0.95  # inches for a colour scale

@@ -1,6 +1,6 @@
 """Snakemake as a process: located, started in its own process group, and ended with everything it started.
 
-    python -m splatpipe.pipeline.app.batch.snakemake_process ARGUMENTS
+    python -m splatpipe.pipeline.app.batch.jobs.snakemake_process ARGUMENTS
 
 runs Snakemake so that it receives our SIGINT even if the calling shell made its children ignore it, and so that it does
 not outlive us.
@@ -23,16 +23,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.engine_errors import record_errors
-from splatpipe.pipeline.app.batch.job import end_with_parent
-from splatpipe.pipeline.app.batch.plan import MEGABYTE, BatchPlan, Call
-from splatpipe.pipeline.app.batch.slurm import largest_node
-from splatpipe.pipeline.app.batch.workflow import SNAKEFILE
+from splatpipe.pipeline.app.batch.jobs.engine_errors import record_errors
+from splatpipe.pipeline.app.batch.jobs.job import end_with_parent
+from splatpipe.pipeline.app.batch.jobs.plan import MEGABYTE, BatchPlan, Call
+from splatpipe.pipeline.app.batch.jobs.slurm import largest_node
+from splatpipe.pipeline.app.batch.jobs.workflow import SNAKEFILE
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
+from splatpipe.pipeline.engine.files.output_file import appended_file, write_file
+from splatpipe.pipeline.engine.files.small_file import read_end, read_small
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
-from splatpipe.pipeline.engine.output_file import appended_file, write_file
 from splatpipe.pipeline.engine.python_module import SAFE_PATH, python_module
-from splatpipe.pipeline.engine.small_file import read_end, read_small
 
 END_PATIENCE_S = 8.0  # a run ends within five seconds and Docker kills after ten
 POLL_S = 0.05
@@ -126,7 +126,7 @@ def _install(package: str) -> str:
 
 def snakemake_command(call: Call, plan: BatchPlan, profile: Profile) -> list[str]:
     """The command that runs a call's workflow."""
-    command = python_module("splatpipe.pipeline.app.batch.snakemake_process")
+    command = python_module("splatpipe.pipeline.app.batch.jobs.snakemake_process")
     command += ["--snakefile", str(call.folder / SNAKEFILE)]
     command += ["--directory", str(call.folder), "--nolock", "--keep-going", "--nocolor"]
     command += ["--retries", str(plan.retries), "--scheduler", "greedy", "--rerun-triggers", "input"]

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
+from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.thumbnails import thumbnail
-from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.photos.files.names import PHOTO_SUFFIXES
 from splatpipe.pipeline.photos.files.photo_list import photo_root
 

@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.output_file import appended_file
-from splatpipe.pipeline.engine.small_file import read_end, read_small
+from splatpipe.pipeline.engine.files.output_file import appended_file
+from splatpipe.pipeline.engine.files.small_file import read_end, read_small
 
 SNAKEMAKE_LOGGER = "snakemake.logging"
 ERRORS_FILE = "engine.jsonl"  # below a call's folder

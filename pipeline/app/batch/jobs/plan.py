@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 BATCH_FOLDER = ".batch"  # below the batch's folder: the command's own files

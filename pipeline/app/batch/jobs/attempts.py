@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.engine_errors import EngineError
+from splatpipe.pipeline.app.batch.jobs.engine_errors import EngineError
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, EXIT_USAGE
-from splatpipe.pipeline.engine.output_file import appended_file
-from splatpipe.pipeline.engine.small_file import read_small
+from splatpipe.pipeline.engine.files.output_file import appended_file
+from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
 
 PERMANENT_FAILURES = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options would fail again: not retried

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatpipe.pipeline.engine.events import Event, parse_event
-from splatpipe.pipeline.engine.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.stage import shards_first
 
 Facts = Mapping[str, Any]

@@ -1,6 +1,6 @@
 """The process of a workflow job: runs its stages of one capture by one `splatpipe run --until`, or one shard.
 
-    python -m splatpipe.pipeline.app.batch.job CALL CAPTURE JOB THREADS MARKER ATTEMPT
+    python -m splatpipe.pipeline.app.batch.jobs.job CALL CAPTURE JOB THREADS MARKER ATTEMPT
 
 It sits between Snakemake and the run so that every outcome is recorded, a capture that cannot succeed is not retried,
 and a signal reaches the run exactly once, whoever sent it to which process.
@@ -21,14 +21,20 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from splatpipe.pipeline.app.batch.attempts import PERMANENT_FAILURES, AttemptLog, AttemptResult, read_attempts, spent_s
-from splatpipe.pipeline.app.batch.plan import BatchPlan, Call, PlannedCapture, StageJob, workflow_jobs
-from splatpipe.pipeline.app.batch.shards import counts_shards, store_shard_jobs
+from splatpipe.pipeline.app.batch.jobs.attempts import (
+    PERMANENT_FAILURES,
+    AttemptLog,
+    AttemptResult,
+    read_attempts,
+    spent_s,
+)
+from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, PlannedCapture, StageJob, workflow_jobs
+from splatpipe.pipeline.app.batch.jobs.shards import counts_shards, store_shard_jobs
 from splatpipe.pipeline.app.commands.runs import SPENT_VARIABLE
 from splatpipe.pipeline.app.commands.summary import PART_VARIABLE
-from splatpipe.pipeline.app.report.run_history import read_history
+from splatpipe.pipeline.app.report.facts.run_history import read_history
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
-from splatpipe.pipeline.engine.output_file import appended_file, write_file
+from splatpipe.pipeline.engine.files.output_file import appended_file, write_file
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.runs.children import PR_SET_PDEATHSIG
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, shard_events

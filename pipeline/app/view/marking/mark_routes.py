@@ -10,8 +10,8 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from splatpipe.pipeline.app.view.marking import Change, Marking, State, WrongRequestError
-from splatpipe.pipeline.app.view.photo import photo_for_browser
+from splatpipe.pipeline.app.view.marking.marking import Change, Marking, State, WrongRequestError
+from splatpipe.pipeline.app.view.marking.photo import photo_for_browser
 from splatpipe.pipeline.app.view.run_pages import Pages
 
 ACTIONS = ("mark", "unmark", "hide")

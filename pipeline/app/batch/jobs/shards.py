@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from splatpipe.pipeline.app.batch.plan import Call, StageJob
+from splatpipe.pipeline.app.batch.jobs.plan import Call, StageJob
 from splatpipe.pipeline.app.commands.runs import existing_request
 from splatpipe.pipeline.engine.runs.line import StageStatus, line_status
 from splatpipe.pipeline.engine.runs.needs import Need, of_shard

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
-from splatpipe.pipeline.app.report.drawing import (
+from splatpipe.pipeline.app.report.charts.drawing import (
     BLUE,
     FAINT,
     GREEN,
@@ -28,7 +28,7 @@ from splatpipe.pipeline.app.report.drawing import (
     new_figure,
     to_svg,
 )
-from splatpipe.pipeline.app.report.geometry import Geometry, OverlapGrid, ResidualField
+from splatpipe.pipeline.app.report.charts.geometry import Geometry, OverlapGrid, ResidualField
 
 POINTS_DRAWN = 20_000  # of a point cloud: more would add nothing at this size
 PAIRS_DRAWN = 3_000  # lines, for the strongest pairs

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES
-from splatpipe.pipeline.app.report.run_history import RunHistory, read_history
+from splatpipe.pipeline.app.report.facts.run_history import RunHistory, read_history
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, Contents, RunFolder, open_run_folder
 from splatpipe.pipeline.engine.runs.store import Artifact
 from splatpipe.stages.line import LINE

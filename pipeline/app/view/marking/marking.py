@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from splatpipe.pipeline.app.view.estimate import (
+from splatpipe.pipeline.app.view.marking.estimate import (
     HELPFUL_MARKS,
     Estimate,
     Estimator,
@@ -23,7 +23,7 @@ from splatpipe.pipeline.app.view.estimate import (
     Projector,
     residual_of,
 )
-from splatpipe.pipeline.app.view.marking_job import MarkingJob
+from splatpipe.pipeline.app.view.marking.marking_job import MarkingJob
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.files.names import NameFinder
 from splatpipe.pipeline.survey.files.control_edit import ControlText

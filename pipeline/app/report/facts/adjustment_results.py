@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from splatpipe.pipeline.app.report.report_inputs import ReportInputs
+from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 
 Entry = TypeVar("Entry")
 

@@ -8,9 +8,9 @@ import json
 import time
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.page import write_page
-from splatpipe.pipeline.app.batch.state import BatchState, CaptureState, as_json
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.app.batch.pages.page import write_page
+from splatpipe.pipeline.app.batch.pages.state import BatchState, CaptureState, as_json
+from splatpipe.pipeline.engine.files.durable import write_durably
 
 JSON_FILE, TABLE_FILE, PAGE_FILE = "batch.json", "batch.csv", "batch.html"
 FIGURES = ("registered", "gaussians", "psnr", "ssim", "check_rmse_3d_m")

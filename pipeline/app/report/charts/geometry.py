@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction

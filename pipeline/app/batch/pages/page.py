@@ -9,12 +9,12 @@ from pathlib import Path, PurePosixPath
 
 from markupsafe import Markup
 
-from splatpipe.pipeline.app.batch.state import FINISHED, STALE_S, BatchState, CaptureState, Level, State
+from splatpipe.pipeline.app.batch.pages.state import FINISHED, STALE_S, BatchState, CaptureState, Level, State
 from splatpipe.pipeline.app.page_file import page_text, printable, relative_link
 from splatpipe.pipeline.app.path_labels import PathLabels
-from splatpipe.pipeline.app.report.wording import duration, plural, roughly, size
+from splatpipe.pipeline.app.report.facts.wording import duration, plural, roughly, size
 from splatpipe.pipeline.app.thumbnails import Thumbnail, thumbnail
-from splatpipe.pipeline.engine.durable import write_durably
+from splatpipe.pipeline.engine.files.durable import write_durably
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 REFRESH_S = 10  # the page's reload interval; the batch rewrites the page somewhat less often

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from splatpipe.pipeline.engine.durable import write_durably
-from splatpipe.pipeline.engine.json_file import read_json
+from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import read_json
 
 QUEUE_FILE = "queue.json"  # below a call's folder
 ASK_INTERVAL_S = 20.0

@@ -16,7 +16,7 @@ from pathlib import Path, PurePath
 from typing import IO
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.engine.small_file import kind_of
+from splatpipe.pipeline.engine.files.small_file import kind_of
 
 MODE = 0o666  # less the user's umask, as for any other program's files
 SAFE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
