@@ -122,8 +122,8 @@ def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
             if seen:
                 pose = np.asarray(image.cam_from_world().matrix(), np.float64)
                 places = np.array([model.points3D[point.point3D_id].xyz for point in seen])
-                shown, _ = project_through_lens(camera, pose, places)
-                off = np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1)
+                projected, _ = project_through_lens(camera, pose, places)
+                off = np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1)
                 total, count = total + float(off[np.isfinite(off)].sum()), count + int(np.isfinite(off).sum())
         if count and math.isfinite(total):
             result[number] = round(total / count, 4)

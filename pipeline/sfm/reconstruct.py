@@ -155,7 +155,7 @@ def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -
     if answer.placed < max(config.min_model_size, math.ceil(MIN_SHARE * len(work.verified.names))):
         raise refusal(answer.placed, config.min_model_size, work.verified, len(capture.tried))
     if config.mapper == "auto":
-        answer = _settled(work, _with_new_pairs(work, answer))
+        answer = _best_attempt(work, _with_new_pairs(work, answer))
     return MappingResult(
         answer.models[0],
         tuple(answer.models[1:]),
@@ -180,7 +180,7 @@ def _first(work: Reconstructor) -> MappingAttempt:
     return best
 
 
-def _settled(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
+def _best_attempt(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """Return the attempt with its cameras rearranged if that explains more, or a better one of the other mapper."""
     answer = _better(answer, work.adjust(answer, "rearranged"))
     doubts = _doubts(answer)

@@ -86,7 +86,7 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
     if not path.is_file():
         device = choose_device(machine.device, note=report.note)
         with same_bits(machine.threads), device.deterministic():
-            setup = _course(trained, device, machine.threads)
+            setup = _copy_setup(trained, device, machine.threads)
             state = go_through(setup, out, report)
             aside = path.with_suffix(".part")
             write_splat(aside, state.finished())
@@ -95,7 +95,7 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
     return read_splat(path)
 
 
-def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetup:
+def _copy_setup(trained: TrainedParts, device: Device, threads: int) -> TrainingSetup:
     """The training setup of the copy."""
     views, split = load_views(trained.dataset), load_split(trained.split)
     exposures = read_exposures(trained.exposures, "train")

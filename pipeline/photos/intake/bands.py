@@ -197,8 +197,8 @@ def _by_names(photos: Sequence[CheckedPhoto]) -> dict[str, str]:
         shot, band = _shot_by_name(photo.name)
         if shot is not None:
             shots.setdefault(shot, []).append((photo, band))
-    told = [shot for shot in shots.values() if _is_shot(shot)]
-    return {photo.name: band for shot in told for photo, band in shot}
+    confirmed = [shot for shot in shots.values() if _is_shot(shot)]
+    return {photo.name: band for shot in confirmed for photo, band in shot}
 
 
 def _is_shot(shot: Iterable[tuple[CheckedPhoto, str]]) -> bool:

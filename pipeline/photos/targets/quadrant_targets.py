@@ -252,14 +252,18 @@ def _check_target(
     if around is None or lines.values[6] > MAX_BLUR_PX:
         return None
     x, y, seen = around
-    shown, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
-    score = float(correlation(seen[None], shown[None])[0])
+    predicted, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
+    score = float(correlation(seen[None], predicted[None])[0])
     middle, half = float(lines.values[4]), abs(float(lines.values[5]))
     if not _is_even(lines, x, y, seen):
         return None
-    if score < MIN_CORRELATION or middle - half > MAX_DARK * (middle + half) or not _is_neutral(pixels, x, y, shown):
+    if (
+        score < MIN_CORRELATION
+        or middle - half > MAX_DARK * (middle + half)
+        or not _is_neutral(pixels, x, y, predicted)
+    ):
         return None
-    variance = float(((seen - shown) ** 2).sum()) / max(len(seen) - 7, 1)
+    variance = float(((seen - predicted) ** 2).sum()) / max(len(seen) - 7, 1)
     covariance = variance * np.linalg.pinv(derivatives.T @ derivatives)
     sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2.0, 0.0)))
     directions = lines.directions()
@@ -305,11 +309,11 @@ def _is_neutral(
     pixels: UInt8[np.ndarray, "h w 3"],
     x: Float64[np.ndarray, " n"],
     y: Float64[np.ndarray, " n"],
-    shown: Float64[np.ndarray, " n"],
+    predicted: Float64[np.ndarray, " n"],
 ) -> bool:
     """Whether the difference between bright and dark is neutral in colour."""
     colours = pixels[y.astype(np.int64), x.astype(np.int64)].astype(np.float64)
-    bright = shown > shown.mean()
+    bright = predicted > predicted.mean()
     if not bright.any() or bright.all():
         return False
     difference = colours[bright].mean(axis=0) - colours[~bright].mean(axis=0)

@@ -117,7 +117,7 @@ def _opened(film: Path, threads: int) -> Iterator[cv2.VideoCapture]:
 
 def _measure(film: Path, container: Container, threads: int, report: Reporter) -> Measures:
     name = printable(film.name)
-    counted = [0]
+    decoded = [0]
 
     def frames() -> Iterator[tuple[int, float, UInt8[np.ndarray, "h w 3"]]]:
         fps = container.frames / container.seconds if container.seconds > 0.0 else MEASURED_FPS
@@ -126,7 +126,7 @@ def _measure(film: Path, container: Container, threads: int, report: Reporter) -
             for number in range(container.frames):
                 if not capture.grab():
                     return
-                counted[0] = number + 1
+                decoded[0] = number + 1
                 if number % stride:
                     continue
                 time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
@@ -143,9 +143,9 @@ def _measure(film: Path, container: Container, threads: int, report: Reporter) -
             hint=f"If it plays, convert it: ffmpeg -i {shlex.quote(name)} -c:v libx264 -crf 16 readable.mp4; "
             "else copy it again.",
         )
-    if counted[0] < WHOLE * container.frames:
+    if decoded[0] < WHOLE * container.frames:
         raise SplatpipeError(
-            f"{name} is damaged: only {counted[0]:,} of its {container.frames:,} frames can be decoded.", hint=REFILM
+            f"{name} is damaged: only {decoded[0]:,} of its {container.frames:,} frames can be decoded.", hint=REFILM
         )
     return measures
 

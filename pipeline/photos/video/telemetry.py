@@ -93,7 +93,7 @@ def read_subtitles(path: Path) -> Iterator[Cue]:
     Raises:
         OSError: if it cannot be read.
     """
-    shown: tuple[float, float] | None = None
+    interval: tuple[float, float] | None = None
     lines: list[str] = []
     read = cues = kept = 0
     with open_regular(path) as file:
@@ -106,16 +106,16 @@ def read_subtitles(path: Path) -> Iterator[Cue]:
                     lines.append(text)
                     kept += len(text) + 1
                 continue
-            if shown is not None:
-                yield Cue(*shown, "\n".join(lines))
+            if interval is not None:
+                yield Cue(*interval, "\n".join(lines))
                 cues += 1
             if read > MAX_FILE_BYTES or cues >= MAX_CUES:
                 return
             numbers = [int(each) for each in found.groups()]
-            shown, lines = (_seconds(numbers[:4], found[4]), _seconds(numbers[4:], found[8])), []
+            interval, lines = (_seconds(numbers[:4], found[4]), _seconds(numbers[4:], found[8])), []
             kept = 0
-    if shown is not None:
-        yield Cue(*shown, "\n".join(lines))
+    if interval is not None:
+        yield Cue(*interval, "\n".join(lines))
 
 
 def _seconds(numbers: Sequence[int], decimals: str) -> float:

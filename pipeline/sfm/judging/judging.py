@@ -199,9 +199,9 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras:
 
 def _unexplained(agreement: Agreement, alike: Bool[np.ndarray, " n"]) -> list[Reason]:
     """Report matches that are not explained, other than those of pairs that only look alike."""
-    counted = agreement.placed & ~alike
-    share = _share(agreement.explained[counted], agreement.matches[counted])
-    if share >= EXPLAINED_GOOD or not counted.any():
+    valid = agreement.placed & ~alike
+    share = _share(agreement.explained[valid], agreement.matches[valid])
+    if share >= EXPLAINED_GOOD or not valid.any():
         return []
     level: Level = "doubt" if share >= EXPLAINED_DOUBT else "bad"
     text = f"The cameras explain only {100 * share:.0f} % of the matches among the placed photos."

@@ -90,8 +90,8 @@ def predicted_errors(model: pycolmap.Reconstruction, tracks: TrackObservations) 
     for number, rows in rows_by_camera(model, tracks):
         rows = rows[ahead[rows]]
         if len(rows):
-            shown = np.asarray(model.cameras[number].img_from_cam(in_camera[rows]), np.float64)
-            distance = np.linalg.norm(shown - tracks.pixels[rows], axis=1)
+            projected = np.asarray(model.cameras[number].img_from_cam(in_camera[rows]), np.float64)
+            distance = np.linalg.norm(projected - tracks.pixels[rows], axis=1)
             errors[rows] = np.where(np.isfinite(distance), distance, np.inf)
     return errors
 

@@ -171,8 +171,8 @@ def _overlapping(views: StatedPoses, neighbours: int) -> set[Pair]:
     tilted = views.axes[:, 2] > TILTED
     return {
         pair
-        for photo, ranked in partners.items()
-        for _, pair in sorted(ranked)[: wide if tilted[photo] else neighbours]
+        for photo, candidates in partners.items()
+        for _, pair in sorted(candidates)[: wide if tilted[photo] else neighbours]
     }
 
 

@@ -73,7 +73,7 @@ def reextract(
     starts = {number: len(found.verified.keypoints[number]) for number in ordered}
     ends = np.cumsum([len(found.verified.keypoints[number]) for number in sorted(found.verified.keypoints)])
     parts = np.split(found.colours, ends[:-1])
-    look = partial(
+    extract_photo = partial(
         extract,
         config=STRONGER,
         part=capture.photos_part,
@@ -91,8 +91,8 @@ def reextract(
         copy_photos(source, database)
         kind = pycolmap.FeatureExtractorType.SIFT
         threads = max(1, int(THREAD_SHARE * capture.threads))
-        looks = ordered_map(look, [capture.photos.photos[number - 1] for number in ordered], threads)
-        for done, (number, features) in enumerate(zip(ordered, looks, strict=True), start=1):
+        extracted = ordered_map(extract_photo, [capture.photos.photos[number - 1] for number in ordered], threads)
+        for done, (number, features) in enumerate(zip(ordered, extracted, strict=True), start=1):
             database.update_keypoints(number, features.keypoints)
             database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, features.descriptors))
             before = np.asarray(source.read_keypoints(number), np.float32).reshape(-1, features.keypoints.shape[1])

@@ -61,13 +61,13 @@ def propose_pairs(
         if i in place and j in place:
             open_[place[i], place[j]] = False
     first, second = np.nonzero(np.triu(open_, 1))
-    ranked = sorted(
+    candidates = sorted(
         (bool(common[i, j]), -float(shares[i, j]), int(i), int(j)) for i, j in zip(first, second, strict=True)
     )
     most = max(1, -(-2 * count // max(len(numbers), 1)))
     taken = np.zeros(len(numbers), int)
     chosen, later = [], []
-    for _, _, i, j in ranked:
+    for _, _, i, j in candidates:
         if taken[i] < most and taken[j] < most:
             taken[[i, j]] += 1
             chosen.append((i, j))
@@ -162,10 +162,10 @@ def match_more(capture: MappingInput, base: Path, pairs: Sequence[Pair], seed: i
     folder = Path(tempfile.mkdtemp(prefix="pairs-", dir=capture.scratch))
     target = folder / "database.db"
     work = folder / "work.db"
-    counted = sorted({(min(i, j) - 1, max(i, j) - 1) for i, j in pairs})
+    zero_based = sorted({(min(i, j) - 1, max(i, j) - 1) for i, j in pairs})
     shutil.copyfile(base, target)
-    if counted:
-        match_pairs(capture.features, work, counted, seed, capture.threads, report)
+    if zero_based:
+        match_pairs(capture.features, work, zero_based, seed, capture.threads, report)
         take_verified(work, target)
     work.unlink(missing_ok=True)
     return target

@@ -194,6 +194,6 @@ def _explained(
     limit_px: float,
 ) -> Bool[np.ndarray, " k"]:
     """Return the mask of points whose reprojection error under a pose is within the limit."""
-    shown, _ = project_through_lens(camera, pose.matrix(), spots)
+    projected, _ = project_through_lens(camera, pose.matrix(), spots)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.linalg.norm(shown - places, axis=1) <= limit_px)
+        return np.asarray(np.linalg.norm(projected - places, axis=1) <= limit_px)

@@ -323,8 +323,8 @@ def _window_sums(
         strip = slice(top, top + _STRIP_ROWS + SSIM_WINDOW - 1)
         similarity, structure = _similarity(x[strip], y[strip])
         values = [similarity] * (len(counts) - 1) + [structure]
-        for found, one, counted in zip(rows, values, counts, strict=True):
-            found += torch.where(counted[top : top + _STRIP_ROWS], one, 0.0).sum(dim=1).tolist()
+        for found, one, valid in zip(rows, values, counts, strict=True):
+            found += torch.where(valid[top : top + _STRIP_ROWS], one, 0.0).sum(dim=1).tolist()
     return [math.fsum(found) for found in rows]
 
 

@@ -42,8 +42,8 @@ def exposure_spread(views: Sequence[View], dataset: Path, threads: int) -> float
         StageError: if a photo or the model is broken.
     """
     points, tracks = load_points_and_tracks(dataset)
-    look = partial(_colours, xyz=points.xyz, tracks=tracks)
-    seen = list(ordered_map(look, views, threads))
+    sample_colours = partial(_colours, xyz=points.xyz, tracks=tracks)
+    seen = list(ordered_map(sample_colours, views, threads))
     rows = np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in seen)])
     logs = np.concatenate([np.zeros((0, 3)), *(logs for _, logs in seen)])
     photo = np.repeat(np.arange(len(seen)), [len(rows) for rows, _ in seen])

@@ -107,9 +107,11 @@ class RobustMask(Technique):
             self.scores[row], self.left_out[row] = scores, left_out
             self._before = None
 
-    def mask_pixels(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> TrainingPhoto:
+    def mask_pixels(
+        self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], rendered_view: RenderedView
+    ) -> TrainingPhoto:
         """The photo without what the other photos contradict."""
-        return self.leave_out_contradicted(photo, shot.rendered, picture)
+        return self.leave_out_contradicted(photo, rendered_view.rendered, picture)
 
     def after_epoch(self, iteration: int) -> None:
         """Set the threshold for the next epoch."""
@@ -120,7 +122,7 @@ class RobustMask(Technique):
         return {"robust_left_out": round(self.share_left_out(), 5)}
 
     def leave_out_contradicted(
-        self, photo: TrainingPhoto, rendered: Render, shown: Float[Tensor, "h w 3"]
+        self, photo: TrainingPhoto, rendered: Render, rendered_colour: Float[Tensor, "h w 3"]
     ) -> TrainingPhoto:
         """Record a photo's residuals and return it without what the other photos contradict, or unchanged.
 
@@ -134,7 +136,7 @@ class RobustMask(Technique):
             self._before = row, self.scores[row].clone(), self.left_out[row].clone()
             opaque = rendered.alpha >= MIN_ALPHA
             counts = opaque if photo.mask is None else photo.mask & opaque
-            self._remember(row, *cell_residuals(shown, photo.colour, counts, photo.camera))
+            self._remember(row, *cell_residuals(rendered_colour, photo.colour, counts, photo.camera))
             cells = PhotoCells(photo.camera, GRID, GRID)
             out = cells.spread(self._left_out_cells(row, rendered, cells))
             self.left_out[row] = out.float().mean()
@@ -211,12 +213,12 @@ class RobustMask(Technique):
 
 
 def cell_residuals(
-    shown: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"], camera: Camera
+    rendered_colour: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"], camera: Camera
 ) -> tuple[Float[Tensor, "g g"], Bool[Tensor, "g g"] | None]:
     """Difference between each cell's mean colour and the closest one of the model there and nearby, mean of channels.
 
     Args:
-        shown: The model's render.
+        rendered_colour: The model's render.
         colour: The photo's colours.
         counts: The pixels to compare.
         camera: The photo's camera, or its window's.
@@ -228,11 +230,11 @@ def cell_residuals(
     whole = camera.uncropped()
     size = (min(GRID, max(1, whole.height // MIN_CELL_PX)), min(GRID, max(1, whole.width // MIN_CELL_PX)))
     cells = PhotoCells(camera, *size)
-    weight, judged = cells.means(counts[None].float()), cells.judged(shown)
+    weight, judged = cells.means(counts[None].float()), cells.judged(rendered_colour)
     known = weight[0] >= 0.5  # of the visible part: the rim of a neighbouring cell is evidence too
     chosen = known if judged is None else known & judged
     model, picture = (
-        cells.means(picture.permute(2, 0, 1) * counts) / weight.clamp(min=1e-6) for picture in (shown, colour)
+        cells.means(picture.permute(2, 0, 1) * counts) / weight.clamp(min=1e-6) for picture in (rendered_colour, colour)
     )
     model = model - _medians(model - picture, chosen)[:, None, None]
     usable = _nearby(known[None].float())[0] > 0.0

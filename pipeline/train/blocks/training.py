@@ -197,7 +197,7 @@ class Block:
         windows = scope.windows
         views, place = self.views(windows), {row: place for place, row in enumerate(rows_of(windows))}
         cut, every = self.scope_reader.cut, self.scope_reader.views
-        cells = {place[row]: grid for row, grid in scope.counted.items()}
+        cells = {place[row]: grid for row, grid in scope.sample_masks.items()}
         pieces = {
             level: [(place[row], cut.frames(every[row].camera, level)[window]) for row, window in pairs.tolist()]
             for level, pairs in windows.items()

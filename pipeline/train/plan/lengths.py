@@ -94,18 +94,18 @@ class PhotoSizes:
         """Most pixels of a window at a level; 0 if all photos fit whole."""
         return 0 if self.parts(level) == self.photos else self.window_pixels
 
-    def pixels(self, look: TrainingSize) -> float:
+    def pixels(self, size: TrainingSize) -> float:
         """Mean number of pixels that an iteration uses."""
-        whole = sum(width * height * count for width, height, count in self.sizes) / 4.0**look.level
-        return whole / (self.parts(look.level) if look.window_pixels else self.photos)
+        whole = sum(width * height * count for width, height, count in self.sizes) / 4.0**size.level
+        return whole / (self.parts(size.level) if size.window_pixels else self.photos)
 
-    def share(self, look: TrainingSize) -> float:
+    def share(self, size: TrainingSize) -> float:
         """Share of a photo's pixels at that level that an iteration uses."""
-        return self.photos / self.parts(look.level) if look.window_pixels else 1.0
+        return self.photos / self.parts(size.level) if size.window_pixels else 1.0
 
-    def largest(self, look: TrainingSize) -> int:
+    def largest(self, size: TrainingSize) -> int:
         """Pixels of the largest window, without its margins."""
-        return max(_cut(w >> look.level, h >> look.level, look.window_pixels)[1] for w, h, _count in self.sizes)
+        return max(_cut(w >> size.level, h >> size.level, size.window_pixels)[1] for w, h, _count in self.sizes)
 
 
 @cache

@@ -202,8 +202,8 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 
 def sizes_of(cameras: Sequence[Camera]) -> tuple[tuple[int, int, int], ...]:
     """Width, height and count of photos of each size, sorted."""
-    counted = Counter((camera.width, camera.height) for camera in cameras)
-    return tuple((*size, counted[size]) for size in sorted(counted))
+    count_by_size = Counter((camera.width, camera.height) for camera in cameras)
+    return tuple((*size, count_by_size[size]) for size in sorted(count_by_size))
 
 
 def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window_pixels: int) -> PhotoSizes:

@@ -199,15 +199,15 @@ def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Traini
             gaussians.sh_degree, antialias=plan.options.antialias, near=plan.near, depth=False
         )
         colour = rasterizer.render(gaussians, photo.camera, options).colour.clamp(0.0, 1.0)
-    shown = photo.colour.cpu()
+    photo_colour = photo.colour.cpu()
     mask = None if photo.mask is None else photo.mask.cpu()
-    pair = metrics.pair_of(colour.cpu(), shown, mask)
+    pair = metrics.pair_of(colour.cpu(), photo_colour, mask)
     for metric in metrics.METRICS.values():
         try:
             metric.of_pair(pair)
         except ValueError:
             continue  # too few pixels for this metric: `evaluate` leaves it out too
-    pixels = (shown * 255.0).to(torch.uint8).numpy()
+    pixels = (photo_colour * 255.0).to(torch.uint8).numpy()
     for _ in range(PICTURES):
         cv2.imencode(".png", pixels)
     return (time.monotonic() - began) / (1e-6 * photo.camera.width * photo.camera.height)

@@ -217,8 +217,8 @@ class TrainState:
         if gone is None:
             gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         schedule = plan.schedule.density
-        ranked = partial(self.techniques.adjust_scores, gaussians=gaussians, schedule=schedule)
-        step = DensityStep(schedule, plan.extent, limit, iteration, gone, ranked)
+        score_adjustment = partial(self.techniques.adjust_scores, gaussians=gaussians, schedule=schedule)
+        step = DensityStep(schedule, plan.extent, limit, iteration, gone, score_adjustment)
         growth, counts = self.density.control(gaussians, step)
         return along_curve(growth), counts
 

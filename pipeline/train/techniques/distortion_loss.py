@@ -71,12 +71,14 @@ class DistortionLoss(Technique):
         if "centre" in arrays:
             self._centre = arrays["centre"].clone()
 
-    def penalty(self, shot: RenderedView) -> Float[Tensor, ""] | None:
+    def penalty(self, rendered_view: RenderedView) -> Float[Tensor, ""] | None:
         """The spread of depths along the photo's rays, weighted."""
-        if not self.is_counted(shot.now.place):
+        if not self.is_counted(rendered_view.now.place):
             return None
-        photo, origin = shot.photo, shot.settings.depth_origin
-        return self._weight * spread_loss(shot.rendered, origin, photo.camera, photo.inside, self._about_median)
+        photo, origin = rendered_view.photo, rendered_view.settings.depth_origin
+        return self._weight * spread_loss(
+            rendered_view.rendered, origin, photo.camera, photo.inside, self._about_median
+        )
 
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:

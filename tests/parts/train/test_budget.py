@@ -144,11 +144,11 @@ def test_a_speed_separates_costs_that_windows_avoid() -> None:
 def test_a_forecast_counts_windows_as_they_are_cut() -> None:
     footage = PhotoSizes(((2304, 1728, 50),), 500_000)
     schedule = resolve_schedule(TrainConfig(least_iterations=1000, max_gaussians=50_000), footage)
-    speed, looks = replace(SPEED, seen_s=5e-7), schedule.training_sizes_until(schedule.iterations)
-    assert len(set(looks)) == 3
-    rooms = [room_at(schedule.density, 8_000, number) for number in range(1, len(looks) + 1)]
+    speed, sizes = replace(SPEED, seen_s=5e-7), schedule.training_sizes_until(schedule.iterations)
+    assert len(set(sizes)) == 3
+    rooms = [room_at(schedule.density, 8_000, number) for number in range(1, len(sizes) + 1)]
     each = [
-        speed.seconds(room, footage.pixels(look), footage.share(look)) for room, look in zip(rooms, looks, strict=True)
+        speed.seconds(room, footage.pixels(size), footage.share(size)) for room, size in zip(rooms, sizes, strict=True)
     ]
     assert forecast(speed, schedule, 8_000, footage) == pytest.approx(math.fsum(each), rel=0.01)
 
@@ -188,7 +188,7 @@ def test_no_cost_is_below_zero_whatever_was_measured() -> None:
 
 def test_forecast_is_the_sum_over_the_iterations() -> None:
     schedule = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
-    levels = [look.level for look in schedule.training_sizes_until(2400)]
+    levels = [size.level for size in schedule.training_sizes_until(2400)]
     each = [SPEED.seconds(room_at(schedule.density, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
     assert forecast(SPEED, schedule, 8_000, PhotoSizes(((800, 500, 32),))) == pytest.approx(math.fsum(each), rel=0.01)
 

@@ -51,8 +51,10 @@ def test_every_window_of_every_photo_is_visited_often_enough_at_every_size(
     assert footage.parts(first) == photos and whole >= WHOLE_VISITS * photos
     assert all(count >= PART_VISITS * footage.parts(level) for level, count in finer)
     assert least <= sum(count for _, count in found)
-    shown = [TrainingSize(level, footage.window_at(level)) for level, _ in found]
-    assert all(0.0 < footage.pixels(look) <= WINDOW and footage.largest(look) <= WINDOW for look in shown)
+    sizes = [TrainingSize(level, footage.window_at(level)) for level, _ in found]
+    assert all(
+        0.0 < footage.pixels(each_size) <= WINDOW and footage.largest(each_size) <= WINDOW for each_size in sizes
+    )
     assert growth_until(found) == sum(count for _, count in found[:-1]) + found[-1][1] // 2
 
 

@@ -262,8 +262,8 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
         summary = dict(train.run(config, inputs, out, tiny_scene.Recorder()))
     model = read_splat(out / "model.ply")
     views = [cameras()[number] for number in HELD_OUT]
-    shown = [torch.from_numpy(tiny_scene.photograph(model, view)).float() / 255.0 for view in views]
-    psnr = [float(metrics.psnr(one, true_photo(view))) for one, view in zip(shown, views, strict=True)]
+    renders = [torch.from_numpy(tiny_scene.photograph(model, view)).float() / 255.0 for view in views]
+    psnr = [float(metrics.psnr(one, true_photo(view))) for one, view in zip(renders, views, strict=True)]
     return TrainedRun(summary, float(np.mean(psnr)), kept[0], out)
 
 

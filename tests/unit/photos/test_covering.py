@@ -53,13 +53,14 @@ def test_the_choice_does_not_depend_on_the_order() -> None:
 
 
 def test_the_choice_is_the_best_at_each_step() -> None:
-    seen, shown, expected = flight(40, seed=5), np.zeros(4000), []
+    seen, view_counts, expected = flight(40, seed=5), np.zeros(4000), []
     for _ in range(len(covering_photos(seen, 4000, FEW))):
         gains = [
-            0.0 if photo in expected else (1.0 / (1.0 + shown[rows]) ** 2).sum() for photo, rows in enumerate(seen)
+            0.0 if photo in expected else (1.0 / (1.0 + view_counts[rows]) ** 2).sum()
+            for photo, rows in enumerate(seen)
         ]
         expected.append(int(np.argmax(gains)))
-        shown[seen[expected[-1]]] += 1
+        view_counts[seen[expected[-1]]] += 1
     assert covering_photos(seen, 4000, FEW) == sorted(expected)
 
 

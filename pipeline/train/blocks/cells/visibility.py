@@ -94,10 +94,10 @@ def block_views(
     found: list[list[BlockPhoto]] = [[] for _ in partition.cells]
     for number, coverage in enumerate(seen):
         parts = cut(coverage.camera)
-        weights = _counted(partition, coverage.samples(xyz), parts)
+        weights = _sum_weights(partition, coverage.samples(xyz), parts)
         points = coverage.of_points(xyz)
         points = Samples(points.pixels, points.places, np.ones(len(points.places)), points.distances)
-        observed = _counted(partition, points, parts)
+        observed = _sum_weights(partition, points, parts)
         sizes = (parts[:, 2] - parts[:, 0]) * (parts[:, 3] - parts[:, 1])
         chosen = (weights >= MIN_SHARE * sizes) | (observed >= MIN_POINTS)
         for block in np.flatnonzero(chosen.any(axis=1)).tolist():
@@ -108,7 +108,7 @@ def block_views(
     return [BlockViews(tuple(photos)) for photos in found]
 
 
-def _counted(partition: Partition, samples: Samples, parts: Windows) -> Float64[np.ndarray, "cells w"]:
+def _sum_weights(partition: Partition, samples: Samples, parts: Windows) -> Float64[np.ndarray, "cells w"]:
     """Total weight of the samples in each cell and window."""
     owners = partition.owners(samples.places)
     inside = _window_of(samples.pixels, parts)
