@@ -16,9 +16,9 @@ from splatpipe.pipeline.sfm.lenses.focal import adjust_within
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 MAX_CAMERAS_REPORTED = 10  # on the console; the report lists them all
-FEW_PHOTOS = 3  # of a camera: with fewer, focal length and distance are not separable
+FEW_PHOTOS = 3  # photos of a camera below which focal length and distance are not separable
 STATED_STRAY = 0.05  # maximum relative deviation from a trusted focal length
-KIN_STRAY = 0.02  # the same, from one calibrated with other photos of the same body and zoom
+KIN_STRAY = 0.02  # maximum relative deviation from a focal length calibrated with the same body and zoom
 
 
 def hold_few(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[int]:

@@ -27,13 +27,13 @@ from splatpipe.pipeline.sfm.recovery.refusal import refusal
 Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]
 
-MIN_SHARE = 0.1  # of the photos; a model of fewer is accidental
+MIN_SHARE = 0.1  # share of the photos in a model; one of fewer is accidental
 MIN_SEEN = 15  # mean points per photo; COLMAP's minimum for a pair
 ENOUGH_SHARE = 0.5  # below this share, an attempt with relaxed thresholds is worth its time
 MAX_SHARE = 0.85  # below this share the other mapper may do better; above it the ladder places the rest more cheaply
 STRAY_UNOBSERVED = 0.03  # relative deviation allowed for a focal length that the photos do not determine
 CLEARLY = 0.005  # score margin by which a second model must be better to replace the first
-ROUNDS = 2  # of matching additional pairs
+ROUNDS = 2  # rounds of matching additional pairs
 FURTHER = 1  # mappings of a doubtful capture
 TEXTS = {"bent": "pairs of photos contradict it", "unexplained": "many matches are unexplained"}
 

@@ -19,7 +19,7 @@ from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import Schedule, tail_of
 from splatpipe.pipeline.train.state.history import History
 
-WINDOW_SHARE = 0.25  # of the iterations done: the line is fitted to these
+WINDOW_SHARE = 0.25  # last share of the iterations done, to which the line is fitted
 FEWEST_EPOCHS = 8  # in the window, so that their scatter can be estimated
 STANDARD_ERRORS = 2.0  # by which the line is made steeper: noise must not end a training that still improves
 

@@ -35,11 +35,12 @@ from splatpipe.pipeline.train.techniques.distortion_loss import DistortionLoss
 from splatpipe.pipeline.train.techniques.smoothness_loss import SmoothnessLoss
 from splatpipe.pipeline.train.techniques.techniques import Techniques, make_techniques
 
-VISITS = 8  # of every photo
+VISITS = 8  # iterations per photo, or per part of it
 MIN_ITERATIONS = 300  # if there are few photos
 SPREAD_WEIGHT = 0.5  # ten times that of a splat trained for images
 EVENNESS_WEIGHT = 0.1
-FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6  # of positions, times the extent: later half of the published
+# positions' learning rates over the extent: later half of the published
+FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6
 OPACITY_RATE = 0.05  # as published
 
 FLATTENED = "flattened.ply"

@@ -44,7 +44,7 @@ CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # minimum time between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # maximum share of training time spent on checkpoints
 REPORT_EVERY = 10  # iterations
-CUDA_REPORT_EVERY = 50  # same on CUDA, where reading the loss synchronizes with the device
+CUDA_REPORT_EVERY = 50  # iterations on CUDA, where reading the loss synchronizes with the device
 
 
 @dataclass(frozen=True)

@@ -30,12 +30,12 @@ from splatpipe.pipeline.photos.files.extra_formats import (
 # Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LARGE_PIXELS = 40_000_000  # larger images are decoded one at a time: some hundred megabytes each
-LEAST_BYTES = 0.01  # of a large photo's file per pixel; one colour all over takes 0.0156 with JPEG's usual tables
-MOST_CHUNKS = 1_000_000  # of a PNG: libpng writes one for 8 kB
+LEAST_BYTES = 0.01  # bytes per pixel of a large photo's file; one colour all over takes 0.0156 with JPEG's usual tables
+MOST_CHUNKS = 1_000_000  # chunks of a PNG that are read at most: libpng writes one for 8 kB
 TILE_TAGS = (322, 323)  # width and length of a TIFF's tiles
 LEAST_TILE = 4096  # pixels per side that a tile may have in a picture of any size
 HEAD_BYTES = 16
-STRIP_ROWS = 256  # of a picture, converted at a time
+STRIP_ROWS = 256  # pixel rows of a picture that are converted at a time
 INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,

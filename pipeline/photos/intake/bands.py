@@ -66,10 +66,10 @@ TAGS = {  # ends of names: of Sequoia, of DJI's multispectral and of its thermal
 _TAGGED = re.compile(rf"(?P<shot>.+)_(?P<tag>{'|'.join(sorted(TAGS, key=len, reverse=True))})")
 _AUTEL = re.compile(r"(?P<tag>irx|max)_(?P<shot>\d+)")
 _TIME = re.compile(r"_\d{14}(?=_)")  # in DJI's names; it may differ by a second between the cameras of a shot
-SMALLER = 0.5  # of a colour photo's pixels: a thermal one that only its name tells has fewer
-COMPARABLE = 0.5  # of the most photos of a band: colour that not even half of the shots have is not used instead
+SMALLER = 0.5  # most pixels of a thermal photo known only by its name, over those of the smallest colour one
+COMPARABLE = 0.5  # colour is used as the band if its photos are this share of the most numerous band's
 SAMPLED = 5  # photos of each band whose sharpness is measured
-SIGMA_PX = 1.0  # of the blur that removes single pixels' noise
+SIGMA_PX = 1.0  # standard deviation of the blur that removes single pixels' noise
 
 
 @dataclass(frozen=True)

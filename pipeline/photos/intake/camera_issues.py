@@ -10,7 +10,7 @@ from splatpipe.pipeline.photos.intake.camera_groups import CameraGroup, camera_n
 from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 
-MINORITY = 0.25  # of the photos: a camera that took more of them was used on purpose
+MINORITY = 0.25  # share of the photos above which a camera was used on purpose
 
 
 def find_camera_issues(

@@ -41,7 +41,7 @@ DEEP_GREY_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 GREY_MODES = ("1", "L", "LA", "La", *DEEP_GREY_MODES)
 COLOUR_MODES = ("RGB", "RGBA")
 READ_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *DEEP_GREY_MODES)
-RANGE_QUANTILES = (0.001, 0.999)  # of a deep image's values: excludes hot and dead pixels
+RANGE_QUANTILES = (0.001, 0.999)  # quantiles of a deep image's values taken as its range: excludes hot and dead pixels
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from splatpipe.pipeline.photos.intake.masks import (
 )
 from splatpipe.pipeline.photos.options import IngestConfig
 
-MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly intended
+MOSTLY_IGNORED = 0.99  # share of masked pixels in a photo above which its mask is hardly intended
 T = TypeVar("T")
 R = TypeVar("R")
 

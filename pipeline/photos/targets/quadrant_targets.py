@@ -30,40 +30,40 @@ from splatpipe.pipeline.photos.targets.quadrant_lines import (
 )
 
 SADDLE_SIGMA_PX = 1.0  # a smaller one admits noise, a larger one loses targets of 12 px seen obliquely
-MIN_CONTRAST = 40.0  # of white over black, of 255
-BLURRED_SIGMA_PX = 1.5  # of a saddle that is still found: lens blur, motion blur and our smoothing together
+MIN_CONTRAST = 40.0  # white minus black, grey levels of 255
+BLURRED_SIGMA_PX = 1.5  # largest blur of a saddle that is still found: lens, motion and our smoothing together
 MIN_SADDLE = MIN_CONTRAST / (np.pi * BLURRED_SIGMA_PX**2)  # a quadrant's is contrast / (π σ²) at its centre
 MAX_SADDLES = 100_000  # per tile, the strongest
 RINGS_PX = (2.0, RING_PX)
 LIKE_ITSELF = 0.75  # correlation of a ring with itself, rotated by 180°
-RING_CONTRAST = 0.65  # of the least contrast: blur reduces it near the centre
-RING_DARK = 0.7  # darkest over brightest: looser than MAX_DARK, for the same reason
+RING_CONTRAST = 0.65  # contrast of a ring over MIN_CONTRAST: blur reduces it near the centre
+RING_DARK = 0.7  # darkest over brightest on a ring: looser than MAX_DARK, since blur mixes them near the centre
 ACROSS_PX = 1.5  # from a line to where its sides are sampled
 REACH_PX = 64  # along a line; larger targets are followed only this far
 MIN_REACH_PX = 2.5
 EVEN = 0.55  # smallest ratio of a line's reaches in its two directions
 STEP_PX = 0.5
 TILE_PX, OVERLAP_PX = 2048, 2 * REACH_PX + 16  # large images are searched in tiles, to save memory
-DIFFERENCES = 0.5  # of the contrast, below which a line has ended
-FIT_SHARE = 0.7  # of the reach, within which pixels are fitted: those of four triangles, too
+DIFFERENCES = 0.5  # difference across a line over the contrast, below which the line has ended
+FIT_SHARE = 0.7  # radius of the fitted pixels over the lines' reach: inside four triangles, too
 MIN_FIT_PX = 2.2
 LARGEST_FIT_PX = 14.0  # more pixels add hardly any information
 MAX_MOVED_PX = 2.5  # from where the lines of the first fit meet
 APART_PX = 3.0  # one target has one centre
-NEAR_CORRELATION = 0.9  # of the first fit
-MIN_CORRELATION = 0.975  # of an isolated target: a shadow's edge may cross it
-CORRELATION_AMONG = 0.986  # of one among similar patterns, which are everywhere in gravel, leaves and façades
+NEAR_CORRELATION = 0.9  # correlation with the first fit's model below which a candidate is dropped
+MIN_CORRELATION = 0.975  # correlation of an isolated target with its model: a shadow's edge may cross it
+CORRELATION_AMONG = 0.986  # correlation required among similar patterns, as in gravel, leaves and façades
 AROUND_PX = (2.0, 16.0)  # beyond a target's corners
-MAX_AROUND = 0.5  # of a saddle's own strength: the strongest other one around an isolated target
+MAX_AROUND = 0.5  # strongest saddle around an isolated target over the target's own
 OWN_PX = 1.6  # from its centre
 MIN_ANGLE_DEG = 18.0  # between the lines
-MAX_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
-MIN_NEUTRAL = 0.75  # of white minus black: the smallest colour channel over the largest
+MAX_DARK = 0.45  # brightness of a target's dark sectors over its bright ones
+MIN_NEUTRAL = 0.75  # white minus black in the colour channel where it is smallest over that where it is largest
 MAX_BLUR_PX = 1.6
 # A disc of 12 px has the area of a square of 10.6 px, and blur takes some of it. Smaller ones have so few pixels that
 # gravel correlates with 0.99.
 MIN_SIZE_PX = 10.0
-UNEVEN = 0.15  # of the contrast, between the two dark sectors, or the two bright ones
+UNEVEN = 0.15  # difference of the two dark sectors, or of the two bright ones, over the contrast
 
 
 @dataclass(frozen=True)

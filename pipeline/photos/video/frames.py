@@ -30,12 +30,12 @@ from splatpipe.pipeline.photos.video.telemetry import FlightPath, Place, read_fi
 
 FRAMES_DIR = "frames"  # in the part `photos`
 MIN_FRAMES = 3  # a reconstruction needs as many
-MEASURED_FPS = 15.0  # of a film with more, every second, third or further frame is measured
-QUALITY = 97  # of the JPEGs, without subsampled colours: the film's own losses are larger
-MAX_STEM_BYTES = 200  # of a name, which a number, masks and conversions make longer
+MEASURED_FPS = 15.0  # frames per second that are measured: of a faster film every second, third or further one
+QUALITY = 97  # JPEG quality of extracted frames, without subsampled colours: the film's own losses are larger
+MAX_STEM_BYTES = 200  # longest film name used for frames, which a number, masks and conversions make longer
 ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}  # EXIF's, by a player's turn, degrees clockwise
-SHEARED = 0.005  # of the frame's size, from one frame to the next: by as much a rolling shutter may shear it
-WHOLE = 0.98  # of the listed frames that must be decoded for the film to count as undamaged
+SHEARED = 0.005  # median motion between frames over the frame's size, above which a rolling shutter may shear them
+WHOLE = 0.98  # least share of the listed frames that decode in an undamaged film
 TAG, GPS = ExifTags.Base, ExifTags.GPS
 XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'

@@ -16,10 +16,10 @@ from splatpipe.pipeline.photos.pixels.images import reduced
 
 SHARP_SIDE, TRACKED_SIDE = 1920, 480  # pixels: the longer sides at which sharpness and motion are measured
 POINTS, QUALITY, APART = 300, 0.01, 8  # corners that are followed: at most, of the best one's strength, pixels
-WINDOW, LEVELS = (15, 15), 3  # of the search for a corner in the next frame: 60 pixels far
+WINDOW, LEVELS = (15, 15), 3  # search window (pixels) and pyramid levels of the corner tracker: 60 pixels far
 TOLERANCE_PX = 1.5  # off the common motion: nearer and farther ground moves differently
 MIN_FOLLOWED, MIN_SHARE = 12, 0.25  # corners, and their share that agrees
-SCALES = (0.5, 2.0)  # of the area, from frame to frame
+SCALES = (0.5, 2.0)  # bounds on the ratio of areas from frame to frame
 LOST = 15  # frames without motion, such as a flash, before it counts as a cut
 
 

@@ -46,7 +46,7 @@ MAX_LINE_BYTES = 4096
 FOCAL_MM = (10.0, 200.0)  # 35 mm equivalents of drones' cameras; ten times as much is tenths
 STALE_S = 2.0  # a position that is repeated longer is one where the drone stood
 MAX_GAP_S = 5.0  # between a frame and the nearest position
-FEW_DECIMALS = 4  # of degrees: 11 m
+FEW_DECIMALS = 4  # decimals of degrees, 11 m, up to which positions are noticeably rounded
 METRES_PER_DEGREE = 111_320.0
 RECEIVER_M = 3.0  # as for photos of a drone without RTK
 

@@ -17,9 +17,9 @@ from splatpipe.pipeline.sfm.judging.agreement import Agreement
 
 MAX_MATCHES = 200  # cap per pair: thousands of matches prove only that two photos are neighbours
 SMALLEST_GROUP = 2  # photos; a single one is a wrong photo, not a bend
-SMALLEST_SHARE = 0.02  # of the photos
+SMALLEST_SHARE = 0.02  # least share of the photos in a group
 DENSE = 600  # photos up to which all eigenvectors are computed
-STEPS = 300  # of the power iteration above
+STEPS = 300  # power iterations for an eigenvector above DENSE photos
 DIGITS = 8  # decimals of the eigenvector that are kept: the last ones vary with the number of threads
 MIN_MATCHES_APART = 1.0  # minimum for the consistent matches across a cut, to avoid dividing by zero
 

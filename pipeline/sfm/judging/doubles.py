@@ -28,11 +28,11 @@ from splatpipe.pipeline.sfm.pairing.view_overlaps import BINS, ViewOverlap, comp
 
 MIN_OWN = 5  # points of the other photo in a cell: it has to show something else
 MIN_EXPECTED = 4.0  # common points expected in a cell: fewer may be missing by chance
-FEW = 0.2  # of those expected
+FEW = 0.2  # common points over the expected ones, below which a cell shows another place
 MIN_COMMON = 30.0  # common points of two groups, to avoid dividing by few
 MIN_MISSING = 60.0  # common points that are missing between two groups: fewer are three or four photos' corners
-RATIO_DOUBT, RATIO_BAD = 0.15, 0.25  # of missing to common points between two groups; sound captures have 0 to 0.09
-CUTS = 5  # of ever better ratios
+RATIO_DOUBT, RATIO_BAD = 0.15, 0.25  # missing over common points of two groups; sound captures have 0 to 0.09
+CUTS = 5  # cuts tried in turn, each with a higher ratio of missing points
 DIGITS = 6  # decimals that are compared: the last ones vary with the number of threads
 
 

@@ -17,8 +17,9 @@ from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.pairing.layout import EARTH_RADIUS_M
 
 MIN_POSITIONS = 8  # photos; a similarity fits fewer too easily
-STEPS = 30  # of the reweighted fit
-FAR_SIGMAS, FAR_SHARE = 5.0, 0.04  # of the stated error, and of the flight's size: more than receiver noise
+STEPS = 30  # rounds of iteratively reweighted least squares
+# median residual over the stated error, and over the flight's size, that noise does not explain
+FAR_SIGMAS, FAR_SHARE = 5.0, 0.04
 SMOOTH = 0.5  # difference of neighbouring residuals over their length: about 1.4 for noise, almost 0 for a bend
 
 

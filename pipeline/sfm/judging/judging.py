@@ -32,11 +32,12 @@ TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "
 # A trusted focal length is off by a few per cent (a Phantom's by 0.5, sensor tables by up to 5); a 35 mm equivalent was
 # seen 26 % off on a phone, and that of a resized file can be off by even more.
 FOCAL_TRUSTED = (0.10, 0.30)  # relative deviation above which the level is doubt, and bad
-FOCAL_STATED = (0.35, 1.0)  # the same for an untrusted focal length, as a ratio less one
-FOCAL_LONGER = (0.25, 6.0)  # of the longer side: the lenses used for mapping, 127 to 10 degrees
-FEW_SHARE = 0.1  # of the photos: a wrong lens of fewer photos says nothing about the others
-EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed photos; sound models have 0.93 or more
-GAIN_DOUBT, GAIN_BAD = 0.01, 0.02  # of the score, by another arrangement; sound models gain at most 0.002
+FOCAL_STATED = (0.35, 1.0)  # ratio to an untrusted focal length, less one, above which the level is doubt, and bad
+FOCAL_LONGER = (0.25, 6.0)  # focal length over the longer side of lenses used for mapping, 127 to 10 degrees
+FEW_SHARE = 0.1  # share of the photos below which a wrong lens says nothing about the others
+# explained share of the matches among placed photos; sound models have 0.93 or more
+EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65
+GAIN_DOUBT, GAIN_BAD = 0.01, 0.02  # gain of the score by another arrangement; sound models gain at most 0.002
 ALIKE_TIMES = 3.0  # median error of a pair that shows another place, over EXPLAINED_PX; a wrong lens is off by less
 FEW_PAIRS = 3  # fewer pairs that look alike are not worth telling
 CUT_DOUBT = 1.0  # ratio of contradicting to agreeing matches between two groups of cameras

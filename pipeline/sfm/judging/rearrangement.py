@@ -28,17 +28,17 @@ from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_s
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 SAMPLE = 24  # matches per pair: the adjustment has six unknowns per photo
-WIDTHS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # of the loss, times EXPLAINED_PX
-STEPS = 4  # of Gauss-Newton at each width
+WIDTHS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # widths of the robust loss, times EXPLAINED_PX, one after another
+STEPS = 4  # Gauss-Newton steps at each width
 FAVOUR, WIDE = 4.0, 8.0  # weight of contradicting pairs while the loss is that wide
 MOVED_WIDTHS = (4.0, 2.0, 1.0)  # where a group was moved: its place is nearly right
-DAMPING = 1e-4  # of the normal matrix' diagonal: the frame of the world and chains of photos are undetermined
-PASSES = 10  # of the reweighted fit of a group's place
+DAMPING = 1e-4  # added share of the normal matrix' diagonal: the world's frame and chains of photos are undetermined
+PASSES = 10  # rounds of the reweighted fit of a group's place
 WEAK_SCALE = 0.01  # weight of a group's scale staying as it is: a single line of sight leaves it open
 GROUPS = 3  # that are moved, one after another
 WORTH_MOVING = 0.5  # contradicting over agreeing matches of a group with the others
 MAX_LINKS = 16  # two-view geometries for a group's place, those of the most matches
-WORTH_COMPARING = 0.003  # of the score by the samples: below the least gain that matters
+WORTH_COMPARING = 0.003  # gain of the sampled score that is worth a full comparison: below the least that matters
 LINK_SAMPLE = 100  # matches for a two-view geometry
 DIGITS = 6  # decimals of angles that are compared: the last ones vary with the number of threads
 TURN_MOST = 0.2  # radians a step; more is outside of the linearisation

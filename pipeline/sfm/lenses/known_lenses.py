@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens, named_params, s
 FILE, DEWARP = "lens-file", "xmp-dewarp"
 SHAPE_TOLERANCE = 0.005  # on the aspect ratio of the lens's images and the photos: a pixel lost in resizing
 MAX_DEWARP_CHARS = 600
-LENS_STRAY = 0.35  # of a focal length from the metadata's: a rough 35 mm equivalent was seen 26 % off
+LENS_STRAY = 0.35  # relative deviation from the metadata's focal length: a rough 35 mm equivalent was 26 % off
 SIZES_SHOWN = 4
 
 

@@ -22,11 +22,11 @@ NAMES = {
     WIDE: ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     WIDE_FISHEYE: ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-NARROW = {  # of each kind, the narrowest first
+NARROW = {  # COLMAP's models of each kind, fewest parameters first
     WIDE: ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
     WIDE_FISHEYE: ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
 }
-PARAMETERS = {  # of each model, by the names of the wide ones; f is both focal lengths
+PARAMETERS = {  # a model's parameters, by the names of the wide models; f is both focal lengths
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),

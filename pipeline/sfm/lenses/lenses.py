@@ -36,11 +36,11 @@ from splatpipe.pipeline.sfm.lenses.lens_trial import LensState, LensTrial
 from splatpipe.pipeline.sfm.mapping.retriangulation import MAX_ERROR_PX, retriangulate
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
-MIN_PHOTOS = 8  # of a camera: fewer cannot separate its lens from their poses
+MIN_PHOTOS = 8  # photos of a camera: fewer cannot separate its lens from their poses
 MIN_TRACKS = 400  # tracks used for the decision; fewer are inconclusive
 MAX_TRACKS = 6000  # some 30,000 observations for a dozen unknowns per camera
 HELD_OUT = 0.25
-FAR_FROM_STATED = 2e-3  # of the width: twice the usual deviation of a lens from its calibration
+FAR_FROM_STATED = 2e-3  # deviation from a calibration over the width that is reported: twice the usual
 WORDS = {
     "cx cy": "principal point",
     "k2": "second radial coefficient",

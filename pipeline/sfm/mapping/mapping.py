@@ -21,8 +21,8 @@ from splatpipe.pipeline.sfm.model.view_graph import read_verified
 Model: TypeAlias = pycolmap.Reconstruction
 
 BEST_KEYPOINTS = 400  # per photo; 700 placed no more photos in any capture, and took up to twice the time
-WORTH_IT = 0.9  # of the matches; if more remain after the reduction, it saves nothing
-GROWTH = 1.5  # of photos or points between global adjustments; COLMAP's 1.1 makes four times as many
+WORTH_IT = 0.9  # share of the matches left by the reduction, above which it saves nothing
+GROWTH = 1.5  # growth of photos or points between global adjustments; COLMAP's 1.1 makes four times as many
 GOOD_ENOUGH = 1e-4  # relative change of the cost at which these adjustments end
 ONE_THREAD = 1  # with several, COLMAP's and Ceres' sums depend on which thread finishes first
 

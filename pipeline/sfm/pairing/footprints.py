@@ -16,9 +16,9 @@ GRID = 5  # rays across an image, and as many down
 FURTHEST = 4.0  # times the height above ground or the distance to the crossing: anything beyond is small in the image
 MIN_HEIGHT_M = 2.0
 CROSSING_DEG = 15.0  # minimum angle between views to determine where they cross
-CROSSING_MISS = 0.3  # of the distance: axes that miss each other by more do not point at the same thing
+CROSSING_MISS = 0.3  # gap between two view axes over the distance: beyond it they do not point at the same thing
 MIN_CROSSINGS = 3
-MARGIN = 0.1  # of half an image: angles are off by a few degrees
+MARGIN = 0.1  # slack on an image's border over half its size: angles are off by a few degrees
 ALIKE_DEG, UNLIKE_DEG = 15.0, 90.0  # SIFT matching is unaffected up to the first angle, and fails beyond the second
 
 

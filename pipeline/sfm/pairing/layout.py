@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.pairing.pairs import LOCATED_SHARE, Layout
 
 LEVELLING_SIGMA_M = 1.0  # altitudes this accurate determine the relative take-off heights of flights
 TAKEN_BY = ("latitude", "yaw_deg", "pitch_deg", "relative_altitude_m")  # fields required for a stated pose
-WITHIN_FLIGHT = 0.5  # of a position's standard deviation: most of the error is common to a flight
+WITHIN_FLIGHT = 0.5  # relative over stated position noise: most of the error is common to a flight
 EARTH_RADIUS_M = 6_371_000.0  # spherical Earth: accurate enough for choosing neighbours
 
 

@@ -20,12 +20,12 @@ Pair = tuple[int, int]
 Costs = Callable[[int], Float64[np.ndarray, " n"]]
 """Costs of all photos as partners of photo i, lower for likelier overlap; infinite where nothing is known."""
 
-LOCATED_SHARE = 0.8  # of the photos must have positions for spatial pairing
+LOCATED_SHARE = 0.8  # share of the photos that must have positions for spatial pairing
 SPREAD_OVER_SIGMA = 2.0  # positions that spread less than this times their sigma say nothing about neighbours
 SAME_PLACE_M = 0.1
 MIN_FACING = 0.01  # minimum of cos² of half the angle between views, by which distances are divided
 SEQUENCE_LENGTH = 8  # photos per folder; shorter folders do not count as sequences
-MIN_OVERLAP = 0.01  # of two photos' footprints; pairs with less yield one point in several hundred
+MIN_OVERLAP = 0.01  # shared part of two photos' footprints; pairs with less yield one point in several hundred
 FLOOR = 6  # nearest photos that are always partners, since the stated angles may be wrong
 TILTED = -0.87  # up component of the viewing direction: 60° down; views of walls diverge more and need more partners
 WIDER = 1.5  # times the partners of a nadir photo

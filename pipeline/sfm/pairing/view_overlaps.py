@@ -19,13 +19,13 @@ MIN_VIEWS = 3  # photos of a point: fewer are not found again reliably
 SAMPLE = 300  # points per photo
 NEAREST = 24  # photos that each photo is compared with: those whose points lie nearest
 ALIKE_DEG = 30.0  # angle between the two views: SIFT finds many points again
-BINS = 6  # of that angle: fewer points are found again from other directions
-ALIKE_SCALE = 0.7  # ratio of the distances to a point, likewise
-HIDDEN = 0.9  # of its distance: a point is hidden if the photo sees one that near, or nearer, beside it
-BESIDE = 0.04  # of the longer side
+BINS = 6  # angle bins up to ALIKE_DEG: fewer points are found again from other directions
+ALIKE_SCALE = 0.7  # ratio of the distances to a point: SIFT finds many points again
+HIDDEN = 0.9  # depth of points seen beside a point, over its own, below which they hide it
+BESIDE = 0.04  # distance in the image, over the longer side, within which points are compared for occlusion
 BESIDE_COUNT = 6
 FAR = np.full(3, 1e12)  # where photos without points are
-MARGIN = 0.02  # of the longer side: points near an image's edge may be outside
+MARGIN = 0.02  # border of an image over its longer side: points in it may be outside
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,11 @@ from splatpipe.pipeline.sfm.recovery.ladder_poses import LARGE_SHARE, MIN_PARTNE
 Model: TypeAlias = pycolmap.Reconstruction
 
 PAIRS_A_PHOTO = 20  # as many as `matches` tries per photo
-ROUNDS = 4  # of registration: newly placed photos add points for the next ones
+ROUNDS = 4  # registration rounds: newly placed photos add points for the next ones
 PARTNERS = 3  # placed photos that also get stronger keypoints, per leftover photo
 MAX_STRONGER = 12  # photos extracted again, or the share of all below: costs no more than mapping
 MAX_STRONGER_SHARE = 0.125
-WEAK_SHARE = 0.5  # of the placed photos' median keypoint count; photos with fewer are worth extracting again
+WEAK_SHARE = 0.5  # keypoints over the placed photos' median, below which a photo is worth extracting again
 MIN_KEYPOINTS = 16  # a photo with fewer is blank, blurred or masked
 KEPT_OBSERVATIONS = 0.98  # share the old photos must keep: a correctly placed photo takes none away
 WORSE_ERROR = 1.05  # the mean reprojection error may grow to this multiple,

@@ -27,7 +27,7 @@ STRONGER = FeaturesConfig(extractor="opencv-sift", max_image_size=2400, max_feat
 """Larger images and one and a half times the keypoints of `standard`. COLMAP's SIFT placed the same photos on two
 captures (docs/cameras.md) and took 1.6 and twice the time."""
 FAINT = 0.015  # contrast: some three times the keypoints of OpenCV's default
-THREAD_SHARE = 0.5  # of the threads: a photo takes up to twice the memory that it did in `features`
+THREAD_SHARE = 0.5  # share of the threads used: a photo takes up to twice the memory that it did in `features`
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.pairing.pairs import Pair
 
 SAMPLE = 64  # points of a photo that are projected into the others
-MIN_POINTS = 8  # of a photo; fewer say nothing about what it shows
+MIN_POINTS = 8  # points projected from a photo; fewer say nothing about what it shows
 ALIKE_COS = float(np.cos(np.radians(40.0)))  # beyond it SIFT matches little, and other sides of objects are visible
 MIN_SCALE = 0.4  # ratio of the distances to a point: beyond a factor of 2.5 the keypoint scales differ
-MIN_SHARE = 0.2  # of a photo's points that must lie in the other image
+MIN_SHARE = 0.2  # share of a photo's points that must lie in the other image
 NEAREST = 60  # candidate photos per photo, nearest by the points they observe: the cost grows linearly with the photos
 
 

@@ -21,10 +21,10 @@ ERROR = 0.003  # reprojection tolerance as a share of the longer side: COLMAP's 
 MIN_ERROR_PX = 4.0  # minimum tolerance for small photos: coarse-scale keypoints are off by pixels
 MIN_INLIERS = 15  # keypoints; COLMAP's minimum for a pair
 MANY_INLIERS = 30  # COLMAP's minimum for a pose
-MIN_SHARE = 0.25  # of the keypoints that lead to a point; COLMAP's minimum for a pose
+MIN_SHARE = 0.25  # inliers over the keypoints that lead to a point; COLMAP's minimum for a pose
 LARGE_SHARE = 0.5  # required where inliers are few: most matches must agree
 CELLS = 4  # grid cells along each side of the image
-MIN_CELLS = 4  # of the 16: a pose from one corner alone can pivot about it
+MIN_CELLS = 4  # grid cells with inliers, out of 16: a pose from one corner alone can pivot about it
 HELD_OUT = 0.6  # a pose from half of the keypoints must explain this fraction of its own inlier share in the other half
 MIN_PARTNERS = 2  # placed photos: a single one may show a look-alike of the place
 

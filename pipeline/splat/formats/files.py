@@ -14,7 +14,7 @@ from splatpipe.pipeline.splat.model.position_cost import PositionCost, two_digit
 from splatpipe.pipeline.splat.model.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 16
-_MAX_HEADER_BYTES = 65_536  # of a PLY, in which it says whether it is compressed
+_MAX_HEADER_BYTES = 65_536  # bytes of a PLY read for its header, which says whether it is compressed
 _MAGIC = ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK", "sog"), (b"glTF", "glb"))
 _HINT = "Give a splat as PLY, compressed PLY, SPZ, SOG or GLB, or the folder of a 3DGS model."
 

@@ -20,15 +20,15 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.position_cost import sizes_of, two_digits
 from splatpipe.pipeline.splat.model.scene import MAX_OFFSET, Scene, SceneFacts
 
-STEPS_PER_SIZE = 16.0  # of float32 in a Gaussian: finer ones are not seen
-STEPS_ACROSS = 4096.0  # of float32 in the extent of a splat whose Gaussians' sizes are in another unit
+STEPS_PER_SIZE = 16.0  # float32 steps in a Gaussian's size: finer ones are not seen
+STEPS_ACROSS = 4096.0  # float32 steps in a splat's extent, if its Gaussians' sizes are in another unit
 ROUNDED_STEPS = 0.5  # Gaussians' sizes in a step that has visibly displaced them
 EXTENT = (0.05, 0.95)  # quantiles that bound a splat's main extent
 SAMPLE = 200_000  # Gaussians that this is estimated from
 MIXED_UNITS = 2.0  # extents of the splat along two axes in its median Gaussian: its scales are in another unit
 TORN = 0.05  # share of Gaussians that float32 displaces by more than their largest size: parts of the splat are lost
 FEW = 10  # Gaussians that may well be larger than the distances between them
-MAX_LOG = 700.0  # of what float64 holds
+MAX_LOG = 700.0  # largest natural logarithm whose exponential float64 holds
 
 
 def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Scene:

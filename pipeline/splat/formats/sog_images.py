@@ -25,14 +25,14 @@ VERSION = 2
 META = "meta.json"
 RECORD = "splatpipe"
 """The name of our record in meta.json."""
-LEVELS = 65_535  # of a coordinate
-FIRST_MODE = 252  # of a quaternion: 252 + which of w, x, y, z is the largest
-ENTRIES_A_ROW = 64  # of the picture of the palette
+LEVELS = 65_535  # steps of a coordinate, 16 bits
+FIRST_MODE = 252  # a quaternion's alpha value is 252 + which of w, x, y, z is the largest
+ENTRIES_A_ROW = 64  # palette entries in a row of its picture
 MAX_ENTRIES = 65_536
-_HARMONIC_LEVELS = 64  # of the palette's numbers: as good as 256 beside the palette's own error, and a quarter smaller
-_MAX_LOG_AREA = 80.0  # of natural logarithms
+_HARMONIC_LEVELS = 64  # codebook size for the palette: as good as 256 beside the palette's own error, a quarter smaller
+_MAX_LOG_AREA = 80.0  # bound on the natural logarithm of a Gaussian's area
 _SHOWN_QUANTILE = 0.99
-_MIN_SHOWN = 1e-3  # of the mean: what is hardly seen from afar is seen from near
+_MIN_SHOWN = 1e-3  # least weight relative to the mean: what is hardly seen from afar is seen from near
 _ROWS_AT_ONCE = 1 << 16
 _SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
 

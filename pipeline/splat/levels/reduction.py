@@ -28,7 +28,7 @@ fill whole images, while the many that are only large because they are far away 
 PIECE = 200_000
 """Gaussians processed together: bounds the memory."""
 _ROWS_AT_ONCE = 1 << 15
-_JITTER_SHARE = 1e-9  # of the extent: separates coincident points in the k-d tree, which would be slow with many
+_JITTER_SHARE = 1e-9  # jitter over the extent: parts coincident points in the k-d tree, which would be slow with many
 _JITTER_SEED = 1
 _FLAT = 1e-3  # standard deviation of what is flat, as a share of the median of the largest ones
 _MIN_LOG_SCALE = -30.0

@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.appearance.auxiliary_model import AuxiliaryModel
 from splatpipe.pipeline.train.hooks import RenderedView, Technique
 
 FIRST_RATE = 1e-3  # learning rate: a photo has about a hundred visits, which change its exposure by at most a tenth
-LAST_RATE = 0.1  # of the first; exponential in between
+LAST_RATE = 0.1  # last over first learning rate; exponential in between
 DECAY = 1e-3  # weight decay towards the identity: unconstrained coefficients stay there
 _NAME = "deviations"
 

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from splatpipe.pipeline.geometry.camera import Camera
 
-MIN_SHOWN = 0.25  # of a cell to be judged in a window: where four windows meet, at least one shows as much
+MIN_SHOWN = 0.25  # visible share by which a window judges a cell: where four windows meet, at least one has as much
 
 
 @dataclass(frozen=True)

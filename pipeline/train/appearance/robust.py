@@ -37,13 +37,13 @@ GRID = 64  # cells along either side of a photo, whatever its size: a car in a d
 MIN_CELL_PX = 4  # smaller photos have fewer cells: a cell has to average out detail
 MEMORY = 0.5  # weight of earlier visits in a cell's residual
 NEARBY = 1  # cells: the model may show this far away what the photo shows here
-MIN_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: anything less is shading, not another object
+MIN_RESIDUAL = 0.05  # residual of a left-out cell, colours in 0..1: anything less is shading, not another object
 VOTES = 4  # minimum among a cell and its eight neighbours: two by two are an object, a single one is noise
-RIM = 0.5  # of the threshold: neighbours of a left-out cell above this are left out too
+RIM = 0.5  # residual over the threshold above which neighbours of a left-out cell are left out too
 MAX_SHARE_OF_PHOTO = 0.25  # may be left out: more than that is a wrong model, not a passer-by
 MAX_WITNESSES = 24  # nearest photos that are compared at a place
-MIN_ALPHA = 0.8  # of a judged pixel: below it the model has a hole rather than a contradiction
-SURFACE_ALPHA = 0.5  # of a cell with a valid depth
+MIN_ALPHA = 0.8  # opacity of a judged pixel: below it the model has a hole rather than a contradiction
+SURFACE_ALPHA = 0.5  # opacity of a cell with a valid depth
 UNKNOWN = -1.0  # residual of a cell that no visit has shown
 
 
@@ -231,7 +231,7 @@ def cell_residuals(
     size = (min(GRID, max(1, whole.height // MIN_CELL_PX)), min(GRID, max(1, whole.width // MIN_CELL_PX)))
     cells = PhotoCells(camera, *size)
     weight, judged = cells.means(counts[None].float()), cells.judged(rendered_colour)
-    known = weight[0] >= 0.5  # of the visible part: the rim of a neighbouring cell is evidence too
+    known = weight[0] >= 0.5  # half of the visible part: the rim of a neighbouring cell is evidence too
     chosen = known if judged is None else known & judged
     model, picture = (
         cells.means(picture.permute(2, 0, 1) * counts) / weight.clamp(min=1e-6) for picture in (rendered_colour, colour)

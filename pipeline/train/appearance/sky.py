@@ -36,11 +36,11 @@ from splatpipe.pipeline.train.random_numbers import ELSEWHERE
 
 MIN_TRACK = 3  # minimum track length of points used in sky detection
 MAX_ERROR_PX = 2.0
-OPACITY_WEIGHT = 0.1  # of the mean opacity in front of the sky in the loss; judgement
+OPACITY_WEIGHT = 0.1  # loss weight for the mean opacity in front of the sky; judgement
 SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills areas no photo covers
 FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # learning rates of the colours at the start and end of the schedule
 EPSILON = 1e-8  # Adam's: cells with hardly any gradient stay where they are
-FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: unseen cells above the horizon are smooth by then
+FILL_ROUNDS = ROWS * ROWS // 2  # rounds of averaging neighbours: unseen cells above the horizon are smooth by then
 MIN_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour must at least average
 
 RGB = tuple[float, float, float]
@@ -70,7 +70,7 @@ class SkyModel(AuxiliaryModel, Technique):
         super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
         self.panorama = Panorama(up, self.tensors[_COLOURS])
         self._skies = PhotoSkies(masks)
-        self._seen: PhotoSky | None = None  # of the current photo
+        self._seen: PhotoSky | None = None  # the current photo's sky
 
     def copied(self) -> SkyModel:
         """A copy with its own tensors; the immutable masks are shared."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
 
 QUEUED = 3  # most iterations queued on the device: enough to keep it busy, with few photos held in memory
-STEP = float(np.float32(1.0 / 255.0))  # of 8-bit values: the same float32 on every device
+STEP = float(np.float32(1.0 / 255.0))  # step of 8-bit values, colours in 0..1: the same float32 on every device
 
 
 @dataclass(frozen=True, eq=False)

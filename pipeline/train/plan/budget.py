@@ -26,7 +26,7 @@ from splatpipe.pipeline.train.plan.windows import TrainingSize
 # None of the values up to COARSEST_MEGAPIXELS was tuned on held-out quality: they are judgement, for the given reasons.
 SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
 SIZE_STEP = 1.5  # ratio of the sizes tried: fine enough to use the time, coarse enough for a short list
-FULL_SHARE = 0.9  # of the dataset's size is as good as all of it, so resampling is skipped
+FULL_SHARE = 0.9  # size over the dataset's that is as good as all of it, so resampling is skipped
 
 FIRST_GROWTH = 1.5  # times the sparse points' Gaussians must fit in every plan before it uses larger photos
 FEWEST_GAUSSIANS = 1000  # fewer cannot represent a building; the initial ones are thinned no further
@@ -35,7 +35,7 @@ COARSEST_MEGAPIXELS = 0.05  # photos are halved no further at the start of a tra
 EXPORT_GAUSSIAN_S = 8e-6  # to move, write twice and hash a Gaussian of the model
 AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
 SAMPLES = 60  # points at which a forecast samples a training: its schedules are linear or stepped
-SCHEDULE_SHARE = 0.95  # of the time for the planned schedule; the rest continues at its final learning rates
+SCHEDULE_SHARE = 0.95  # share of the time for the planned schedule; the rest continues at its final learning rates
 POLISH = 1.5  # times the planned iterations at most, if the forecast was too high
 
 

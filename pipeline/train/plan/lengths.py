@@ -19,12 +19,10 @@ from splatpipe.pipeline.train.plan.windows import TrainingSize, windows_of
 # Judgement, except where docs/lengths.md reports comparisons.
 WHOLE_VISITS = 20  # minimum per photo at the size at which it fits whole
 PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/lengths.md
-FIRST_SHARE = 0.5  # of the minimum iterations are at the first size,
-MAX_FIRST_ITERATIONS = 3500  # but no more than these if 20 visits are fewer: the finest size is worth more
-FEWEST_VISITS = (
-    10.0  # of a part, below which a run that was given its length stays with the size before: it learns more
-)
-COARSE_SHARE = 0.5  # of the iterations at the first size use photos halved further by `coarse_levels`
+FIRST_SHARE = 0.5  # share of the minimum iterations at the first size, but for MAX_FIRST_ITERATIONS
+MAX_FIRST_ITERATIONS = 3500  # cap on FIRST_SHARE where WHOLE_VISITS are fewer: the finest size is worth more
+FEWEST_VISITS = 10.0  # visits per part below which a run of a given length stays with the size before: it learns more
+COARSE_SHARE = 0.5  # share of the first size's iterations that use photos halved further by `coarse_levels`
 
 UNTIL = 0.5  # end of density control, as a share of the run (published), or of the finest size's part of it
 

@@ -26,7 +26,7 @@ from splatpipe.pipeline.train.plan.windows import TrainingSize
 
 PLAN_FORMAT = 4
 MAX_PLAN_BYTES = 64 << 20
-EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
+EXTENT_MARGIN = 1.1  # extent over the cameras' radius, as in 3D Gaussian splatting's NeRF++ normalisation
 NEAR_PER_EXTENT = 0.01  # 3DGS uses 0.2 world units at extents of about 5; drones see nothing that near
 
 

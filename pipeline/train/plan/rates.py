@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
-LARGEST_BOOST = 4.0  # of learning rates: best in measurements at 1,500 iterations; beyond it Gaussians overshoot
+LARGEST_BOOST = 4.0  # largest factor on learning rates: best at 1,500 iterations; beyond it Gaussians overshoot
 
 PUBLISHED_OPACITY_RATE = 0.05
 OPACITY_RATE = 0.15  # at the published rate surfaces become opaque too late

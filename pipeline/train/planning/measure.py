@@ -32,8 +32,8 @@ WARM_UP_ITERATIONS = 100  # until opacities, which step by a twentieth of a logi
 WARM_UP_SHARE = 0.5  # largest share of the measuring time
 PILOT_ITERATION = 10  # iteration that the pilot's state claims, so that all SH degrees take part
 WINDOW_SIDE = 2  # divisor of the sides of the timed windows
-SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a split surface (0.5)
-STREAM = 7  # of the jitter's random numbers; the pilot is thrown away, so nothing depends on them
+SPLIT_SHRINK = 0.25  # fall of log scales per log of growth: between clones, which keep their size, and splits (0.5)
+STREAM = 7  # added to the seed for the jitter's random numbers; the pilot is thrown away, nothing depends on them
 
 Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 

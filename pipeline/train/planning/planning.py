@@ -24,13 +24,13 @@ from splatpipe.pipeline.train.planning.measure import MachineSpeed, MeasuringBud
 from splatpipe.pipeline.train.planning.shortage import HINT
 from splatpipe.pipeline.train.state.memory import within_memory
 
-MEASURE_SHARE = 0.05  # of the budget at most is spent on measuring,
-MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
+MEASURE_SHARE = 0.05  # share of the budget spent on measuring at most
+MEASURE_SECONDS = 10.0  # spent on measuring at most: by then the noise of a shared machine is averaged out
 PILOT_GROWTH_A_SECOND = {"cpu": 150.0, "cuda": 15_000.0}
 """Approximate number of Gaussians that a second of budget pays for: where the forecast has to be accurate. Measured on
 CPUs; for CUDA a judgement, two orders of magnitude more: with fewer Gaussians an iteration there is all fixed cost,
 which says nothing about the cost per Gaussian."""
-MIN_SHARE = 0.1  # of the budget for the training, even if nothing is left: the overall tolerance
+MIN_SHARE = 0.1  # share of the budget for the training, even if nothing is left: the overall tolerance
 FILM_VIEWS = 40  # held-out views that take as long to evaluate as a ten-second film takes to render
 EXPORT_SECONDS = 5.5  # fixed cost of the last stages: digests, the report with its images, process exit
 

@@ -19,7 +19,7 @@ from splatpipe.pipeline.train.plan.budget import FEWEST_GAUSSIANS
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.state.state import TrainState
 
-KEPT_SHARE = 0.9  # of the Gaussians are kept each time, the most opaque: those lost are the least visible
+KEPT_SHARE = 0.9  # share of the Gaussians kept each time, the most opaque: those lost are the least visible
 HINT = "Lower train.max_megapixels or train.max_gaussians, or close other programs that use the graphics card."
 
 Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]

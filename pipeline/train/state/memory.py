@@ -22,7 +22,7 @@ from splatpipe.pipeline.train.plan.limits import (
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 
 RESIDENT_STEP = 16_000_000  # resident memory is rounded up to it: a few pages more or less change no plan
-GROWTH_STOPS_AT = 0.97  # of the limit, at rest after a density-control step: above it the next step may exceed it
+GROWTH_STOPS_AT = 0.97  # share of the limit in use at rest, after density control: above it the next step may exceed it
 
 
 def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bool = False) -> TrainingPlan:

@@ -35,7 +35,7 @@ from splatpipe.pipeline.train.state.history import History
 from splatpipe.pipeline.train.state.memory import within_room
 from splatpipe.pipeline.train.techniques.techniques import Techniques
 
-SMALLEST_SCALE = 1e-6  # of a Gaussian, relative to the scene's extent: float32 covariances stay non-singular
+SMALLEST_SCALE = 1e-6  # smallest scale over the scene's extent: float32 covariances stay non-singular
 LARGEST_SCALE = 1e2  # the sky is no farther than that
 
 _ADAM = "adam."
@@ -204,7 +204,7 @@ class TrainState:
         free_frames()  # they change size in this step, and memory is tight until then
         try:
             growth, counts = self._growth(plan, limit, iteration)
-        except torch.OutOfMemoryError:  # of a device: not even room to select what to grow
+        except torch.OutOfMemoryError:  # the device has not even room to select what to grow
             self.history.growth_ended = self.history.growth_ended or iteration
             return
         self._become(growth)
@@ -226,7 +226,7 @@ class TrainState:
         """Remove the Gaussians that a technique rejects; this goes on after the last step of density control."""
         try:
             gone = self.techniques.prune_mask(self.gaussians.detach(), iteration)
-        except torch.OutOfMemoryError:  # of a device: the next check finds them
+        except torch.OutOfMemoryError:  # on a device; the next check finds the floaters
             return
         if gone is not None and bool(gone.any()) and not bool(gone.all()):
             self._remove(gone, iteration)

@@ -22,7 +22,7 @@ from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.photos.stream import EVERYWHERE
 from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 
-FIRST_SHARE = 0.2  # of a run from sparse points, without this loss: the surface has to form first
+FIRST_SHARE = 0.2  # first share of a run from sparse points, without this loss: the surface has to form first
 MIN_ALPHA = 0.5  # below it a pixel shows more background than surface
 FREE_PX = 0.5  # standard deviation without penalty, in GSD
 HALF_PX = 10.0  # excess in GSD at which half of the maximum penalty is reached

@@ -19,7 +19,7 @@ from splatpipe.pipeline.train.hooks import Technique
 from splatpipe.pipeline.train.plan.schedule import Schedule
 
 STEPS_BETWEEN = 5  # steps of density control between checks: a check takes as long as several iterations
-LAST_LOOK = 0.9  # of the run: the rest closes the holes
+LAST_LOOK = 0.9  # share of the run after which no floaters are pruned: the rest closes the holes
 
 
 def free_space_of(views: Sequence[View], dataset: Path) -> FreeSpace:

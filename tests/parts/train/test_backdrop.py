@@ -88,7 +88,7 @@ def test_initial_points_include_all_of_the_inside_and_an_even_sample_of_the_rest
     assert set(range(100, 400)) <= set(rows.tolist())
     others = np.setdiff1d(rows, np.arange(100, 400))
     assert len(others) == backdrop_limit(300) == 150
-    assert np.diff(np.searchsorted(np.flatnonzero(~inside), others)).max() <= 5  # of 700, every 4.7th is taken
+    assert np.diff(np.searchsorted(np.flatnonzero(~inside), others)).max() <= 5  # every 4.7th of 700 is taken
     np.testing.assert_array_equal(coarse_start(np.ones(7, np.bool_)), np.arange(7))
     assert len(coarse_start(np.zeros(70, np.bool_))) == 5  # no inside, but still a backdrop
 

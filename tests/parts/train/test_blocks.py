@@ -41,7 +41,7 @@ UP = np.array([0.0, 0.0, 1.0])
 PLAN = GroundPlan.across(UP)
 
 
-EVERY = 7  # of the surface's points is a sparse one
+EVERY = 7  # stride: every seventh point of the surface is a sparse one
 
 
 @pytest.fixture(scope="module")

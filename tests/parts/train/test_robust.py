@@ -31,7 +31,7 @@ from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
 
-SCALE = 2  # of the tiny photos: so that cells of four pixels average something
+SCALE = 2  # times the tiny photos' sides: so that cells of four pixels average something
 HELD_OUT = (1, 3, 5)  # between the others: a test of what was learnt, not of extrapolation
 CARS = {2: (20, 30, 40, 60), 4: (60, 90, 85, 125)}  # top, left, bottom, right in a photo, pixels
 YELLOW = (0.9, 0.86, 0.12)

@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrd
 from splatpipe.pipeline.train.plan.windows import PixelRectangle, TrainingSize, windows_of
 
 MASKED = "flight 1/photo_5.png"
-PIXELS = 800  # of a window: six in a tiny photo
+PIXELS = 800  # size of a window: six in a tiny photo
 SIZES = [(5472, 3648, 500_000), (5472, 3648, 1_000_000), (2300, 1740, 500_000), (3000, 4000, 700_000), (72, 54, 800)]
 
 

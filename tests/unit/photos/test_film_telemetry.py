@@ -123,7 +123,7 @@ def test_across_the_date_line_and_with_few_decimals() -> None:
     path = FlightPath([Fix(0.0, -17.0, 179.9998, decimals=4), Fix(1.0, -17.0, -179.9998, decimals=4)])
     middle = path.at(0.5)
     assert middle is not None and abs(middle.longitude) == pytest.approx(180.0)
-    assert middle.sigma_m == pytest.approx(4.39, abs=0.01)  # of 11 m steps and a receiver's 3 m
+    assert middle.sigma_m == pytest.approx(4.39, abs=0.01)  # combines rounding to 11 m and a receiver's 3 m
 
 
 def test_hostile_subtitles_take_little_time_and_memory(tmp_path: Path) -> None:

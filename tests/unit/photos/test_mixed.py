@@ -143,7 +143,7 @@ def test_every_camera_is_reported_with_its_photos_focal_length_and_error() -> No
     model, verified, groups = two_cameras(1.0)
     rows = camera_rows(model, verified, groups)
     assert [(row["name"], row["photos"], row["placed"]) for row in rows] == [("DJI FC330", 39, 39), ("DJI FC330", 1, 1)]
-    assert rows[0]["error_px"] == pytest.approx(0.37, abs=0.05)  # of 0.3 px noise in each coordinate
+    assert rows[0]["error_px"] == pytest.approx(0.37, abs=0.05)  # mean distance of 0.3 px noise in each coordinate
     assert rows[1]["error_px"] == pytest.approx(rows[0]["error_px"] / 2, rel=0.3)
     notes = Notes()
     report_cameras(rows, notes)

@@ -117,7 +117,7 @@ def test_broken_files_are_refused_with_a_hint(tmp_path: Path) -> None:
     with (tmp_path / "lone.npz").open("wb") as file:
         np.save(file, TILTED)
     foreign = whole.read_bytes()
-    for name, at, byte in (("packed", 10, 99), ("secret", 8, 1), ("later", 6, 200)):  # of zip's central directory
+    for name, at, byte in (("packed", 10, 99), ("secret", 8, 1), ("later", 6, 200)):  # bytes of zip's central directory
         at += foreign.index(b"PK\x01\x02")
         (tmp_path / f"{name}.npz").write_bytes(foreign[:at] + bytes([byte]) + foreign[at + 1 :])
     header = foreign.index(b"}", foreign.index(b"NUMPY"))

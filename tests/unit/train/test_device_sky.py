@@ -14,7 +14,7 @@ from splatpipe.pipeline.train.appearance.sky import SkyModel
 
 TILTED = np.array([0.36, -0.48, 0.8])
 BACKGROUND = (0.1, 0.7, 0.3)
-PICTURE_ATOL = 2e-5  # of colours up to 1 in float32: the place between two cells is rounded to it
+PICTURE_ATOL = 2e-5  # colours up to 1 in float32: the place between two cells is rounded to it
 EXACT_ATOL = 1e-9  # in float64, but for the CPU's weights, which are float32 there, too
 WEIGHTS_ATOL = 1e-6
 

@@ -34,7 +34,7 @@ from splatpipe.pipeline.train.techniques.techniques import Techniques
 LOOK = skies.aimed_camera(12.0, roll_deg=4.0)
 CAMERA = LOOK.scaled(331, 247)
 WINDOW_PIXELS = 16_000  # six windows of it
-FLOAT32 = 2e-4  # of a sum over a picture, added up in another order
+FLOAT32 = 2e-4  # relative error of a sum over a picture, added up in another order
 LATE = resolve_schedule(TrainConfig(iterations=100)).at(60)  # every technique takes part
 
 
@@ -210,7 +210,7 @@ def test_cells_of_windows_are_those_of_the_whole_photo() -> None:
 
 
 CAR = (40, 60, 80, 120)  # top, left, bottom, right in the photo that shows it, pixels
-CAR_PIXELS = 11_000  # of a window: their borders go through the car
+CAR_PIXELS = 11_000  # size of a window: their borders go through the car
 
 
 def cameras() -> list[Camera]:

@@ -27,7 +27,7 @@ from splatpipe.pipeline.train.plan.limits import (
 )
 
 PHOTOS_A_BLOCK = 8  # at least: each photo shows many smaller blocks and would be trained on in each
-FEWEST_GAUSSIANS = 1000  # of a block: fewer are not a useful model
+FEWEST_GAUSSIANS = 1000  # Gaussians of a block: fewer are not a useful model
 MAX_LIKELY_GROWTH = 2.0  # times the expected size is hardly ever exceeded: forecasts are off by up to this factor
 
 

@@ -20,7 +20,8 @@ from splatpipe.pipeline.train.blocks.cells.needs import (
 from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.plan.limits import FIXED_BYTES, LIBRARIES_BYTES, PIXEL_BYTES, bytes_per_gaussian
 
-MAX_GROWTH = 2.0 * MARGIN_GROWTH  # of a cell with its margin over the cell: beyond it, the neighbours are what is full
+# growth of a cell with its margin over the cell: beyond it, the neighbours are what is full
+MAX_GROWTH = 2.0 * MARGIN_GROWTH
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,8 @@ def block_limits(
     Args:
         division: How the scene is divided.
         sh_degree: SH degree of the model.
-        block_counts: For each block its weight, and the number of the coarse model's Gaussians in its cell and in cell and
-            margin.
+        block_counts: For each block its weight, and the number of the coarse model's Gaussians in its cell and in cell
+            and margin.
     """
     cap, most = division.cap, _most(division, sh_degree)
     top = max(1, int(most / MARGIN_GROWTH)) if division.limit_bytes else cap

@@ -19,7 +19,7 @@ from splatpipe.pipeline.train.blocks.cells.partition import NOBODY, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, Samples
 from splatpipe.pipeline.train.plan.windows import windows_of
 
-MIN_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner that neighbouring windows show whole
+MIN_SHARE = 0.02  # share of a window's pixels that see the cell: less is a corner that neighbouring windows show whole
 MIN_POINTS = 4  # observed points in the cell and the window: thin objects that a coarse depth misses
 
 Windows = Int64[np.ndarray, "w 4"]  # left, top, right and bottom of each in the dataset's photo, the last two exclusive
