@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.plan.schedule import Schedule, tail_of
 from splatpipe.pipeline.train.state.history import History
 
 WINDOW_SHARE = 0.25  # last share of the iterations done, to which the line is fitted
-FEWEST_EPOCHS = 8  # in the window, so that their scatter can be estimated
+MIN_EPOCHS = 8  # in the window, so that their scatter can be estimated
 STANDARD_ERRORS = 2.0  # by which the line is made steeper: noise must not end a training that still improves
 
 
@@ -83,11 +83,11 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: TrainingPlan, iteration: 
     """
     scheduled = plan.schedule.iterations
     recent = [epoch for epoch in epochs if epoch[0] > (1.0 - WINDOW_SHARE) * iteration]
-    recent = list(epochs[-max(FEWEST_EPOCHS, len(recent)) :])
+    recent = list(epochs[-max(MIN_EPOCHS, len(recent)) :])
     number = plan.schedule.stretch_at(iteration)
     is_finest = number == len(plan.schedule.stretches) - 1
     end = iteration + tail_of(iteration) if is_finest else iteration
-    if len(recent) < FEWEST_EPOCHS or end >= plan.schedule.stretches[number].until:
+    if len(recent) < MIN_EPOCHS or end >= plan.schedule.stretches[number].until:
         return False
     return expected_gain(recent, scheduled) < plan.options.stop_when_flat
 

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int64
 
-COVERED = 0.9  # least share of the points that the chosen photos show; the rest, only one or two photos show at all
+# least share of the points that the chosen photos show; the rest, only one or two photos show at all
+MIN_COVERED_SHARE = 0.9
 
 
 def covering_photos(seen: Sequence[Int64[np.ndarray, " _"]], points: int, few: int) -> list[int]:
@@ -29,7 +30,7 @@ def covering_photos(seen: Sequence[Int64[np.ndarray, " _"]], points: int, few: i
         Indices of the chosen photos, ascending.
     """
     view_counts = np.zeros(points, np.int64)
-    needed = COVERED * np.unique(np.concatenate([*seen, np.zeros(0, np.int64)])).size
+    needed = MIN_COVERED_SHARE * np.unique(np.concatenate([*seen, np.zeros(0, np.int64)])).size
     least = math.ceil(math.sqrt(min(len(seen), few) * len(seen)))
 
     def gain(photo: int) -> float:

@@ -46,7 +46,7 @@ MAX_LINE_BYTES = 4096
 FOCAL_MM = (10.0, 200.0)  # 35 mm equivalents of drones' cameras; ten times as much is tenths
 STALE_S = 2.0  # a position that is repeated longer is one where the drone stood
 MAX_GAP_S = 5.0  # between a frame and the nearest position
-FEW_DECIMALS = 4  # decimals of degrees, 11 m, up to which positions are noticeably rounded
+MAX_ROUNDED_DECIMALS = 4  # decimals of degrees, 11 m, up to which positions are noticeably rounded
 METRES_PER_DEGREE = 111_320.0
 RECEIVER_M = 3.0  # as for photos of a drone without RTK
 
@@ -237,7 +237,7 @@ class FlightPath:
         self._heights = _column([fix.height_m for fix in kept])
         decimals = max((fix.decimals for fix in kept), default=6)
         step_m = METRES_PER_DEGREE / 10.0**decimals
-        self._sigma_m = math.hypot(RECEIVER_M, step_m / math.sqrt(12.0)) if decimals <= FEW_DECIMALS else None
+        self._sigma_m = math.hypot(RECEIVER_M, step_m / math.sqrt(12.0)) if decimals <= MAX_ROUNDED_DECIMALS else None
 
     def at(self, time_s: float) -> Place | None:
         """Where the camera was; None further than ``MAX_GAP_S`` from all fixes."""

@@ -32,9 +32,9 @@ TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "
 # A trusted focal length is off by a few per cent (a Phantom's by 0.5, sensor tables by up to 5); a 35 mm equivalent was
 # seen 26 % off on a phone, and that of a resized file can be off by even more.
 FOCAL_TRUSTED = (0.10, 0.30)  # relative deviation above which the level is doubt, and bad
-FOCAL_STATED = (0.35, 1.0)  # ratio to an untrusted focal length, less one, above which the level is doubt, and bad
-FOCAL_LONGER = (0.25, 6.0)  # focal length over the longer side of lenses used for mapping, 127 to 10 degrees
-FEW_SHARE = 0.1  # share of the photos below which a wrong lens says nothing about the others
+FOCAL_UNTRUSTED = (0.35, 1.0)  # ratio to an untrusted focal length, less one, above which the level is doubt, and bad
+FOCAL_BOUNDS = (0.25, 6.0)  # focal length over the longer side of lenses used for mapping, 127 to 10 degrees
+MIN_WRONG_LENS_SHARE = 0.1  # share of the photos below which a wrong lens says nothing about the others
 # explained share of the matches among placed photos; sound models have 0.93 or more
 EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65
 GAIN_DOUBT, GAIN_BAD = 0.01, 0.02  # gain of the score by another arrangement; sound models gain at most 0.002
@@ -175,12 +175,12 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras:
         which = "The focal length" if len(used) == 1 else f"The focal length of camera {number}"
         ratio = focal / max(camera.width, camera.height)
         stray = max(focal / prior, prior / focal) - 1.0
-        doubt, bad = FOCAL_TRUSTED if is_trusted(group) else FOCAL_STATED
+        doubt, bad = FOCAL_TRUSTED if is_trusted(group) else FOCAL_UNTRUSTED
         hint = (
             "Heights and scale may be off: compare a known one. Oblique photos or a second flying height "
             "constrain the lens better."
         )
-        if not FOCAL_LONGER[0] <= ratio <= FOCAL_LONGER[1]:
+        if not FOCAL_BOUNDS[0] <= ratio <= FOCAL_BOUNDS[1]:
             text = (
                 f"{which} came out as {focal:.0f} pixels, {ratio:.2g} times the photo's longer side, which is "
                 "implausible."
@@ -193,7 +193,7 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras:
                 text += " The value in the metadata is only approximate."
             found.append(Reason("bad" if stray > bad else "doubt", text, hint, "focal"))
             ran_away += photos[number] if stray > bad else 0
-    if ran_away < FEW_SHARE * photos.total():
+    if ran_away < MIN_WRONG_LENS_SHARE * photos.total():
         found = [replace(reason, level="doubt") for reason in found]
     return found
 

@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float64, Int64
 MIN_VIEWS = 3  # two that intersect, and one that is predicted
 REWEIGHTINGS = 2  # by the distance to the point from the previous round
 MIN_ANGLE = 0.02  # its square is the minimum eigenvalue ratio: nearly parallel rays do not determine a point
-CAP = 4.0  # times the median error: a single wrong match must not decide
+MAX_ERROR_RATIO = 4.0  # times the median error: a single wrong match must not decide
 BOOTSTRAPS = 500
-DOUBT = 0.01  # share of the bootstrap samples that may show no improvement
+MAX_UNIMPROVED_SHARE = 0.01  # share of the bootstrap samples that may show no improvement
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def improves(
     if not len(before):
         return 0.0, False
     _, photo = np.unique(images, return_inverse=True)
-    cap = CAP * float(np.median(before))
+    cap = MAX_ERROR_RATIO * float(np.median(before))
     if not math.isfinite(cap):
         return 0.0, False
     was = np.bincount(photo, np.minimum(before, cap) ** 2)
@@ -126,7 +126,7 @@ def improves(
     share = float(gained.sum() / max(float(was.sum()), 1e-300))
     drawn = np.random.default_rng(seed).integers(0, len(was), (BOOTSTRAPS, len(was)))
     wrong = float((gained[drawn].sum(axis=1) <= 0.0).mean())
-    return share, share >= least and wrong <= DOUBT
+    return share, share >= least and wrong <= MAX_UNIMPROVED_SHARE
 
 
 def _well_placed(left: Float64[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n"]:

@@ -40,7 +40,7 @@ MIN_PHOTOS = 8  # photos of a camera: fewer cannot separate its lens from their 
 MIN_TRACKS = 400  # tracks used for the decision; fewer are inconclusive
 MAX_TRACKS = 6000  # some 30,000 observations for a dozen unknowns per camera
 HELD_OUT = 0.25
-FAR_FROM_STATED = 2e-3  # deviation from a calibration over the width that is reported: twice the usual
+MAX_STATED_DEVIATION = 2e-3  # deviation from a calibration over the width that is reported: twice the usual
 WORDS = {
     "cx cy": "principal point",
     "k2": "second radial coefficient",
@@ -237,7 +237,7 @@ def report_lenses(summary: Mapping[str, JSON], report: Reporter) -> None:
             report.note(
                 f"The lens of camera {row['camera']} needs more than the simple model: {what} ({row['model']})."
             )
-        if row["stated"] and (row["off_stated_px"] or 0.0) > FAR_FROM_STATED * row["width"]:
+        if row["stated"] and (row["off_stated_px"] or 0.0) > MAX_STATED_DEVIATION * row["width"]:
             report.warning(
                 f"The photos move the lens of camera {row['camera']} {row['off_stated_px']:.1f} pixels (RMS) from the"
                 " one that is stated.",

@@ -146,10 +146,10 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
     left = unplaced(found)
     work.report_progress(0, len(left), "looking for matches of the remaining photos")
     partners_by_photo = rank_partners(work.capture, found, left, work.options.seed)
-    photos = _worth_another_look(
+    photos = _choose_reextraction(
         found, partners_by_photo, max(MAX_STRONGER, int(MAX_STRONGER_SHARE * len(work.capture.photos)))
     )
-    pairs = _among(found, partners_by_photo, photos)
+    pairs = _pairs_among(found, partners_by_photo, photos)
     if not pairs:
         return found
     stronger = reextract(work.capture, found, photos, pairs, work.options.seed, work.report)
@@ -163,7 +163,7 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
     return grown if len(unplaced(grown)) < len(left) else found
 
 
-def _worth_another_look(found: MappingResult, partners_by_photo: PartnersByPhoto, most: int) -> list[int]:
+def _choose_reextraction(found: MappingResult, partners_by_photo: PartnersByPhoto, most: int) -> list[int]:
     """Choose leftover photos and their likeliest partners, at most ``most``; those with the most matches first.
 
     A photo with many keypoints but no match with a placed photo is left out: it shows something else.
@@ -184,7 +184,7 @@ def _worth_another_look(found: MappingResult, partners_by_photo: PartnersByPhoto
     return sorted(chosen)
 
 
-def _among(found: MappingResult, partners_by_photo: PartnersByPhoto, photos: Collection[int]) -> list[Pair]:
+def _pairs_among(found: MappingResult, partners_by_photo: PartnersByPhoto, photos: Collection[int]) -> list[Pair]:
     """Return pairs among photos: each leftover photo with its partners, and pairs that already have matches."""
     chosen = set(photos)
     pairs = {pair for pair in found.verified.matches if chosen.issuperset(pair)}

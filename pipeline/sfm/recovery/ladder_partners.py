@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.recovery.ladder_poses import partners_of
 PartnersByPhoto = dict[int, list[int]]
 """For each leftover photo, others that may show the same thing, most likely first."""
 
-LOOKED_AT = 100  # entries of a ranking that are kept; callers never need more
+MAX_PARTNERS = 100  # entries of a ranking that are kept; callers never need more
 
 
 def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[int], seed: int) -> PartnersByPhoto:
@@ -68,7 +68,7 @@ def by_model(found: MappingResult, left: Collection[int], placed: Collection[int
         for partner, _, _ in partners_of(found.verified, photo):
             if partner in placed:
                 counts.update(member for row in rows.get(partner, []) for member, _ in tracks[row])
-        partners_by_photo[photo] = sorted(counts, key=lambda member: (-counts[member], member))[:LOOKED_AT]
+        partners_by_photo[photo] = sorted(counts, key=lambda member: (-counts[member], member))[:MAX_PARTNERS]
     return partners_by_photo
 
 
@@ -96,6 +96,6 @@ def _by_costs(left: Collection[int], costs: Costs) -> PartnersByPhoto:
     for photo in sorted(left):
         row = costs(photo - 1).copy()
         row[photo - 1] = np.inf
-        order: Sequence[int] = np.argsort(row, kind="stable")[:LOOKED_AT].tolist()
+        order: Sequence[int] = np.argsort(row, kind="stable")[:MAX_PARTNERS].tolist()
         partners_by_photo[photo] = [other + 1 for other in order if np.isfinite(row[other])]
     return partners_by_photo

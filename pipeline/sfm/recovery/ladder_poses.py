@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
-ERROR = 0.003  # reprojection tolerance as a share of the longer side: COLMAP's 12 pixels in a photo of 4,000
+MAX_ERROR_SHARE = 0.003  # reprojection tolerance as a share of the longer side: COLMAP's 12 pixels in a photo of 4,000
 MIN_ERROR_PX = 4.0  # minimum tolerance for small photos: coarse-scale keypoints are off by pixels
 MIN_INLIERS = 15  # keypoints; COLMAP's minimum for a pair
 MANY_INLIERS = 30  # COLMAP's minimum for a pose
@@ -114,7 +114,7 @@ def place(
     if total < MIN_INLIERS:
         return None
     places, spots = keypoints[seen.keypoints].astype(np.float64), points[seen.rows]
-    limit = max(MIN_ERROR_PX, ERROR * max(camera.width, camera.height))
+    limit = max(MIN_ERROR_PX, MAX_ERROR_SHARE * max(camera.width, camera.height))
     camera = copy.deepcopy(camera)
     answer = _estimate(places, spots, camera, calibrated, limit, seed)
     if answer is None:

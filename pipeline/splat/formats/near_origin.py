@@ -26,7 +26,8 @@ ROUNDED_STEPS = 0.5  # Gaussians' sizes in a step that has visibly displaced the
 EXTENT = (0.05, 0.95)  # quantiles that bound a splat's main extent
 SAMPLE = 200_000  # Gaussians that this is estimated from
 MIXED_UNITS = 2.0  # extents of the splat along two axes in its median Gaussian: its scales are in another unit
-TORN = 0.05  # share of Gaussians that float32 displaces by more than their largest size: parts of the splat are lost
+# share of Gaussians that float32 displaces by more than their largest size: parts of the splat are lost
+MIN_TORN_SHARE = 0.05
 FEW = 10  # Gaussians that may well be larger than the distances between them
 MAX_LOG = 700.0  # largest natural logarithm whose exponential float64 holds
 
@@ -138,7 +139,7 @@ def _to_float32(path: Path, gaussians: Gaussians) -> None:
     for piece in gaussians.pieces():
         moved = (piece.means - piece.means.float()).abs().amax(1).numpy()
         lost += int((moved > sizes_of(piece.log_scales)[:, 1]).sum())
-    if lost > TORN * count:
+    if lost > MIN_TORN_SHARE * count:
         raise SplatpipeError(
             f"{path}: it extends so far that 32-bit coordinates would displace {lost:,} of {count:,} Gaussians by more "
             "than their size.",

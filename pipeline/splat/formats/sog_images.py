@@ -31,8 +31,8 @@ ENTRIES_A_ROW = 64  # palette entries in a row of its picture
 MAX_ENTRIES = 65_536
 _HARMONIC_LEVELS = 64  # codebook size for the palette: as good as 256 beside the palette's own error, a quarter smaller
 _MAX_LOG_AREA = 80.0  # bound on the natural logarithm of a Gaussian's area
-_SHOWN_QUANTILE = 0.99
-_MIN_SHOWN = 1e-3  # least weight relative to the mean: what is hardly seen from afar is seen from near
+_MAX_WEIGHT_QUANTILE = 0.99
+_MIN_WEIGHT = 1e-3  # least weight relative to the mean: what is hardly seen from afar is seen from near
 _ROWS_AT_ONCE = 1 << 16
 _SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
 
@@ -127,9 +127,9 @@ def _area_weights(gaussians: Gaussians) -> Float[Tensor, " n"]:
         return torch.zeros(0)
     sides = gaussians.log_scales.sort(1).values[:, 1:].sum(1).clamp(-_MAX_LOG_AREA, _MAX_LOG_AREA)
     areas = torch.sigmoid(gaussians.opacity_logits).double() * torch.exp(sides.double())
-    most = areas.sort().values[int(_SHOWN_QUANTILE * (len(areas) - 1))]  # the largest are hidden behind others
+    most = areas.sort().values[int(_MAX_WEIGHT_QUANTILE * (len(areas) - 1))]  # the largest are hidden behind others
     areas = areas.clamp_max(most)
-    return (areas / areas.mean().clamp_min(1e-300)).clamp_min(_MIN_SHOWN).float()
+    return (areas / areas.mean().clamp_min(1e-300)).clamp_min(_MIN_WEIGHT).float()
 
 
 def _means(means: Float[Tensor, "n 3"]) -> _Part:

@@ -39,7 +39,7 @@ CELLS = 24  # along the longer side: about 30 pixels at half a megapixel, 4 % of
 OWN_POINTS = 2  # that a cell needs for a bound: a single one may lie past the edge of a foreground object
 POINTS_AROUND = 6  # including its eight neighbours
 MARGIN = 0.1  # share of the depth kept free before a surface: it curves between points accurate to a tenth of a pixel
-VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin object
+MIN_VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin object
 SUPPORT_TRACK = 3  # least track length of a point that overrules: two-view points themselves hang in free space
 SUPPORT_SHARE = 0.04  # distance to a point over that to the nearest camera (one cell): nearer is on its surface
 NEAR_SHARE = 0.2  # nearest depth tested over the depth where a photo's points begin
@@ -79,7 +79,7 @@ class FreeSpace:
     @property
     def known(self) -> bool:
         """Whether enough photos have enough points to identify free space."""
-        return sum(bool(photo.depth.any()) for photo in self.photos) >= VIEWS
+        return sum(bool(photo.depth.any()) for photo in self.photos) >= MIN_VIEWS
 
 
 def free_space(
@@ -99,7 +99,7 @@ def free_space(
     return FreeSpace(tuple(bounds), xyz[photos >= SUPPORT_TRACK])
 
 
-def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = VIEWS) -> Bool[Tensor, " n"]:
+def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = MIN_VIEWS) -> Bool[Tensor, " n"]:
     """Which Gaussians are floaters: in free space, or right in front of a camera.
 
     Args:

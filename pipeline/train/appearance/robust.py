@@ -35,11 +35,11 @@ from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone photo spans two
 MIN_CELL_PX = 4  # smaller photos have fewer cells: a cell has to average out detail
-MEMORY = 0.5  # weight of earlier visits in a cell's residual
-NEARBY = 1  # cells: the model may show this far away what the photo shows here
+RESIDUAL_MOMENTUM = 0.5  # weight of earlier visits in a cell's residual
+SEARCH_RADIUS_CELLS = 1  # cells: the model may show this far away what the photo shows here
 MIN_RESIDUAL = 0.05  # residual of a left-out cell, colours in 0..1: anything less is shading, not another object
-VOTES = 4  # minimum among a cell and its eight neighbours: two by two are an object, a single one is noise
-RIM = 0.5  # residual over the threshold above which neighbours of a left-out cell are left out too
+MIN_VOTES = 4  # minimum among a cell and its eight neighbours: two by two are an object, a single one is noise
+RIM_THRESHOLD_SHARE = 0.5  # residual over the threshold above which neighbours of a left-out cell are left out too
 MAX_SHARE_OF_PHOTO = 0.25  # may be left out: more than that is a wrong model, not a passer-by
 MAX_WITNESSES = 24  # nearest photos that are compared at a place
 MIN_ALPHA = 0.8  # opacity of a judged pixel: below it the model has a hole rather than a contradiction
@@ -147,15 +147,16 @@ class RobustMask(Technique):
     def _remember(self, row: int, now: Float[Tensor, "g g"], judged: Bool[Tensor, "g g"] | None) -> None:
         """Blend a visit's residuals into the stored ones; cells that its window does not show stay unchanged."""
         before = self.scores[row]
-        mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
-        faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: the old residual fades
+        mixed = torch.where(before < 0.0, now, RESIDUAL_MOMENTUM * before + (1.0 - RESIDUAL_MOMENTUM) * now)
+        # nothing to compare: the old residual fades
+        faded = torch.where(before < 0.0, before, RESIDUAL_MOMENTUM * before)
         after = torch.where(now < 0.0, faded, mixed)
         self.scores[row] = after if judged is None else torch.where(judged, after, before)
 
     def _left_out_cells(self, row: int, rendered: Render, cells: PhotoCells) -> Bool[Tensor, "g g"]:
         scores, threshold = self.scores[row], self.threshold
         most = torch.quantile(scores, 1.0 - MAX_SHARE_OF_PHOTO)
-        high, low = torch.maximum(threshold, most), torch.maximum(RIM * threshold, most)
+        high, low = torch.maximum(threshold, most), torch.maximum(RIM_THRESHOLD_SHARE * threshold, most)
         core = _voted(scores > high)
         core &= self._contradicted(row, core, rendered, cells)
         return (_near(core) & (scores > low)) | core
@@ -262,15 +263,17 @@ def _worth_asking(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
 
 
 def _nearby(planes: Float[Tensor, "c gh gw"]) -> Float[Tensor, "c k gh gw"]:
-    """The values up to ``NEARBY`` cells around each cell; zeros beyond the border."""
-    side = 2 * NEARBY + 1
-    return functional.unfold(planes[None], side, padding=NEARBY).view(len(planes), side * side, *planes.shape[1:])
+    """The values up to ``SEARCH_RADIUS_CELLS`` cells around each cell; zeros beyond the border."""
+    side = 2 * SEARCH_RADIUS_CELLS + 1
+    return functional.unfold(planes[None], side, padding=SEARCH_RADIUS_CELLS).view(
+        len(planes), side * side, *planes.shape[1:]
+    )
 
 
 def _voted(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
     """The cells that have enough of their neighbourhood with them."""
     votes = 9.0 * functional.avg_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0]
-    return cells & (votes > VOTES - 0.5)
+    return cells & (votes > MIN_VOTES - 0.5)
 
 
 def _near(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:

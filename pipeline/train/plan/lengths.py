@@ -21,7 +21,7 @@ WHOLE_VISITS = 20  # minimum per photo at the size at which it fits whole
 PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/lengths.md
 FIRST_SHARE = 0.5  # share of the minimum iterations at the first size, but for MAX_FIRST_ITERATIONS
 MAX_FIRST_ITERATIONS = 3500  # cap on FIRST_SHARE where WHOLE_VISITS are fewer: the finest size is worth more
-FEWEST_VISITS = 10.0  # visits per part below which a run of a given length stays with the size before: it learns more
+MIN_PART_VISITS = 10.0  # visits per part below which a run of a given length stays with the size before: it learns more
 COARSE_SHARE = 0.5  # share of the first size's iterations that use photos halved further by `coarse_levels`
 
 UNTIL = 0.5  # end of density control, as a share of the run (published), or of the finest size's part of it
@@ -146,7 +146,7 @@ def divided(footage: PhotoSizes, least: int, iterations: int) -> list[Length]:
     for finest in range(footage.first_level + 1):
         wanted = lengths(footage, least, finest)
         share = min(1.0, iterations / sum(count for _level, count in wanted))
-        if len(wanted) == 1 or share * wanted[-1][1] >= FEWEST_VISITS * footage.parts(finest):
+        if len(wanted) == 1 or share * wanted[-1][1] >= MIN_PART_VISITS * footage.parts(finest):
             break
     ends, done = [], 0
     for _level, count in wanted:

@@ -120,7 +120,7 @@ class TrainingPlan:
         """
         schedule, footage = self.schedule, self.footage
         for iteration in sizes_ended:
-            pixels = footage.pixels(schedule.look_at(iteration))
+            pixels = footage.pixels(schedule.training_size_at(iteration))
             schedule = schedule.without_rest(iteration, min(1.0, pixels / footage.pixels(schedule.finest)))
         spared = self.schedule.iterations - schedule.iterations
         return replace(self, schedule=schedule, last_iteration=self.last_iteration - spared) if sizes_ended else self

@@ -134,7 +134,7 @@ class Schedule:
         """The degree trained at an iteration (from 1): one more every ``sh_every``."""
         return min(self.sh_degree, iteration // self.sh_every)
 
-    def look_at(self, iteration: int) -> TrainingSize:
+    def training_size_at(self, iteration: int) -> TrainingSize:
         """The training size of an iteration (from 1)."""
         return self.stretches[self.stretch_at(iteration)].training_size
 
@@ -167,8 +167,8 @@ class Schedule:
         return replace(self, iterations=total, stretches=tuple(changed), density=density)
 
     def training_sizes_until(self, last: int) -> list[TrainingSize]:
-        """``look_at`` for every iteration from 1 to ``last``."""
-        return [self.look_at(iteration) for iteration in range(1, last + 1)]
+        """``training_size_at`` for every iteration from 1 to ``last``."""
+        return [self.training_size_at(iteration) for iteration in range(1, last + 1)]
 
     @property
     def finest(self) -> TrainingSize:

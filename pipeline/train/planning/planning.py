@@ -15,7 +15,7 @@ from splatpipe.pipeline.raster.device import Device, cpu, free_bytes
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, BudgetTask, choose
+from splatpipe.pipeline.train.plan.budget import FIRST_GROWTH, MIN_GAUSSIANS, BudgetTask, choose
 from splatpipe.pipeline.train.plan.limits import FIRST_ITERATIONS, device_bytes_per_gaussian, worthwhile_iterations
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of
 from splatpipe.pipeline.train.plan.start import InitialGaussians, started
@@ -126,7 +126,7 @@ def pilot(plan: TrainingPlan, scene: PlanningInput) -> TrainingPlan:
     free = free_bytes(scene.device.tensors)
     if free is not None:  # a smaller model exists at the same time; both are discarded
         paid_for = min(paid_for, free / (2 * device_bytes_per_gaussian(plan.options.sh_degree)))
-    wanted = max(FIRST_GROWTH * scene.start.sparse, paid_for, FEWEST_GAUSSIANS)
+    wanted = max(FIRST_GROWTH * scene.start.sparse, paid_for, MIN_GAUSSIANS)
     short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
     return plan.of(scene.config.model_copy(update=short))
 

@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
-from splatpipe.pipeline.train.plan.budget import FEWEST_GAUSSIANS
+from splatpipe.pipeline.train.plan.budget import MIN_GAUSSIANS
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.state.state import TrainState
 
@@ -73,7 +73,7 @@ def _take_less(state: TrainState, kernels: CudaKernels | None, report: Reporter)
     count, now = len(state.gaussians), state.iteration + 1
     if kernels is not None and kernels.forecast.shrink():
         return
-    fewer = max(int(KEPT_SHARE * count), FEWEST_GAUSSIANS)
+    fewer = max(int(KEPT_SHARE * count), MIN_GAUSSIANS)
     if fewer >= count:
         raise MachineError(f"The graphics card's memory does not hold even {count:,} Gaussians.", hint=HINT)
     state.history.growth_ended = state.history.growth_ended or max(1, state.iteration)

@@ -27,7 +27,7 @@ from splatpipe.pipeline.train.blocks.cells.needs import (
     shared_cap,
     with_margin,
 )
-from splatpipe.pipeline.train.blocks.cells.partition import NOBODY, Cell, Partition
+from splatpipe.pipeline.train.blocks.cells.partition import NO_OWNER, Cell, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.cells.surroundings import visible_around
 from splatpipe.pipeline.train.blocks.cells.thinning import thinned
@@ -131,7 +131,7 @@ def test_places_beyond_the_site_belong_to_the_nearest_cell(
     for block in range(len(partition.cells)):
         assert partition.trained_by(block, beyond)[owners == block].all()
     broken = np.array([[math.nan] * 3, [math.inf, 0.0, 0.0], [0.0, -math.inf, 0.0]])
-    assert partition.owners(broken).tolist() == 3 * [NOBODY]
+    assert partition.owners(broken).tolist() == 3 * [NO_OWNER]
     assert not partition.trained_by(0, broken).any()
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.photos.pixels.covering import COVERED, covering_photos
+from splatpipe.pipeline.photos.pixels.covering import MIN_COVERED_SHARE, covering_photos
 
 FEW = 12
 
@@ -29,7 +29,7 @@ def test_chosen_photos_show_nearly_every_point_several_times(photos: int) -> Non
     seen = flight(photos)
     chosen = covering_photos(seen, 4000, FEW)
     assert np.sqrt(FEW * photos) <= len(chosen) <= photos
-    assert (counts(seen, chosen) > 0).sum() >= COVERED * (counts(seen, range(photos)) > 0).sum()
+    assert (counts(seen, chosen) > 0).sum() >= MIN_COVERED_SHARE * (counts(seen, range(photos)) > 0).sum()
     assert np.median(counts(seen, chosen)) >= (1 if photos == 300 else 2)
 
 

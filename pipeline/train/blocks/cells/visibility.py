@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.train.blocks.cells.partition import NOBODY, Partition
+from splatpipe.pipeline.train.blocks.cells.partition import NO_OWNER, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, Samples
 from splatpipe.pipeline.train.plan.windows import windows_of
 
@@ -112,7 +112,7 @@ def _sum_weights(partition: Partition, samples: Samples, parts: Windows) -> Floa
     """Total weight of the samples in each cell and window."""
     owners = partition.owners(samples.places)
     inside = _window_of(samples.pixels, parts)
-    rows = (owners != NOBODY) & (inside >= 0)
+    rows = (owners != NO_OWNER) & (inside >= 0)
     flat = owners[rows] * len(parts) + inside[rows]
     size = len(partition.cells) * len(parts)
     return np.bincount(flat, samples.weights[rows], minlength=size).reshape(-1, len(parts))
