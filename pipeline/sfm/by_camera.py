@@ -15,13 +15,15 @@ from splatpipe.pipeline.sfm.judging.judging import TRUSTED_SOURCES
 from splatpipe.pipeline.sfm.lenses.focal import adjust_within
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
-MAX_CAMERAS_REPORTED = 10  # on the console; the report lists them all
+MAX_CAMERAS_REPORTED = 10  # cameras listed on the console; the report lists them all
 MIN_CAMERA_PHOTOS = 3  # photos of a camera below which focal length and distance are not separable
 MAX_STATED_DEVIATION = 0.05  # maximum relative deviation from a trusted focal length
 MAX_SIBLING_DEVIATION = 0.02  # maximum relative deviation from a focal length calibrated with the same body and zoom
 
 
-def hold_few(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[int]:
+def reset_underdetermined_focals(
+    model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]
+) -> list[int]:
     """Reset the focal lengths of cameras with one or two photos to known values, and adjust, in place.
 
     A single photo, far from others or of a flat object, does not determine its focal length, which may run away in

@@ -234,7 +234,7 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
         work.add_note(answer, note)
         work.database, work.verified = found.database, found.verified
         if thin or found.contradicting:
-            answer = _judged_again(work, answer)
+            answer = _rejudge(work, answer)
         if not thin:
             break
         work.further += number == 0
@@ -249,7 +249,7 @@ def _unsure(answer: MappingAttempt, verified: ViewGraph) -> bool:
     return not known or (answer.judgement is not None and answer.judgement.level != "good")
 
 
-def _judged_again(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
+def _rejudge(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """Judge an attempt's largest model again, against the current view graph."""
     judgement = judge(answer.models[0], work.verified, work.capture.cameras)
     fresh = replace(answer, judgement=judgement)
@@ -273,7 +273,7 @@ def _with_held_focal(work: Reconstructor, answer: MappingAttempt) -> MappingAtte
     adjust_within(
         model, {number: priors[number].mean_focal_length() for number in _used(model)}, MAX_UNOBSERVED_DEVIATION
     )
-    held = _judged_again(work, held)
+    held = _rejudge(work, held)
     if held.judgement is None or answer.judgement is None:
         return answer
     return held if held.judgement.score >= answer.judgement.score - MIN_SCORE_MARGIN else answer
@@ -312,7 +312,9 @@ def _has_points(model: Model) -> bool:
 def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bool:
     """Whether a focal length left its prior although the photos do not determine it; ground control may, later."""
     used = _used(model)
-    strayed = [number for number in used if _stray(model.cameras[number], priors[number]) >= MAX_UNOBSERVED_DEVIATION]
+    strayed = [
+        number for number in used if _focal_deviation(model.cameras[number], priors[number]) >= MAX_UNOBSERVED_DEVIATION
+    ]
     if not strayed or not all(priors[number].has_prior_focal_length for number in used):
         return False
     sigmas = focal_sigmas(model)
@@ -324,5 +326,5 @@ def _used(model: Model) -> list[int]:
     return sorted({model.images[number].camera_id for number in model.reg_image_ids()})
 
 
-def _stray(camera: pycolmap.Camera, prior: pycolmap.Camera) -> float:
+def _focal_deviation(camera: pycolmap.Camera, prior: pycolmap.Camera) -> float:
     return float(abs(camera.mean_focal_length() / prior.mean_focal_length() - 1.0))

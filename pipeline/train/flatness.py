@@ -20,11 +20,12 @@ from splatpipe.pipeline.train.plan.schedule import Schedule, tail_of
 from splatpipe.pipeline.train.state.history import History
 
 WINDOW_SHARE = 0.25  # last share of the iterations done, to which the line is fitted
-MIN_EPOCHS = 8  # in the window, so that their scatter can be estimated
-STANDARD_ERRORS = 2.0  # by which the line is made steeper: noise must not end a training that still improves
+MIN_EPOCHS = 8  # epochs in the window, so that their scatter can be estimated
+# standard errors by which the line is made steeper: noise must not end a training that still improves
+STANDARD_ERRORS = 2.0
 
 
-def settled_from(schedule: Schedule) -> int:
+def final_phase_from(schedule: Schedule) -> int:
     """Iteration after which only the rates change: Gaussians, SH degree and photo size have reached their final state.
 
     Args:
@@ -46,7 +47,7 @@ def judged_from(schedule: Schedule, iteration: int, resets: Sequence[int]) -> in
     """
     number = schedule.stretch_at(iteration)
     if number == len(schedule.stretches) - 1:
-        return settled_from(schedule)
+        return final_phase_from(schedule)
     begun = schedule.stretches[number - 1].until if number else 0
     grown = schedule.density.first if schedule.density.on else 0
     return max(begun, grown, *resets[-1:])

@@ -86,7 +86,7 @@ def without_zeros(name: str) -> str:
     return re.sub(r"(?<!\d)0+(?=\d)", "", name)
 
 
-NAMES_SHOWN = 10  # in one message; left_out.json lists them all
+NAMES_SHOWN = 10  # names listed in one message; left_out.json lists them all
 
 
 def list_names(names: Iterable[str], limit: int = NAMES_SHOWN) -> str:

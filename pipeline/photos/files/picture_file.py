@@ -1,6 +1,6 @@
 """The one way to open and decode a user's picture, whose size is not to be trusted: a few kB can claim 500 megapixels.
 
-Everybody asks ``why_hollow`` or compares the size that the header states before any pixel is decoded, and large
+Everybody asks ``sparse_data_reason`` or compares the size that the header states before any pixel is decoded, and large
 pictures are decoded one at a time in a process.
 """
 
@@ -97,7 +97,7 @@ def _check_tiles(picture: Image.Image) -> None:
             raise OSError(f"its tiles of {found} pixels are larger than the picture")
 
 
-def why_hollow(picture: Image.Image, data: bytes) -> str:
+def sparse_data_reason(picture: Image.Image, data: bytes) -> str:
     """Why an opened image cannot be a photo: its pixels take too few bytes of its file; empty if it can be one."""
     pixels = picture.width * picture.height
     if pixels <= LARGE_PIXELS:

@@ -21,9 +21,9 @@ from splatpipe.pipeline.photos.files.picture_file import (
     STRIP_ROWS,
     load_stored,
     open_picture,
+    sparse_data_reason,
     strips_of,
     turn_to_decode,
-    why_hollow,
 )
 from splatpipe.pipeline.photos.files.scan import Candidate, ExcludedPhoto
 from splatpipe.pipeline.photos.metadata.exif import Exif, read_exif
@@ -106,7 +106,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
     except Exception as error:  # Pillow's readers raise almost anything on broken images
         return ExcludedPhoto(candidate.name, _decode_problem(error))
     with picture:
-        reason = _refusal_reason(picture, data, limits) or why_hollow(picture, data)
+        reason = _refusal_reason(picture, data, limits) or sparse_data_reason(picture, data)
         return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
 
 

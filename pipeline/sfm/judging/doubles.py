@@ -20,7 +20,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.judging.cuts import GraphCut, cut_between
-from splatpipe.pipeline.sfm.judging.judging import Level, Reason, who
+from splatpipe.pipeline.sfm.judging.judging import Level, Reason, name_photo_group
 from splatpipe.pipeline.sfm.model.structure import read_structure
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.pairing.pairs import Pair
@@ -145,7 +145,9 @@ def doubles_reasons(verified: ViewGraph, found: Doubles) -> list[Reason]:
     if found.level() == "good":
         return []
     names = [verified.names[number] for number in found.pair]
-    text = f"{who(found.group, verified)} show other things than the photos that the model has at the same "
+    text = (
+        f"{name_photo_group(found.group, verified)} show other things than the photos that the model has at the same "
+    )
     text += f"place, such as {names[0]} and {names[1]}: two places that look alike may have been taken for one."
     hint = "Compare the two photos: the report shows that place in both. Add photos that lead from one place to the "
     hint += "other, or run the places separately."

@@ -220,20 +220,20 @@ def _bent(agreement: Agreement, found: Rearrangement, verified: ViewGraph) -> li
         cut = find_cut(agreement, against)
         if cut.ratio < CUT_DOUBT:
             return []
-        text = f"{who(cut.group, verified)} match the other photos elsewhere more than where the model has them: the "
-        text += "scene repeats itself there, or the model is bent."
+        text = f"{name_photo_group(cut.group, verified)} match the other photos elsewhere more than where the model has "
+        text += "them: the scene repeats itself there, or the model is bent."
         return [Reason("doubt", text, hint, "bent")]
     resolved = int((against & ~contradicting(found.agreement)).sum())
     text = "Another arrangement of the cameras explains "
     text += f"{resolved} of the {against.sum()} contradicting pairs of photos" if resolved else "the matches better"
     cut = find_cut(agreement, against)
     if cut.ratio >= CUT_DOUBT:
-        text += f": {who(cut.group, verified)} disagree with the others"
+        text += f": {name_photo_group(cut.group, verified)} disagree with the others"
     text += ", so the model is bent or contains duplicates."
     return [Reason("bad" if gain >= GAIN_BAD else "doubt", text, hint, "bent")]
 
 
-def who(group: Sequence[int], verified: ViewGraph) -> str:
+def name_photo_group(group: Sequence[int], verified: ViewGraph) -> str:
     """Name a group of photos."""
     names = [verified.names[number] for number in group]
     if len(names) <= 2:

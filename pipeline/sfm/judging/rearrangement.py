@@ -30,12 +30,12 @@ from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 SAMPLE = 24  # matches per pair: the adjustment has six unknowns per photo
 LOSS_WIDTHS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # widths of the robust loss, times EXPLAINED_PX, one after another
 GAUSS_NEWTON_STEPS = 4  # Gauss-Newton steps at each width
-CONTRADICTION_WEIGHT, MIN_FAVOURED_WIDTH = 4.0, 8.0  # weight of contradicting pairs while the loss is that wide
+CONTRADICTION_WEIGHT, MIN_FAVOURED_WIDTH = 4.0, 8.0  # weight of contradicting pairs from that width of the loss on
 MOVED_LOSS_WIDTHS = (4.0, 2.0, 1.0)  # where a group was moved: its place is nearly right
 DAMPING = 1e-4  # added share of the normal matrix' diagonal: the world's frame and chains of photos are undetermined
 IRLS_ROUNDS = 10  # rounds of the reweighted fit of a group's place
 WEAK_SCALE = 0.01  # weight of a group's scale staying as it is: a single line of sight leaves it open
-MAX_MOVED_GROUPS = 3  # that are moved, one after another
+MAX_MOVED_GROUPS = 3  # groups of photos moved at most, one after another
 MIN_CONTRADICTION_RATIO = 0.5  # contradicting over agreeing matches of a group with the others
 MAX_LINKS = 16  # two-view geometries for a group's place, those of the most matches
 MIN_SAMPLED_GAIN = 0.003  # gain of the sampled score that is worth a full comparison: below the least that matters

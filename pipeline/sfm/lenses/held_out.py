@@ -14,7 +14,7 @@ import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 MIN_VIEWS = 3  # two that intersect, and one that is predicted
-REWEIGHTINGS = 2  # by the distance to the point from the previous round
+REWEIGHTINGS = 2  # rounds of weighting rays by the distance to the point from the previous round
 MIN_ANGLE = 0.02  # its square is the minimum eigenvalue ratio: nearly parallel rays do not determine a point
 MAX_ERROR_RATIO = 4.0  # times the median error: a single wrong match must not decide
 BOOTSTRAPS = 500

@@ -16,7 +16,7 @@ from splatpipe.pipeline.sfm.lenses.lens_file import FileLens, checked_lens, fitt
 from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens, named_params, simplest
 
 FILE, DEWARP = "lens-file", "xmp-dewarp"
-SHAPE_TOLERANCE = 0.005  # on the aspect ratio of the lens's images and the photos: a pixel lost in resizing
+SHAPE_TOLERANCE = 0.005  # difference of the aspect ratios of the lens's images and the photos: a pixel lost in resizing
 MAX_DEWARP_CHARS = 600
 MAX_FOCAL_DEVIATION = 0.35  # relative deviation from the metadata's focal length: a rough 35 mm equivalent was 26 % off
 SIZES_SHOWN = 4

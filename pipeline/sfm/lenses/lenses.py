@@ -70,7 +70,7 @@ def calibrate(
         The model itself if every lens stays simple, otherwise a new one; and a row per camera for ``models.json``.
     """
     usable = {number: lens for number, lens in stated.items() if number in model.cameras}
-    chosen = _deciding(model, seed)
+    chosen = _decision_tracks(model, seed)
     if how == "simple" or (len(chosen) < MIN_TRACKS and not usable):
         return model, ()
     if len(chosen) < MIN_TRACKS:
@@ -108,7 +108,7 @@ def _with_held(
     return result, _rows(model, result, states, stated)
 
 
-def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
+def _decision_tracks(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
     """Choose the points used for the decision, in a seeded order.
 
     Only points seen by three photos or more; up to ``MAX_TRACKS``, and beyond that only those of photos that still

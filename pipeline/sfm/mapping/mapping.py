@@ -74,9 +74,11 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
     def place() -> None:
         nonlocal placed
         placed += 1
-        tell(min(placed, total), total, "placing photos" if begun < 2 else f"placing photos (model {begun})", "photos")
+        report_step(
+            min(placed, total), total, "placing photos" if begun < 2 else f"placing photos (model {begun})", "photos"
+        )
 
-    def tell(done: int, of: int, what: str, unit: str) -> None:
+    def report_step(done: int, of: int, what: str, unit: str) -> None:
         nonlocal now
         now = (done, of, what, unit)
 
@@ -95,7 +97,7 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
                 cancellation_token=stop,
             )
         for model in found.values():
-            complete(model, database, settings, stop, on_progress=tell)
+            complete(model, database, settings, stop, on_progress=report_step)
         return largest_first(found)
 
     return run_in_thread(work, lambda: on_progress(*now), stop.cancel)

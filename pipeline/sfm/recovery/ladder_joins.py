@@ -89,7 +89,7 @@ def join(
     if fitted is None:
         return None
     similarity, inliers = fitted
-    if not _sure(ties, inliers) or not _cross_validates(ties, seed):
+    if not _is_certain(ties, inliers) or not _cross_validates(ties, seed):
         return None
     return _united(model, here, other, there, verified, similarity, ties.rows[inliers])
 
@@ -209,7 +209,7 @@ def agree(ties: TiePoints, similarity: Similarity) -> Bool[np.ndarray, " k"]:
     return good
 
 
-def _sure(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
+def _is_certain(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
     """Whether the inliers are numerous enough, a large enough share, and spread over the images and photo pairs."""
     held = min(len(np.unique(ties.rows[inliers, side])) for side in (0, 1))
     share = held / max(1, min(len(np.unique(ties.rows[:, side])) for side in (0, 1)))

@@ -116,13 +116,13 @@ def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> Po
             raise UsageError(f"{path} is an existing folder.", hint="Name a new file or folder.")
         with beside(path) as aside:
             cost = kind.write(aside, scene if kind.exact else in_unit_quats(scene))
-            _refuse_ruin(path, scene, cost)
+            _refuse_position_loss(path, scene, cost)
             return cost
     except OSError as error:
         raise MachineError(f"Cannot write {path}: {error.strerror or error}.", hint="Check the free space.") from error
 
 
-def _refuse_ruin(path: Path, scene: Scene, cost: PositionCost) -> None:
+def _refuse_position_loss(path: Path, scene: Scene, cost: PositionCost) -> None:
     """Refuse a file that would not show the splat.
 
     Raises:

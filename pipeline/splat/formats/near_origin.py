@@ -47,7 +47,7 @@ def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Sc
         SplatpipeError: if float32 is too coarse for positions that a record places on the earth.
     """
     stored_as_float32 = gaussians.means.dtype == torch.float32
-    lying = _Lying.of(gaussians)
+    lying = _Placement.of(gaussians)
     notes = () if lying is None else lying.notes(path)
     if stored_as_float32 and lying is not None and lying.too_far:
         notes += lying.rounding(path)
@@ -71,7 +71,7 @@ def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Sc
     return Scene(gaussians, replace(facts, axes=axes, offset=(x, y, z)), notes)
 
 
-class _Lying:
+class _Placement:
     """Where a splat lies in its coordinates, and how large it and its Gaussians are."""
 
     def __init__(self, means: Float64[np.ndarray, "n 3"], log_scales: Float64[np.ndarray, "n 3"]) -> None:
@@ -86,12 +86,12 @@ class _Lying:
         self.step = float(np.spacing(np.float32(np.abs(self.middle).max())))
 
     @staticmethod
-    def of(gaussians: Gaussians) -> _Lying | None:
+    def of(gaussians: Gaussians) -> _Placement | None:
         """Of an even sample; None if no Gaussian has usable values."""
         every = max(1, -(-len(gaussians) // SAMPLE))
         sample = gaussians.select(torch.arange(0, len(gaussians), every))
         sample = sample.select(usable(sample))
-        return _Lying(sample.means.double().numpy(), sample.log_scales.double().numpy()) if len(sample) else None
+        return _Placement(sample.means.double().numpy(), sample.log_scales.double().numpy()) if len(sample) else None
 
     @property
     def too_far(self) -> bool:

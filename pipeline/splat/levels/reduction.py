@@ -50,7 +50,7 @@ class Reduction:
     counts: Int64[np.ndarray, " n"]
 
     @classmethod
-    def none_yet(cls, gaussians: Gaussians) -> Reduction:
+    def unmerged(cls, gaussians: Gaussians) -> Reduction:
         """All Gaussians, unmerged."""
         return cls(gaussians, np.zeros(len(gaussians)), np.ones(len(gaussians), dtype=np.int64))
 
@@ -79,7 +79,7 @@ def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
     """
     if 1 <= count < len(gaussians):
         gaussians = gaussians.clone()
-    return reduce_further(Reduction.none_yet(gaussians), count).gaussians
+    return reduce_further(Reduction.unmerged(gaussians), count).gaussians
 
 
 def reduce_further(start: Reduction, count: int, large_power: float = LARGE_POWER) -> Reduction:

@@ -36,8 +36,8 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.model.gaussians import Gaussians, multiply_quats
 
 CELLS = 24  # along the longer side: about 30 pixels at half a megapixel, 4 % of the depth
-OWN_POINTS = 2  # that a cell needs for a bound: a single one may lie past the edge of a foreground object
-POINTS_AROUND = 6  # including its eight neighbours
+OWN_POINTS = 2  # points that a cell needs for a bound: a single one may lie past the edge of a foreground object
+POINTS_AROUND = 6  # points needed in a cell and its eight neighbours
 MARGIN = 0.1  # share of the depth kept free before a surface: it curves between points accurate to a tenth of a pixel
 MIN_VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin object
 SUPPORT_TRACK = 3  # least track length of a point that overrules: two-view points themselves hang in free space

@@ -22,7 +22,7 @@ from splatpipe.pipeline.geometry.upright import up_without_orientation
 
 WORK_MEGAPIXELS = 0.1  # resolution of the search: noise and distant texture are averaged out, edges stay
 SMOOTH_SLOPE = 0.03  # change of a channel over a pixel, of 1: haze and soft clouds are below, edges and leaves above
-BLUE_STEP = 0.03  # by which a bluish sky's blue is at least above its red and at most below its green
+BLUE_STEP = 0.03  # least blue minus red, and most green minus blue, of a bluish sky
 CLEARLY_BLUE = 0.1  # blue minus red from which it is not just grey made bluish by shade or haze
 MIN_BLUE_LIGHT = 0.3  # blue channel of a bluish sky, 0 to 1
 MIN_GREY_LIGHT = 0.75  # darkest channel of a grey sky, 0 to 1: clouds, haze, overexposed
@@ -32,7 +32,7 @@ HORIZON_MARGIN_DEG = 2.0  # below the horizon: error of the estimated up, dip of
 ZENITH_DEG = 85.0
 TOP_COSINE = 0.5  # between up and the way out of the picture over its top border: a corner up has two top borders
 POINT_CLEARANCE_PX = 3  # around a triangulated point nothing is sky
-CORE_PX = 5  # from a region's edge on, points are no longer those of the roof under it
+CORE_PX = 5  # depth inside a region from which points are not those of the roof under it
 MAX_SPREAD = 0.2  # share of a region's core near points over that of the rest: spires, outliers, birds, clouds
 MIN_SHARE = 0.002  # area of a region over the picture: smaller patches are not worth the risk
 MIN_CONTACT = 0.5  # region's width at the top over the root of its area: a sky is open, a road or a wall narrow
@@ -44,7 +44,7 @@ MIN_WITNESSES = 2  # other photos that look the same way, before their word coun
 MIN_AGREEMENT = 0.15  # agreeing share of the witnesses: buildings rightly hide much of one's sky from another
 ROOF_COLUMNS = 72  # sectors of azimuth, 5° each, tested for something above a region
 ROOF_REACH_DEG = 5.0  # azimuth on either side that a point above covers: points of smooth ceilings are far apart
-ROOF_MARGIN_DEG = 3.0  # from a region's top to such a point: a roof's edge does not cover the sky beside it
+ROOF_MARGIN_DEG = 3.0  # elevation of such a point above a region's top: a roof's edge does not cover the sky beside it
 ROOF_POINTS = 3  # points needed: a single one may be wrong, or a bird
 MAX_ROOFED_SHARE = 0.5  # covered share of a region's pixels: a branch or a wire over the sky does not make it a wall
 OPEN_FROM_DEG = 5.0  # rays above this elevation pass over low walls and furniture

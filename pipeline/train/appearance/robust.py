@@ -157,7 +157,7 @@ class RobustMask(Technique):
         scores, threshold = self.scores[row], self.threshold
         most = torch.quantile(scores, 1.0 - MAX_SHARE_OF_PHOTO)
         high, low = torch.maximum(threshold, most), torch.maximum(RIM_THRESHOLD_SHARE * threshold, most)
-        core = _voted(scores > high)
+        core = _majority(scores > high)
         core &= self._contradicted(row, core, rendered, cells)
         return (_near(core) & (scores > low)) | core
 
@@ -169,7 +169,7 @@ class RobustMask(Technique):
             return torch.zeros_like(core)
         alpha, depth_sum = cells.means(torch.stack((rendered.alpha, rendered.depth_sum))).double()
         asked = (core & (alpha >= SURFACE_ALPHA)).flatten()
-        numbers = _worth_asking(asked)
+        numbers = _cell_indices(asked)
         middles = (torch.stack((numbers % GRID, numbers // GRID), dim=1) + 0.5) / GRID
         depths = (depth_sum / alpha).flatten()[numbers]
         places = self.witnesses.places(row, middles.double(), depths)
@@ -255,7 +255,7 @@ def _medians(planes: Float[Tensor, "c gh gw"], known: Bool[Tensor, "gh gw"]) -> 
     return ordered.index_select(1, middle[None])[:, 0]
 
 
-def _worth_asking(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
+def _cell_indices(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
     """Indices of the cells to work on: the requested ones, or all on a device, where counting would synchronize."""
     if asked.device.type == "cpu":
         return torch.nonzero(asked).flatten()
@@ -270,7 +270,7 @@ def _nearby(planes: Float[Tensor, "c gh gw"]) -> Float[Tensor, "c k gh gw"]:
     )
 
 
-def _voted(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
+def _majority(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
     """The cells that have enough of their neighbourhood with them."""
     votes = 9.0 * functional.avg_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0]
     return cells & (votes > MIN_VOTES - 0.5)

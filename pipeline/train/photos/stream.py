@@ -101,9 +101,9 @@ class PhotoStream:
         self._pending: deque[Future[_PendingPhoto]] = deque()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
-        self.go_on(order, first)
+        self.switch_order(order, first)
 
-    def go_on(self, order: TrainingOrder, first: int) -> None:
+    def switch_order(self, order: TrainingOrder, first: int) -> None:
         """Switch to another order, as if the stream had started with it; photos read ahead are dropped.
 
         Args:

@@ -32,7 +32,7 @@ FIRST_GROWTH = 1.5  # times the sparse points' Gaussians must fit in every plan 
 MIN_GAUSSIANS = 1000  # fewer cannot represent a building; the initial ones are thinned no further
 COARSEST_MEGAPIXELS = 0.05  # photos are halved no further at the start of a training
 
-EXPORT_GAUSSIAN_S = 8e-6  # to move, write twice and hash a Gaussian of the model
+EXPORT_GAUSSIAN_S = 8e-6  # seconds to move, write twice and hash a Gaussian of the model
 COST_GROWTH = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
 SAMPLES = 60  # points at which a forecast samples a training: its schedules are linear or stepped
 SCHEDULE_SHARE = 0.95  # share of the time for the planned schedule; the rest continues at its final learning rates

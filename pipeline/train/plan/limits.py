@@ -45,7 +45,7 @@ MACHINE_SHARE = 0.8  # share of the machine's memory for a training without a gi
 SMALLEST_WINDOW = 60_000  # pixels: below it the 5-pixel margins and the per-Gaussian cost dominate
 WINDOW_SHARE = 0.25  # largest share of the memory for pixels and Gaussians that a window may take
 
-FIRST_ITERATIONS = 1500  # wanted within FIRST_SECONDS: with fewer the colours have not settled
+FIRST_ITERATIONS = 1500  # iterations wanted within FIRST_SECONDS: with fewer the colours have not settled
 FIRST_SECONDS = 30.0
 MAX_ITERATIONS = 30_000  # iterations, as published: little is gained beyond
 MIN_ITERATIONS = 300  # iterations, however short the time: with fewer the model stays as blurred as it began

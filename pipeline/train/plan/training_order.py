@@ -167,7 +167,7 @@ class PhotoOrder(TrainingOrder):
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
-        return _wanted_again(self._views[first - 1 :].tolist(), self._sizes[first - 1 :])
+        return _revisited_photos(self._views[first - 1 :].tolist(), self._sizes[first - 1 :])
 
 
 class WindowOrder(TrainingOrder):
@@ -221,7 +221,9 @@ class WindowOrder(TrainingOrder):
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
         sizes, rows = self._sizes[first - 1 :], self._rows[first - 1 :].tolist()
-        return _wanted_again([self._parts[size.level][row][0] for size, row in zip(sizes, rows, strict=True)], sizes)
+        return _revisited_photos(
+            [self._parts[size.level][row][0] for size, row in zip(sizes, rows, strict=True)], sizes
+        )
 
 
 def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"]:
@@ -251,7 +253,7 @@ def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits
     return found
 
 
-def _wanted_again(views: Sequence[int], sizes: Sequence[TrainingSize]) -> dict[int, list[int]]:
+def _revisited_photos(views: Sequence[int], sizes: Sequence[TrainingSize]) -> dict[int, list[int]]:
     """The photos visited more than once in these iterations, with their levels."""
     times: Counter[int] = Counter()
     levels: defaultdict[int, set[int]] = defaultdict(set)

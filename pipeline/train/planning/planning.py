@@ -58,7 +58,7 @@ class PlanningInput:
     sky: SkyModel | None = None
 
 
-def under_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
+def plan_within_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
     """Fit a plan to the budgets of its options, and its initial Gaussians to the cap.
 
     Args:

@@ -47,7 +47,7 @@ def iterate_within_memory(
         state.roll_back()
         if state.gaussians.means.device.type == "cuda":
             torch.cuda.empty_cache()  # torch's cached blocks may be too fragmented for the next request
-        _take_less(state, kernels, report)
+        _reduce_memory(state, kernels, report)
     if kernels is not None and kernels.forecast.most_pairs < pairs:  # once, however often they were halved
         report.warning(
             f"The graphics card's memory is short in iteration {now:,}: each picture is processed in smaller parts, "
@@ -68,7 +68,7 @@ def _fits(step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhot
     return True
 
 
-def _take_less(state: TrainState, kernels: CudaKernels | None, report: Reporter) -> None:
+def _reduce_memory(state: TrainState, kernels: CudaKernels | None, report: Reporter) -> None:
     """Reduce the next thing: chunks of pairs first, then the model."""
     count, now = len(state.gaussians), state.iteration + 1
     if kernels is not None and kernels.forecast.shrink():

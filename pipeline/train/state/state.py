@@ -207,7 +207,7 @@ class TrainState:
         except torch.OutOfMemoryError:  # the device has not even room to select what to grow
             self.history.growth_ended = self.history.growth_ended or iteration
             return
-        self._become(growth)
+        self._adopt_growth(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
 
     def _growth(self, plan: TrainingPlan, limit: int, iteration: int) -> tuple[DensifiedGaussians, dict[str, int]]:
@@ -240,10 +240,10 @@ class TrainState:
             self._remove(gone.to(self.gaussians.means.device), self.iteration)
 
     def _remove(self, gone: Bool[Tensor, " n"], iteration: int) -> None:
-        self._become(unchanged(self.gaussians.detach(), ~gone))
+        self._adopt_growth(unchanged(self.gaussians.detach(), ~gone))
         self.history.add_density(DensityEvent(iteration, 0, 0, int(gone.sum()), 0, gaussians=len(self.gaussians)))
 
-    def _become(self, growth: DensifiedGaussians) -> None:
+    def _adopt_growth(self, growth: DensifiedGaussians) -> None:
         """Adopt the rows of a growth with their moments, one tensor after the other because memory is tight."""
         self.buffers = GradientBuffers()
         frozen = None if self.whole is None else self.whole.detach().after(len(self.gaussians)).clone()

@@ -52,11 +52,11 @@ class DistortionLoss(Technique):
         """Turn on depths, with an origin at which float32 is most precise."""
         if not self.is_counted(now.place):
             return settings
-        if self._is_worn(model, now):
+        if self._is_stale(model, now):
             self._centre = model.means.detach().mean(dim=0).double().cpu()
         return replace(settings, depth=True, depth_origin=depth_along(self._centre, camera))
 
-    def _is_worn(self, model: Gaussians, now: ScheduleStep) -> bool:
+    def _is_stale(self, model: Gaussians, now: ScheduleStep) -> bool:
         """Whether to recompute the model's centre: rarely on a device, because that synchronizes."""
         if model.means.device.type == "cpu":
             return True

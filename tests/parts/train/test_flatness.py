@@ -63,12 +63,12 @@ def test_a_falling_curve_few_epochs_and_the_schedules_end_are_not_flat() -> None
 
 def test_nothing_is_judged_before_density_control_all_degrees_and_full_size() -> None:
     schedule = make_plan(1000, 0.1).schedule
-    assert flatness.settled_from(schedule) == 3 * schedule.sh_every == 600
+    assert flatness.final_phase_from(schedule) == 3 * schedule.sh_every == 600
     longer = replace(schedule, density=replace(schedule.density, last=700))
-    assert flatness.settled_from(longer) == 700
+    assert flatness.final_phase_from(longer) == 700
     unchanging = replace(schedule, sh_degree=1, density=replace(longer.density, on=False))
-    assert flatness.settled_from(unchanging) == 200
-    assert flatness.settled_from(replace(schedule, stretches=(Stretch(1, 0, 900), Stretch(0, 0, 1000)))) == 900
+    assert flatness.final_phase_from(unchanging) == 200
+    assert flatness.final_phase_from(replace(schedule, stretches=(Stretch(1, 0, 900), Stretch(0, 0, 1000)))) == 900
 
 
 def test_before_the_finest_size_losses_count_since_growth_begins_and_opacities_were_reset() -> None:
@@ -77,7 +77,7 @@ def test_before_the_finest_size_losses_count_since_growth_begins_and_opacities_w
     assert flatness.judged_from(schedule, 650, [300, 500]) == 500
     three = replace(schedule, stretches=(Stretch(2, 0, 600), *schedule.stretches))
     assert flatness.judged_from(three, 650, [300]) == 600
-    assert flatness.judged_from(three, 701, [300]) == flatness.settled_from(three)
+    assert flatness.judged_from(three, 701, [300]) == flatness.final_phase_from(three)
 
 
 def test_a_size_is_flat_where_all_iterations_that_are_left_would_gain_too_little() -> None:

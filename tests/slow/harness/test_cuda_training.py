@@ -282,7 +282,7 @@ def test_a_budgets_trial_also_uses_smaller_chunks_if_memory_is_short(
         assert trial.iteration == 1 and len(trial.gaussians) == len(begun)
         return plan
 
-    monkeypatch.setattr(loop, "under_budgets", tried)
+    monkeypatch.setattr(loop, "plan_within_budgets", tried)
     _, recorder = trained(scene, tmp_path, ALL.model_copy(update={"iterations": 1}), kernels=kernels)
     assert recorder.warnings and all("smaller parts" in warning for warning in recorder.warnings)
 
