@@ -145,10 +145,8 @@ def doubles_reasons(verified: ViewGraph, found: Doubles) -> list[Reason]:
     if found.level() == "good":
         return []
     names = [verified.names[number] for number in found.pair]
-    text = (
-        f"{name_photo_group(found.group, verified)} show other things than the photos that the model has at the same "
-    )
-    text += f"place, such as {names[0]} and {names[1]}: two places that look alike may have been taken for one."
+    text = f"{name_photo_group(found.group, verified)} show other things than the photos that the model has at the "
+    text += f"same place, such as {names[0]} and {names[1]}: two places that look alike may have been taken for one."
     hint = "Compare the two photos: the report shows that place in both. Add photos that lead from one place to the "
     hint += "other, or run the places separately."
     return [Reason(found.level(), text, hint, "doubles")]

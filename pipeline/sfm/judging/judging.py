@@ -220,8 +220,8 @@ def _bent(agreement: Agreement, found: Rearrangement, verified: ViewGraph) -> li
         cut = find_cut(agreement, against)
         if cut.ratio < CUT_DOUBT:
             return []
-        text = f"{name_photo_group(cut.group, verified)} match the other photos elsewhere more than where the model has "
-        text += "them: the scene repeats itself there, or the model is bent."
+        text = f"{name_photo_group(cut.group, verified)} match the other photos elsewhere more than where the model "
+        text += "has them: the scene repeats itself there, or the model is bent."
         return [Reason("doubt", text, hint, "bent")]
     resolved = int((against & ~contradicting(found.agreement)).sum())
     text = "Another arrangement of the cameras explains "
