@@ -5,12 +5,13 @@
 # make develop                 editable install: edited sources take effect at once; make test reverts to the wheel
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            generates the tables of docs/options.md from the code
+# make rooms-page              generates the graphs and tables of docs/rooms.md and docs/stages.md from the contracts
 # make release                 checks wheel and sdist in clean environments: licences, SBOM, types, the demo's bits
 # make aarch64                 builds the kernels and their C++ tests for 64-bit Arm, and runs them under QEMU
 # make test-image              builds the container image and runs the demo in it (Linux, root, buildah, runc)
 # make test-docker             builds the image with a Docker daemon of its own, and tries it and the compose file (root)
 # make test-cluster            runs batches on a Slurm of two hosts on this machine (Linux, root, Debian's slurm-wlm)
-# make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/cuda.md
+# make gpu-visit               packs a visit to an NVIDIA GPU and prints its commands (PEERS=folder FIRST=file): docs/gpu_visit.md
 # make sanitize                runs the native tests under AddressSanitizer, UBSan and ThreadSanitizer
 # TORCH=cpu                    installs torch without CUDA from PyTorch's own CPU index
 # SPLATPIPE_CUDA=auto|all|off  CUDA kernels for this machine's GPU, for all (`make wheel`), for none; or a list: "80;90"
@@ -30,7 +31,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' \
   -not -path 'pipeline/web/dist/*' -not -path 'pipeline/web/node_modules/*' -not -name '*.so' -not -name versions.toml \
   2>/dev/null)
-BUILT := pyproject.toml constraints.txt $(filter pipeline/raster/native/% pipeline/web/%,$(filter-out pipeline/%.py,$(SOURCES)))
+BUILT := pyproject.toml constraints.txt $(filter pipeline/native/% pipeline/web/%,$(filter-out pipeline/%.py pipeline/%.pyi,$(SOURCES)))
 NATIVE := $(filter %.cpp %.h %.cu %.cuh,$(SOURCES)) $(wildcard tests/native/*.cpp tests/native/*.h tests/harness/*.cpp tests/harness/*.h tests/harness/*.cu)
 
 # The index has only torch's own wheels; torch's dependencies come from PyPI like the rest.
@@ -47,7 +48,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-.PHONY: run test test-all aarch64 gpu-visit release sdist test-image test-docker test-cluster options-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-all aarch64 gpu-visit release sdist test-image test-docker test-cluster options-page rooms-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -101,7 +102,7 @@ sanitize-thread: SANITIZERS = thread
 # ThreadSanitizer supports few memory layouts; setarch -R, where permitted, provides one of those.
 sanitize-%: .venv/.tested
 	@echo "== native tests under $(SANITIZERS)"
-	@$(BIN)/cmake -S pipeline/raster/native -B build/sanitize/$* -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
+	@$(BIN)/cmake -S pipeline/native -B build/sanitize/$* -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
 	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPLATPIPE_SANITIZE=$(SANITIZERS) > /dev/null
 	@$(BIN)/ninja -j2 --quiet -C build/sanitize/$*
 	@if setarch -R true 2>/dev/null; then setarch -R build/sanitize/$*/native_tests; else build/sanitize/$*/native_tests; fi
@@ -120,7 +121,7 @@ sdist: .venv/.dev .venv/.node
 aarch64: .venv/.dependencies
 	@command -v aarch64-linux-gnu-g++ >/dev/null || { echo "needs apt install g++-aarch64-linux-gnu qemu-user-static"; exit 1; }
 	@echo "== native tests on aarch64"
-	@SPLATPIPE_WERROR=1 $(BIN)/cmake -S pipeline/raster/native -B build/aarch64 -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
+	@SPLATPIPE_WERROR=1 $(BIN)/cmake -S pipeline/native -B build/aarch64 -G Ninja -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" \
 	  --toolchain $(CURDIR)/tests/native/aarch64.cmake -DSPLATPIPE_NATIVE_TESTS=ON > /dev/null
 	@$(BIN)/ninja -j2 --quiet -C build/aarch64
 	@if command -v qemu-aarch64-static >/dev/null; then qemu-aarch64-static -L /usr/aarch64-linux-gnu build/aarch64/native_tests; \
@@ -150,6 +151,10 @@ versions: $(EITHER) .venv/.dev
 # The tables in docs/options.md, from the options' types, defaults and help.
 options-page: $(EITHER)
 	@$(BIN)/python tests/options_page.py
+
+# The graphs and tables in docs/rooms.md and docs/stages.md, from import-linter's contracts, the imports and the line.
+rooms-page: $(EITHER) .venv/.dev
+	@$(BIN)/python tests/rooms_page.py
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 
 SOURCE = Path(__file__).with_name("ceilings.cpp")
 FLAGS = {"avx512": ["-mavx512f", "-mprefer-vector-width=512", "-DLANES=16"], "avx2": ["-mavx2", "-mfma", "-DLANES=8"]}

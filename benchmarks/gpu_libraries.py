@@ -13,17 +13,18 @@ from pathlib import Path
 from gpu_parts import Row
 
 ROOT = Path(__file__).resolve().parents[1]
-NATIVE = ROOT / "pipeline" / "raster" / "native"
+NATIVE = ROOT / "pipeline" / "native"
 FIND_PYTHON = Path(__file__).parent / "stable_abi"  # in place of CMake's FindPython, which wants an interpreter
 ARCHITECTURE = "90"  # of H100 and H200
 DEBIAN = "deb http://deb.debian.org/debian trixie main"  # with Python 3.13, whose headers know the ABI of 3.12
 HEADERS = "libpython3.13-dev"
 STABLE = "_native.abi3.so"
 CUDA = "libsplat_cuda.so"
+COMPILED = (".cpp", ".h", ".cu", ".cuh")
 COMPILE_S = 150.0  # at most, there; the module takes 190 s of one core
-ROOM = ("pipeline", "raster")
+ROOM = ("pipeline", "native")
 FITS = {  # ends with an error if the library does not fit; in processes of their own, as the second starts the device
-    STABLE: "import numpy; from splatpipe.pipeline.raster import _native; print(_native.isa())",
+    STABLE: "import numpy; from splatpipe.pipeline.native import _native; print(_native.isa())",
     CUDA: (
         "from splatpipe.pipeline.raster.cuda.cuda_library import load\n"
         "code, device = load().device(0)\n"
@@ -36,7 +37,7 @@ FITS = {  # ends with an error if the library does not fit; in processes of thei
 def sources_digest() -> str:
     """Return a digest of everything that the libraries are compiled from."""
     digest = hashlib.sha256()
-    for path in sorted(path for path in NATIVE.rglob("*") if path.is_file()):
+    for path in sorted(path for path in NATIVE.rglob("*") if path.suffix in COMPILED or path.name == "CMakeLists.txt"):
         digest.update(f"{path.relative_to(NATIVE)}\0".encode() + path.read_bytes())
     return digest.hexdigest()
 

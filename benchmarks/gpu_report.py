@@ -1,4 +1,4 @@
-"""Turn the files of a visit to a GPU into the tables of docs/cuda.md, and say which demands hold.
+"""Turn the files of a visit to a GPU into the tables of docs/gpu_visit.md, and say which demands hold.
 
 ``gpu_report.py FOLDER/first.jsonl FOLDER/second.jsonl --pack .gpu_visit``. A demand on correctness that does not hold
 ends it with exit code 1; a factor against a peer that is missed is a finding, no failure.

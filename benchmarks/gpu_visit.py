@@ -1,4 +1,4 @@
-"""Prove and measure everything on an NVIDIA GPU within a quarter of an hour on a bare machine; see docs/cuda.md.
+"""Prove and measure everything on an NVIDIA GPU within a quarter of an hour on a bare machine; see docs/gpu_visit.md.
 
 Where the line runs:   ``make gpu-visit``                             packs everything, and prints the commands
 Where the GPU is:      ``gpu_visit.py first --out FOLDER``            420 s: proofs, speed, peers, trainings
@@ -40,7 +40,7 @@ SMALL_SMOKE = {"count": 3000, "size": [161, 117]}  # under memcheck, which slows
 BUILT_PEERS = (*TIMED_PEERS, "fused-ssim")
 RED = ("failed", "late", "not begun")
 ROOMS = ("pipeline", "stages", "configs")
-UNUSED = shutil.ignore_patterns("native", "node_modules", "src", "dist", "__pycache__", "*.so")
+UNUSED = shutil.ignore_patterns("node_modules", "src", "dist", "__pycache__", "*.so")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-SOURCES = Path(__file__).resolve().parent.parent / "pipeline" / "raster" / "native" / "cuda"
+NATIVE = Path(__file__).resolve().parent.parent / "pipeline" / "native"
+SOURCES = NATIVE / "cuda"
 FAMILIES = {75: (75,), 80: (80, 86, 89), 90: (90,), 100: (100,), 120: (120,)}
 """Devices by the architecture that their code is made from, as in `CMakeLists.txt` beside the sources."""
 FLAGS = (
@@ -87,7 +88,7 @@ def compiled(source: Path, devices: Sequence[int], nvcc: str) -> list[KernelReso
             targets.append(f"-gencode=arch=compute_{made_from},code=[{','.join(wanted)}]")
     with tempfile.TemporaryDirectory() as folder:
         command = [nvcc, *FLAGS, *FLAGS_OF.get(source.name, ()), *targets]
-        command += ["-c", str(source), "-o", str(Path(folder) / "kernels.o")]
+        command += [f"-I{NATIVE}", "-c", str(source), "-o", str(Path(folder) / "kernels.o")]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     said = done.stdout + done.stderr
     if done.returncode != 0:

@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 

@@ -33,9 +33,10 @@ from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.photos.pixels.dataset import IMAGES, MODEL, Split, View, load_views, mask_path
 from splatpipe.pipeline.photos.pixels.images import load_colour, load_mask
-from splatpipe.pipeline.raster import _native, rasterizer
+from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.train import iteration

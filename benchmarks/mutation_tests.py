@@ -40,9 +40,9 @@ ROOMS = (
     *("survey", "train", "web"),
 )
 PER_ROOM = 2
-NATIVE = "pipeline/raster/native"
-KERNELS = ((f"{NATIVE}/*.cpp", 2), (f"{NATIVE}/cuda/*.cu*", 2))
-UNTESTABLE = ("bindings", "sbom", "options.py", "__init__.py")  # glue, defaults
+NATIVE = "pipeline/native"
+KERNELS = ((f"{NATIVE}/*/*.cpp", 2), (f"{NATIVE}/cuda/*.cu*", 2))
+UNTESTABLE = ("bind_", "sbom", "options.py", "__init__.py")  # glue, defaults
 TEXT_CHECKS = ("test_every_version_matches_the_present_sources", "test_every_name_imported")
 NEAREST = 6  # test files that a mutation meets alone
 TIMEOUT_S = 300  # of a test: a mutation may make a loop endless
@@ -250,8 +250,8 @@ class Workshop:
         found = importlib.util.find_spec("splatpipe.pipeline")
         assert found is not None and found.origin is not None
         installed = Path(found.origin).resolve().parent
-        for library in (installed / "raster").glob("*.so"):
-            shutil.copy2(library, self.clone / "pipeline" / "raster")
+        for library in (installed / "native").glob("*.so"):
+            shutil.copy2(library, self.clone / NATIVE)
         shutil.copytree(installed / "web" / "dist", self.clone / "pipeline" / "web" / "dist")
         self.build()
 
@@ -266,7 +266,7 @@ class Workshop:
             subprocess.run([*made, *(f"-D{name}={value}" for name, value in defines.items())], check=True)
         done = subprocess.run([programs / "ninja", "-C", work, "_native"], capture_output=True, check=False)
         for library in work.glob("_native*.so"):
-            target = self.clone / "pipeline" / "raster" / library.name
+            target = self.clone / NATIVE / library.name
             target.unlink(missing_ok=True)  # not overwritten: a running program may have it mapped
             shutil.copy2(library, target)
         return done.returncode == 0

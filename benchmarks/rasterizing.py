@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import _native, rasterizer
+from splatpipe.pipeline.native import _native
+from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.iteration import render_options
 from splatpipe.pipeline.train.plan.plan import TrainingPlan

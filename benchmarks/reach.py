@@ -11,7 +11,7 @@ RINGS = ("tests/unit", "tests/parts")
 SLOW = "tests/slow"
 ELSEWHERE = ("tests/slow/captures", "tests/slow/device")
 PLAIN = ("tests", "tests/scenes", "tests/harness", "tests/lines", "tests/records", "benchmarks")
-NATIVE = "pipeline/raster/native"
+NATIVE = "pipeline/native"
 HARNESS = ("tests/harness/building.py", "tests/harness/on_cpu.py")  # a test that imports these runs CUDA's sources
 RUNS_ALL = ("demo_run", "demo_copy", "splatpipe.pipeline.app.cli.main", "from command import")
 WHOLE_LINE = "stages/line.py"  # what starts the command, or reads its finished run, runs all stages
@@ -61,7 +61,7 @@ class Reach:
         if source.startswith(f"{NATIVE}/cuda"):
             return set(HARNESS)
         if source.startswith(NATIVE):
-            return {"pipeline/raster/_native.pyi"}
+            return {f"{NATIVE}/_native.pyi"}
         return {source}
 
     def _walk(self, test: Path) -> dict[str, int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.survey.crs.crs import parse_crs
 from splatpipe.pipeline.survey.files.control_file import read_control_file
 from splatpipe.pipeline.survey.files.scale_bars import ScaleBar, read_scale_bars
 from splatpipe.pipeline.survey.options import ControlConfig
@@ -23,8 +22,7 @@ def run(config: ControlConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     bars: tuple[ScaleBar, ...] = ()
     if inputs["source.control"].is_file():
         file = read_control_file(inputs["source.control"])
-        parse_crs(file.crs)
-        crs = file.crs
+        crs = file.crs.text
         points = [(point.name, point.x, point.y, point.z) for point in file.points]
     if inputs["source.scale_bars"].is_file():
         bars = read_scale_bars(inputs["source.scale_bars"])

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 from splatpipe.pipeline.edit.options import CleanConfig
 from splatpipe.pipeline.engine.stage import StageConfig
 from splatpipe.pipeline.film.options import FlythroughConfig
@@ -15,29 +12,12 @@ from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, Sparse
 from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, FacadesConfig, MeshConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
-from splatpipe.pipeline.train.options import REMOVED_OPTIONS as REMOVED_TRAIN_OPTIONS
 from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
 from splatpipe.pipeline.web.options import ExportConfig
 
 
 class LineConfig(StageConfig):
     """Everything that affects the results, one section per stage."""
-
-    renamed_options: ClassVar[Mapping[str, str]] = {
-        "evaluate.every": "split.every",
-        "evaluate.views": "split.views",
-        "train.spread_weight": "train.distortion_weight",
-    }
-    replaced_values: ClassVar[Mapping[str, Mapping[str, str | bool]]] = {
-        "initialize.dense": {"off": False, "sweep": True},
-        "train.density": {"error": "absolute", "mcmc": "absolute"},
-        "train.exposure": {"bilateral": "affine"},
-    }
-    removed_options: ClassVar[Mapping[str, str]] = {
-        **{old: f"It is now called {new}." for old, new in renamed_options.items()},
-        **{f"train.{name}": hint for name, hint in REMOVED_TRAIN_OPTIONS.items()},
-        "initialize.dense_points": "At most 50,000 points are added.",
-    }
 
     ingest: IngestConfig = IngestConfig()
     control: ControlConfig = ControlConfig()

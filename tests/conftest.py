@@ -88,7 +88,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.fixture
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
     """Run the native kernels on an instruction set; restore it and the number of threads after the test."""
-    from splatpipe.pipeline.raster import _native
+    from splatpipe.pipeline.native import _native
 
     before, threads = _native.isa(), _native.threads()
     _native.set_isa(request.param)

@@ -31,7 +31,7 @@ def main(wheel: Path) -> None:
         link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         link.symlink_to(ROOT / source)
-    for library in (LINKS / "splatpipe" / "pipeline" / "raster").glob("lib*.so"):
+    for library in (LINKS / "splatpipe" / "pipeline" / "native").glob("lib*.so"):
         library.unlink()  # CUDA's, which this wheel may lack
     with zipfile.ZipFile(wheel) as archive, tempfile.TemporaryDirectory() as scratch:
         for name in archive.namelist():

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import difflib
-import json
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
@@ -73,31 +71,13 @@ def load_file(path: Path) -> Table:
 
 
 def current_options(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
-    """Convert an OUT's options to this version's names and values.
-
-    Unknown options, e.g. those of a newer version, are dropped. Invalid values are kept, to be rejected later.
-    """
-    converted: Table = copy.deepcopy(dict(table))
-    for old, new in getattr(model, "renamed_options", {}).items():
-        section, option = old.split(".")
-        if option in converted.get(section, {}):
-            converted = merge([_nested(new.split("."), converted[section].pop(option)), converted])
-    for dotted, values in getattr(model, "replaced_values", {}).items():
-        section, option = dotted.split(".")
-        value = converted.get(section, {}).get(option)
-        if isinstance(value, str) and value in values:
-            converted[section][option] = values[value]
-    return _existing_options(model, converted)
-
-
-def _existing_options(model: type[BaseModel], table: Mapping[str, JSON]) -> Table:
-    """The entries of a table that the model has."""
+    """The entries of an OUT's options that this version has; invalid values are kept, to be rejected later."""
     result: Table = {}
     for name, value in table.items():
         if name in model.model_fields:
             section = model.model_fields[name].annotation
             nested = isinstance(section, type) and issubclass(section, BaseModel) and isinstance(value, Mapping)
-            result[name] = _existing_options(section, value) if nested else value  # type: ignore[arg-type]
+            result[name] = current_options(section, value) if nested else value  # type: ignore[arg-type]
     return result
 
 
@@ -164,21 +144,10 @@ def resolve(model: type[Model], layers: Iterable[Mapping[str, JSON]]) -> Model:
     try:
         return model.model_validate(merge(layers))
     except ValidationError as error:
-        removed: Mapping[str, str] = getattr(model, "removed_options", {})
-        replaced: Mapping[str, Mapping[str, JSON]] = getattr(model, "replaced_values", {})
-        by_hint: dict[str, list[str]] = {}
-        problems = []
-        for problem in _merged_by_option(model, error):
-            dotted = ".".join(str(key) for key in problem["loc"])
-            if problem["type"] == "extra_forbidden" and dotted in removed:
-                by_hint.setdefault(removed[dotted], []).append(dotted)
-            elif isinstance(problem["input"], str) and problem["input"] in (now := replaced.get(dotted, {})):
-                problems.append(
-                    f"{dotted} = {problem['input']!r} no longer exists; write {json.dumps(now[problem['input']])}."
-                )
-            else:
-                problems.append(_describe(model, dotted, problem["type"], problem["msg"], problem["input"]))
-        problems += [_removed_message(names, hint) for hint, names in by_hint.items()]
+        problems = [
+            _describe(model, ".".join(map(str, problem["loc"])), problem["type"], problem["msg"], problem["input"])
+            for problem in _merged_by_option(model, error)
+        ]
         raise UsageError(" ".join(problems), hint="`splatpipe options` lists every option with its default.") from error
 
 
@@ -196,13 +165,6 @@ def _merged_by_option(model: type[BaseModel], error: ValidationError) -> Iterabl
         text = message if before is None else f"{before['msg']}, or {message[0].lower()}{message[1:]}"
         found[place] = {**problem, "loc": place, "msg": text}
     return found.values()
-
-
-def _removed_message(names: Sequence[str], hint: str) -> str:
-    """The message for removed options; an old configuration may name many that were removed for the same reason."""
-    if len(names) == 1:
-        return f"The option {names[0]} no longer exists. {hint}"
-    return f"The options {', '.join(names)} no longer exist. {hint}"
 
 
 def _describe(model: type[BaseModel], dotted: str, kind: str, message: str, value: JSON) -> str:

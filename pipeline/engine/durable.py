@@ -57,20 +57,54 @@ def beside(path: Path) -> Iterator[Path]:
 
     On success, what was written there is flushed and renamed to ``path``; otherwise it is removed.
     """
-    aside = path.with_name(f".{path.name}.{os.getpid()}.{token()}{UNFINISHED}")
+    aside = _aside(path)
     try:
         yield aside
         if aside.is_dir():
             sync_tree(aside)
             if path.is_dir() and not path.is_symlink():
                 path.rmdir()  # it must be empty, or this fails
+            aside.replace(path)
+            sync_folder(path.parent)
         else:
-            with aside.open("rb") as file:
-                os.fsync(file.fileno())
-        aside.replace(path)
+            _move(aside, path)
     except BaseException:
         _remove(aside)
         raise
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary path in a folder of its own; the file is moved to ``path`` once it is complete.
+
+    The folder also holds what libraries write beside their own files (GDAL's temporary overviews). Only one process at
+    a time may write a file: unfinished files of killed ones are removed.
+
+    Args:
+        path: Final path; an older file there is replaced.
+
+    Raises:
+        OSError: if the disk is full or not writable; what was at ``path`` is still there.
+    """
+    remove_unfinished(path.parent, path.name)
+    folder = _aside(path)
+    folder.mkdir()
+    try:
+        yield folder / path.name
+        _move(folder / path.name, path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.{token()}{UNFINISHED}")
+
+
+def _move(aside: Path, path: Path) -> None:
+    """Flush a complete file to disk and give it its name."""
+    with aside.open("rb") as file:
+        os.fsync(file.fileno())
+    aside.replace(path)
     sync_folder(path.parent)
 
 

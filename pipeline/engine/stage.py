@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict
 
@@ -19,12 +19,7 @@ class StageConfig(BaseModel):
 
     The docstring under each field is its help text. ``enabled = False`` turns a stage off: it then reads nothing, waits
     for no other stage, and its body writes empty parts.
-
-    Attributes:
-        removed_options: Removed options by dotted name, each with a sentence on what replaces it.
     """
-
-    removed_options: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False, strict=True

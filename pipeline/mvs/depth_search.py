@@ -21,10 +21,10 @@ from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.mvs.neighbours import SparseVisibility, inverse_depths, load_tracks, neighbours
 from splatpipe.pipeline.mvs.patch_match import DepthEstimate, find_depths
 from splatpipe.pipeline.mvs.picture import Picture
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.photos.pixels.images import reduced_camera
 from splatpipe.pipeline.photos.pixels.small_views import small_view
-from splatpipe.pipeline.raster import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.containers.archives import open_archive

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatpipe.pipeline.mvs.picture import Picture, relative
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 
 ITERATIONS = (6, 3, 1)  # from the coarsest size; each size is half the next
 PERTURBATION_STEPS = (0, 1, 4)  # reductions of the perturbation at the start: planes of larger sizes are nearly right

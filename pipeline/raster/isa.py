@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 
 __all__ = ["_native", "choose_isa", "isa_name", "isa_names", "use_isa_of_environment"]
 

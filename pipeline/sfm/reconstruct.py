@@ -80,7 +80,7 @@ class Reconstructor:
         self.database = capture.database
         self.verified = read_verified(capture.database)
         self.tried: list[MappingAttempt] = []
-        self.notes: dict[int, str] = {}
+        self.notes: dict[MappingAttempt, str] = {}
         self.further = MAX_FURTHER_MAPPINGS
 
     def map(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:
@@ -126,7 +126,7 @@ class Reconstructor:
 
     def add_note(self, answer: MappingAttempt, text: str) -> None:
         """Say something about an attempt in its row."""
-        self.notes[id(answer)] = "; ".join(filter(None, [self.notes.get(id(answer), ""), text]))
+        self.notes[answer] = "; ".join(filter(None, [self.notes.get(answer, ""), text]))
 
     def _judged(self, answer: MappingAttempt) -> MappingAttempt:
         if answer.models:
@@ -137,7 +137,7 @@ class Reconstructor:
     def rows(self, chosen: MappingAttempt) -> tuple[JSON, ...]:
         """Rows describing every attempt, for ``models.json``."""
         return tuple(
-            {**_row(answer), "chosen": answer is chosen, "why": self.notes.get(id(answer), "")} for answer in self.tried
+            {**_row(answer), "chosen": answer is chosen, "why": self.notes.get(answer, "")} for answer in self.tried
         )
 
 
@@ -179,7 +179,7 @@ def _first(work: Reconstructor) -> MappingAttempt:
     total = len(work.verified.names)
     if work.config.mapper == "auto" and best.placed < MAX_SHARE * total:
         placed = f"{best.placed} of {total} photos placed" if best.placed else "no photo was placed"
-        work.notes[id(best)] = f"doubtful: {placed}"
+        work.notes[best] = f"doubtful: {placed}"
         best = _better(best, work.map_further("global", "global"))
     if best.placed < ENOUGH_SHARE * total and work.config.mapper != "global":
         best = _better(best, work.map("incremental", "incremental, relaxed thresholds", relaxed=True))
@@ -254,7 +254,7 @@ def _rejudge(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     judgement = judge(answer.models[0], work.verified, work.capture.cameras)
     fresh = replace(answer, judgement=judgement)
     work.tried[work.tried.index(answer)] = fresh
-    work.notes[id(fresh)] = work.notes.pop(id(answer), "")
+    work.notes[fresh] = work.notes.pop(answer, "")
     return fresh
 
 

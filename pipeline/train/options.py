@@ -12,28 +12,6 @@ from splatpipe.pipeline.engine.stage import StageConfig
 LONGEST_BUDGET_S = 30 * 86_400.0
 LARGEST_MEMORY = 1 << 50
 FILM_FROM_BUDGET_S = 600.0  # a shorter time budget has no time for a film
-_CONSTANT = "This is now set by constants: remove it."
-_NO_GAIN = "This was removed, as it never gave a measurable gain: remove it."
-REMOVED_OPTIONS = {
-    **dict.fromkeys(
-        (
-            *("sh_every", "ssim_weight", "exposure_decay", "coarse_until", "sky_opacity_weight"),
-            *("densify_from", "densify_until", "densify_every", "densify_gradient", "split_extent", "split_shrink"),
-            *("prune_opacity", "prune_extent", "prune_screen_px", "reset_every", "reset_opacity", "sparse_adam"),
-            *("lr_boost", "lr_means", "lr_means_final", "lr_sh", "lr_sh_rest_divisor", "lr_opacity", "lr_scales"),
-            *("lr_quats", "lr_exposure"),
-        ),
-        _CONSTANT,
-    ),
-    **dict.fromkeys(
-        (
-            *("exposure_side", "exposure_levels", "exposure_smoothness", "refine_cameras", "refine_decay"),
-            *("lr_cameras", "opacity_decay", "scale_decay", "depth_weight", "sh_limit", "max_anisotropy", "filter_3d"),
-        ),
-        _NO_GAIN,
-    ),
-}
-"""Options of earlier versions, and what to do instead."""
 
 
 class TrainConfig(StageConfig):

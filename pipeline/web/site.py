@@ -61,9 +61,9 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
     for name in ("nodes", "photos"):
         (folder / name).mkdir(parents=True)
     tree = [_write_node(folder, node, splat.facts.antialias) for node in nodes]
-    number = {id(node): k for k, node in enumerate(nodes)}
+    number = {node: k for k, node in enumerate(nodes)}
     for entry, node in zip(tree, nodes, strict=True):
-        entry["children"] = [number[id(child)] for child in node.children]
+        entry["children"] = [number[child] for child in node.children]
     for shown, address in zip(scene.cameras, thumbs, strict=True):
         if shown.thumb is not None and address is not None:
             write_file(folder / address, shown.thumb)

@@ -1,6 +1,6 @@
 // The sort and the plan by themselves, and where a frame's lists lie, for tests/slow/harness/test_cuda_sort.py.
-#include "api.h"
-#include "bin.cuh"
+#include "cuda/api.h"
+#include "cuda/bin.cuh"
 
 namespace splat {
 namespace cuda {

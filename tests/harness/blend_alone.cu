@@ -1,5 +1,5 @@
 // The blending of the CUDA backend by itself: the lists that it walks are the test's.
-#include "blend_back.cuh"
+#include "cuda/blend_back.cuh"
 
 using splat::PictureGradients;
 using splat::Pictures;

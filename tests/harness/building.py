@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 HARNESS = Path(__file__).resolve().parent
-NATIVE = HARNESS.parents[1] / "pipeline" / "raster" / "native"
+NATIVE = HARNESS.parents[1] / "pipeline" / "native"
 KEPT = Path(tempfile.gettempdir()) / f"splatpipe-cuda-on-cpu-{os.getuid()}"
 
 FORWARD, REVERSE, SHUFFLED = range(3)
@@ -126,7 +126,7 @@ def _depends(source: Path, native: Path) -> set[Path]:
             continue
         found.add(path)
         for name in _INCLUDE.findall(path.read_text()):
-            places = (path.parent / name, native / "cuda" / name, HARNESS / name)
+            places = (path.parent / name, native / name, HARNESS / name)
             left += [place.resolve() for place in places if place.exists()][:1]
     return found
 
@@ -137,7 +137,7 @@ def _compile(source: Path, native: Path, options: tuple[str, ...]) -> Path:
     built = KEPT / "objects" / f"{source.stem}-{_digest([source.name, *options, *texts])}.o"
     if not built.exists():
         language = ("-x", "c++") if source.suffix == ".cu" else ()
-        _write(built, [*options, f"-I{HARNESS}", f"-I{native / 'cuda'}", "-c", *language, str(source)])
+        _write(built, [*options, f"-I{HARNESS}", f"-I{native}", "-c", *language, str(source)])
     return built
 
 

@@ -1,5 +1,5 @@
 // Kernels that do what test_cuda_harness.py says of them, rightly and wrongly.
-#include "grid.cuh"
+#include "cuda/grid.cuh"
 
 namespace splat {
 namespace cuda {

@@ -1,5 +1,5 @@
 // What a frame's memory holds, for the tests: its layout is the kernels' own matter.
-#include "frame.h"
+#include "cuda/frame.h"
 
 using namespace splat::cuda;
 

@@ -1,14 +1,14 @@
 // Adam against its float64 definition, sparse and with non-finite gradients.
-#include "adam.h"
+#include "adam/adam.h"
 
 #include <cmath>
 #include <limits>
 #include <string>
 #include <vector>
 
-#include "adam_step.h"
+#include "adam/adam_step.h"
+#include "base/threads.h"
 #include "check.h"
-#include "threads.h"
 
 namespace {
 

@@ -1,14 +1,14 @@
 // Affine maps of colours and their gradients: against the definition, and the same bits for any number of threads.
-#include "colour.h"
+#include "loss/colour.h"
 
 #include <cmath>
 #include <cstddef>
 #include <string>
 #include <vector>
 
-#include "affine_colour.h"
+#include "base/threads.h"
 #include "check.h"
-#include "threads.h"
+#include "loss/affine_colour.h"
 
 namespace {
 

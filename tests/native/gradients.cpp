@@ -2,9 +2,9 @@
 #include <cmath>
 #include <string>
 
+#include "base/threads.h"
 #include "check.h"
 #include "scenes.h"
-#include "threads.h"
 
 namespace {
 

@@ -1,13 +1,13 @@
 // The loss and its gradient: against central differences, and the same bits for any number of threads.
-#include "loss.h"
+#include "loss/loss.h"
 
 #include <cmath>
 #include <string>
 #include <vector>
 
+#include "base/threads.h"
 #include "check.h"
-#include "photo_loss.h"
-#include "threads.h"
+#include "loss/photo_loss.h"
 
 namespace {
 

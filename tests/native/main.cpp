@@ -1,8 +1,8 @@
 #include <cstdio>
 #include <stdexcept>
 
+#include "base/isa.h"
 #include "check.h"
-#include "isa.h"
 
 namespace {
 

@@ -1,5 +1,5 @@
 // PatchMatch: no out-of-bounds access to its images, and the same bits for any number of threads.
-#include "patch_match.h"
+#include "patch_match/patch_match.h"
 
 #include <cstddef>
 #include <cstdint>
@@ -7,8 +7,8 @@
 #include <utility>
 #include <vector>
 
+#include "base/threads.h"
 #include "check.h"
-#include "threads.h"
 
 namespace {
 

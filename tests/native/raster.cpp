@@ -4,9 +4,9 @@
 #include <thread>
 #include <vector>
 
+#include "base/threads.h"
 #include "check.h"
 #include "scenes.h"
-#include "threads.h"
 
 namespace {
 

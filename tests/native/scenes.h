@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "raster_cpu.h"
+#include "raster/raster_cpu.h"
 
 struct Scene {
     std::vector<float> means, log_scales, quats, opacity_logits, sh;

@@ -1,5 +1,5 @@
 // Renders composited over the sky and their gradients: against the definition, the same bits for any number of threads.
-#include "sky.h"
+#include "sky/sky.h"
 
 #include <cmath>
 #include <cstddef>
@@ -7,9 +7,9 @@
 #include <string>
 #include <vector>
 
+#include "base/threads.h"
 #include "check.h"
-#include "sky_behind.h"
-#include "threads.h"
+#include "sky/sky_behind.h"
 
 namespace {
 

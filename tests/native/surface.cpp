@@ -7,10 +7,10 @@
 #include <vector>
 
 #include "check.h"
-#include "surface_cell_votes.h"
-#include "surface_colours.h"
-#include "surface_mosaic.h"
-#include "surface_sight.h"
+#include "surface/surface_cell_votes.h"
+#include "surface/surface_colours.h"
+#include "surface/surface_mosaic.h"
+#include "surface/surface_sight.h"
 
 namespace {
 

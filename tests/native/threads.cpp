@@ -1,5 +1,5 @@
 // The pool: every index once, nesting, exceptions, several callers, and a changing number of threads.
-#include "threads.h"
+#include "base/threads.h"
 
 #include <atomic>
 #include <limits>

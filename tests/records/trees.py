@@ -17,7 +17,8 @@ from pathlib import Path
 from sources import PACKAGE, data_digests, sha
 
 FOLDERS = ("pipeline", "stages", "configs", "demo")  # as pyproject.toml maps them
-KERNELS = Path("pipeline/raster/native")
+KERNELS = {"pipeline/native": "pipeline/native", "pipeline/raster/native": "pipeline/raster"}
+"""Folders of the kernels' sources, now and before, and those of the module made from them."""
 PAGES = Path("pipeline/web")
 Say = Callable[[str], None]
 
@@ -87,10 +88,11 @@ def complete(trees: Sequence[Tree], working: Tree, builds: Path, say: Say) -> No
     """
     installed = _installed()
     for tree in trees:
-        native = tree.root / KERNELS.parent
-        same = data_digests(tree.root / KERNELS) == data_digests(working.root / KERNELS)
-        for library in (installed / KERNELS.parent if same else _build(tree, builds, say)).glob("_native*.so"):
-            shutil.copy2(library, native)
+        sources, module = _kernels(tree)
+        present, beside = _kernels(working)
+        same = data_digests(tree.root / sources) == data_digests(working.root / present)
+        for library in (installed / beside if same else _build(tree.root / sources, builds, say)).glob("_native*.so"):
+            shutil.copy2(library, tree.root / module)
         shutil.copytree(installed / PAGES / "dist", tree.root / PAGES / "dist")
         _run([sys.executable, str(tree.root / PAGES / "build.py")])  # does nothing if dist/ matches these sources
 
@@ -102,9 +104,13 @@ def _installed() -> Path:
     return Path(found.origin).resolve().parent.parent
 
 
-def _build(tree: Tree, builds: Path, say: Say) -> Path:
-    """Build a tree's kernels, once; return their folder."""
-    kernels = tree.root / KERNELS
+def _kernels(tree: Tree) -> tuple[str, str]:
+    """Return the folders of a tree's kernels and of their module, relative to its root."""
+    return next(pair for pair in KERNELS.items() if (tree.root / pair[0]).is_dir())
+
+
+def _build(kernels: Path, builds: Path, say: Say) -> Path:
+    """Build kernels from their sources' folder, once; return the module's folder."""
     folder = builds / sha(data_digests(kernels))[:16]
     if any(folder.glob("_native*.so")):
         return folder

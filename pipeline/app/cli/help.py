@@ -61,7 +61,7 @@ PAGES = {
         "Reads a folder of capture folders, or a list (TOML, CSV) with options for each. Writes a run to OUT/NAME for "
         "each capture, and batch.html, batch.csv and batch.json about all of them.",
         ("batch CAPTURES OUT --dry-run", "batch captures.toml OUT --retries 3"),
-        "docs/unattended.md",
+        "docs/unattended.md, docs/processes.md",
         "0 all captures succeeded, 1 some failed, 2 invalid command line or list, 3 Snakemake failed, 4 this "
         "machine lacks something; 130 and 143 stopped.",
     ),
@@ -69,14 +69,14 @@ PAGES = {
         "Reads the artifacts of earlier stages in OUT. Writes the stage's own; stages that depend on it become out "
         "of date (see splatpipe status), and splatpipe run runs them again.",
         ("stage evaluate OUT", "stage train OUT --shard 2"),
-        "docs/rooms.md, docs/blocks.md",
+        "docs/stages.md, docs/blocks.md",
         RUN_EXITS,
     ),
     "georef": HelpPage(
         "Reads OUT and the control points. Updates the georeference in all files of OUT; trains again only if the "
         "control bends the model.",
         ("georef OUT --gcp gcp_list.txt", "georef OUT --set georef.crs=EPSG:2178"),
-        "docs/surveying.md",
+        "docs/surveying.md, docs/coordinates.md",
         RUN_EXITS,
     ),
     "surface": HelpPage(
@@ -112,17 +112,17 @@ PAGES = {
     "status": HelpPage(
         "Reads OUT, even during a run, and changes nothing.",
         ("status OUT",),
-        "docs/rooms.md",
+        "docs/stages.md",
     ),
     "report": HelpPage(
         "Reads OUT and writes report.html into it. A run does this by itself; use this for one that was stopped.",
         ("report OUT",),
         "docs/products.md",
     ),
-    "clean": HelpPage(
+    "tidy": HelpPage(
         "Reads OUT. Removes artifacts of older options and photos from OUT/stages, and nothing else in OUT.",
-        ("clean OUT",),
-        "docs/rooms.md",
+        ("tidy OUT",),
+        "docs/stages.md",
     ),
     "options": HelpPage(
         "Prints the options that --set and a --config file take.",

@@ -71,7 +71,7 @@ from splatpipe.pipeline.engine.machine import available_cores
 app = typer.Typer(
     name="splatpipe",
     help="From a folder of drone photos to a georeferenced, quality-checked 3D Gaussian splat.",
-    epilog="Details of each command: splatpipe COMMAND --help. See also: README.md, docs/options.md",
+    epilog="Details of each command: splatpipe COMMAND --help. See also: README.md, docs/README.md",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -354,7 +354,7 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 
 
 @with_help(app)
-def clean(out: OutArgument, as_json: JsonOption = False) -> None:
+def tidy(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the current configuration no longer uses."""
     from splatpipe.pipeline.app.commands.console import print_line
     from splatpipe.pipeline.app.report.wording import plural, size
@@ -369,6 +369,15 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
             removed, freed = store.remove_stale(keep)
         done.details = {"removed": removed, "freed_bytes": freed}
         print_line(f"Removed {plural(removed, 'stale artifact')}, {size(freed)}.")
+
+
+@app.command(hidden=True)
+def clean(out: OutArgument, as_json: JsonOption = False) -> None:
+    """The former name of ``tidy``."""
+    from splatpipe.pipeline.app.commands.console import print_line
+
+    print_line("splatpipe clean is now called splatpipe tidy; the stage clean removes floaters.")
+    tidy(out, as_json)
 
 
 @with_help(app)

@@ -16,7 +16,7 @@ from splatpipe.pipeline.photos.files.names import NameFinder, list_names
 from splatpipe.pipeline.sfm.pairing.footprints import MAX_DISTANCE_RATIO, MIN_HEIGHT_M, StatedPoses
 from splatpipe.pipeline.sfm.pairing.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.crs.coordinate_readings import nearer_reading
-from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs, to_geodetic
+from splatpipe.pipeline.survey.crs.crs import Crs, to_geodetic
 from splatpipe.pipeline.survey.files.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.files.scale_bars import read_scale_bars
 from splatpipe.pipeline.survey.points.surveyed_points import eaten_zeros, missing_photos
@@ -63,7 +63,6 @@ def control_findings(
     """
     try:
         file = read_control_file(path)
-        crs = parse_crs(file.crs)
     except SplatpipeError as error:
         return [Finding("control-broken", "error", error.message, error.hint)], []
     findings = _mark_findings(path.name, file, intake, half_pixel)
@@ -71,9 +70,9 @@ def control_findings(
         return findings, []
     rows = np.array([[p.x, p.y, np.nan if p.z is None else p.z] for p in file.points], dtype=np.float64)
     try:
-        located = to_geodetic(rows, crs, approximate).geodetic
+        located = to_geodetic(rows, file.crs, approximate).geodetic
     except SplatpipeError as error:
-        hint = _reading_of(rows, crs, intake) or error.hint
+        hint = _reading_of(rows, file.crs, intake) or error.hint
         return [*findings, Finding("control-broken", "error", error.message, hint)], []
     origin = origin_of(intake)
     assert origin is not None
@@ -90,7 +89,7 @@ def control_findings(
         )
         for point, at in zip(file.points, points, strict=True)
     ]
-    better = _reading_of(rows, crs, intake)
+    better = _reading_of(rows, file.crs, intake)
     return [*findings, *_outside(path.name, places, points, intake, better)], places
 
 

@@ -173,10 +173,9 @@ def _read_film(path: Path) -> None:
 
 
 def _read_control(path: Path) -> None:
-    from splatpipe.pipeline.survey.crs.crs import parse_crs
     from splatpipe.pipeline.survey.files.control_file import read_control_file
 
-    parse_crs(read_control_file(path).crs)
+    read_control_file(path)
 
 
 def _read_scale_bars(path: Path) -> None:

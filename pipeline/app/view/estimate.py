@@ -169,8 +169,8 @@ class Estimator:
 
     def _survey(self, points: list[SurveyPoint]) -> Survey:
         job = self._job
-        file = ControlFile(job.crs.text, job.points, ())
-        return Survey(file, job.crs, job.text.path.name, tuple(with_roles(points, job.config.check_points)))
+        file = ControlFile(job.text.path.name, job.crs, job.points, ())
+        return Survey(file, tuple(with_roles(points, job.config.check_points)))
 
     def _fit(self, survey: Survey, collector: WarningCollector) -> _GeoreferencedSite:
         job, stations = self._job, self._stations

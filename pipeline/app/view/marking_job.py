@@ -15,12 +15,13 @@ from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.runs.source import AUTO, NONE, open_source
 from splatpipe.pipeline.photos.files.names import NameFinder
 from splatpipe.pipeline.photos.files.photo_list import Photo, load_photo_list
-from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs
+from splatpipe.pipeline.survey.crs.crs import Crs
 from splatpipe.pipeline.survey.crs.frames import Frame
 from splatpipe.pipeline.survey.files.control_edit import ControlText
 from splatpipe.pipeline.survey.files.control_file import (
     SAME_PLACE_M,
     SurveyedPoint,
+    crs_of,
     read_control_file,
     read_points_file,
 )
@@ -100,7 +101,7 @@ def open_job(run: RunFolder, points_file: Path | None) -> MarkingJob:
         )
     photos = load_photo_list(parts["ingest.photos"]).by_name()
     text, points = _text_and_points(run, source.named.get(CONTROL), points_file, (source.folder, config.georef), photos)
-    crs = parse_crs(text.table.crs)
+    crs = crs_of(text.path, text.table)
     model = read_model(parts["sparse.model"], photos)
     positions = with_assumed_heights(model, read_positions(parts["ingest.positions"]))
     command = _command(run, text.path, config.georef.control, source.named.get(CONTROL))
@@ -165,16 +166,16 @@ def _text_and_points(
         text = ControlText.read(path, find)
         known = (*(read_control_file(path).points if text.table.rows else ()), *text.unmarked)
     elif stated is not None:
-        text, known = ControlText.begin(path, stated.crs, as_csv, find), ()
+        text, known = ControlText.begin(path, stated.crs.text, as_csv, find), ()
     else:
         raise UsageError(
             "There are no points to mark: the run has no control file.",
             hint="Give their names and coordinates: --points FILE, a first line with the CRS (EPSG:25832), then a CSV"
             " with the header name,x,y,z.",
         )
-    if stated is not None and parse_crs(stated.crs) != parse_crs(text.table.crs):
+    if stated is not None and stated.crs != crs_of(text.path, text.table):
         raise UsageError(
-            f"{points_file} is in {stated.crs}, and {text.path} in {text.table.crs}.",
+            f"{points_file} is in {stated.crs.text}, and {text.path} in {text.table.crs}.",
             hint="One control file has one CRS: convert the points to it.",
         )
     return text, _merge_points(known, () if stated is None else stated.points, text.path)

@@ -12,11 +12,12 @@ from ctypes import c_char_p, c_int32, c_int64
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatpipe.pipeline import native
 from splatpipe.pipeline.engine.errors import CARD_HINT, MachineError
 from splatpipe.pipeline.raster.cuda.cuda_api import ABI, CALLS, NO_KERNEL, SIZES, SplatDevice
 from splatpipe.pipeline.raster.cuda.cuda_driver import driver, driver_release
 
-LIBRARY = Path(__file__).parents[1] / "libsplat_cuda.so"
+LIBRARY = Path(native.__file__).parent / "libsplat_cuda.so"
 NO_DEVICE = 100  # cudaErrorNoDevice, and the driver's code for it
 DRIVERS = {11: "450.80.02", 12: "525.60.13", 13: "580.65.06"}
 """The minimum Linux driver for each major version of CUDA, whatever the minor version (CUDA Compatibility, NVIDIA,

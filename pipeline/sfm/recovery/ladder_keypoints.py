@@ -25,7 +25,7 @@ from splatpipe.pipeline.sfm.recovery.ladder_pairs import take_verified
 
 STRONGER = FeaturesConfig(extractor="opencv-sift", max_image_size=2400, max_features=12_288)
 """Larger images and one and a half times the keypoints of `standard`. COLMAP's SIFT placed the same photos on two
-captures (docs/cameras.md) and took 1.6 and twice the time."""
+captures (docs/measurements/mapping.md) and took 1.6 and twice the time."""
 FAINT = 0.015  # contrast: some three times the keypoints of OpenCV's default
 THREAD_SHARE = 0.5  # share of the threads used: a photo takes up to twice the memory that it did in `features`
 

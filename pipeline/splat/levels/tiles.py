@@ -82,11 +82,11 @@ def write_tiles(
     """
     require_georeference(scene.facts)
     own_folder(folder, TILES)
-    names = {}
+    names: dict[LevelNode, str] = {}
     for number, node in enumerate(root.nodes()):
         if len(node.gaussians):
-            names[id(node)] = f"{TILES}/{number}.glb"
-            _write_tile(folder / names[id(node)], node.gaussians, scene.facts)
+            names[node] = f"{TILES}/{number}.glb"
+            _write_tile(folder / names[node], node.gaussians, scene.facts)
     tile = _tile(root, names, scene.facts.axes, esri_crs)
     tile["transform"] = _column_major(ecef_from_local)
     if esri_crs is not None:
@@ -145,12 +145,12 @@ def _tileset(tile: Mapping[str, Any], root: LevelNode, facts: SceneFacts, esri_c
     }
 
 
-def _tile(node: LevelNode, names: Mapping[int, str], axes: Axes, esri_crs: EsriCrs | None) -> dict[str, Any]:
+def _tile(node: LevelNode, names: Mapping[LevelNode, str], axes: Axes, esri_crs: EsriCrs | None) -> dict[str, Any]:
     """The tileset's entry for a node and all below it: z up, unlike their glTF."""
     volume = {"box": _box(box_z_up(node.box, axes))}
     tile: dict[str, Any] = {"boundingVolume": volume, "geometricError": float(node.error), "refine": "REPLACE"}
-    if id(node) in names:
-        tile["content"] = {"uri": names[id(node)]}
+    if node in names:
+        tile["content"] = {"uri": names[node]}
     if esri_crs is not None:
         tile["extensions"] = {ESRI_CRS: {"boundingVolume": volume}}
     if node.children:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8, UInt16
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.depths.point_visibility import Points, contiguous
 from splatpipe.pipeline.surface.depths.sources import DepthSource

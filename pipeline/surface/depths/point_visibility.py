@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.depths.sources import PosedDepthMap
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from splatpipe.pipeline.engine.durable import whole_file, write_durably
 from splatpipe.pipeline.surface.drawings.drawing import (
     EXTENT,
     GRID,
@@ -30,7 +31,6 @@ from splatpipe.pipeline.surface.drawings.drawing import (
     Stroke,
 )
 from splatpipe.pipeline.surface.drawings.dxf import DxfDocument, TextEntityAlignment, new_document, reproducible
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file, write_whole_text
 
 DXF_VERSION = "R2000"  # the oldest with drawing units and images, so most programs read it
 METRES = 6  # value of $INSUNITS
@@ -158,7 +158,7 @@ def write_svg_drawing(path: Path, drawing: Drawing, colours: UInt8[np.ndarray, "
             f'<text x="{x:.2f}" y="{y:.2f}" font-family="sans-serif" font-size="{label.size_mm * 1.4:.2f}"'
             f' text-anchor="{label.anchor}">{escape(label.text)}</text>'
         )
-    write_whole_text(path, "\n".join([*parts, "</svg>\n"]))
+    write_durably(path, "\n".join([*parts, "</svg>\n"]))
 
 
 def _svg_path(stroke: Stroke, line: np.ndarray) -> str:

@@ -7,9 +7,9 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.surface.drawings.drawing import Drawing
 from splatpipe.pipeline.surface.drawings.drawing_files import LAYERS, MARGIN_MM
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file
 
 DOTS_PER_INCH = 150  # of paper: a page fills a screen
 MM_AN_INCH, POINTS_A_MM = 25.4, 72.0 / 25.4

@@ -17,12 +17,12 @@ from affine import Affine
 from jaxtyping import Float64
 from PIL import Image
 
+from splatpipe.pipeline.engine.durable import whole_file, write_durably
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.surface.facades.elevation import Elevation
 from splatpipe.pipeline.surface.rasters.geotiff import GDAL_ERRORS, NODATA_HEIGHT, gdal
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file, write_whole_text
 
 FORMAT = 1
 METRE_DIGITS = 4  # of lengths and coordinates in the JSON: a tenth of a millimetre
@@ -124,7 +124,7 @@ def write_facades(path: Path, facts: Sequence[dict[str, Any]], crs: MapCrs) -> N
         "depths": "metres before the plane, towards the viewer",
         "facades": list(facts),
     }
-    write_whole_text(path, json_text(value))
+    write_durably(path, json_text(value))
 
 
 def _plane(elevation: Elevation, crs: MapCrs) -> dict[str, Any]:

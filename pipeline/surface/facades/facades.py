@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.json_file import json_text, read_json
 from splatpipe.pipeline.engine.stage import Reporter
@@ -30,7 +31,6 @@ from splatpipe.pipeline.surface.facades.facets import Facets, upright_facets
 from splatpipe.pipeline.surface.facades.walls import Wall, find_walls, name_walls, stated_wall
 from splatpipe.pipeline.surface.rasters.grid import DIGITS
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, open_map
-from splatpipe.pipeline.surface.rasters.whole_file import write_whole_text
 
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
@@ -162,4 +162,4 @@ def _write(folder: Path, elevation: Elevation, crs: MapCrs) -> None:
     write_picture(folder / files["picture"], elevation)
     write_dxf_drawing(folder / files["dxf"], drawing)
     write_svg_drawing(folder / files["svg"], drawing, elevation.colour, f"Façade {name}")
-    write_whole_text(folder / f"{name}.json", json_text(elevation_facts(elevation, crs, files)))
+    write_durably(folder / f"{name}.json", json_text(elevation_facts(elevation, crs, files)))

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.surface.drawings.dxf import new_document, reproducible
 from splatpipe.pipeline.surface.heights.contours import Contours
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, unit_name
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file
 
 DXF_VERSION = "R2000"
 DXF_UNITS = {"metre": 6, "foot": 2, "US survey foot": 21}  # of $INSUNITS

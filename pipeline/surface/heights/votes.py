@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.depths.sources import HeightRange, PhotoWindow, PosedDepthMap
 from splatpipe.pipeline.surface.rasters.lattice import Lattice

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.surface.drawings.drawing import (
     GRID,
@@ -28,7 +29,6 @@ from splatpipe.pipeline.surface.drawings.drawing_files import write_dxf_drawing
 from splatpipe.pipeline.surface.drawings.drawing_picture import write_png_drawing
 from splatpipe.pipeline.surface.measuring.sections import Section
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, unit_name
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file
 
 UNIT_KEYS = {"metre": "m", "foot": "ft", "US survey foot": "us_ft"}
 DIGITS = 4  # of lengths and coordinates: a tenth of a millimetre

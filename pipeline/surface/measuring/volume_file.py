@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from splatpipe.pipeline.engine.durable import write_durably
 from splatpipe.pipeline.engine.json_file import json_text
 from splatpipe.pipeline.surface.measuring.volumes import Amount, Volume
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
-from splatpipe.pipeline.surface.rasters.whole_file import write_whole_text
 
 FORMAT = 1
 DIGITS = 4
@@ -33,7 +33,7 @@ def write_volumes(path: Path, facts: Sequence[Mapping[str, Any]], crs: MapCrs) -
         OSError: if the disk is full or not writable.
     """
     value = {"format": FORMAT, "crs": crs.horizontal.name, "heights": crs.described_heights(), "uncertainty": HOW}
-    write_whole_text(path, json_text({**value, "volumes": list(facts)}))
+    write_durably(path, json_text({**value, "volumes": list(facts)}))
 
 
 def volume_facts(number: int, name: str, volume: Volume) -> dict[str, Any]:

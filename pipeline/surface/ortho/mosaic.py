@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int16, UInt8, UInt16
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 
 MAX_CANDIDATES = 8  # candidate photos per cell: enough to detect outliers
 MARGIN: int = _native.MOSAIC_MARGIN  # cells around a tile that its colours depend on

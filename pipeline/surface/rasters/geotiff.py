@@ -31,11 +31,11 @@ from rasterio.errors import RasterioError, RasterioIOError
 from rasterio.shutil import copy as copy_raster
 from rasterio.windows import Window
 
+from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.surface.rasters.grid import TILE, Grid
 from splatpipe.pipeline.surface.rasters.map_crs import unit_name
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file
 
 NODATA_HEIGHT = -9999.0
 HEIGHT_STEPS_PER_UNIT = 1024.0  # a power of two, so that steps have few bits and compress well

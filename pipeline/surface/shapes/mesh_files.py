@@ -17,11 +17,11 @@ import numpy as np
 
 from splatpipe.pipeline.delivery.delivery_frame import facts_of, georef_facts
 from splatpipe.pipeline.delivery.sparse_scene import GLTF_FROM_WORLD
+from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.json_file import write_json
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.splat.formats.plain_ply import frame_comments
 from splatpipe.pipeline.surface.depths.photo_samples import linear_light
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh
 from splatpipe.pipeline.survey.crs.frames import Frame
 

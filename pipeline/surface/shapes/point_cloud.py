@@ -19,11 +19,11 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 
+from splatpipe.pipeline.engine.durable import whole_file
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.output_file import new_file
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file
 
 SCALE = 0.001  # of coordinates: a millimetre, or a thousandth of a foot
 NORMAL_STEPS = 127.0

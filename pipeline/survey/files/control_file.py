@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
+from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.files.names import is_photo
+from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs
 from splatpipe.pipeline.survey.files.survey_text import (
     ELLIPSOIDAL_Z,
     GEOGRAPHIC,
@@ -129,12 +131,14 @@ class ControlFile:
     """The contents of a control file.
 
     Attributes:
-        crs: The CRS as written.
+        name: The file's name, for messages.
+        crs: The CRS of its points.
         points: In the order of their first lines.
         zero_heights: Points whose height of 0.0 was treated as unknown.
     """
 
-    crs: str
+    name: str
+    crs: Crs
     points: tuple[SurveyedPoint, ...]
     zero_heights: tuple[str, ...]
 
@@ -192,22 +196,24 @@ def read_control_file(path: Path) -> ControlFile:
     """Read a file of control and check points.
 
     Raises:
-        SplatpipeError: if it is not such a file; the message names the line, the hint what is expected there.
+        SplatpipeError: if it is not such a file, or its CRS is unknown; the message names the line, the hint what is
+            expected there.
     """
     table = read_table(path)
     with line_errors(path, _KIND):
-        return _assemble(table)
+        return _assemble(path, table)
 
 
 def read_points_file(path: Path) -> ControlFile:
     """Read surveyed points that need not be marked yet: a control file, or a CSV with only name,x,y,z.
 
     Raises:
-        SplatpipeError: if it is not such a file; the message names the line, the hint what is expected there.
+        SplatpipeError: if it is not such a file, or its CRS is unknown; the message names the line, the hint what is
+            expected there.
     """
     table = read_table(path, _NEEDED_OF_POINTS)
     with line_errors(path, _POINTS):
-        return _assemble(table)
+        return _assemble(path, table)
 
 
 def read_table(path: Path, needed: Sequence[str] = _NEEDED) -> Table:
@@ -335,7 +341,7 @@ def _csv_row(number: int, row: Mapping[str, str]) -> Row:
     return Row(number, _name(number, row["name"]) if row.get("name") else "", place, mark, ROLES.get(role), sigmas)
 
 
-def _assemble(table: Table) -> ControlFile:
+def _assemble(path: Path, table: Table) -> ControlFile:
     crs, groups = table.crs, table.groups
     if not crs or len(crs) > MAX_LINE_CHARS:
         raise LineError(0, "it states no CRS")
@@ -351,7 +357,19 @@ def _assemble(table: Table) -> ControlFile:
         points.append(point)
         if point.z is None and group[0].place[2] == 0.0:
             zero.append(name)
-    return ControlFile(crs, tuple(points), tuple(zero))
+    return ControlFile(path.name, crs_of(path, table), tuple(points), tuple(zero))
+
+
+def crs_of(path: Path, table: Table) -> Crs:
+    """The CRS that a control file states.
+
+    Raises:
+        SplatpipeError: if it is unknown; the message names the file.
+    """
+    try:
+        return parse_crs(table.crs)
+    except SplatpipeError as error:
+        raise SplatpipeError(f"The CRS of {path.name}: {error}", error.hint) from error
 
 
 def _point(name: str, rows: Sequence[Row], keep_zero: bool) -> SurveyedPoint:

@@ -12,7 +12,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.files.names import NameFinder, list_names, without_zeros
 from splatpipe.pipeline.photos.files.photo_list import Photo
-from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs
+from splatpipe.pipeline.survey.crs.crs import Crs
 from splatpipe.pipeline.survey.crs.readings import EXPLAINED
 from splatpipe.pipeline.survey.files.control_file import ControlFile, read_control_file, titled
 from splatpipe.pipeline.survey.options import GeorefConfig
@@ -31,15 +31,21 @@ class Survey:
 
     Attributes:
         file: The contents of the control file.
-        crs: Its CRS.
-        name: The file's name, for messages.
         points: In the file's order.
     """
 
     file: ControlFile
-    crs: Crs
-    name: str
     points: tuple[SurveyPoint, ...]
+
+    @property
+    def crs(self) -> Crs:
+        """The CRS of the file's coordinates."""
+        return self.file.crs
+
+    @property
+    def name(self) -> str:
+        """The file's name, for messages."""
+        return self.file.name
 
     def with_points(self, points: Sequence[SurveyPoint]) -> Survey:
         """The same file with other points."""
@@ -76,10 +82,6 @@ def load_survey(
         SplatpipeError: if it is not a control file, or does not belong to these photos.
     """
     file = read_control_file(path)
-    try:
-        crs = parse_crs(file.crs)
-    except SplatpipeError as error:
-        raise SplatpipeError(f"The CRS of {path.name}: {error}", error.hint) from error
     find = NameFinder(sorted(photos))
     marks = _marks(file, find, config)
     sightings = _sightings(file, path.name, marks, config, photos, model, report)
@@ -89,13 +91,13 @@ def load_survey(
     ]
     require_agreement(path.name, marks, points, model, photos, config.mark_sigma_px)
     if find_targets is not None:
-        points = _with_targets(points, find_targets(Survey(file, crs, path.name, tuple(points))), model, photos, config)
+        points = _with_targets(points, find_targets(Survey(file, tuple(points))), model, photos, config)
     if not any(point.sightings for point in points):
         report.warning(
             f"{path.name} has points without marks in photos, and no targets were detected for them.",
             "Mark each point in at least two, better four photos: splatpipe view OUT --mark.",
         )
-        return Survey(file, crs, path.name, tuple(with_roles(points, config.check_points)))
+        return Survey(file, tuple(with_roles(points, config.check_points)))
     if file.zero_heights:
         report.note(
             f"A height of 0.0 is treated as unknown: {list_names(file.zero_heights)} of {path.name} "
@@ -104,7 +106,7 @@ def load_survey(
     _warn_of_unusable(points, path.name, model, photos, report)
     roled = with_roles(points, config.check_points)
     _report_overruled_roles(roled, path.name, config.check_points, report)
-    return Survey(file, crs, path.name, tuple(roled))
+    return Survey(file, tuple(roled))
 
 
 def _with_targets(

@@ -98,9 +98,9 @@ def named_tracks(
     if expected is None:
         refused["quadrants without coordinates to identify them"] += sum(find.number is None for find in finds)
         return TargetMarks(tuple(by_number), +refused)
-    taken = {id(each.track) for each in by_number}
+    taken = {each.track for each in by_number}
     unnamed = unnamed_tracks([find for find in finds if find.number is None], *scene)
-    unnamed += [track for track in coded if id(track) not in taken]
+    unnamed += [track for track in coded if track not in taken]
     by_place, wrong = _by_place(unnamed, by_number, expected, seeds)
     kept = [each for each in by_number if each.name not in wrong]
     refused["coded targets far from the points of their numbers"] += len(by_number) - len(kept)
@@ -150,17 +150,19 @@ def _by_number(coded: Sequence[Track], names: Sequence[str]) -> tuple[list[Named
         if number is not None:
             numbers[number].append(name)
     exact = {
-        id(t): spelled[_spelled(f"{t.kind}{t.number}")] for t in coded if _spelled(f"{t.kind}{t.number}") in spelled
+        track: spelled[_spelled(f"{track.kind}{track.number}")]
+        for track in coded
+        if _spelled(f"{track.kind}{track.number}") in spelled
     }
     votes: Counter[str] = Counter()
     for track in coded:
-        if len(numbers[track.number or 0]) == 1 or id(track) in exact:
+        if len(numbers[track.number or 0]) == 1 or track in exact:
             votes[track.kind] += len(track.finds)
     claims: defaultdict[str, list[Track]] = defaultdict(list)
     for track in coded:
         called = numbers[track.number or 0]
-        if id(track) in exact:
-            claims[exact[id(track)]].append(track)
+        if track in exact:
+            claims[exact[track]].append(track)
         elif len(called) == 1:
             claims[called[0]].append(track)
     result = []

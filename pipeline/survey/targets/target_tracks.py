@@ -23,7 +23,7 @@ MAX_SEEDS = 4000
 BEYOND = 2.0  # factor by which a target may be farther or nearer than the sparse points in a photo
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Track:
     """A target in several photos.
 

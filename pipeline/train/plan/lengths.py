@@ -16,9 +16,9 @@ from functools import cache
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.windows import TrainingSize, windows_of
 
-# Judgement, except where docs/lengths.md reports comparisons.
+# Judgement, except where docs/measurements/training.md reports comparisons.
 WHOLE_VISITS = 20  # minimum per photo at the size at which it fits whole
-PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/lengths.md
+PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/measurements/training.md
 FIRST_SHARE = 0.5  # share of the minimum iterations at the first size, but for MAX_FIRST_ITERATIONS
 MAX_FIRST_ITERATIONS = 3500  # cap on FIRST_SHARE where WHOLE_VISITS are fewer: the finest size is worth more
 MIN_PART_VISITS = 10.0  # visits per part below which a run of a given length stays with the size before: it learns more

@@ -28,10 +28,10 @@ def photos(tmp_path: Path) -> Path:
 def test_help_names_every_command_and_imports_nothing_heavy() -> None:
     done = in_a_process("--help")
     assert done.returncode == 0
-    for command in ("run", "stage", "demo", "georef", "render", "status", "clean", "doctor", "options"):
+    for command in ("run", "stage", "demo", "georef", "render", "status", "tidy", "doctor", "options"):
         assert command in done.stdout
     code = (
-        "import sys; from splatpipe.pipeline.app import cli; from splatpipe.stages import line\n"
+        "import sys; from splatpipe.pipeline.app.cli import main; from splatpipe.stages import line\n"
         "print([name for name in ('torch', 'numpy', 'scipy', 'pycolmap', 'cv2', 'kornia') if name in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
@@ -69,7 +69,8 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
         (["stage", "train", "{tmp}/out"], 2, "does not contain a run"),
         (["stage", "trains", "{tmp}/out"], 2, "no stage"),
         (["status", "{tmp}/out"], 2, "does not contain a run"),
-        (["clean", "{photos}"], 2, "does not contain a run"),
+        (["tidy", "{photos}"], 2, "does not contain a run"),
+        (["clean", "{photos}"], 2, "is now called splatpipe tidy"),
         (["fly"], 2, "No such command"),
     ],
 )

@@ -1,6 +1,6 @@
 """The shipped CUDA library: one file with the C interface and nothing else, for every requested architecture.
 
-Whether there is one follows from SPLATPIPE_CUDA, as in `pipeline/raster/native/cuda/CMakeLists.txt`: CI asks for all.
+Whether there is one follows from SPLATPIPE_CUDA, as in `pipeline/native/cuda/CMakeLists.txt`: CI asks for all.
 With ``auto``, the build records what it found.
 """
 
@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 from repository import ROOT
 
-from splatpipe.pipeline import raster
+from splatpipe.pipeline import native
 
-API = ROOT / "pipeline" / "raster" / "native" / "cuda" / "api.h"
-LIBRARY = Path(raster.__file__).parent / "libsplat_cuda.so"
+API = ROOT / "pipeline" / "native" / "cuda" / "api.h"
+LIBRARY = Path(native.__file__).parent / "libsplat_cuda.so"
 EVERY_DEVICE = {75, 80, 86, 89, 90, 100, 120}
 NEWEST = 120
 FAT_MAGIC = 0xBA55ED50  # of what nvcc packs for several devices

@@ -1,4 +1,4 @@
-"""README and docs: links lead somewhere, commands and options are real, and the options' page is what the code says."""
+"""README and docs: links lead somewhere, commands and options are real, generated pages are what the code says."""
 
 import re
 import shlex
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import options_page
 import pytest
+import rooms_page
 import typer
 from command import splatpipe
 from repository import ROOT
@@ -21,9 +22,12 @@ from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
 README = ROOT / "README.md"
-DOCS = sorted((ROOT / "docs").glob("*.md"))
+INDEX = ROOT / "docs/README.md"
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [README, *DOCS]
 LONGEST_README = 150  # lines: what a surveyor reads in an afternoon, with the run
+LONGEST_GUIDE = 150  # lines
+GENERATED = ("options.md", "rooms.md", "stages.md")  # in part; reference may be longer
 FIRST_SCREEN = 30  # lines
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 QUICK = (
@@ -39,7 +43,7 @@ ENDINGS = ("csv", "json", "tif", "glb", "ply", "webm", "py", "toml", "laz", "md"
 
 
 def name_of(page: Path) -> str:
-    return page.name
+    return page.relative_to(ROOT).as_posix()
 
 
 def fences(page: Path, *languages: str) -> Iterator[str]:
@@ -72,10 +76,23 @@ def links(page: Path) -> list[str]:
     return re.findall(r"\]\(([^)\s]+)\)", prose(page))
 
 
-def test_the_readme_takes_an_afternoon_and_leads_to_every_page() -> None:
+def linked_by(page: Path) -> set[Path]:
+    return {(page.parent / link.partition("#")[0]).resolve() for link in links(page)}
+
+
+def test_the_readme_takes_an_afternoon_and_leads_to_the_index() -> None:
     assert len(README.read_text(encoding="utf-8").splitlines()) <= LONGEST_README
-    linked = {(ROOT / link.partition("#")[0]).resolve() for link in links(README)}
-    assert set(DOCS) <= linked
+    assert INDEX in linked_by(README)
+
+
+def test_the_index_leads_to_every_page() -> None:
+    assert set(DOCS) - {INDEX} <= linked_by(INDEX)
+
+
+def test_guides_are_short() -> None:
+    guides = [page for page in DOCS if page.parent == INDEX.parent and page.name not in GENERATED]
+    long = {page.name: len(page.read_text(encoding="utf-8").splitlines()) for page in guides}
+    assert {name: lines for name, lines in long.items() if lines > LONGEST_GUIDE} == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -179,9 +196,32 @@ def test_the_page_of_options_has_types_limits_and_presets() -> None:
 
 
 def test_the_stages_of_the_line_are_described() -> None:
-    params = (ROOT / "docs/rooms.md").read_text(encoding="utf-8")
-    rows = [name.strip() for row in re.findall(r"^\| ([a-z_, ]+) \|", params, re.MULTILINE) for name in row.split(",")]
-    assert [name for name in rows if name not in ("stage", "thing")][: len(LINE)] == [stage.name for stage in LINE]
+    page = (ROOT / "docs/stages.md").read_text(encoding="utf-8")
+    rows = [name.strip() for row in re.findall(r"^\| ([a-z_, ]+) \|", page, re.MULTILINE) for name in row.split(",")]
+    assert [name for name in rows if name != "stage"] == [stage.name for stage in LINE]
+
+
+def test_the_pages_of_rooms_and_stages_match_the_code() -> None:
+    for page, text in rooms_page.pages().items():
+        assert page.read_text(encoding="utf-8") == text, f"{page.name}: run make rooms-page"
+
+
+def test_a_graph_leaves_out_arrows_that_a_longer_way_replaces() -> None:
+    edges = {"app": {"train", "engine"}, "train": {"engine"}, "engine": set[str]()}
+    assert rooms_page.reduced(edges) == {"app": {"train"}, "train": {"engine"}, "engine": set()}
+    with pytest.raises(ValueError, match="a circle: app imports train imports app"):
+        rooms_page.reduced({"app": {"train"}, "train": {"app"}})
+
+
+def test_rooms_within_a_room_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    app = f"{rooms_page.ROOMS}.app"
+    members = [f"{app}.{name}" for name in ("cli", "preflight", "report")]
+    monkeypatch.setattr(rooms_page, "containers", lambda: {app: members})
+    part = rooms_page.inner_rooms_part()
+    assert part.startswith("### app\n")
+    assert "preflight_ --> report_" in part
+    assert "| `report` |" in part
+    assert "`renders`" in part.partition("Beside them: ")[2]
 
 
 def test_the_quick_commands_of_the_pages_run(tmp_path: Path) -> None:

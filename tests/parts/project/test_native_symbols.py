@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from repository import ROOT
 
-NATIVE = ROOT / "pipeline" / "raster" / "native"
+NATIVE = ROOT / "pipeline" / "native"
 KERNEL_TABLE = re.compile(r"splat::(?P<isa>\w+)::\w+_kernels")
 WEAK = "WwVvu"  # nm's letters for what the linker may take from another object
 
@@ -48,7 +48,7 @@ def test_the_builds_objects_have_no_global_symbols_but_their_kernel_tables() -> 
 
 
 KERNEL = """
-#include "isa.h"
+#include "base/isa.h"
 {include}
 struct Kernels {{ int (*count)(int); }};
 SPLAT_DECLARE_KERNELS(Kernels, test_kernels)

@@ -23,7 +23,7 @@ PURL = re.compile(r"pkg:(npm|cargo|pypi|generic)/[A-Za-z0-9%._/-]+(@[A-Za-z0-9.+
 def bill(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = tmp_path_factory.mktemp("sbom") / "splatpipe.cdx.json"
     subprocess.run(
-        [sys.executable, ROOT / "pipeline/raster/native/sbom.py", path, "--nanobind", "3.1.0", "--cuda", "13.0"],
+        [sys.executable, ROOT / "pipeline/native/sbom.py", path, "--nanobind", "3.1.0", "--cuda", "13.0"],
         check=True,
     )
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -48,7 +48,7 @@ def test_the_body_of_a_stages_shards_belongs_to_it(copy: Path) -> None:
 
 
 def test_kernels_belong_to_the_stages_that_reach_them(copy: Path) -> None:
-    kernel = copy / "pipeline/raster/native/adam_cpu.cpp"
+    kernel = copy / "pipeline/native/adam/adam_cpu.cpp"
     append(kernel, "\n// A comment,\n/* and\nanother */\n\n")
     assert record.complaint(copy) == ""
     append(kernel, "int planted;\n")

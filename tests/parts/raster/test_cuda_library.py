@@ -17,8 +17,8 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.cuda import cuda_api, cuda_driver, cuda_library
 from splatpipe.pipeline.raster.cuda.cuda_library import CudaDevice, CudaInstallation, CudaLibrary, reason_of
 
-NATIVE = ROOT / "pipeline" / "raster" / "native" / "cuda"
-API = (NATIVE / "api.h").read_text()
+NATIVE = ROOT / "pipeline" / "native"
+API = "".join((NATIVE / name).read_text() for name in ("cuda/api.h", "raster/shot.h"))
 H200 = CudaDevice("NVIDIA H200", 90, 13000, 13000, 150_000_000_000)
 GOOD = CudaInstallation(13000, library=(0, H200), torch_cuda="12.8")
 
@@ -49,7 +49,7 @@ def test_structures_are_those_of_the_header(tmp_path):
             lines.append(f'std::printf("\\"{field}\\": (%zu, %zu), ", offsetof({name}, {field}), {size});')
         lines.append('std::printf("}],\\n");')
     lines.append('std::printf("}\\n");')
-    includes = '#include "api.h"\n#include <cstddef>\n#include <cstdio>\n'
+    includes = '#include "cuda/api.h"\n#include <cstddef>\n#include <cstdio>\n'
     build(f"{includes}int main() {{ {' '.join(lines)} }}", tmp_path / "sizes")
     printed = subprocess.run([tmp_path / "sizes"], capture_output=True, text=True, check=True).stdout
     expected = eval(printed)

@@ -10,7 +10,7 @@ from random_scene import random_camera, random_scene
 from torch import Tensor
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render

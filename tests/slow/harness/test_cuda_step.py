@@ -14,7 +14,7 @@ from exact import case_of, exact_outcome
 from frames import ORDERS, PARAMETERS, DeviceFrame, Memory, RenderCase, controls, pointer, rows_of, run
 from random_scene import random_camera, random_scene
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.cuda.cuda_api import SplatAdam, SplatStep
 from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary
 

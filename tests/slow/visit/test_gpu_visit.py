@@ -131,7 +131,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     model.sh[:, 0] += 0.3  # or the photos' differences from its renders are of rounding alone, and of either sign
     write_splat(capture / "trained.ply", model)
     (pack / "libraries").mkdir()
-    package = find_spec("splatpipe.pipeline.raster")
+    package = find_spec("splatpipe.pipeline.native")
     assert package is not None and package.submodule_search_locations is not None
     for library in Path(package.submodule_search_locations[0]).glob("_native*.so"):
         shutil.copyfile(library, pack / "libraries" / library.name)
@@ -310,12 +310,12 @@ def test_a_carried_library_that_does_not_fit_is_compiled_there(
     carried, packages = tmp_path / "carried", tmp_path / "packages"
     carried.mkdir()
     (carried / "_native.abi3.so").write_bytes(b"of another machine")
-    shutil.copytree(NATIVE.parents[1], packages / "splatpipe" / "pipeline", ignore=gpu_visit.UNUSED)
+    shutil.copytree(NATIVE.parent, packages / "splatpipe" / "pipeline", ignore=gpu_visit.UNUSED)
     monkeypatch.setenv("SPLATPIPE_HARNESS", str(place.library))
     monkeypatch.setattr(gpu_libraries, "_compile_here", lambda scratch, target: good)
     said = gpu_libraries.place(carried, packages, tmp_path)
     assert said["_native.abi3.so"].startswith("compiled here, since the carried one does not fit: ImportError")
-    assert [path.name for path in (packages / "splatpipe" / "pipeline" / "raster").glob("*.so")] == [good.name]
+    assert [path.name for path in (packages / "splatpipe" / "pipeline" / "native").glob("*.so")] == [good.name]
     (carried / "_native.abi3.so").unlink()
     shutil.copy(good, carried)
     assert gpu_libraries.place(carried, packages, tmp_path)["_native.abi3.so"] == "as carried"

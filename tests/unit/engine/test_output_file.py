@@ -49,7 +49,7 @@ ALLOWED = {
     "pipeline/train/state/checkpoint.py": "a member of an archive that is open",
     # Never installed:
     "pipeline/web/build.py": "builds the wheel",
-    "pipeline/raster/native/sbom.py": "builds the wheel",
+    "pipeline/native/sbom.py": "builds the wheel",
 }
 WRITERS = {"write_text", "write_bytes", "touch", "symlink_to", "hardlink_to", "tofile"}
 OF_MODULES = {

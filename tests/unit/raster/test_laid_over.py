@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.rasterizer import set_threads
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes, laid_over_nodes_reference
 from splatpipe.pipeline.splat.sky.panorama import STEP_PX, nodes_along

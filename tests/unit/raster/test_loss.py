@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.loss import photo_loss, photo_loss_reference
 
 # Relative, the gradient in L2, against float64. The worst case is a flat white image, where the variances of the

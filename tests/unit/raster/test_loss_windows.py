@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.loss import SSIM_REACH_PX, Rectangle, photo_loss, photo_loss_reference
 
 LOSS_RTOL = {torch.float64: 1e-12, torch.float32: 2e-6}

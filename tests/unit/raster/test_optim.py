@@ -7,7 +7,7 @@ import weakref
 import pytest
 import torch
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
 
 # Relative to the size of a step: rounding of float32 in another order of the same operations, over 30 steps.

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.isa import isa_names
 
 WIDTH, HEIGHT, FOCAL = 96, 64, 80.0

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render, set_threads
 from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 

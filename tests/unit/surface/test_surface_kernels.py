@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from house_site import cameras, depths_of, photo_of, true_height
 
-from splatpipe.pipeline.raster import _native
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.surface.depths.photo_samples import (
     PLAIN_TONE,

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from splatpipe.pipeline.surface.rasters.whole_file import whole_file
+from splatpipe.pipeline.engine.durable import whole_file
 
 
 def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_beside_it(tmp_path: Path) -> None:
     path = tmp_path / "a[1].tif"  # a name that is no pattern
     path.write_text("old")
-    (tmp_path / ".a[1].tif.999999.making").mkdir()
+    (tmp_path / ".a[1].tif.999999.0.new").mkdir()
     with pytest.raises(OSError, match="No space"), whole_file(path) as aside:
         aside.write_text("half")
         (aside.parent / "overviews.tmp").write_text("of a library")

@@ -192,12 +192,12 @@ def test_points_without_marks_are_read_by_name(tmp_path: Path) -> None:
     path = tmp_path / "points.csv"
     path.write_text("EPSG:25832\npoint;easting;northing;height;role\nP1;1,5;2,5;;check\nP2;3;4;5;\n")
     found = read_points_file(path)
-    assert (found.crs, [(p.name, p.x, p.z, p.role) for p in found.points]) == (
+    assert (found.crs.text, [(p.name, p.x, p.z, p.role) for p in found.points]) == (
         "EPSG:25832",
         [("P1", 1.5, None, "check"), ("P2", 3.0, 5.0, None)],
     )
     path.write_text("lon,lat,name\n13.5,47.8,P1\n")
-    assert read_points_file(path).crs == "EPSG:4326"
+    assert read_points_file(path).crs.text == "EPSG:4326"
     path.write_text("EPSG:32633\n1 2 3 4 5 A.JPG P1\n")  # a control file has points, too
     assert len(read_points_file(path).points[0].marks) == 1
     for text, wrong in (("EPSG:25832\nname,x\nP1,1\n", "points.csv"), ("", "empty"), ("name,x,y\nP1,1,2\n", "no CRS")):

@@ -6,6 +6,7 @@ import pytest
 
 from splatpipe.demo import CAPTURE
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.survey.crs.crs import parse_crs
 from splatpipe.pipeline.survey.files.control_file import ControlFile, Mark, read_control_file, read_points_file, titled
 
 
@@ -22,7 +23,7 @@ def test_odm_list_gives_points_with_their_marks(tmp_path: Path, crs: str) -> Non
         f"# surveyed by us\n{crs}\r\n10.5 20.25 512.0 100.5 200.25 A.JPG P1 extra 7\r\n\n# pause\n"
         "10.5\t20.25\t512.0\t7\t8\tmy photo.JPG\tP1\n11 21 513 1 2 A.JPG P2\n",
     )
-    assert found.crs == crs.strip()
+    assert found.crs == parse_crs(crs)
     assert [point.name for point in found.points] == ["P1", "P2"]
     assert (found.points[0].x, found.points[0].y, found.points[0].z) == (10.5, 20.25, 512.0)
     assert found.points[0].marks == (Mark("A.JPG", 100.5, 200.25), Mark("my photo.JPG", 7.0, 8.0))
@@ -53,7 +54,7 @@ def test_lines_without_names_are_distinguished_by_their_coordinates(tmp_path: Pa
 
 def test_demo_capture_has_eighteen_points(tmp_path: Path) -> None:
     found = read_control_file(CAPTURE / "gcp_list.txt")
-    assert found.crs == "EPSG:32633"
+    assert found.crs.text == "EPSG:32633"
     assert len(found.points) == 18
     assert all(point.z is not None and len(point.marks) >= 2 for point in found.points)
 
@@ -71,14 +72,14 @@ def test_demo_capture_has_eighteen_points(tmp_path: Path) -> None:
 def test_tables_are_read_by_their_header(tmp_path: Path, text: str) -> None:
     found = read(tmp_path, text, "control.csv")
     point = found.points[0]
-    assert found.crs == "EPSG:25832"
+    assert found.crs.text == "EPSG:25832"
     assert (point.name, point.x, point.y, point.z) == ("P1", 1.5, 2.5, 3.5)
     assert (point.role, point.sigma_m, point.marks) == ("check", (0.01, 0.02), (Mark("A.JPG", 10.0, 20.0),))
 
 
 def test_table_of_longitudes_and_latitudes_needs_no_crs(tmp_path: Path) -> None:
     found = read(tmp_path, "name,lat,lon,photo,px,py\nP1,47.8,13.5,A.JPG,1,2\n")
-    assert (found.crs, found.points[0].x, found.points[0].y, found.points[0].z) == ("EPSG:4326", 13.5, 47.8, None)
+    assert (found.crs.text, found.points[0].x, found.points[0].y, found.points[0].z) == ("EPSG:4326", 13.5, 47.8, None)
 
 
 def test_height_of_exactly_zero_is_unknown_unless_others_are_near_sea_level(tmp_path: Path) -> None:
@@ -154,7 +155,7 @@ def test_too_large_files_are_refused(tmp_path: Path) -> None:
 def test_separator_and_columns_of_other_programs_are_found(tmp_path: Path, text: str, photo: str) -> None:
     found = read(tmp_path, text.format(photo=photo))
     (point,) = found.points
-    assert found.crs == "EPSG:32633"
+    assert found.crs.text == "EPSG:32633"
     assert (point.x, point.y, point.z, point.marks) == (1.5, 2.5, 3.5, (Mark(photo, 10.0, 20.0),))
     assert point.name.startswith("P")
 
@@ -166,7 +167,7 @@ def test_points_of_a_receiver_without_marks_are_read_by_their_titles(tmp_path: P
         "P1,GCP,388710.5,5299705.2,465,13.5127,47.8412,512,0.01,ETRS89 / UTM 33N + height\n"
     )
     file = read_points_file(path)
-    assert file.crs == "EPSG:4979"
+    assert file.crs.text == "EPSG:4979"
     assert [(point.x, point.y, point.z) for point in file.points] == [(13.5127, 47.8412, 512.0)]
 
 
