@@ -18,7 +18,7 @@ from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import list_names
 from splatpipe.pipeline.photos.files.photo_list import load_photo_list
-from splatpipe.pipeline.sfm.by_camera import camera_rows, hold_few, report_cameras
+from splatpipe.pipeline.sfm.by_camera import camera_rows, report_cameras, reset_underdetermined_focals
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.judging.doubles import doubles_reasons, find_doubles
 from splatpipe.pipeline.sfm.judging.external_evidence import outside_reasons
@@ -44,7 +44,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         capture = _capture(inputs, Path(scratch))
         found = run_ladder(capture, reconstruct(capture, config, report), config, report)
-        hold_few(found.model, found.verified, capture.cameras)
+        reset_underdetermined_focals(found.model, found.verified, capture.cameras)
         stated = stated_lenses(read_json(inputs["ingest.lenses"])["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from PIL import Image, ImageOps
 
 from splatpipe.pipeline.engine.files.small_file import open_regular
-from splatpipe.pipeline.photos.files.picture_file import open_picture, turn_to_decode, why_hollow
+from splatpipe.pipeline.photos.files.picture_file import open_picture, sparse_data_reason, turn_to_decode
 
 MAX_BYTES = 512 << 20  # of a file
 MAX_PIXELS = 300_000_000  # of a photo that cannot be reduced while decoding: about a gigabyte of memory
@@ -114,7 +114,7 @@ def _read(path: Path, side: int | None) -> tuple[Image.Image, bool] | None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about large images or broken metadata: check has reported these
                 with open_picture(io.BytesIO(data + more)) as image:
-                    if why_hollow(image, data):
+                    if sparse_data_reason(image, data):
                         return None
                     if side is not None:
                         image.draft("RGB", (2 * side, 2 * side))

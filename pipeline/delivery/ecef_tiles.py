@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.splat.levels.levels import LevelNode
-from splatpipe.pipeline.splat.levels.tiles import EsriCrs, box_z_up, refuse_nowhere, write_tiles
+from splatpipe.pipeline.splat.levels.tiles import EsriCrs, box_z_up, require_georeference, write_tiles
 from splatpipe.pipeline.splat.model.scene import Scene
 from splatpipe.pipeline.survey.crs.crs import ELLIPSOIDAL
 from splatpipe.pipeline.survey.crs.world import Placement, World, open_world
@@ -36,7 +36,7 @@ def write_tiles_on_globe(folder: Path, scene: Scene, root: LevelNode) -> Placeme
         ValueError: as ``write_tiles``.
         OSError: as ``write_tiles``.
     """
-    refuse_nowhere(scene.facts)
+    require_georeference(scene.facts)
     assert scene.facts.place is not None
     world = open_world(frame_of(scene.facts.place))
     box = box_z_up(root.box, scene.facts.axes)

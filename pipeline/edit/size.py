@@ -84,7 +84,7 @@ class Reduce:
         if self.count:
             if len(piece) > self.count:
                 piece.replace_gaussians(
-                    reduce_further(Reduction.none_yet(piece.with_motion_applied()), self.count).gaussians
+                    reduce_further(Reduction.unmerged(piece.with_motion_applied()), self.count).gaussians
                 )
             return {"step": "reduce", "to": self.count}
         piece.replace_gaussians(self._fitting(piece.scene()))

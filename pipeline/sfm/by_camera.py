@@ -15,13 +15,15 @@ from splatpipe.pipeline.sfm.judging.judging import TRUSTED_SOURCES
 from splatpipe.pipeline.sfm.lenses.focal import adjust_within
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
-MAX_CAMERAS_REPORTED = 10  # on the console; the report lists them all
-FEW_PHOTOS = 3  # of a camera: with fewer, focal length and distance are not separable
-STATED_STRAY = 0.05  # maximum relative deviation from a trusted focal length
-KIN_STRAY = 0.02  # the same, from one calibrated with other photos of the same body and zoom
+MAX_CAMERAS_REPORTED = 10  # cameras listed on the console; the report lists them all
+MIN_CAMERA_PHOTOS = 3  # photos of a camera below which focal length and distance are not separable
+MAX_STATED_DEVIATION = 0.05  # maximum relative deviation from a trusted focal length
+MAX_SIBLING_DEVIATION = 0.02  # maximum relative deviation from a focal length calibrated with the same body and zoom
 
 
-def hold_few(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]) -> list[int]:
+def reset_underdetermined_focals(
+    model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Sequence[JSON]
+) -> list[int]:
     """Reset the focal lengths of cameras with one or two photos to known values, and adjust, in place.
 
     A single photo, far from others or of a flat object, does not determine its focal length, which may run away in
@@ -37,7 +39,7 @@ def hold_few(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Seque
         COLMAP's ids of the cameras that were reset.
     """
     placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
-    few = [number for number, count in sorted(placed.items()) if count < FEW_PHOTOS]
+    few = [number for number, count in sorted(placed.items()) if count < MIN_CAMERA_PHOTOS]
     if 2 * sum(placed[number] for number in few) > model.num_reg_images():
         return []  # a collection of many people's photos: its cameras constrain each other
     strayed = {}
@@ -46,7 +48,7 @@ def hold_few(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Seque
         if known is not None and abs(model.cameras[number].mean_focal_length() / known[0] - 1.0) > known[1]:
             strayed[number] = known[0]
     if strayed:
-        adjust_within(model, strayed, KIN_STRAY)
+        adjust_within(model, strayed, MAX_SIBLING_DEVIATION)
     return list(strayed)
 
 
@@ -62,11 +64,11 @@ def _known(
     changes = [
         model.cameras[other].mean_focal_length() / verified.cameras[other].mean_focal_length()
         for other, count in sorted(placed.items())
-        if count >= FEW_PHOTOS and body[1] and _body(cameras, other) == body
+        if count >= MIN_CAMERA_PHOTOS and body[1] and _body(cameras, other) == body
     ]
     if changes:
-        return own * float(np.median(changes)), KIN_STRAY
-    return (own, STATED_STRAY) if body[2] in TRUSTED_SOURCES else None
+        return own * float(np.median(changes)), MAX_SIBLING_DEVIATION
+    return (own, MAX_STATED_DEVIATION) if body[2] in TRUSTED_SOURCES else None
 
 
 def _body(cameras: Sequence[JSON], number: int) -> tuple[str, str, str, float]:
@@ -122,8 +124,8 @@ def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
             if seen:
                 pose = np.asarray(image.cam_from_world().matrix(), np.float64)
                 places = np.array([model.points3D[point.point3D_id].xyz for point in seen])
-                shown, _ = project_through_lens(camera, pose, places)
-                off = np.linalg.norm(shown - np.array([point.xy for point in seen]), axis=1)
+                projected, _ = project_through_lens(camera, pose, places)
+                off = np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1)
                 total, count = total + float(off[np.isfinite(off)].sum()), count + int(np.isfinite(off).sum())
         if count and math.isfinite(total):
             result[number] = round(total / count, 4)

@@ -21,20 +21,26 @@ from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_s
 from splatpipe.pipeline.sfm.model.structure import Structure, cameras_of, make_model, poses_of
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.recovery.probing import FILL, PROBES, THIN, pairs_a_photo, probe
+from splatpipe.pipeline.sfm.recovery.probing import (
+    FILL_PAIRS_PER_PHOTO,
+    PROBE_PAIRS,
+    SPARSE_PAIRS_PER_PHOTO,
+    pairs_a_photo,
+    probe,
+)
 from splatpipe.pipeline.sfm.recovery.refusal import refusal
 
 Model: TypeAlias = pycolmap.Reconstruction
 Mapper: TypeAlias = Literal["incremental", "global"]
 
-MIN_SHARE = 0.1  # of the photos; a model of fewer is accidental
+MIN_SHARE = 0.1  # share of the photos in a model; one of fewer is accidental
 MIN_SEEN = 15  # mean points per photo; COLMAP's minimum for a pair
 ENOUGH_SHARE = 0.5  # below this share, an attempt with relaxed thresholds is worth its time
 MAX_SHARE = 0.85  # below this share the other mapper may do better; above it the ladder places the rest more cheaply
-STRAY_UNOBSERVED = 0.03  # relative deviation allowed for a focal length that the photos do not determine
-CLEARLY = 0.005  # score margin by which a second model must be better to replace the first
-ROUNDS = 2  # of matching additional pairs
-FURTHER = 1  # mappings of a doubtful capture
+MAX_UNOBSERVED_DEVIATION = 0.03  # relative deviation allowed for a focal length that the photos do not determine
+MIN_SCORE_MARGIN = 0.005  # score margin by which a second model must be better to replace the first
+ROUNDS = 2  # rounds of matching additional pairs
+MAX_FURTHER_MAPPINGS = 1  # mappings of a doubtful capture
 TEXTS = {"bent": "pairs of photos contradict it", "unexplained": "many matches are unexplained"}
 
 
@@ -75,7 +81,7 @@ class Reconstructor:
         self.verified = read_verified(capture.database)
         self.tried: list[MappingAttempt] = []
         self.notes: dict[MappingAttempt, str] = {}
-        self.further = FURTHER
+        self.further = MAX_FURTHER_MAPPINGS
 
     def map(self, mapper: Mapper, how: str, **options: bool) -> MappingAttempt:
         """Run one mapper and judge its largest model."""
@@ -155,7 +161,7 @@ def reconstruct(capture: MappingInput, config: SparseConfig, report: Reporter) -
     if answer.placed < max(config.min_model_size, math.ceil(MIN_SHARE * len(work.verified.names))):
         raise refusal(answer.placed, config.min_model_size, work.verified, len(capture.tried))
     if config.mapper == "auto":
-        answer = _settled(work, _with_new_pairs(work, answer))
+        answer = _best_attempt(work, _with_new_pairs(work, answer))
     return MappingResult(
         answer.models[0],
         tuple(answer.models[1:]),
@@ -180,7 +186,7 @@ def _first(work: Reconstructor) -> MappingAttempt:
     return best
 
 
-def _settled(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
+def _best_attempt(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """Return the attempt with its cameras rearranged if that explains more, or a better one of the other mapper."""
     answer = _better(answer, work.adjust(answer, "rearranged"))
     doubts = _doubts(answer)
@@ -195,7 +201,7 @@ def _doubts(answer: MappingAttempt) -> list[str]:
     if answer.judgement is None:
         return ["no photo was placed"]
     found = ["the focal length diverged"] if any(it.kind == "focal" for it in answer.judgement.reasons) else []
-    if answer.judgement.reachable > answer.judgement.score + CLEARLY:
+    if answer.judgement.reachable > answer.judgement.score + MIN_SCORE_MARGIN:
         found += sorted({TEXTS[it.kind] for it in answer.judgement.reasons if it.kind in TEXTS})
     return found
 
@@ -207,7 +213,7 @@ def _better(first: MappingAttempt, second: MappingAttempt) -> MappingAttempt:
     bad = first.judgement.level == "bad", second.judgement.level == "bad"
     if bad[0] != bad[1]:
         return second if bad[0] else first
-    return second if second.judgement.score > first.judgement.score + CLEARLY else first
+    return second if second.judgement.score > first.judgement.score + MIN_SCORE_MARGIN else first
 
 
 def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
@@ -217,10 +223,10 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
     """
     for number in range(ROUNDS):
         model = answer.models[0]
-        thin = pairs_a_photo(model, work.verified) < THIN
+        thin = pairs_a_photo(model, work.verified) < SPARSE_PAIRS_PER_PHOTO
         if not thin and not _unsure(answer, work.verified):
             break
-        count = FILL * model.num_reg_images() if thin else PROBES
+        count = FILL_PAIRS_PER_PHOTO * model.num_reg_images() if thin else PROBE_PAIRS
         found = probe(work.capture, model, (work.database, work.verified), count, work.config.seed, work.report)
         if not found.held:
             break
@@ -228,7 +234,7 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
         work.add_note(answer, note)
         work.database, work.verified = found.database, found.verified
         if thin or found.contradicting:
-            answer = _judged_again(work, answer)
+            answer = _rejudge(work, answer)
         if not thin:
             break
         work.further += number == 0
@@ -243,7 +249,7 @@ def _unsure(answer: MappingAttempt, verified: ViewGraph) -> bool:
     return not known or (answer.judgement is not None and answer.judgement.level != "good")
 
 
-def _judged_again(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
+def _rejudge(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """Judge an attempt's largest model again, against the current view graph."""
     judgement = judge(answer.models[0], work.verified, work.capture.cameras)
     fresh = replace(answer, judgement=judgement)
@@ -264,11 +270,13 @@ def _with_held_focal(work: Reconstructor, answer: MappingAttempt) -> MappingAtte
     if held.placed < answer.placed:
         return answer
     model, priors = held.models[0], work.verified.cameras
-    adjust_within(model, {number: priors[number].mean_focal_length() for number in _used(model)}, STRAY_UNOBSERVED)
-    held = _judged_again(work, held)
+    adjust_within(
+        model, {number: priors[number].mean_focal_length() for number in _used(model)}, MAX_UNOBSERVED_DEVIATION
+    )
+    held = _rejudge(work, held)
     if held.judgement is None or answer.judgement is None:
         return answer
-    return held if held.judgement.score >= answer.judgement.score - CLEARLY else answer
+    return held if held.judgement.score >= answer.judgement.score - MIN_SCORE_MARGIN else answer
 
 
 def _row(answer: MappingAttempt) -> dict[str, JSON]:
@@ -304,7 +312,9 @@ def _has_points(model: Model) -> bool:
 def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bool:
     """Whether a focal length left its prior although the photos do not determine it; ground control may, later."""
     used = _used(model)
-    strayed = [number for number in used if _stray(model.cameras[number], priors[number]) >= STRAY_UNOBSERVED]
+    strayed = [
+        number for number in used if _focal_deviation(model.cameras[number], priors[number]) >= MAX_UNOBSERVED_DEVIATION
+    ]
     if not strayed or not all(priors[number].has_prior_focal_length for number in used):
         return False
     sigmas = focal_sigmas(model)
@@ -316,5 +326,5 @@ def _used(model: Model) -> list[int]:
     return sorted({model.images[number].camera_id for number in model.reg_image_ids()})
 
 
-def _stray(camera: pycolmap.Camera, prior: pycolmap.Camera) -> float:
+def _focal_deviation(camera: pycolmap.Camera, prior: pycolmap.Camera) -> float:
     return float(abs(camera.mean_focal_length() / prior.mean_focal_length() - 1.0))

@@ -257,8 +257,8 @@ def grow(
         The new rows (kept ones in their order, then clones, then two children for each split), and the counts
         ``cloned``, ``split`` and ``held_back``.
     """
-    lasting = gaussians.opacity_logits >= lowest_logit_to_halve(schedule.prune_opacity)
-    wanted = torch.nonzero((score > schedule.gradient) & lasting).flatten()
+    resettable = gaussians.opacity_logits >= lowest_logit_to_halve(schedule.prune_opacity)
+    wanted = torch.nonzero((score > schedule.gradient) & resettable).flatten()
     chosen = _largest(wanted, score, max(0, room))
     size = gaussians.log_scales.amax(dim=1)
     large = size[chosen] > math.log(SPLIT_EXTENT * extent)
@@ -299,8 +299,8 @@ def _largest(candidates: Int64[Tensor, " c"], value: Float[Tensor, " n"], limit:
     """The up to ``limit`` candidates of largest value (ties: lowest row first), in row order."""
     if len(candidates) <= limit:
         return candidates
-    ranked = torch.argsort(value[candidates], descending=True, stable=True)
-    return candidates[ranked[:limit]].sort().values
+    order = torch.argsort(value[candidates], descending=True, stable=True)
+    return candidates[order[:limit]].sort().values
 
 
 def _split_offsets(gaussians: Gaussians, rows: Int64[Tensor, " s"], seed: int, iteration: int) -> Float[Tensor, "t 3"]:

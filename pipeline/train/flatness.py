@@ -19,12 +19,13 @@ from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import Schedule, tail_of
 from splatpipe.pipeline.train.state.history import History
 
-WINDOW_SHARE = 0.25  # of the iterations done: the line is fitted to these
-FEWEST_EPOCHS = 8  # in the window, so that their scatter can be estimated
-STANDARD_ERRORS = 2.0  # by which the line is made steeper: noise must not end a training that still improves
+WINDOW_SHARE = 0.25  # last share of the iterations done, to which the line is fitted
+MIN_EPOCHS = 8  # epochs in the window, so that their scatter can be estimated
+# standard errors by which the line is made steeper: noise must not end a training that still improves
+STANDARD_ERRORS = 2.0
 
 
-def settled_from(schedule: Schedule) -> int:
+def final_phase_from(schedule: Schedule) -> int:
     """Iteration after which only the rates change: Gaussians, SH degree and photo size have reached their final state.
 
     Args:
@@ -46,7 +47,7 @@ def judged_from(schedule: Schedule, iteration: int, resets: Sequence[int]) -> in
     """
     number = schedule.stretch_at(iteration)
     if number == len(schedule.stretches) - 1:
-        return settled_from(schedule)
+        return final_phase_from(schedule)
     begun = schedule.stretches[number - 1].until if number else 0
     grown = schedule.density.first if schedule.density.on else 0
     return max(begun, grown, *resets[-1:])
@@ -83,11 +84,11 @@ def is_flat(epochs: Sequence[tuple[int, float]], plan: TrainingPlan, iteration: 
     """
     scheduled = plan.schedule.iterations
     recent = [epoch for epoch in epochs if epoch[0] > (1.0 - WINDOW_SHARE) * iteration]
-    recent = list(epochs[-max(FEWEST_EPOCHS, len(recent)) :])
+    recent = list(epochs[-max(MIN_EPOCHS, len(recent)) :])
     number = plan.schedule.stretch_at(iteration)
     is_finest = number == len(plan.schedule.stretches) - 1
     end = iteration + tail_of(iteration) if is_finest else iteration
-    if len(recent) < FEWEST_EPOCHS or end >= plan.schedule.stretches[number].until:
+    if len(recent) < MIN_EPOCHS or end >= plan.schedule.stretches[number].until:
         return False
     return expected_gain(recent, scheduled) < plan.options.stop_when_flat
 

@@ -24,7 +24,7 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.sky.panorama import read_panorama
 from splatpipe.pipeline.train.appearance.exposure import Exposure, read_exposures
 from splatpipe.pipeline.train.appearance.sky import SkyModel
-from splatpipe.pipeline.train.loop import CHECKPOINT, TrainingSetup, go_through
+from splatpipe.pipeline.train.loop import CHECKPOINT, TrainingSetup, run_training
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS, Stretch
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
@@ -35,11 +35,12 @@ from splatpipe.pipeline.train.techniques.distortion_loss import DistortionLoss
 from splatpipe.pipeline.train.techniques.smoothness_loss import SmoothnessLoss
 from splatpipe.pipeline.train.techniques.techniques import Techniques, make_techniques
 
-VISITS = 8  # of every photo
-MIN_ITERATIONS = 300  # if there are few photos
+VISITS = 8  # iterations per photo, or per part of it
+MIN_ITERATIONS = 300  # iterations at least, if there are few photos
 SPREAD_WEIGHT = 0.5  # ten times that of a splat trained for images
 EVENNESS_WEIGHT = 0.1
-FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6  # of positions, times the extent: later half of the published
+# positions' learning rates over the extent: later half of the published
+FIRST_MEANS_RATE, LAST_MEANS_RATE = 1.6e-5, 1.6e-6
 OPACITY_RATE = 0.05  # as published
 
 FLATTENED = "flattened.ply"
@@ -86,8 +87,8 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
     if not path.is_file():
         device = choose_device(machine.device, note=report.note)
         with same_bits(machine.threads), device.deterministic():
-            setup = _course(trained, device, machine.threads)
-            state = go_through(setup, out, report)
+            setup = _copy_setup(trained, device, machine.threads)
+            state = run_training(setup, out, report)
             aside = path.with_suffix(".part")
             write_splat(aside, state.finished())
             aside.replace(path)
@@ -95,7 +96,7 @@ def flatten(trained: TrainedParts, machine: Machine, out: Path, report: Reporter
     return read_splat(path)
 
 
-def _course(trained: TrainedParts, device: Device, threads: int) -> TrainingSetup:
+def _copy_setup(trained: TrainedParts, device: Device, threads: int) -> TrainingSetup:
     """The training setup of the copy."""
     views, split = load_views(trained.dataset), load_split(trained.split)
     exposures = read_exposures(trained.exposures, "train")

@@ -57,11 +57,13 @@ class Technique:
         """Return the model as rendered in this iteration."""
         return model
 
-    def apply_appearance(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, picture: Float[Tensor, "h w 3"], rendered_view: RenderedView) -> Float[Tensor, "h w 3"]:
         """Return the render as the photo would show it."""
         return picture
 
-    def mask_pixels(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> TrainingPhoto:
+    def mask_pixels(
+        self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], rendered_view: RenderedView
+    ) -> TrainingPhoto:
         """Return the photo, masked to the pixels that count.
 
         Args:
@@ -71,14 +73,14 @@ class Technique:
         """
         return photo
 
-    def penalty(self, shot: RenderedView) -> Float[Tensor, ""] | None:
+    def penalty(self, rendered_view: RenderedView) -> Float[Tensor, ""] | None:
         """Return a loss term or None; a penalty on the Gaussians themselves must keep the model of `before_render`."""
         return None
 
     def roll_back(self) -> None:
         """Undo what the hooks changed: the iteration restarts because memory ran out before its step."""
 
-    def after_step(self, shot: RenderedView) -> None:
+    def after_step(self, rendered_view: RenderedView) -> None:
         """Take an optimizer step for the technique's own parameters."""
 
     def after_epoch(self, iteration: int) -> None:

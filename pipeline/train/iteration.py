@@ -58,13 +58,13 @@ def optimise_step(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, n
     model = techniques.before_render(state.drawn, now)
     rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
     # Show.
-    shot = RenderedView(photo, rendered, settings, now)
-    picture = techniques.apply_appearance(shot)
+    rendered_view = RenderedView(photo, rendered, settings, now)
+    picture = techniques.apply_appearance(rendered_view)
     # Loss.
-    counted = techniques.mask_pixels(picture, shot)
+    masked = techniques.mask_pixels(picture, rendered_view)
     measure = photo_loss if plan.options.loss == "native" else photo_loss_reference
-    photometric = measure(picture, counted.colour, SSIM_WEIGHT, counted.mask, counted.inner)
-    loss = techniques.with_penalties(photometric, shot)
+    photometric = measure(picture, masked.colour, SSIM_WEIGHT, masked.mask, masked.inner)
+    loss = techniques.with_penalties(photometric, rendered_view)
     # Backward.
     loss.backward()  # type: ignore[no-untyped-call]
     # Step.
@@ -73,7 +73,7 @@ def optimise_step(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, n
         state.step(own.visible, now, plan, photo.camera)
         if probe is not None and probe.grad is not None:
             state.density.observe(own, probe.grad, plan.schedule.density, photo)
-        techniques.after_step(shot)
+        techniques.after_step(rendered_view)
     state.history.add_loss(photometric.detach())
 
 

@@ -33,7 +33,7 @@ from splatpipe.pipeline.train.plan.start import read_start
 from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrder
 from splatpipe.pipeline.train.plan.windows import TrainingSize
 from splatpipe.pipeline.train.planning.measure import Step
-from splatpipe.pipeline.train.planning.planning import PlanningInput, under_budgets
+from splatpipe.pipeline.train.planning.planning import PlanningInput, plan_within_budgets
 from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
 from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.state.history import History
@@ -43,8 +43,9 @@ from splatpipe.pipeline.train.techniques.techniques import Techniques, begin_sky
 CHECKPOINT = "checkpoint.npz"
 CHECKPOINT_SECONDS = 20.0  # minimum time between checkpoints: what a kill may cost
 CHECKPOINT_SHARE = 0.02  # maximum share of training time spent on checkpoints
-REPORT_EVERY = 10  # iterations
-CUDA_REPORT_EVERY = 50  # same on CUDA, where reading the loss synchronizes with the device
+REPORT_EVERY = 10  # iterations between progress reports on a CPU
+# iterations between progress reports on CUDA, where reading the loss synchronizes with the device
+CUDA_REPORT_EVERY = 50
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def run(config: TrainConfig, inputs: Inputs, out: Path, report: Reporter) -> Sum
         MachineError: if the requested device is not available.
         KeyboardInterrupt: on Ctrl-C or SIGTERM, after a checkpoint.
     """
-    _, summary = train_whole(config, inputs, out, report, under_budgets)
+    _, summary = train_whole(config, inputs, out, report, plan_within_budgets)
     return summary
 
 
@@ -147,7 +148,7 @@ def train_whole(
             techniques=lambda: make_techniques(plan, sky, trained_on, dataset, device.tensors, area),
             start=lambda: start.within(plan.options.max_gaussians),
         )
-        state = go_through(setup, out, report)
+        state = run_training(setup, out, report)
         gaussians = state.finished()
     write_splat(out / "model.ply", gaussians, [MIP_COMMENT] if plan.options.antialias else [])
     write_file(out / "history.json", state.whole_history().to_json())
@@ -155,7 +156,7 @@ def train_whole(
     return state, {"gaussians": len(gaussians)} | summary_of(state, plan) | device.facts()
 
 
-def go_through(setup: TrainingSetup, out: Path, report: Reporter) -> TrainState:
+def run_training(setup: TrainingSetup, out: Path, report: Reporter) -> TrainState:
     """Train to the end, from the start or from a killed run's checkpoint, and return the final state.
 
     Args:
@@ -344,7 +345,7 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
             if state.iteration in state.history.sizes_ended[-1:]:
                 plan = training.now
                 order = training.setup.order_of(training_sizes(training.setup.plan, state.history))
-                photos.go_on(order, state.iteration + 1)
+                photos.switch_order(order, state.iteration + 1)
                 report_larger_photos(state, plan, report)
             if interrupt.requested:
                 break

@@ -36,7 +36,7 @@ class Block:
 HOUSES = (Block(-9.0, -2.0, 20.0, 5.0), Block(1.0, 6.0, 16.0, 3.0), Block(6.0, 15.0, 30.0, 8.0))
 
 
-def look(heading_deg: float = 0.0, pitch_deg: float = 5.0, roll_deg: float = 0.0, x: float = 0.0) -> Camera:
+def aimed_camera(heading_deg: float = 0.0, pitch_deg: float = 5.0, roll_deg: float = 0.0, x: float = 0.0) -> Camera:
     """Return a camera on the plain; heading 0 looks along +y."""
     heading, pitch, roll = np.radians([heading_deg, pitch_deg, roll_deg])
     forward = np.array([np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)])

@@ -53,7 +53,7 @@ from splatpipe.pipeline.engine.runs.needs import whole
 from splatpipe.pipeline.engine.runs.source import RunSource, is_film, open_source
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.intake.detail import DIRECTIONS
-from splatpipe.pipeline.sfm.matching.comparison import brighter_ev, duller
+from splatpipe.pipeline.sfm.matching.comparison import brighter_ev, detail_loss
 from splatpipe.pipeline.sfm.matching.keypoints import single_threaded_opencv
 from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures, quick_features
 
@@ -149,7 +149,7 @@ def examine_photos(intake: Intake, threads: int, report: Reporter) -> PhotoExami
             quick.append(found)
             report.progress(len(quick), count, "examining photos", "photos")
         overlap = match_quickly(intake.layout, quick, threads, report)
-    dull = duller(quick, overlap.found)
+    dull = detail_loss(quick, overlap.found)
     assert dull.shape == (count, DIRECTIONS)
     steps = brighter_ev(quick, overlap.found)
     flight = flight_of(intake.layout, overlap)

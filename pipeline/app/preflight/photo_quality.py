@@ -24,16 +24,16 @@ LITTLE_TEXTURE = 400  # median of the keypoints at 640 px; all captures tried ha
 SAME_PICTURE = 1.0  # largest grey level difference between thumbnails of a photo saved twice
 
 
-def sharpness(duller: Float64[np.ndarray, "n directions"]) -> Float64[np.ndarray, " n"]:
+def sharpness(detail_loss: Float64[np.ndarray, "n directions"]) -> Float64[np.ndarray, " n"]:
     """Amplitude of fine detail relative to the neighbours, in the direction where it is least; NaN if unknown."""
-    known = np.isfinite(duller).any(axis=1)
-    worst = np.where(known, np.max(np.where(np.isfinite(duller), duller, -np.inf), axis=1), np.nan)
+    known = np.isfinite(detail_loss).any(axis=1)
+    worst = np.where(known, np.max(np.where(np.isfinite(detail_loss), detail_loss, -np.inf), axis=1), np.nan)
     return np.asarray(np.exp(-worst / 2.0))
 
 
-def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n directions"]) -> list[Finding]:
+def find_blurred(photos: Sequence[CheckedPhoto], detail_loss: Float64[np.ndarray, "n directions"]) -> list[Finding]:
     """Find photos with less fine detail than their neighbours in the area both show."""
-    worst = -2.0 * np.log(sharpness(duller))
+    worst = -2.0 * np.log(sharpness(detail_loss))
     known = worst[np.isfinite(worst)]
     if not len(known):
         return []

@@ -13,7 +13,7 @@ from splatpipe.pipeline.app.preflight.findings import ControlPlace, Finding, Pla
 from splatpipe.pipeline.app.preflight.intake import Intake
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.files.names import NameFinder, list_names
-from splatpipe.pipeline.sfm.pairing.footprints import FURTHEST, MIN_HEIGHT_M, StatedPoses
+from splatpipe.pipeline.sfm.pairing.footprints import MAX_DISTANCE_RATIO, MIN_HEIGHT_M, StatedPoses
 from splatpipe.pipeline.sfm.pairing.layout import EARTH_RADIUS_M
 from splatpipe.pipeline.survey.crs.coordinate_readings import nearer_reading
 from splatpipe.pipeline.survey.crs.crs import Crs, to_geodetic
@@ -39,7 +39,7 @@ def footprint(views: StatedPoses | None, photo: int) -> tuple[Place, ...] | None
     signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     rays = np.concatenate([signs * views.half_size[photo], np.ones((4, 1))], axis=1) @ views.enu_from_camera[photo].T
     height = max(float(views.centres_m[photo, 2] - views.ground_m[photo]), MIN_HEIGHT_M)
-    reach = FURTHEST * height
+    reach = MAX_DISTANCE_RATIO * height
     corners = []
     for ray in rays:
         flat = float(np.hypot(ray[0], ray[1]))
@@ -175,7 +175,7 @@ def _outside(
     off = [
         place.name
         for place, metres in zip(places, nearest.tolist(), strict=True)
-        if metres > FURTHEST * reach or (not place.marks and _is_beyond(place.photos, metres, reach))
+        if metres > MAX_DISTANCE_RATIO * reach or (not place.marks and _is_beyond(place.photos, metres, reach))
     ]
     if not off:
         return []

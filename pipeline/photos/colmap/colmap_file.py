@@ -21,10 +21,10 @@ COUNT = struct.Struct("<Q")
 CAMERA = struct.Struct("<IiQQ")
 IMAGE = struct.Struct("<I4d3dI")
 POINT = struct.Struct("<Q3d3BdQ")  # ends with the length of the track
-XYZ_AT, XYZ_BYTES = 8, 24  # in a point
-_TRACK_LENGTH = struct.Struct("<43xQ")  # of a point, without the rest
+XYZ_AT, XYZ_BYTES = 8, 24  # offset and size, in bytes, of a point's coordinates in its record
+_TRACK_LENGTH = struct.Struct("<43xQ")  # reads a point's track length, the last 8 of its 51 bytes
 OBSERVATION = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
-ELEMENT_BYTES = 8  # of a track: two 32-bit numbers
+ELEMENT_BYTES = 8  # bytes of a track's element: image and keypoint number, 32 bits each
 POINTS_AT_ONCE = 1 << 16
 
 

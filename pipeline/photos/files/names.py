@@ -86,14 +86,14 @@ def without_zeros(name: str) -> str:
     return re.sub(r"(?<!\d)0+(?=\d)", "", name)
 
 
-NAMES_SHOWN = 10  # in one message; left_out.json lists them all
+NAMES_SHOWN = 10  # names listed in one message; left_out.json lists them all
 
 
-def list_names(names: Iterable[str], shown: int = NAMES_SHOWN) -> str:
+def list_names(names: Iterable[str], limit: int = NAMES_SHOWN) -> str:
     """Format names for a message: the first few, and how many more."""
     listed = [printable(name) for name in names]
-    more = f" and {len(listed) - shown} more" if len(listed) > shown else ""
-    return ", ".join(listed[:shown]) + more
+    more = f" and {len(listed) - limit} more" if len(listed) > limit else ""
+    return ", ".join(listed[:limit]) + more
 
 
 def printable(name: str) -> str:

@@ -1,6 +1,6 @@
 """The one way to open and decode a user's picture, whose size is not to be trusted: a few kB can claim 500 megapixels.
 
-Everybody asks ``why_hollow`` or compares the size that the header states before any pixel is decoded, and large
+Everybody asks ``sparse_data_reason`` or compares the size that the header states before any pixel is decoded, and large
 pictures are decoded one at a time in a process.
 """
 
@@ -30,12 +30,13 @@ from splatpipe.pipeline.photos.files.extra_formats import (
 # Pillow's JPEG plugin also opens MPO, a JPEG with a second image, which DJI and phones write.
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF")
 LARGE_PIXELS = 40_000_000  # larger images are decoded one at a time: some hundred megabytes each
-LEAST_BYTES = 0.01  # of a large photo's file per pixel; one colour all over takes 0.0156 with JPEG's usual tables
-MOST_CHUNKS = 1_000_000  # of a PNG: libpng writes one for 8 kB
+# bytes per pixel of a large photo's file; one colour all over takes 0.0156 with JPEG's usual tables
+MIN_BYTES_PER_PIXEL = 0.01
+MAX_PNG_CHUNKS = 1_000_000  # chunks of a PNG that are read at most: libpng writes one for 8 kB
 TILE_TAGS = (322, 323)  # width and length of a TIFF's tiles
-LEAST_TILE = 4096  # pixels per side that a tile may have in a picture of any size
+ALWAYS_ALLOWED_TILE_PX = 4096  # pixels per side that a tile may have in a picture of any size
 HEAD_BYTES = 16
-STRIP_ROWS = 256  # of a picture, converted at a time
+STRIP_ROWS = 256  # pixel rows of a picture that are converted at a time
 INVERSE_ORIENTATION = {  # the inverse of the transposition that each EXIF orientation requires
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -92,17 +93,17 @@ def _check_tiles(picture: Image.Image) -> None:
     tags = getattr(picture, "tag_v2", {})
     for tag, side in zip(TILE_TAGS, picture.size, strict=True):
         found = tags.get(tag, 0)
-        if not isinstance(found, int) or found > max(LEAST_TILE, 2 * side):
+        if not isinstance(found, int) or found > max(ALWAYS_ALLOWED_TILE_PX, 2 * side):
             raise OSError(f"its tiles of {found} pixels are larger than the picture")
 
 
-def why_hollow(picture: Image.Image, data: bytes) -> str:
+def sparse_data_reason(picture: Image.Image, data: bytes) -> str:
     """Why an opened image cannot be a photo: its pixels take too few bytes of its file; empty if it can be one."""
     pixels = picture.width * picture.height
     if pixels <= LARGE_PIXELS:
         return ""
     taken = _png_bytes(data) if picture.format == "PNG" else len(data)
-    if taken >= LEAST_BYTES * pixels:
+    if taken >= MIN_BYTES_PER_PIXEL * pixels:
         return ""
     return f"claims {picture.width} × {picture.height} pixels in only {taken / 1e3:,.0f} kB: it is no photo"
 
@@ -110,7 +111,7 @@ def why_hollow(picture: Image.Image, data: bytes) -> str:
 def _png_bytes(data: bytes) -> int:
     """How many bytes of a PNG are pixels: other chunks may have any size."""
     at, taken = 8, 0
-    for _ in range(MOST_CHUNKS):
+    for _ in range(MAX_PNG_CHUNKS):
         length = int.from_bytes(data[at : at + 4], "big")
         taken += length if data[at + 4 : at + 8] == b"IDAT" else 0
         at += 12 + length

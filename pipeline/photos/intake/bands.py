@@ -66,10 +66,11 @@ TAGS = {  # ends of names: of Sequoia, of DJI's multispectral and of its thermal
 _TAGGED = re.compile(rf"(?P<shot>.+)_(?P<tag>{'|'.join(sorted(TAGS, key=len, reverse=True))})")
 _AUTEL = re.compile(r"(?P<tag>irx|max)_(?P<shot>\d+)")
 _TIME = re.compile(r"_\d{14}(?=_)")  # in DJI's names; it may differ by a second between the cameras of a shot
-SMALLER = 0.5  # of a colour photo's pixels: a thermal one that only its name tells has fewer
-COMPARABLE = 0.5  # of the most photos of a band: colour that not even half of the shots have is not used instead
+# most pixels of a thermal photo known only by its name, over those of the smallest colour one
+MAX_THERMAL_PIXEL_SHARE = 0.5
+MIN_COLOUR_PHOTO_SHARE = 0.5  # colour is used as the band if its photos are this share of the most numerous band's
 SAMPLED = 5  # photos of each band whose sharpness is measured
-SIGMA_PX = 1.0  # of the blur that removes single pixels' noise
+SIGMA_PX = 1.0  # standard deviation of the blur that removes single pixels' noise
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def choose_band(photos: Sequence[CheckedPhoto], wanted: str) -> BandChoice:
     elif len(counts) < 2:
         return BandChoice(list(photos), [], "")
     else:
-        band = COLOUR if counts[COLOUR] >= COMPARABLE * max(counts.values()) else _sharpest(photos, bands)
+        band = COLOUR if counts[COLOUR] >= MIN_COLOUR_PHOTO_SHARE * max(counts.values()) else _sharpest(photos, bands)
     kept = [photo for photo in photos if bands.get(photo.name, band) == band]
     left_out = [
         ExcludedPhoto(photo.name, f"shows the band {bands[photo.name]}, and {band} is used", "companion")
@@ -197,8 +198,8 @@ def _by_names(photos: Sequence[CheckedPhoto]) -> dict[str, str]:
         shot, band = _shot_by_name(photo.name)
         if shot is not None:
             shots.setdefault(shot, []).append((photo, band))
-    told = [shot for shot in shots.values() if _is_shot(shot)]
-    return {photo.name: band for shot in told for photo, band in shot}
+    confirmed = [shot for shot in shots.values() if _is_shot(shot)]
+    return {photo.name: band for shot in confirmed for photo, band in shot}
 
 
 def _is_shot(shot: Iterable[tuple[CheckedPhoto, str]]) -> bool:
@@ -209,7 +210,7 @@ def _is_shot(shot: Iterable[tuple[CheckedPhoto, str]]) -> bool:
             return False
         pixels.setdefault(band, []).append(photo.width * photo.height)
     if set(pixels) == {COLOUR, THERMAL}:
-        return max(pixels[THERMAL]) <= SMALLER * min(pixels[COLOUR])
+        return max(pixels[THERMAL]) <= MAX_THERMAL_PIXEL_SHARE * min(pixels[COLOUR])
     return len(pixels) > 1
 
 

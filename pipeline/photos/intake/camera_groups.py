@@ -16,17 +16,17 @@ from splatpipe.pipeline.photos.metadata.sensors import sensor_size_mm
 from splatpipe.pipeline.photos.metadata.xmp import xmp_number
 
 MODEL = "SIMPLE_RADIAL"
-DEFAULT_FOCAL = 1.2  # of the longer side, COLMAP's default guess: a lens of 43 mm on 35 mm film
-FOCAL_BOUNDS = (0.2, 30.0)  # of the longer side; values outside are errors
+DEFAULT_FOCAL = 1.2  # focal length over the image's longer side without metadata: COLMAP's default, 43 mm on 35 mm film
+FOCAL_BOUNDS = (0.2, 30.0)  # focal length over the image's longer side; values outside are errors
 ASPECT_TOLERANCE = 0.01
 SHAPE_TOLERANCE = 0.03  # between a sensor's specified aspect ratio and that of the images that use all of it
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 WIDEST_SENSOR = 1.51  # width over height; wider images are cropped from a 4:3 sensor
 PANORAMA = 2.5  # no sensor has this aspect ratio or a larger one
-CAMERAS_SHOWN = 10  # on the console; the report lists them all
-EQUIVALENT_TOLERANCE = 0.05  # of the 35 mm equivalent, which is rounded; a larger difference is digital zoom
-ZOOM_TOLERANCE = 0.01  # of the focal length: focus and heat change it by as much
-CALIBRATION_TOLERANCE = 0.15  # of the focal length by sensor size: more means another unit, or another camera mode
+CAMERAS_SHOWN = 10  # cameras listed on the console; the report lists them all
+EQUIVALENT_TOLERANCE = 0.05  # relative difference of rounded 35 mm equivalents; a larger one is digital zoom
+ZOOM_TOLERANCE = 0.01  # relative difference of focal lengths that focus and heat explain
+CALIBRATION_TOLERANCE = 0.15  # relative, calibrated to nominal focal length: more is another unit or camera mode
 
 
 @dataclass(frozen=True)

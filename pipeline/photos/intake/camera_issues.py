@@ -10,7 +10,7 @@ from splatpipe.pipeline.photos.intake.camera_groups import CameraGroup, camera_n
 from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 
-MINORITY = 0.25  # of the photos: a camera that took more of them was used on purpose
+MAX_MINORITY_SHARE = 0.25  # share of the photos above which a camera was used on purpose
 
 
 def find_camera_issues(
@@ -71,7 +71,7 @@ def _mixed_cameras(
         members.setdefault(camera_of[photo.name], []).append(photo)
     main = max(members, key=lambda number: len(members[number]))
     issues = []
-    many = [number for number, own in members.items() if len(own) > MINORITY * len(photos)]
+    many = [number for number, own in members.items() if len(own) > MAX_MINORITY_SHARE * len(photos)]
     if len(many) > 1:
         listed = "; ".join(f"{len(members[number])} photos of {_describe(members[number][0])}" for number in many)
         issues.append(

@@ -21,9 +21,9 @@ from splatpipe.pipeline.photos.files.picture_file import (
     STRIP_ROWS,
     load_stored,
     open_picture,
+    sparse_data_reason,
     strips_of,
     turn_to_decode,
-    why_hollow,
 )
 from splatpipe.pipeline.photos.files.scan import Candidate, ExcludedPhoto
 from splatpipe.pipeline.photos.metadata.exif import Exif, read_exif
@@ -41,7 +41,7 @@ DEEP_GREY_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 GREY_MODES = ("1", "L", "LA", "La", *DEEP_GREY_MODES)
 COLOUR_MODES = ("RGB", "RGBA")
 READ_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *DEEP_GREY_MODES)
-RANGE_QUANTILES = (0.001, 0.999)  # of a deep image's values: excludes hot and dead pixels
+RANGE_QUANTILES = (0.001, 0.999)  # quantiles of a deep image's values taken as its range: excludes hot and dead pixels
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
     except Exception as error:  # Pillow's readers raise almost anything on broken images
         return ExcludedPhoto(candidate.name, _decode_problem(error))
     with picture:
-        reason = _refusal_reason(picture, data, limits) or why_hollow(picture, data)
+        reason = _refusal_reason(picture, data, limits) or sparse_data_reason(picture, data)
         return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
 
 

@@ -22,7 +22,7 @@ from splatpipe.pipeline.photos.intake.convert import read_8bit
 
 MIN_SIDE_PX = 2000  # a JPEG is decoded at the smallest of 1/2, 1/4 and 1/8 that still has as many
 PATCH = 32  # pixels: the coarse band includes its three longest waves
-DIRECTIONS = 4  # of 45° each
+DIRECTIONS = 4  # sectors of wave directions, 45° each
 COARSE, FINE = (0.05, 0.14), (0.2, 0.42)  # cycles per pixel; JPEG keeps little beyond
 QUIET = 0.35  # grey levels: standard deviation of rounding and of JPEG's own noise, in a band
 WHITE, BLACK = 250, 5  # grey levels: no detail is left at or above the first, and at or below the second

@@ -16,7 +16,7 @@ from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 from splatpipe.pipeline.photos.intake.convert import read_8bit
 
 BLACK, WHITE = 5, 250  # grey levels of a mask, with JPEG's noise
-MASK_SHARE = 0.98  # of the pixels of a mask are black or white
+MASK_SHARE = 0.98  # least share of black or white pixels by which a picture is a mask
 
 
 def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], list[ExcludedPhoto]]:

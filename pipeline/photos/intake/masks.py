@@ -220,7 +220,7 @@ def _grey(picture: Image.Image) -> Image.Image:
     return Image.fromarray(rgb.max(axis=2))  # any colour counts: only black is ignored
 
 
-def _mask_files(folder: Path, above: PurePosixPath, shown: str) -> Iterator[MaskFile]:
+def _mask_files(folder: Path, above: PurePosixPath, prefix: str) -> Iterator[MaskFile]:
     pseudo = pseudo_devices()
     for inner, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
@@ -229,5 +229,5 @@ def _mask_files(folder: Path, above: PurePosixPath, shown: str) -> Iterator[Mask
             if name.startswith(".") or path.suffix.casefold() not in PHOTO_SUFFIXES or not is_real_file(path, pseudo):
                 continue
             relative = PurePosixPath(path.relative_to(folder).as_posix())
-            label = os.fsencode(f"{shown}{folder.name}/{relative}").decode("utf-8", errors="backslashreplace")
+            label = os.fsencode(f"{prefix}{folder.name}/{relative}").decode("utf-8", errors="backslashreplace")
             yield MaskFile(label, str((above / relative).with_suffix("")), path)

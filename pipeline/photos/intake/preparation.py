@@ -33,7 +33,7 @@ from splatpipe.pipeline.photos.intake.masks import (
 )
 from splatpipe.pipeline.photos.options import IngestConfig
 
-MOSTLY_IGNORED = 0.99  # of a mask's pixels: hardly intended
+MAX_MASKED_SHARE = 0.99  # share of masked pixels in a photo above which its mask is hardly intended
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -152,7 +152,7 @@ def prepare_masks(
         if values is None:
             return problem
         save_png(values, work.part / mask_path(photo.name, kind.part))
-        if kind is MASKS and np.mean(values == 0) > MOSTLY_IGNORED:
+        if kind is MASKS and np.mean(values == 0) > MAX_MASKED_SHARE:
             return f"The mask of {printable(photo.name)} hides almost the whole photo: black areas are ignored."
         return problem
 

@@ -21,7 +21,7 @@ NO_FIX = "V"  # GPSStatus of a receiver without a fix
 FAR_DATUMS: tuple[str, ...] = ("TOKYO", "NAD27", "NAD1927", "ED50", "OSGB", "PULKOVO", "AGD66", "AGD84", "DHDN")
 FAR_DATUMS += ("POTSDAM", "CH1903", "NTF", "GCJ02", "BD09", "BEIJING", "XIAN", "INDIAN", "ARC19", "CAPE")
 SIXTY = 60.0  # minutes in a degree; 60 itself is what 59.9999 is rounded to
-WHOLE = 1e-6  # by which a whole number may be off: fractions of large terms
+WHOLE = 1e-6  # largest deviation from a whole number: fractions of large terms
 LATITUDE_SIGNS = {"N": 1.0, "S": -1.0}  # first letters of GPSLatitudeRef; some programs write whole words
 LONGITUDE_SIGNS = {"E": 1.0, "W": -1.0}
 

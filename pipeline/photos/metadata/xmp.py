@@ -17,7 +17,7 @@ MAX_PROPERTIES = 2000
 MAX_DEPTH = 32
 MAX_VALUE_CHARS = 1000
 MAX_NAME_CHARS = 200
-SEPARATOR = ", "  # of a list's items
+SEPARATOR = ", "  # joins the items of an XMP list
 PREFIX_OF_NAMESPACE = {
     "http://www.dji.com/drone-dji/1.0/": "drone-dji",
     "http://pix4d.com/camera/1.0": "Camera",

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int64
 
-COVERED = 0.9  # least share of the points that the chosen photos show; the rest, only one or two photos show at all
+# least share of the points that the chosen photos show; the rest, only one or two photos show at all
+MIN_COVERED_SHARE = 0.9
 
 
 def covering_photos(seen: Sequence[Int64[np.ndarray, " _"]], points: int, few: int) -> list[int]:
@@ -28,23 +29,23 @@ def covering_photos(seen: Sequence[Int64[np.ndarray, " _"]], points: int, few: i
     Returns:
         Indices of the chosen photos, ascending.
     """
-    shown = np.zeros(points, np.int64)
-    needed = COVERED * np.unique(np.concatenate([*seen, np.zeros(0, np.int64)])).size
+    view_counts = np.zeros(points, np.int64)
+    needed = MIN_COVERED_SHARE * np.unique(np.concatenate([*seen, np.zeros(0, np.int64)])).size
     least = math.ceil(math.sqrt(min(len(seen), few) * len(seen)))
 
     def gain(photo: int) -> float:
-        return float((1.0 / np.square(1.0 + shown[seen[photo]])).sum())
+        return float((1.0 / np.square(1.0 + view_counts[seen[photo]])).sum())
 
     chosen: list[int] = []
-    ranked = [(-gain(photo), photo) for photo in range(len(seen))]
-    heapq.heapify(ranked)
-    while ranked and (len(chosen) < least or np.count_nonzero(shown) < needed):
-        before, photo = ranked[0]
+    heap = [(-gain(photo), photo) for photo in range(len(seen))]
+    heapq.heapify(heap)
+    while heap and (len(chosen) < least or np.count_nonzero(view_counts) < needed):
+        before, photo = heap[0]
         now = -gain(photo)
         if now != before:  # gains only fall, so one that is still the best was the best all along
-            heapq.heapreplace(ranked, (now, photo))
+            heapq.heapreplace(heap, (now, photo))
             continue
-        heapq.heappop(ranked)
+        heapq.heappop(heap)
         chosen.append(photo)
-        shown[seen[photo]] += 1
+        view_counts[seen[photo]] += 1
     return sorted(chosen)

@@ -16,7 +16,7 @@ SINGLE_PIXELS = 1 << 18  # with one sample per pixel: strips are then independen
 PROJECTED = 1 << 16  # places projected at a time, in double precision
 MARGIN = 3  # rows around those that samples lie in: a cubic uses one before and two after
 ONE_TO_ONE = 1.1  # up to this reduction, one cubic sample per pixel is sharper than several
-KEPT_PIXELS = 1 << 23  # of a target whose places are kept for all photos of a camera: 64 MB
+KEPT_PIXELS = 1 << 23  # largest target, in pixels, whose sample places are kept for all photos of a camera: 64 MB
 
 Rows = UInt8[np.ndarray, "rows w *channels"]
 Places = Float32[np.ndarray, "2 rows columns"]

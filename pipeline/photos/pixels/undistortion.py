@@ -24,7 +24,7 @@ from splatpipe.pipeline.photos.pixels.jpeg_strips import write_jpeg
 from splatpipe.pipeline.photos.pixels.resampling import Places, kept_places, resample, resampled_strips
 
 SHAPE_TOLERANCE = 0.01  # between the aspect ratios of a photo and of its camera in the model
-WHITE = 254.5  # of 255: a pixel counts only if no part of it is masked, and is sky only if all of it is sky
+WHITE = 254.5  # mask value, 0 to 255, above which a pixel counts (or is sky): none of it is masked, all of it is sky
 MIN_VIEWS = 2
 
 

@@ -31,14 +31,14 @@ DICTIONARIES = (
 )
 ENLARGED = 2
 SMALLEST_PX = 12.0  # side of a black square
-LARGEST_SHARE = 0.9  # of the image's longer side
+LARGEST_SHARE = 0.9  # largest side of a black square over the image's longer side
 TILE_PX, OVERLAP_PX = 1536, 160  # enlarged images are searched in tiles, to save memory; larger squares at full size
 SAMPLES = 3  # along a cell's side
-MIN_CORRELATION = 0.7  # of the pixels with the dictionary's pattern
+MIN_CORRELATION = 0.7  # correlation of a square's pixels with the dictionary's pattern
 # One square in 66 is a code of this dictionary by chance (250 codes, four rotations, 16 bits): eight times as many as
 # for any other. Windows of a façade reach 0.79; rendered targets of 20 px or more have at least 0.86.
 DENSEST, MIN_OF_DENSEST = "DICT_4X4_250", 0.83
-MIN_CONTRAST = 25.0  # of 255
+MIN_CONTRAST = 25.0  # white minus black, grey levels of 255
 CENTRE_SIGMA_PX = 0.1
 
 

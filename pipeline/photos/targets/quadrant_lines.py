@@ -104,19 +104,19 @@ def _fit_discs(
     seen = grey[y, x].astype(np.float64)
     x, y = x.astype(np.float64), y.astype(np.float64)
     damping = np.full(len(values), 1e-3)
-    shown, derivatives = model(values, x, y)
-    cost = ((seen - shown) ** 2).sum(axis=1)
+    predicted, derivatives = model(values, x, y)
+    cost = ((seen - predicted) ** 2).sum(axis=1)
     for _ in range(NEAR_ROUNDS):
-        trial = _take_step(values, seen - shown, derivatives, damping)
-        shown_there, derivatives_there = model(trial, x, y)
-        there = ((seen - shown_there) ** 2).sum(axis=1)
+        trial = _take_step(values, seen - predicted, derivatives, damping)
+        predicted_there, derivatives_there = model(trial, x, y)
+        there = ((seen - predicted_there) ** 2).sum(axis=1)
         better = there < cost
         values = np.where(better[:, None], trial, values)
-        shown = np.where(better[:, None], shown_there, shown)
+        predicted = np.where(better[:, None], predicted_there, predicted)
         derivatives = np.where(better[:, None, None], derivatives_there, derivatives)
         cost = np.where(better, there, cost)
         damping = np.where(better, damping / 5.0, damping * 8.0)
-    return values, correlation(seen, shown)
+    return values, correlation(seen, predicted)
 
 
 def fit_within(grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64[np.ndarray, " 2"]) -> LinePair | None:
@@ -132,19 +132,19 @@ def fit_within(grey: Float32[np.ndarray, "h w"], lines: LinePair, reach: Float64
         return None
     x, y, seen = (v[None] for v in around)
     values, damping = lines.values[None], np.full(1, 1e-3)
-    shown, derivatives = model(values, x, y)
-    cost = float(((seen - shown) ** 2).sum())
+    predicted, derivatives = model(values, x, y)
+    cost = float(((seen - predicted) ** 2).sum())
     for _ in range(ROUNDS):
-        trial = _take_step(values, seen - shown, derivatives, damping)
-        shown_there, derivatives_there = model(trial, x, y)
-        there = float(((seen - shown_there) ** 2).sum())
+        trial = _take_step(values, seen - predicted, derivatives, damping)
+        predicted_there, derivatives_there = model(trial, x, y)
+        there = float(((seen - predicted_there) ** 2).sum())
         if there >= cost:
             damping = damping * 8.0
             continue
-        settled = cost - there < 1e-5 * cost
-        values, shown, derivatives, cost = trial, shown_there, derivatives_there, there
+        converged = cost - there < 1e-5 * cost
+        values, predicted, derivatives, cost = trial, predicted_there, derivatives_there, there
         damping = damping / 5.0
-        if settled:
+        if converged:
             break
     return LinePair(values[0]) if np.isfinite(values).all() else None
 
@@ -194,9 +194,9 @@ def model(
     return middle + contrast * p * q, derivatives
 
 
-def correlation(seen: Float64[np.ndarray, "n m"], shown: Float64[np.ndarray, "n m"]) -> Float64[np.ndarray, " n"]:
+def correlation(seen: Float64[np.ndarray, "n m"], predicted: Float64[np.ndarray, "n m"]) -> Float64[np.ndarray, " n"]:
     """Correlation of corresponding rows."""
-    a, b = seen - seen.mean(axis=1, keepdims=True), shown - shown.mean(axis=1, keepdims=True)
+    a, b = seen - seen.mean(axis=1, keepdims=True), predicted - predicted.mean(axis=1, keepdims=True)
     return np.asarray((a * b).sum(axis=1) / np.maximum(np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1)), 1e-9))
 
 

@@ -30,40 +30,41 @@ from splatpipe.pipeline.photos.targets.quadrant_lines import (
 )
 
 SADDLE_SIGMA_PX = 1.0  # a smaller one admits noise, a larger one loses targets of 12 px seen obliquely
-MIN_CONTRAST = 40.0  # of white over black, of 255
-BLURRED_SIGMA_PX = 1.5  # of a saddle that is still found: lens blur, motion blur and our smoothing together
+MIN_CONTRAST = 40.0  # white minus black, grey levels of 255
+BLURRED_SIGMA_PX = 1.5  # largest blur of a saddle that is still found: lens, motion and our smoothing together
 MIN_SADDLE = MIN_CONTRAST / (np.pi * BLURRED_SIGMA_PX**2)  # a quadrant's is contrast / (π σ²) at its centre
 MAX_SADDLES = 100_000  # per tile, the strongest
 RINGS_PX = (2.0, RING_PX)
-LIKE_ITSELF = 0.75  # correlation of a ring with itself, rotated by 180°
-RING_CONTRAST = 0.65  # of the least contrast: blur reduces it near the centre
-RING_DARK = 0.7  # darkest over brightest: looser than MAX_DARK, for the same reason
-ACROSS_PX = 1.5  # from a line to where its sides are sampled
+MIN_RING_SYMMETRY = 0.75  # correlation of a ring with itself, rotated by 180°
+RING_CONTRAST = 0.65  # contrast of a ring over MIN_CONTRAST: blur reduces it near the centre
+# darkest over brightest on a ring: looser than MAX_DARK_RATIO, since blur mixes them near the centre
+MAX_RING_DARK_RATIO = 0.7
+ACROSS_PX = 1.5  # distance from a line at which its two sides are sampled
 REACH_PX = 64  # along a line; larger targets are followed only this far
 MIN_REACH_PX = 2.5
-EVEN = 0.55  # smallest ratio of a line's reaches in its two directions
+MIN_REACH_RATIO = 0.55  # smallest ratio of a line's reaches in its two directions
 STEP_PX = 0.5
 TILE_PX, OVERLAP_PX = 2048, 2 * REACH_PX + 16  # large images are searched in tiles, to save memory
-DIFFERENCES = 0.5  # of the contrast, below which a line has ended
-FIT_SHARE = 0.7  # of the reach, within which pixels are fitted: those of four triangles, too
+MIN_EDGE_CONTRAST_SHARE = 0.5  # difference across a line over the contrast, below which the line has ended
+FIT_SHARE = 0.7  # radius of the fitted pixels over the lines' reach: inside four triangles, too
 MIN_FIT_PX = 2.2
 LARGEST_FIT_PX = 14.0  # more pixels add hardly any information
-MAX_MOVED_PX = 2.5  # from where the lines of the first fit meet
+MAX_MOVED_PX = 2.5  # distance of the fitted centre from the first fit's
 APART_PX = 3.0  # one target has one centre
-NEAR_CORRELATION = 0.9  # of the first fit
-MIN_CORRELATION = 0.975  # of an isolated target: a shadow's edge may cross it
-CORRELATION_AMONG = 0.986  # of one among similar patterns, which are everywhere in gravel, leaves and façades
-AROUND_PX = (2.0, 16.0)  # beyond a target's corners
-MAX_AROUND = 0.5  # of a saddle's own strength: the strongest other one around an isolated target
-OWN_PX = 1.6  # from its centre
+NEAR_CORRELATION = 0.9  # correlation with the first fit's model below which a candidate is dropped
+MIN_CORRELATION = 0.975  # correlation of an isolated target with its model: a shadow's edge may cross it
+MIN_CORRELATION_AMONG_SIMILAR = 0.986  # correlation required among similar patterns, as in gravel, leaves and façades
+AROUND_PX = (2.0, 16.0)  # distances beyond a target's corners that are searched for other saddles
+MAX_NEIGHBOUR_SADDLE_SHARE = 0.5  # strongest saddle around an isolated target over the target's own
+OWN_PX = 1.6  # radius around a target's centre in which saddles are its own
 MIN_ANGLE_DEG = 18.0  # between the lines
-MAX_DARK = 0.45  # of the dark sectors' brightness over the bright ones'
-MIN_NEUTRAL = 0.75  # of white minus black: the smallest colour channel over the largest
+MAX_DARK_RATIO = 0.45  # brightness of a target's dark sectors over its bright ones
+MIN_NEUTRAL = 0.75  # white minus black in the colour channel where it is smallest over that where it is largest
 MAX_BLUR_PX = 1.6
 # A disc of 12 px has the area of a square of 10.6 px, and blur takes some of it. Smaller ones have so few pixels that
 # gravel correlates with 0.99.
 MIN_SIZE_PX = 10.0
-UNEVEN = 0.15  # of the contrast, between the two dark sectors, or the two bright ones
+MAX_UNEVENNESS_SHARE = 0.15  # difference of the two dark sectors, or of the two bright ones, over the contrast
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def _search_tile(pixels: UInt8[np.ndarray, "h w 3"]) -> list[QuadrantTarget]:
     places = _saddles(grey)
     values, scores = fit_near(grey, places[_has_quadrant_ring(grey, places)])
     dark = (values[:, 4] - np.abs(values[:, 5])) / np.maximum(values[:, 4] + np.abs(values[:, 5]), 1e-9)
-    worth = (scores > NEAR_CORRELATION) & (dark < RING_DARK) & (2.0 * np.abs(values[:, 5]) > MIN_CONTRAST)
+    worth = (scores > NEAR_CORRELATION) & (dark < MAX_RING_DARK_RATIO) & (2.0 * np.abs(values[:, 5]) > MIN_CONTRAST)
     found: list[QuadrantTarget] = []
     for k in np.flatnonzero(worth).tolist():
         x, y = (values[k, :2] + 0.5).tolist()
@@ -178,8 +179,8 @@ def _has_quadrant_ring(grey: Float32[np.ndarray, "h w"], places: Float64[np.ndar
         good[chosen] = (
             (crossings == 4)
             & (high - low > RING_CONTRAST * MIN_CONTRAST)
-            & (low < RING_DARK * high)
-            & (alike > LIKE_ITSELF * np.maximum(power, 1e-6))
+            & (low < MAX_RING_DARK_RATIO * high)
+            & (alike > MIN_RING_SYMMETRY * np.maximum(power, 1e-6))
         )
     return good
 
@@ -224,10 +225,10 @@ def _reach(grey: Float32[np.ndarray, "h w"], lines: LinePair) -> Float64[np.ndar
             # Positive as long as the sides match the sectors at the centre.
             sign = way * np.sign(lines.values[5]) * _side(directions, k)
             difference = sign * (sides[0] - sides[1]) / contrast
-            ended = np.flatnonzero(difference[2:] < DIFFERENCES)
+            ended = np.flatnonzero(difference[2:] < MIN_EDGE_CONTRAST_SHARE)
             end = len(steps) if len(ended) == 0 else int(ended[0]) + 2
             ways.append(float(steps[min(end, len(steps) - 1)]))
-        if min(ways) < EVEN * max(ways) or min(ways) < MIN_REACH_PX:
+        if min(ways) < MIN_REACH_RATIO * max(ways) or min(ways) < MIN_REACH_PX:
             return None
         reaches.append(sum(ways) / 2.0)
     return np.array(reaches)
@@ -252,21 +253,25 @@ def _check_target(
     if around is None or lines.values[6] > MAX_BLUR_PX:
         return None
     x, y, seen = around
-    shown, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
-    score = float(correlation(seen[None], shown[None])[0])
+    predicted, derivatives = (v[0] for v in model(lines.values[None], x[None], y[None]))
+    score = float(correlation(seen[None], predicted[None])[0])
     middle, half = float(lines.values[4]), abs(float(lines.values[5]))
     if not _is_even(lines, x, y, seen):
         return None
-    if score < MIN_CORRELATION or middle - half > MAX_DARK * (middle + half) or not _is_neutral(pixels, x, y, shown):
+    if (
+        score < MIN_CORRELATION
+        or middle - half > MAX_DARK_RATIO * (middle + half)
+        or not _is_neutral(pixels, x, y, predicted)
+    ):
         return None
-    variance = float(((seen - shown) ** 2).sum()) / max(len(seen) - 7, 1)
+    variance = float(((seen - predicted) ** 2).sum()) / max(len(seen) - 7, 1)
     covariance = variance * np.linalg.pinv(derivatives.T @ derivatives)
     sigma = float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2.0, 0.0)))
     directions = lines.directions()
     area = 4.0 * reach[0] * reach[1] * abs(float(np.linalg.det(directions)))
     cx, cy = lines.values[:2].tolist()
     size = float(np.sqrt(area))
-    if size < MIN_SIZE_PX or (score < CORRELATION_AMONG and not _is_isolated(grey, cx, cy, size)):
+    if size < MIN_SIZE_PX or (score < MIN_CORRELATION_AMONG_SIMILAR and not _is_isolated(grey, cx, cy, size)):
         return None
     return QuadrantTarget(cx + 0.5, cy + 0.5, size, sigma, score)
 
@@ -283,7 +288,7 @@ def _is_isolated(grey: Float32[np.ndarray, "h w"], cx: float, cy: float, size_px
     around = (away > corners + AROUND_PX[0]) & (away < corners + AROUND_PX[1])
     if not around.any():
         return False
-    return bool(strengths[around].max() < MAX_AROUND**2 * strengths[away < OWN_PX].max())
+    return bool(strengths[around].max() < MAX_NEIGHBOUR_SADDLE_SHARE**2 * strengths[away < OWN_PX].max())
 
 
 def _is_even(
@@ -298,18 +303,18 @@ def _is_even(
         return False
     means = [float(sector.mean()) for sector in sectors]
     off = max(abs(means[0] - means[3]), abs(means[1] - means[2]))
-    return bool(off < UNEVEN * 2.0 * abs(contrast))
+    return bool(off < MAX_UNEVENNESS_SHARE * 2.0 * abs(contrast))
 
 
 def _is_neutral(
     pixels: UInt8[np.ndarray, "h w 3"],
     x: Float64[np.ndarray, " n"],
     y: Float64[np.ndarray, " n"],
-    shown: Float64[np.ndarray, " n"],
+    predicted: Float64[np.ndarray, " n"],
 ) -> bool:
     """Whether the difference between bright and dark is neutral in colour."""
     colours = pixels[y.astype(np.int64), x.astype(np.int64)].astype(np.float64)
-    bright = shown > shown.mean()
+    bright = predicted > predicted.mean()
     if not bright.any() or bright.all():
         return False
     difference = colours[bright].mean(axis=0) - colours[~bright].mean(axis=0)

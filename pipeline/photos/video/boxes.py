@@ -36,7 +36,7 @@ FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"
 SUBTITLE_HANDLERS = (b"text", b"sbtl", b"subt")
 SUBTITLE_FORMATS = (b"tx3g", b"text")
 STILLS = ("jpeg", "png ", "mjpa")  # thumbnails, which cameras keep as a track
-EPOCH = datetime.datetime(1904, 1, 1)  # of an MP4's times, UTC
+EPOCH = datetime.datetime(1904, 1, 1)  # zero of an MP4's times, UTC
 LOCATION = re.compile(rb"([+-]\d{1,2}\.\d{1,12})([+-]\d{1,3}\.\d{1,12})(?:[+-]\d{1,6}(?:\.\d{1,9})?)?/?")  # ISO 6709
 REFILM = "Copy it again from the camera's card; a repair tool may restore a recording that broke off."
 

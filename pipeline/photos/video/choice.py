@@ -16,13 +16,13 @@ from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.photos.video.motion import Measures
 
-LEAST, MOST = 0.7, 0.8  # overlap of successive frames
-NEARER = 0.9  # overlap up to which frames are accepted if all others are blurred
-GRID = 5  # points per side
-TURNING = 2.5  # times counts what a point moves apart from the shift of all: steps of some 15° around a house
-BLURRED = 0.5  # of the sharpness that the sharper frames around have
-AROUND_S = 3.0  # what is around, to both sides
-SHARPER = 0.9  # their quantile
+MIN_OVERLAP, MAX_OVERLAP = 0.7, 0.8  # overlap of successive frames
+MAX_BLURRED_OVERLAP = 0.9  # overlap up to which frames are accepted if all others are blurred
+GRID = 5  # points along each side of a frame at which motion is evaluated
+PARALLAX_WEIGHT = 2.5  # times counts what a point moves apart from the shift of all: steps of some 15° around a house
+MIN_SHARPNESS_SHARE = 0.5  # sharpness over that of the sharper frames around, below which a frame is blurred
+SHARPNESS_WINDOW_S = 3.0  # seconds to either side in which a frame's sharpness is compared
+SHARPNESS_QUANTILE = 0.9  # quantile of the sharpness in that window that counts as sharp
 BLOCK = 64  # frames that are compared at a time
 
 
@@ -53,10 +53,10 @@ def choose(measures: Measures, most: int) -> Choice:
         most: At most so many frames; if there are more, every few are left out evenly.
     """
     cuts = np.flatnonzero(np.isnan(measures.steps[:, 0, 0]))
-    dull = measures.sharpness < BLURRED * _usual(measures)
+    blurry = measures.sharpness < MIN_SHARPNESS_SHARE * _usual(measures)
     chosen: list[int] = []
     for begin, end in zip(cuts, [*cuts[1:], len(measures)], strict=True):
-        part = _Part(int(begin), measures.sharpness[begin:end], dull[begin:end], measures.steps[begin:end])
+        part = _Part(int(begin), measures.sharpness[begin:end], blurry[begin:end], measures.steps[begin:end])
         found = part.choose()
         if len(found) > 1 or len(cuts) == 1:  # a single frame between two cuts shows nothing in depth
             chosen += found
@@ -69,7 +69,7 @@ def choose(measures: Measures, most: int) -> Choice:
         kept,
         np.array(overlaps[: len(kept)]),
         len(chosen),
-        kept[dull[kept]],
+        kept[blurry[kept]],
         tuple(float(measures.times_s[cut]) for cut in cuts[1:]),
     )
 
@@ -80,17 +80,17 @@ def overlaps_with(maps: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " n
     points = np.stack([*map(np.ravel, np.meshgrid(side, side)), np.ones(GRID * GRID)])
     moved = (maps @ points - points)[:, :2]
     shift = moved.mean(axis=2, keepdims=True)
-    moved = shift + TURNING * (moved - shift)
+    moved = shift + PARALLAX_WEIGHT * (moved - shift)
     return np.asarray(np.prod(np.clip(1.0 - np.abs(moved), 0.0, 1.0), axis=1).mean(axis=1))
 
 
 def _usual(measures: Measures) -> Float64[np.ndarray, " n"]:
     """The sharpness that the sharper frames around each frame have."""
-    begins = np.searchsorted(measures.times_s, measures.times_s - AROUND_S, side="left")
-    ends = np.searchsorted(measures.times_s, measures.times_s + AROUND_S, side="right")
+    begins = np.searchsorted(measures.times_s, measures.times_s - SHARPNESS_WINDOW_S, side="left")
+    ends = np.searchsorted(measures.times_s, measures.times_s + SHARPNESS_WINDOW_S, side="right")
     return np.array(
         [
-            np.quantile(measures.sharpness[a:b], SHARPER)
+            np.quantile(measures.sharpness[a:b], SHARPNESS_QUANTILE)
             for a, b in zip(begins, np.maximum(ends, begins + 1), strict=True)
         ]
     )
@@ -118,15 +118,15 @@ class _Part:
         self,
         begin: int,
         sharpness: Float64[np.ndarray, " n"],
-        dull: np.ndarray,
+        blurry: np.ndarray,
         steps: Float64[np.ndarray, "n 3 3"],
     ) -> None:
-        self._begin, self._sharpness, self._dull, self._steps = begin, sharpness, dull, steps
+        self._begin, self._sharpness, self._blurry, self._steps = begin, sharpness, blurry, steps
 
     def choose(self) -> list[int]:
         """The chosen frames' indices into the measures."""
         start = self._along(0)
-        same = [0, *(at for at, overlap in enumerate(start, 1) if overlap >= NEARER)]
+        same = [0, *(at for at, overlap in enumerate(start, 1) if overlap >= MAX_BLURRED_OVERLAP)]
         chosen = [self._sharpest(np.array(same))]
         while (following := self._next(chosen[-1])) is not None:
             chosen.append(following)
@@ -136,20 +136,20 @@ class _Part:
         overlaps = self._along(key)
         if len(overlaps) == 0:
             return None
-        reached = overlaps[-1] < LEAST
+        reached = overlaps[-1] < MIN_OVERLAP
         inside = len(overlaps) - 1 if reached else len(overlaps)  # the last one is past the window
         numbers = key + 1 + np.arange(inside)
-        window, wider = numbers[overlaps[:inside] <= MOST], numbers[overlaps[:inside] <= NEARER]
-        if len(window) and not self._dull[window].all():
+        window, wider = numbers[overlaps[:inside] <= MAX_OVERLAP], numbers[overlaps[:inside] <= MAX_BLURRED_OVERLAP]
+        if len(window) and not self._blurry[window].all():
             return self._sharpest(window)
         if len(wider):  # all in the window are blurred, or the film ends before it
-            return self._sharpest(wider if not self._dull[wider].all() or not len(window) else window)
+            return self._sharpest(wider if not self._blurry[wider].all() or not len(window) else window)
         if not reached:
             return None  # the rest of the part shows nothing new
         return key + len(overlaps)  # a leap: from one frame to the next
 
     def _along(self, key: int) -> Float64[np.ndarray, " m"]:
-        """Overlaps with a frame of those after it, up to the first below ``LEAST``, or to the end."""
+        """Overlaps with a frame of those after it, up to the first below ``MIN_OVERLAP``, or to the end."""
         total: Float64[np.ndarray, "3 3"] = np.eye(3)
         found: list[Float64[np.ndarray, " k"]] = []
         for begin in range(key + 1, len(self._steps), BLOCK):
@@ -158,7 +158,7 @@ class _Part:
                 total = step @ total
                 maps.append(total)
             overlaps = overlaps_with(np.array(maps))
-            below = np.flatnonzero(overlaps < LEAST)
+            below = np.flatnonzero(overlaps < MIN_OVERLAP)
             if len(below):
                 return np.concatenate([*found, overlaps[: below[0] + 1]])
             found.append(overlaps)

@@ -30,12 +30,13 @@ from splatpipe.pipeline.photos.video.telemetry import FlightPath, Place, read_fi
 
 FRAMES_DIR = "frames"  # in the part `photos`
 MIN_FRAMES = 3  # a reconstruction needs as many
-MEASURED_FPS = 15.0  # of a film with more, every second, third or further frame is measured
-QUALITY = 97  # of the JPEGs, without subsampled colours: the film's own losses are larger
-MAX_STEM_BYTES = 200  # of a name, which a number, masks and conversions make longer
+MEASURED_FPS = 15.0  # frames per second that are measured: of a faster film every second, third or further one
+JPEG_QUALITY = 97  # JPEG quality of extracted frames, without subsampled colours: the film's own losses are larger
+MAX_STEM_BYTES = 200  # longest film name used for frames, which a number, masks and conversions make longer
 ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}  # EXIF's, by a player's turn, degrees clockwise
-SHEARED = 0.005  # of the frame's size, from one frame to the next: by as much a rolling shutter may shear it
-WHOLE = 0.98  # of the listed frames that must be decoded for the film to count as undamaged
+# median motion between frames over the frame's size, above which a rolling shutter may shear them
+MAX_MOTION_SHARE = 0.005
+MIN_DECODED_SHARE = 0.98  # least share of the listed frames that decode in an undamaged film
 TAG, GPS = ExifTags.Base, ExifTags.GPS
 XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -117,7 +118,7 @@ def _opened(film: Path, threads: int) -> Iterator[cv2.VideoCapture]:
 
 def _measure(film: Path, container: Container, threads: int, report: Reporter) -> Measures:
     name = printable(film.name)
-    counted = [0]
+    decoded = [0]
 
     def frames() -> Iterator[tuple[int, float, UInt8[np.ndarray, "h w 3"]]]:
         fps = container.frames / container.seconds if container.seconds > 0.0 else MEASURED_FPS
@@ -126,7 +127,7 @@ def _measure(film: Path, container: Container, threads: int, report: Reporter) -
             for number in range(container.frames):
                 if not capture.grab():
                     return
-                counted[0] = number + 1
+                decoded[0] = number + 1
                 if number % stride:
                     continue
                 time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
@@ -143,9 +144,9 @@ def _measure(film: Path, container: Container, threads: int, report: Reporter) -
             hint=f"If it plays, convert it: ffmpeg -i {shlex.quote(name)} -c:v libx264 -crf 16 readable.mp4; "
             "else copy it again.",
         )
-    if counted[0] < WHOLE * container.frames:
+    if decoded[0] < MIN_DECODED_SHARE * container.frames:
         raise SplatpipeError(
-            f"{name} is damaged: only {counted[0]:,} of its {container.frames:,} frames can be decoded.", hint=REFILM
+            f"{name} is damaged: only {decoded[0]:,} of its {container.frames:,} frames can be decoded.", hint=REFILM
         )
     return measures
 
@@ -245,7 +246,7 @@ def _write(film: Path, folder: Path, frames: Sequence[_Frame], threads: int, rep
 
 
 def _save(pixels: UInt8[np.ndarray, "h w 3"], frame: _Frame, folder: Path) -> None:
-    settings: dict[str, Any] = {"quality": QUALITY, "subsampling": 0, "exif": frame.exif.tobytes()}
+    settings: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0, "exif": frame.exif.tobytes()}
     if frame.xmp:
         settings["xmp"] = frame.xmp
     with new_file(folder / frame.name) as file:
@@ -305,7 +306,7 @@ def _shutter_issues(container: Container, measures: Measures, name: str) -> list
     centre = np.array([0.5, 0.5, 1.0])
     moved = np.abs(steps @ centre - centre)[:, :2]
     usual = float(np.median(moved.max(axis=1))) if len(moved) else 0.0
-    if usual > SHEARED:
+    if usual > MAX_MOTION_SHARE:
         pixels = usual * max(container.width, container.height)
         text = (
             f"The picture in {name} moves by {pixels:.0f} pixels a frame: a rolling shutter, as most films are taken "

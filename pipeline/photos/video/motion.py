@@ -15,12 +15,13 @@ from jaxtyping import Float64, Int64, UInt8
 from splatpipe.pipeline.photos.pixels.images import reduced
 
 SHARP_SIDE, TRACKED_SIDE = 1920, 480  # pixels: the longer sides at which sharpness and motion are measured
-POINTS, QUALITY, APART = 300, 0.01, 8  # corners that are followed: at most, of the best one's strength, pixels
-WINDOW, LEVELS = (15, 15), 3  # of the search for a corner in the next frame: 60 pixels far
+# corners that are followed: at most, of the best one's strength, pixels
+POINTS, MIN_CORNER_QUALITY, CORNER_SPACING_PX = 300, 0.01, 8
+WINDOW, LEVELS = (15, 15), 3  # search window (pixels) and pyramid levels of the corner tracker: 60 pixels far
 TOLERANCE_PX = 1.5  # off the common motion: nearer and farther ground moves differently
 MIN_FOLLOWED, MIN_SHARE = 12, 0.25  # corners, and their share that agrees
-SCALES = (0.5, 2.0)  # of the area, from frame to frame
-LOST = 15  # frames without motion, such as a flash, before it counts as a cut
+AREA_RATIO_BOUNDS = (0.5, 2.0)  # bounds on the ratio of areas from frame to frame
+MAX_LOST_FRAMES = 15  # frames without motion, such as a flash, before it counts as a cut
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ def measure(film: Iterable[tuple[int, float, UInt8[np.ndarray, "h w 3"]]]) -> It
         grey = reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), SHARP_SIDE)
         small = reduced(grey, TRACKED_SIDE)
         step = None if last is None else motion(last, small)
-        if step is not None or last is None or waited >= LOST:
+        if step is not None or last is None or waited >= MAX_LOST_FRAMES:
             last, waited = small, 0
         else:
             waited += 1  # compared again with the last good frame; this one is not chosen
@@ -88,7 +89,7 @@ def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
 
 def motion(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> Float64[np.ndarray, "3 3"] | None:
     """The affine map from one frame to the next, in shares of width and height; None if they show different things."""
-    corners = cv2.goodFeaturesToTrack(first, POINTS, QUALITY, APART)
+    corners = cv2.goodFeaturesToTrack(first, POINTS, MIN_CORNER_QUALITY, CORNER_SPACING_PX)
     if corners is None or len(corners) < MIN_FOLLOWED:
         return None
     moved, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=WINDOW, maxLevel=LEVELS)
@@ -98,7 +99,7 @@ def motion(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) ->
     affine, agree = cv2.estimateAffine2D(corners[kept], moved[kept], ransacReprojThreshold=TOLERANCE_PX)
     if affine is None or agree.sum() < max(MIN_FOLLOWED, MIN_SHARE * len(corners)):
         return None
-    if not SCALES[0] <= np.linalg.det(affine[:, :2]) <= SCALES[1]:
+    if not AREA_RATIO_BOUNDS[0] <= np.linalg.det(affine[:, :2]) <= AREA_RATIO_BOUNDS[1]:
         return None
     height, width = first.shape
     shares = np.diag([1.0 / width, 1.0 / height, 1.0])

@@ -46,7 +46,7 @@ MAX_LINE_BYTES = 4096
 FOCAL_MM = (10.0, 200.0)  # 35 mm equivalents of drones' cameras; ten times as much is tenths
 STALE_S = 2.0  # a position that is repeated longer is one where the drone stood
 MAX_GAP_S = 5.0  # between a frame and the nearest position
-FEW_DECIMALS = 4  # of degrees: 11 m
+MAX_ROUNDED_DECIMALS = 4  # decimals of degrees, 11 m, up to which positions are noticeably rounded
 METRES_PER_DEGREE = 111_320.0
 RECEIVER_M = 3.0  # as for photos of a drone without RTK
 
@@ -93,7 +93,7 @@ def read_subtitles(path: Path) -> Iterator[Cue]:
     Raises:
         OSError: if it cannot be read.
     """
-    shown: tuple[float, float] | None = None
+    interval: tuple[float, float] | None = None
     lines: list[str] = []
     read = cues = kept = 0
     with open_regular(path) as file:
@@ -106,16 +106,16 @@ def read_subtitles(path: Path) -> Iterator[Cue]:
                     lines.append(text)
                     kept += len(text) + 1
                 continue
-            if shown is not None:
-                yield Cue(*shown, "\n".join(lines))
+            if interval is not None:
+                yield Cue(*interval, "\n".join(lines))
                 cues += 1
             if read > MAX_FILE_BYTES or cues >= MAX_CUES:
                 return
             numbers = [int(each) for each in found.groups()]
-            shown, lines = (_seconds(numbers[:4], found[4]), _seconds(numbers[4:], found[8])), []
+            interval, lines = (_seconds(numbers[:4], found[4]), _seconds(numbers[4:], found[8])), []
             kept = 0
-    if shown is not None:
-        yield Cue(*shown, "\n".join(lines))
+    if interval is not None:
+        yield Cue(*interval, "\n".join(lines))
 
 
 def _seconds(numbers: Sequence[int], decimals: str) -> float:
@@ -237,7 +237,7 @@ class FlightPath:
         self._heights = _column([fix.height_m for fix in kept])
         decimals = max((fix.decimals for fix in kept), default=6)
         step_m = METRES_PER_DEGREE / 10.0**decimals
-        self._sigma_m = math.hypot(RECEIVER_M, step_m / math.sqrt(12.0)) if decimals <= FEW_DECIMALS else None
+        self._sigma_m = math.hypot(RECEIVER_M, step_m / math.sqrt(12.0)) if decimals <= MAX_ROUNDED_DECIMALS else None
 
     def at(self, time_s: float) -> Place | None:
         """Where the camera was; None further than ``MAX_GAP_S`` from all fixes."""

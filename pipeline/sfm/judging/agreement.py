@@ -17,7 +17,7 @@ from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_s
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 EXPLAINED_PX = 4.0  # distance from the epipolar line that verification itself allows; more in large photos
-MIN_MATCHES = 15  # for a pair to count as contradicting; COLMAP's own minimum for a pair
+MIN_MATCHES = 15  # matches of a pair that counts as contradicting; COLMAP's own minimum for a pair
 MIN_PARALLAX = 2.0  # times EXPLAINED_PX: minimum parallax of a match for the sign of its depth to be meaningful
 
 Rays = Float64[np.ndarray, "n 2"]

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.sfm.judging.agreement import Agreement
 
 MAX_MATCHES = 200  # cap per pair: thousands of matches prove only that two photos are neighbours
-SMALLEST_GROUP = 2  # photos; a single one is a wrong photo, not a bend
-SMALLEST_SHARE = 0.02  # of the photos
-DENSE = 600  # photos up to which all eigenvectors are computed
-STEPS = 300  # of the power iteration above
+MIN_GROUP_PHOTOS = 2  # photos; a single one is a wrong photo, not a bend
+MIN_GROUP_SHARE = 0.02  # least share of the photos in a group
+MAX_DENSE_PHOTOS = 600  # photos up to which all eigenvectors are computed
+POWER_ITERATIONS = 300  # power iterations for an eigenvector above MAX_DENSE_PHOTOS
 DIGITS = 8  # decimals of the eigenvector that are kept: the last ones vary with the number of threads
 MIN_MATCHES_APART = 1.0  # minimum for the consistent matches across a cut, to avoid dividing by zero
 
@@ -40,7 +40,7 @@ class GraphCut:
 def find_cut(agreement: Agreement, contradicts: Bool[np.ndarray, " n"]) -> GraphCut:
     """Return the cut of the placed photos with the largest ratio; empty if nothing contradicts."""
     numbers = np.unique(agreement.pairs[agreement.placed])
-    if not contradicts.any() or len(numbers) < 2 * SMALLEST_GROUP:
+    if not contradicts.any() or len(numbers) < 2 * MIN_GROUP_PHOTOS:
         return GraphCut()
     return cut_between(*_weights(agreement, contradicts, numbers), numbers)
 
@@ -60,7 +60,7 @@ def cut_between(
         floor: Least weight of what agrees between two groups.
     """
     best = GraphCut()
-    least = max(SMALLEST_GROUP, int(np.ceil(SMALLEST_SHARE * len(numbers))))
+    least = max(MIN_GROUP_PHOTOS, int(np.ceil(MIN_GROUP_SHARE * len(numbers))))
     for order in (np.argsort(_eigenvector(agree, against), kind="stable"), *_detached(agree, against)):
         held, contra = _crossing(agree, order), _crossing(against, order)
         ratios = contra / np.maximum(held, floor)
@@ -94,11 +94,11 @@ def _eigenvector(agree: Float64[np.ndarray, "m m"], against: Float64[np.ndarray,
     """Return the eigenvector of the smallest eigenvalue of the signed Laplacian, normalised by degree."""
     degree = np.maximum((agree + against).sum(axis=1), 1.0)
     signed = (agree - against) / np.sqrt(degree[:, None] * degree[None, :])
-    if len(signed) <= DENSE:
+    if len(signed) <= MAX_DENSE_PHOTOS:
         vector = np.linalg.eigh(signed)[1][:, -1]
     else:
         vector = np.cos(np.arange(len(signed), dtype=np.float64))  # any start that is not an eigenvector
-        for _ in range(STEPS):
+        for _ in range(POWER_ITERATIONS):
             vector = vector + signed @ vector
             vector /= np.linalg.norm(vector)
     vector = vector / np.sqrt(degree)

@@ -20,19 +20,19 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.judging.cuts import GraphCut, cut_between
-from splatpipe.pipeline.sfm.judging.judging import Level, Reason, who
+from splatpipe.pipeline.sfm.judging.judging import Level, Reason, name_photo_group
 from splatpipe.pipeline.sfm.model.structure import read_structure
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.pairing.pairs import Pair
-from splatpipe.pipeline.sfm.pairing.view_overlaps import BINS, ViewOverlap, compare_views
+from splatpipe.pipeline.sfm.pairing.view_overlaps import ANGLE_BINS, ViewOverlap, compare_views
 
 MIN_OWN = 5  # points of the other photo in a cell: it has to show something else
 MIN_EXPECTED = 4.0  # common points expected in a cell: fewer may be missing by chance
-FEW = 0.2  # of those expected
+MAX_FOUND_SHARE = 0.2  # common points over the expected ones, below which a cell shows another place
 MIN_COMMON = 30.0  # common points of two groups, to avoid dividing by few
 MIN_MISSING = 60.0  # common points that are missing between two groups: fewer are three or four photos' corners
-RATIO_DOUBT, RATIO_BAD = 0.15, 0.25  # of missing to common points between two groups; sound captures have 0 to 0.09
-CUTS = 5  # of ever better ratios
+RATIO_DOUBT, RATIO_BAD = 0.15, 0.25  # missing over common points of two groups; sound captures have 0 to 0.09
+MAX_CUTS = 5  # cuts tried in turn, each with a higher ratio of missing points
 DIGITS = 6  # decimals that are compared: the last ones vary with the number of threads
 
 
@@ -104,7 +104,7 @@ def _largest_cut(
 ) -> GraphCut:
     """Return the cut with the largest ratio: the common points are weighed by the ratio found so far (Dinkelbach)."""
     best, scale = GraphCut(), 1.0
-    for _ in range(CUTS):
+    for _ in range(MAX_CUTS):
         cut = cut_between(scale * common, against, numbers, scale * MIN_COMMON)
         if scale * cut.ratio <= best.ratio:
             break
@@ -126,13 +126,13 @@ def missing(entry: ViewOverlap, usual: Float64[np.ndarray, " bins"]) -> Float64[
     total, common = entry.hits + entry.lacking, entry.hits > 0
     own_rate = float(entry.hits[common].sum()) / max(float(total[common].sum()), 1.0)
     expected = min(float(usual[entry.bin]), own_rate) * total
-    differs = (entry.own >= MIN_OWN) & (expected >= MIN_EXPECTED) & (entry.hits < FEW * expected)
+    differs = (entry.own >= MIN_OWN) & (expected >= MIN_EXPECTED) & (entry.hits < MAX_FOUND_SHARE * expected)
     return np.asarray(np.where(differs, expected - entry.hits, 0.0))
 
 
 def usual_rates(found: Sequence[ViewOverlap]) -> Float64[np.ndarray, " bins"]:
     """Return the share of points that a photo usually finds again, by angle: the median over pairs that share any."""
-    rates: list[list[float]] = [[] for _ in range(BINS)]
+    rates: list[list[float]] = [[] for _ in range(ANGLE_BINS)]
     for entry in found:
         hits, total = float(entry.hits.sum()), float((entry.hits + entry.lacking).sum())
         if hits:
@@ -145,8 +145,8 @@ def doubles_reasons(verified: ViewGraph, found: Doubles) -> list[Reason]:
     if found.level() == "good":
         return []
     names = [verified.names[number] for number in found.pair]
-    text = f"{who(found.group, verified)} show other things than the photos that the model has at the same "
-    text += f"place, such as {names[0]} and {names[1]}: two places that look alike may have been taken for one."
+    text = f"{name_photo_group(found.group, verified)} show other things than the photos that the model has at the "
+    text += f"same place, such as {names[0]} and {names[1]}: two places that look alike may have been taken for one."
     hint = "Compare the two photos: the report shows that place in both. Add photos that lead from one place to the "
     hint += "other, or run the places separately."
     return [Reason(found.level(), text, hint, "doubles")]

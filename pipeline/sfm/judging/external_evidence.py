@@ -17,9 +17,11 @@ from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.pairing.layout import EARTH_RADIUS_M
 
 MIN_POSITIONS = 8  # photos; a similarity fits fewer too easily
-STEPS = 30  # of the reweighted fit
-FAR_SIGMAS, FAR_SHARE = 5.0, 0.04  # of the stated error, and of the flight's size: more than receiver noise
-SMOOTH = 0.5  # difference of neighbouring residuals over their length: about 1.4 for noise, almost 0 for a bend
+IRLS_ROUNDS = 30  # rounds of iteratively reweighted least squares
+# median residual over the stated error, and over the flight's size, that noise does not explain
+MIN_RESIDUAL_SIGMAS, MIN_RESIDUAL_SHARE = 5.0, 0.04
+# difference of neighbouring residuals over their length: about 1.4 for noise, almost 0 for a bend
+MAX_NEIGHBOUR_DIFFERENCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,10 @@ def _positions(model: pycolmap.Reconstruction, positions: Sequence[JSON]) -> lis
     entries = [known[image.name] for image in images]
     sigma = float(np.median([max(entry["sigma_horizontal_m"], entry["sigma_vertical_m"]) for entry in entries]))
     off = disagreement(np.array([image.projection_center() for image in images]), _metres(entries))
-    if off.median_m < max(FAR_SIGMAS * sigma, FAR_SHARE * off.size_m) or off.smooth > SMOOTH:
+    if (
+        off.median_m < max(MIN_RESIDUAL_SIGMAS * sigma, MIN_RESIDUAL_SHARE * off.size_m)
+        or off.smooth > MAX_NEIGHBOUR_DIFFERENCE
+    ):
         return []
     text = (
         f"The cameras are {off.median_m:.0f} m (median) from the photos' stated positions, with similar offsets "
@@ -106,7 +111,7 @@ def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray
         places: Their stated positions, metres, in the same order.
     """
     weights = np.ones(len(centres))
-    for _ in range(STEPS):  # iteratively reweighted least squares
+    for _ in range(IRLS_ROUNDS):  # iteratively reweighted least squares
         residuals = _similar(centres, places, weights) - places
         lengths = np.linalg.norm(residuals, axis=1)
         weights = 1.0 / np.maximum(lengths, 0.1 * max(float(np.median(lengths)), 1e-9))

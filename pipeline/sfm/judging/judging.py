@@ -32,11 +32,12 @@ TRUSTED_SOURCES = ("xmp-calibrated", "sensor-table", "focal-plane-resolution", "
 # A trusted focal length is off by a few per cent (a Phantom's by 0.5, sensor tables by up to 5); a 35 mm equivalent was
 # seen 26 % off on a phone, and that of a resized file can be off by even more.
 FOCAL_TRUSTED = (0.10, 0.30)  # relative deviation above which the level is doubt, and bad
-FOCAL_STATED = (0.35, 1.0)  # the same for an untrusted focal length, as a ratio less one
-FOCAL_LONGER = (0.25, 6.0)  # of the longer side: the lenses used for mapping, 127 to 10 degrees
-FEW_SHARE = 0.1  # of the photos: a wrong lens of fewer photos says nothing about the others
-EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65  # of the matches among placed photos; sound models have 0.93 or more
-GAIN_DOUBT, GAIN_BAD = 0.01, 0.02  # of the score, by another arrangement; sound models gain at most 0.002
+FOCAL_UNTRUSTED = (0.35, 1.0)  # ratio to an untrusted focal length, less one, above which the level is doubt, and bad
+FOCAL_BOUNDS = (0.25, 6.0)  # focal length over the longer side of lenses used for mapping, 127 to 10 degrees
+MIN_WRONG_LENS_SHARE = 0.1  # share of the photos below which a wrong lens says nothing about the others
+# explained share of the matches among placed photos; sound models have 0.93 or more
+EXPLAINED_GOOD, EXPLAINED_DOUBT = 0.85, 0.65
+GAIN_DOUBT, GAIN_BAD = 0.01, 0.02  # gain of the score by another arrangement; sound models gain at most 0.002
 ALIKE_TIMES = 3.0  # median error of a pair that shows another place, over EXPLAINED_PX; a wrong lens is off by less
 FEW_PAIRS = 3  # fewer pairs that look alike are not worth telling
 CUT_DOUBT = 1.0  # ratio of contradicting to agreeing matches between two groups of cameras
@@ -174,12 +175,12 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras:
         which = "The focal length" if len(used) == 1 else f"The focal length of camera {number}"
         ratio = focal / max(camera.width, camera.height)
         stray = max(focal / prior, prior / focal) - 1.0
-        doubt, bad = FOCAL_TRUSTED if is_trusted(group) else FOCAL_STATED
+        doubt, bad = FOCAL_TRUSTED if is_trusted(group) else FOCAL_UNTRUSTED
         hint = (
             "Heights and scale may be off: compare a known one. Oblique photos or a second flying height "
             "constrain the lens better."
         )
-        if not FOCAL_LONGER[0] <= ratio <= FOCAL_LONGER[1]:
+        if not FOCAL_BOUNDS[0] <= ratio <= FOCAL_BOUNDS[1]:
             text = (
                 f"{which} came out as {focal:.0f} pixels, {ratio:.2g} times the photo's longer side, which is "
                 "implausible."
@@ -192,16 +193,16 @@ def _focal_lengths(model: pycolmap.Reconstruction, verified: ViewGraph, cameras:
                 text += " The value in the metadata is only approximate."
             found.append(Reason("bad" if stray > bad else "doubt", text, hint, "focal"))
             ran_away += photos[number] if stray > bad else 0
-    if ran_away < FEW_SHARE * photos.total():
+    if ran_away < MIN_WRONG_LENS_SHARE * photos.total():
         found = [replace(reason, level="doubt") for reason in found]
     return found
 
 
 def _unexplained(agreement: Agreement, alike: Bool[np.ndarray, " n"]) -> list[Reason]:
     """Report matches that are not explained, other than those of pairs that only look alike."""
-    counted = agreement.placed & ~alike
-    share = _share(agreement.explained[counted], agreement.matches[counted])
-    if share >= EXPLAINED_GOOD or not counted.any():
+    valid = agreement.placed & ~alike
+    share = _share(agreement.explained[valid], agreement.matches[valid])
+    if share >= EXPLAINED_GOOD or not valid.any():
         return []
     level: Level = "doubt" if share >= EXPLAINED_DOUBT else "bad"
     text = f"The cameras explain only {100 * share:.0f} % of the matches among the placed photos."
@@ -219,20 +220,20 @@ def _bent(agreement: Agreement, found: Rearrangement, verified: ViewGraph) -> li
         cut = find_cut(agreement, against)
         if cut.ratio < CUT_DOUBT:
             return []
-        text = f"{who(cut.group, verified)} match the other photos elsewhere more than where the model has them: the "
-        text += "scene repeats itself there, or the model is bent."
+        text = f"{name_photo_group(cut.group, verified)} match the other photos elsewhere more than where the model "
+        text += "has them: the scene repeats itself there, or the model is bent."
         return [Reason("doubt", text, hint, "bent")]
     resolved = int((against & ~contradicting(found.agreement)).sum())
     text = "Another arrangement of the cameras explains "
     text += f"{resolved} of the {against.sum()} contradicting pairs of photos" if resolved else "the matches better"
     cut = find_cut(agreement, against)
     if cut.ratio >= CUT_DOUBT:
-        text += f": {who(cut.group, verified)} disagree with the others"
+        text += f": {name_photo_group(cut.group, verified)} disagree with the others"
     text += ", so the model is bent or contains duplicates."
     return [Reason("bad" if gain >= GAIN_BAD else "doubt", text, hint, "bent")]
 
 
-def who(group: Sequence[int], verified: ViewGraph) -> str:
+def name_photo_group(group: Sequence[int], verified: ViewGraph) -> str:
     """Name a group of photos."""
     names = [verified.names[number] for number in group]
     if len(names) <= 2:

@@ -28,17 +28,17 @@ from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_s
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 SAMPLE = 24  # matches per pair: the adjustment has six unknowns per photo
-WIDTHS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # of the loss, times EXPLAINED_PX
-STEPS = 4  # of Gauss-Newton at each width
-FAVOUR, WIDE = 4.0, 8.0  # weight of contradicting pairs while the loss is that wide
-MOVED_WIDTHS = (4.0, 2.0, 1.0)  # where a group was moved: its place is nearly right
-DAMPING = 1e-4  # of the normal matrix' diagonal: the frame of the world and chains of photos are undetermined
-PASSES = 10  # of the reweighted fit of a group's place
+LOSS_WIDTHS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # widths of the robust loss, times EXPLAINED_PX, one after another
+GAUSS_NEWTON_STEPS = 4  # Gauss-Newton steps at each width
+CONTRADICTION_WEIGHT, MIN_FAVOURED_WIDTH = 4.0, 8.0  # weight of contradicting pairs from that width of the loss on
+MOVED_LOSS_WIDTHS = (4.0, 2.0, 1.0)  # where a group was moved: its place is nearly right
+DAMPING = 1e-4  # added share of the normal matrix' diagonal: the world's frame and chains of photos are undetermined
+IRLS_ROUNDS = 10  # rounds of the reweighted fit of a group's place
 WEAK_SCALE = 0.01  # weight of a group's scale staying as it is: a single line of sight leaves it open
-GROUPS = 3  # that are moved, one after another
-WORTH_MOVING = 0.5  # contradicting over agreeing matches of a group with the others
+MAX_MOVED_GROUPS = 3  # groups of photos moved at most, one after another
+MIN_CONTRADICTION_RATIO = 0.5  # contradicting over agreeing matches of a group with the others
 MAX_LINKS = 16  # two-view geometries for a group's place, those of the most matches
-WORTH_COMPARING = 0.003  # of the score by the samples: below the least gain that matters
+MIN_SAMPLED_GAIN = 0.003  # gain of the sampled score that is worth a full comparison: below the least that matters
 LINK_SAMPLE = 100  # matches for a two-view geometry
 DIGITS = 6  # decimals of angles that are compared: the last ones vary with the number of threads
 TURN_MOST = 0.2  # radians a step; more is outside of the linearisation
@@ -117,7 +117,7 @@ def sample(
 
 
 def rearrange(
-    start: Arrangement, samples: Samples, contradicts: Bool[np.ndarray, " n"], widths: Sequence[float] = WIDTHS
+    start: Arrangement, samples: Samples, contradicts: Bool[np.ndarray, " n"], widths: Sequence[float] = LOSS_WIDTHS
 ) -> Arrangement:
     """Adjust poses to the epipolar lines of all samples, robustly.
 
@@ -129,9 +129,9 @@ def rearrange(
     """
     here = start
     for width in widths:
-        favour = FAVOUR if width >= WIDE else 1.0
+        favour = CONTRADICTION_WEIGHT if width >= MIN_FAVOURED_WIDTH else 1.0
         weights = samples.weights * np.where(contradicts, favour, 1.0)[:, None]
-        for _ in range(STEPS):
+        for _ in range(GAUSS_NEWTON_STEPS):
             here = _stepped(here, samples, weights, width)
     return here
 
@@ -162,7 +162,7 @@ def move_group(
     left = np.concatenate([across, across @ arms[:, :, None]], axis=2)
     right = (across @ (here.centres[outside] - about)[:, :, None])[:, :, 0]
     weights = np.ones(len(links))
-    for _ in range(PASSES):
+    for _ in range(IRLS_ROUNDS):
         weighted = np.sqrt(weights)[:, None, None]
         rows, values = (weighted * left).reshape(-1, 4), (weighted[:, :, 0] * right).ravel()
         held = np.concatenate([rows, [[0.0, 0.0, 0.0, WEAK_SCALE]]]), np.append(values, WEAK_SCALE)
@@ -268,17 +268,17 @@ def find_better(
     numbers = sorted(rays)
     samples = sample(model, verified, agreement, rays)
     here, now = arrangement_of(model, numbers), agreement
-    for number in range(GROUPS + 1):
+    for number in range(MAX_MOVED_GROUPS + 1):
         against = contradicting(now)
-        starts: list[tuple[Arrangement, Sequence[float]]] = [(here, WIDTHS)] if number == 0 else []
+        starts: list[tuple[Arrangement, Sequence[float]]] = [(here, LOSS_WIDTHS)] if number == 0 else []
         group = find_cut(now, against)
-        if group.ratio >= WORTH_MOVING:
+        if group.ratio >= MIN_CONTRADICTION_RATIO:
             moved = _moved_group(model, verified, (now, here), group.group, numbers)
-            starts += [(moved, MOVED_WIDTHS)] if moved is not None else []
+            starts += [(moved, MOVED_LOSS_WIDTHS)] if moved is not None else []
         before = now
         for start, widths in starts:
             moved = rearrange(start, samples, against[agreement.placed], widths)
-            if _sampled_score(moved, samples) < _sampled_score(here, samples) + WORTH_COMPARING:
+            if _sampled_score(moved, samples) < _sampled_score(here, samples) + MIN_SAMPLED_GAIN:
                 continue
             found = compare(model, verified, dict(zip(numbers, moved.matrices(), strict=True)), rays)
             if found.score > now.score:

@@ -14,11 +14,11 @@ import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 MIN_VIEWS = 3  # two that intersect, and one that is predicted
-REWEIGHTINGS = 2  # by the distance to the point from the previous round
+REWEIGHTINGS = 2  # rounds of weighting rays by the distance to the point from the previous round
 MIN_ANGLE = 0.02  # its square is the minimum eigenvalue ratio: nearly parallel rays do not determine a point
-CAP = 4.0  # times the median error: a single wrong match must not decide
+MAX_ERROR_RATIO = 4.0  # times the median error: a single wrong match must not decide
 BOOTSTRAPS = 500
-DOUBT = 0.01  # share of the bootstrap samples that may show no improvement
+MAX_UNIMPROVED_SHARE = 0.01  # share of the bootstrap samples that may show no improvement
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ def predicted_errors(model: pycolmap.Reconstruction, tracks: TrackObservations) 
     for number, rows in rows_by_camera(model, tracks):
         rows = rows[ahead[rows]]
         if len(rows):
-            shown = np.asarray(model.cameras[number].img_from_cam(in_camera[rows]), np.float64)
-            distance = np.linalg.norm(shown - tracks.pixels[rows], axis=1)
+            projected = np.asarray(model.cameras[number].img_from_cam(in_camera[rows]), np.float64)
+            distance = np.linalg.norm(projected - tracks.pixels[rows], axis=1)
             errors[rows] = np.where(np.isfinite(distance), distance, np.inf)
     return errors
 
@@ -118,7 +118,7 @@ def improves(
     if not len(before):
         return 0.0, False
     _, photo = np.unique(images, return_inverse=True)
-    cap = CAP * float(np.median(before))
+    cap = MAX_ERROR_RATIO * float(np.median(before))
     if not math.isfinite(cap):
         return 0.0, False
     was = np.bincount(photo, np.minimum(before, cap) ** 2)
@@ -126,7 +126,7 @@ def improves(
     share = float(gained.sum() / max(float(was.sum()), 1e-300))
     drawn = np.random.default_rng(seed).integers(0, len(was), (BOOTSTRAPS, len(was)))
     wrong = float((gained[drawn].sum(axis=1) <= 0.0).mean())
-    return share, share >= least and wrong <= DOUBT
+    return share, share >= least and wrong <= MAX_UNIMPROVED_SHARE
 
 
 def _well_placed(left: Float64[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n"]:

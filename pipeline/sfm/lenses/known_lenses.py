@@ -16,9 +16,9 @@ from splatpipe.pipeline.sfm.lenses.lens_file import FileLens, checked_lens, fitt
 from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens, named_params, simplest
 
 FILE, DEWARP = "lens-file", "xmp-dewarp"
-SHAPE_TOLERANCE = 0.005  # on the aspect ratio of the lens's images and the photos: a pixel lost in resizing
+SHAPE_TOLERANCE = 0.005  # difference of the aspect ratios of the lens's images and the photos: a pixel lost in resizing
 MAX_DEWARP_CHARS = 600
-LENS_STRAY = 0.35  # of a focal length from the metadata's: a rough 35 mm equivalent was seen 26 % off
+MAX_FOCAL_DEVIATION = 0.35  # relative deviation from the metadata's focal length: a rough 35 mm equivalent was 26 % off
 SIZES_SHOWN = 4
 
 
@@ -99,7 +99,7 @@ def _of_file(
 def _is_likely(lens: StatedLens, group: CameraGroup) -> bool:
     """Whether a lens agrees with a group's prior focal length; rules out other cameras of the same aspect ratio."""
     named = named_params(lens.colmap())
-    return not group.has_prior or abs(0.5 * (named["fx"] + named["fy"]) / group.focal_px - 1.0) <= LENS_STRAY
+    return not group.has_prior or abs(0.5 * (named["fx"] + named["fy"]) / group.focal_px - 1.0) <= MAX_FOCAL_DEVIATION
 
 
 def _chosen(near: Sequence[tuple[FileLens, StatedLens, int]], group: CameraGroup, name: str) -> StatedLens | None:

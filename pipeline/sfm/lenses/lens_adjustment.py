@@ -20,9 +20,9 @@ from splatpipe.pipeline.sfm.lenses.focal import solver_options
 from splatpipe.pipeline.sfm.lenses.lens_blocks import hold, tie_focals
 from splatpipe.pipeline.sfm.lenses.lens_model import NAMES, is_known, named_params
 
-PRINCIPAL_POINT_SHARE = 0.01  # of the width: typical offset of a principal point from the image centre
+PRINCIPAL_POINT_SHARE = 0.01  # typical offset of a principal point from the image centre over the width
 WEAK_SIGMA = {"k1": 0.2, "k2": 0.2, "k3": 0.2, "k4": 0.2, "p1": 0.01, "p2": 0.01}  # no camera lens has more
-STATED_SHARE = 1e-3  # of the width, at the corner: how far a lens departs from its calibration with temperature, focus
+STATED_SHARE = 1e-3  # departure from a calibration at the corner, over the width: temperature, focus
 STATED_FOCAL_SHARE = 3e-3
 FREE = 1e6
 ROBUST_PX = 1.0  # scale of the SOFT_L1 loss, as in the last adjustment of mapping

@@ -29,10 +29,11 @@ MAX_LENSES = 1000
 MAX_LINES = 2_000_000
 MAX_DEPTH = 16
 MAX_ELEMENTS = 200_000  # Metashape's cameras.xml has about ten per photo
-MAX_CHARS = 200  # of a number, or of a name that is kept
+MAX_CHARS = 200  # longest text of a number, and characters of a name that are kept
 HIGHEST_TERM_PX = 0.5  # maximum error from dropping lens terms that COLMAP's models lack
-INNER = 0.95  # of the image: calibrations have no targets in the outermost corners
-LARGEST_COEFFICIENT = 100.0  # of distortion; long lenses have large ones, since r is small
+# central share of the sides over which lens terms are tested: calibrations have no targets in the corners
+CALIBRATED_SIDE_SHARE = 0.95
+MAX_COEFFICIENT = 100.0  # largest distortion coefficient; long lenses have large ones, since r is small
 FORMATS = "COLMAP's cameras.txt, Metashape's calibration XML, or Pix4D's .cam or calibrated_camera_parameters.txt"
 CAM_KEYS = ("F", "Px", "Py", "K1", "K2", "K3", "T1", "T2")
 SENSOR = re.compile(r"sensor width of\s+([0-9.eE+-]{1,40})\s*x\s*([0-9.eE+-]{1,40})\s*mm")
@@ -120,7 +121,7 @@ def checked_lens(lens: StatedLens) -> StatedLens:
         raise ValueError("its focal length cannot be one of pictures of its size")
     if not (0.0 < named["cx"] < lens.width and 0.0 < named["cy"] < lens.height):
         raise ValueError("its principal point is outside the picture")
-    if any(abs(value) > LARGEST_COEFFICIENT for name, value in named.items() if name[0] in "kp"):
+    if any(abs(value) > MAX_COEFFICIENT for name, value in named.items() if name[0] in "kp"):
         raise ValueError("a coefficient of distortion is impossible")
     pixels = fitted(
         lens, max(1, round(1000.0 * lens.width / larger)), max(1, round(1000.0 * lens.height / larger)), 1.0
@@ -128,7 +129,8 @@ def checked_lens(lens: StatedLens) -> StatedLens:
     assert pixels is not None
     camera = pixels.colmap()
     across, down = (
-        np.linspace(0.5 - INNER / 2, 0.5 + INNER / 2, GRID) * side for side in (camera.width, camera.height)
+        np.linspace(0.5 - CALIBRATED_SIDE_SHARE / 2, 0.5 + CALIBRATED_SIDE_SHARE / 2, GRID) * side
+        for side in (camera.width, camera.height)
     )
     x, y = np.meshgrid(across, down)
     places = np.stack([x.ravel(), y.ravel()], axis=1)

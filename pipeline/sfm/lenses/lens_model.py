@@ -22,11 +22,11 @@ NAMES = {
     WIDE: ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     WIDE_FISHEYE: ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-NARROW = {  # of each kind, the narrowest first
+MODELS_BY_SIZE = {  # COLMAP's models of each kind, fewest parameters first
     WIDE: ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
     WIDE_FISHEYE: ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
 }
-PARAMETERS = {  # of each model, by the names of the wide ones; f is both focal lengths
+PARAMETERS = {  # a model's parameters, by the names of the wide models; f is both focal lengths
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
@@ -115,7 +115,7 @@ def widen(camera: pycolmap.Camera) -> None:
 def narrow(camera: pycolmap.Camera) -> None:
     """Convert a camera in place to the narrowest model of its kind with the same projection."""
     named = named_params(camera)
-    for model in NARROW[kind_of(camera.model_name)]:
+    for model in MODELS_BY_SIZE[kind_of(camera.model_name)]:
         kept = PARAMETERS[model]
         lost = [name for name in named if name not in kept and name not in ("fx", "fy")]
         if all(named[name] == 0.0 for name in lost) and ("f" not in kept or named["fx"] == named["fy"]):

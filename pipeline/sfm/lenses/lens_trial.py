@@ -36,7 +36,7 @@ from splatpipe.pipeline.sfm.lenses.lens_model import (
 
 MIN_GAIN = 0.002  # relative reduction of the squared held-out errors; noise gives a tenth of it
 MIN_SIGMAS = 3.0
-MIN_EFFECT = 0.25  # of the held-out error, at the corner: smaller effects do not change any later measurement
+MIN_EFFECT = 0.25  # effect at the corner over the held-out error: smaller ones do not change any later measurement
 STEPS = {
     WIDE: (("k2",), ("cx", "cy"), ("p1", "p2"), ("k3",)),
     WIDE_FISHEYE: (("k2",), ("cx", "cy"), ("k3",), ("k4",)),

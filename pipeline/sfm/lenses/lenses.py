@@ -36,11 +36,11 @@ from splatpipe.pipeline.sfm.lenses.lens_trial import LensState, LensTrial
 from splatpipe.pipeline.sfm.mapping.retriangulation import MAX_ERROR_PX, retriangulate
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
-MIN_PHOTOS = 8  # of a camera: fewer cannot separate its lens from their poses
+MIN_PHOTOS = 8  # photos of a camera: fewer cannot separate its lens from their poses
 MIN_TRACKS = 400  # tracks used for the decision; fewer are inconclusive
 MAX_TRACKS = 6000  # some 30,000 observations for a dozen unknowns per camera
 HELD_OUT = 0.25
-FAR_FROM_STATED = 2e-3  # of the width: twice the usual deviation of a lens from its calibration
+MAX_STATED_DEVIATION = 2e-3  # deviation from a calibration over the width that is reported: twice the usual
 WORDS = {
     "cx cy": "principal point",
     "k2": "second radial coefficient",
@@ -70,7 +70,7 @@ def calibrate(
         The model itself if every lens stays simple, otherwise a new one; and a row per camera for ``models.json``.
     """
     usable = {number: lens for number, lens in stated.items() if number in model.cameras}
-    chosen = _deciding(model, seed)
+    chosen = _decision_tracks(model, seed)
     if how == "simple" or (len(chosen) < MIN_TRACKS and not usable):
         return model, ()
     if len(chosen) < MIN_TRACKS:
@@ -108,7 +108,7 @@ def _with_held(
     return result, _rows(model, result, states, stated)
 
 
-def _deciding(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
+def _decision_tracks(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
     """Choose the points used for the decision, in a seeded order.
 
     Only points seen by three photos or more; up to ``MAX_TRACKS``, and beyond that only those of photos that still
@@ -237,7 +237,7 @@ def report_lenses(summary: Mapping[str, JSON], report: Reporter) -> None:
             report.note(
                 f"The lens of camera {row['camera']} needs more than the simple model: {what} ({row['model']})."
             )
-        if row["stated"] and (row["off_stated_px"] or 0.0) > FAR_FROM_STATED * row["width"]:
+        if row["stated"] and (row["off_stated_px"] or 0.0) > MAX_STATED_DEVIATION * row["width"]:
             report.warning(
                 f"The photos move the lens of camera {row['camera']} {row['off_stated_px']:.1f} pixels (RMS) from the"
                 " one that is stated.",

@@ -15,7 +15,7 @@ Progress: TypeAlias = Callable[[int, int, str, str], None]
 
 MIN_MATCHES = 15  # verified matches of a pair; COLMAP's own minimum
 STRICT_PX = 2.0  # filtered observations return only within this error, or they would come and go forever
-SETTLED = 2e-3  # share of observations filtered after a robust adjustment: so few had hardly any influence
+MAX_FILTERED_SHARE = 2e-3  # share of observations filtered after a robust adjustment: so few had hardly any influence
 MAX_ROUNDS = 4
 ROUGH_TOLERANCE, ROUGH_ITERATIONS = 1e-4, 10  # relative change of the cost: before wrong observations are filtered
 FINE_TOLERANCE, FINE_ITERATIONS = 1e-5, 100
@@ -69,7 +69,7 @@ def complete(
         on_progress(number, 1 + MAX_ROUNDS, ADJUSTING, "rounds")
         mapper.complete_and_merge_tracks(triangulation)
         _adjust(mapper, options, stop, rough=False)
-        if mapper.filter_points(mapping) <= SETTLED * model.compute_num_observations():
+        if mapper.filter_points(mapping) <= MAX_FILTERED_SHARE * model.compute_num_observations():
             break
     mapper.filter_frames(mapping)
     mapper.end_reconstruction(False)

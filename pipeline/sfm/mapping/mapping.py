@@ -21,9 +21,9 @@ from splatpipe.pipeline.sfm.model.view_graph import read_verified
 Model: TypeAlias = pycolmap.Reconstruction
 
 BEST_KEYPOINTS = 400  # per photo; 700 placed no more photos in any capture, and took up to twice the time
-WORTH_IT = 0.9  # of the matches; if more remain after the reduction, it saves nothing
-GROWTH = 1.5  # of photos or points between global adjustments; COLMAP's 1.1 makes four times as many
-GOOD_ENOUGH = 1e-4  # relative change of the cost at which these adjustments end
+MAX_REDUCED_SHARE = 0.9  # share of the matches left by the reduction, above which it saves nothing
+GLOBAL_BA_GROWTH = 1.5  # growth of photos or points between global adjustments; COLMAP's 1.1 makes four times as many
+GLOBAL_BA_TOLERANCE = 1e-4  # relative change of the cost at which these adjustments end
 ONE_THREAD = 1  # with several, COLMAP's and Ceres' sums depend on which thread finishes first
 
 
@@ -74,9 +74,11 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
     def place() -> None:
         nonlocal placed
         placed += 1
-        tell(min(placed, total), total, "placing photos" if begun < 2 else f"placing photos (model {begun})", "photos")
+        report_step(
+            min(placed, total), total, "placing photos" if begun < 2 else f"placing photos (model {begun})", "photos"
+        )
 
-    def tell(done: int, of: int, what: str, unit: str) -> None:
+    def report_step(done: int, of: int, what: str, unit: str) -> None:
         nonlocal now
         now = (done, of, what, unit)
 
@@ -95,7 +97,7 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
                 cancellation_token=stop,
             )
         for model in found.values():
-            complete(model, database, settings, stop, on_progress=tell)
+            complete(model, database, settings, stop, on_progress=report_step)
         return largest_first(found)
 
     return run_in_thread(work, lambda: on_progress(*now), stop.cancel)
@@ -129,7 +131,7 @@ def _reduced(database: Path, folder: Path) -> Path:
     """Write a database of the best keypoints' matches; return the whole one if that drops hardly any matches."""
     target = folder / "best.db"
     kept, total = write_reduced(database, target, best_keypoints(read_verified(database), BEST_KEYPOINTS))
-    return target if kept < WORTH_IT * total else database
+    return target if kept < MAX_REDUCED_SHARE * total else database
 
 
 def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipelineOptions:
@@ -142,10 +144,10 @@ def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipeline
     result.triangulation.random_seed = options.seed
     result.num_threads = ONE_THREAD
     # The final adjustment runs to convergence; until then cameras need only be good enough to place the next photo.
-    result.ba_global_frames_ratio = result.ba_global_points_ratio = GROWTH
+    result.ba_global_frames_ratio = result.ba_global_points_ratio = GLOBAL_BA_GROWTH
     result.ba_global_max_refinements, result.ba_local_max_refinements = 2, 1
     result.ba_global_max_num_iterations = 20
-    result.ba_global_function_tolerance = result.ba_local_function_tolerance = GOOD_ENOUGH
+    result.ba_global_function_tolerance = result.ba_local_function_tolerance = GLOBAL_BA_TOLERANCE
     result.mapper.ba_global_ignore_redundant_points3D = True
     result.mapper.init_max_error *= options.pixel_tolerance_scale
     result.mapper.filter_max_reproj_error *= options.pixel_tolerance_scale

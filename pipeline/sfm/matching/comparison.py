@@ -24,7 +24,7 @@ CLIPPED = -0.06  # binary logarithm of linear light above which values are satur
 ALONE_DETAIL, ALONE_EV = 2.0, 2.0  # for photos that match none, against all others, whose content differs as well
 
 
-def duller(
+def detail_loss(
     all_features: Sequence[QuickFeatures], found: Mapping[Pair, InlierMatches]
 ) -> Float64[np.ndarray, "n directions"]:
     """Estimate how much less fine detail each photo has than its neighbours where both show the same, by direction.

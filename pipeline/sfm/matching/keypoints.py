@@ -120,7 +120,7 @@ def largest(keypoints: Floats, places: int) -> npt.NDArray[np.int64]:
     sizes = np.hypot(keypoints[:, 2], keypoints[:, 4])
     order = np.argsort(-sizes, kind="stable")
     _, first, index = np.unique(keypoints[order, :2], axis=0, return_index=True, return_inverse=True)
-    ranks = np.argsort(np.argsort(first))  # of each location, by its largest keypoint
+    ranks = np.argsort(np.argsort(first))  # rank of each location by its largest keypoint
     return np.asarray(order[ranks[index.ravel()] < places], np.int64)
 
 

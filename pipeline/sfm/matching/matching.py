@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.pairing.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.pairing.retrieval import PER_PHOTO, look_alike_costs
 
 PAIRS_A_PROCESS = 12  # at least: a process takes half a second to start
-PROCESS_BYTES = 400_000_000  # of a matching process, at most: 0.16 to 0.27 GB on six captures
+PROCESS_BYTES = 400_000_000  # memory of a matching process at most: 0.16 to 0.27 GB on six captures
 MATCHER = "splatpipe.pipeline.sfm.matching.matching_process"
 
 

@@ -24,9 +24,9 @@ UNIT = 512 * 512  # the product of a descriptor with itself, up to rounding
 # COLMAP's tests with whole numbers. The squared distance of two descriptors is 2 * (UNIT - product).
 RATIO_FRACTION = (16, 25)  # 0.8 squared: the nearest must be closer than 0.8 times the second nearest
 LEAST_PRODUCT = UNIT - math.floor(0.49 * UNIT / 2)  # a distance of at most 0.7 times 512
-NEAR_WORDS = 6  # of about 70 in a photo of 5,000: cells overlap, so that a neighbour is rarely outside
+NEAR_WORDS = 6  # searched words of about 70 in a photo of 5,000: cells overlap, a neighbour is rarely outside
 WORD_SAMPLE = 2048  # descriptors that a photo's words are learnt from
-WORD_ROUNDS = 5  # of k-means; it need not converge
+WORD_ROUNDS = 5  # k-means iterations for the words; they need not converge
 BLOCK = 512  # rows that are multiplied at once: 16 MB for 8,000 columns
 
 

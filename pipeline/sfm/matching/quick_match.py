@@ -27,11 +27,11 @@ LONGEST_PX = 640  # longer side of the matched images: a fifth of a second per p
 MAX_KEYPOINTS = 1000
 FEW_KEYPOINTS = 600  # below this (fields, water, dark or hazy photos) fainter keypoints are used too
 FAINT = 0.008  # OpenCV's contrast threshold for these; its default is 0.04, COLMAP's is about as low as this
-RATIO = 0.85  # of the angles to the best and second-best descriptor, looser than COLMAP's 0.8: RANSAC follows
+RATIO = 0.85  # best over second-best descriptor angle (ratio test), looser than COLMAP's 0.8: RANSAC follows
 MIN_MATCHES = 12  # inliers of a two-view geometry; chance gives a few more than 8
-MIN_SHARE = 0.2  # of the candidates: among many, a smaller share agrees by chance
+MIN_SHARE = 0.2  # inliers over candidate matches: among many, a smaller share agrees by chance
 TOLERANCE_PX = 1.5  # at the low resolution
-ROUNDS = 1000  # of RANSAC
+ROUNDS = 1000  # RANSAC iterations at most
 CONFIDENCE = 0.999
 
 

@@ -107,8 +107,8 @@ def _spread_best(
     order = np.lexsort((usable, -degree[usable], ~chosen[usable], cell))  # the last key leads
     sizes = np.bincount(cell, minlength=GRID * GRID)
     rank = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    ranked = usable[order[np.lexsort((usable[order], -degree[usable[order]], rank))]]
-    return np.asarray(ranked[~chosen[ranked]][:missing])
+    best_first = usable[order[np.lexsort((usable[order], -degree[usable[order]], rank))]]
+    return np.asarray(best_first[~chosen[best_first]][:missing])
 
 
 def write_reduced(database: Path, target: Path, chosen: Mapping[int, Bool[np.ndarray, " n"]]) -> tuple[int, int]:

@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 GRID = 5  # rays across an image, and as many down
-FURTHEST = 4.0  # times the height above ground or the distance to the crossing: anything beyond is small in the image
+# times the height above ground or the distance to the crossing: anything beyond is small in the image
+MAX_DISTANCE_RATIO = 4.0
 MIN_HEIGHT_M = 2.0
 CROSSING_DEG = 15.0  # minimum angle between views to determine where they cross
-CROSSING_MISS = 0.3  # of the distance: axes that miss each other by more do not point at the same thing
+CROSSING_MISS = 0.3  # gap between two view axes over the distance: beyond it they do not point at the same thing
 MIN_CROSSINGS = 3
-MARGIN = 0.1  # of half an image: angles are off by a few degrees
+MARGIN = 0.1  # slack on an image's border over half its size: angles are off by a few degrees
 ALIKE_DEG, UNLIKE_DEG = 15.0, 90.0  # SIFT matching is unaffected up to the first angle, and fails beyond the second
 
 
@@ -102,7 +103,7 @@ def _points(views: StatedPoses, i: int, crossing_m: float) -> Float64[np.ndarray
     across, down = np.meshgrid(steps * views.half_size[i, 0], steps * views.half_size[i, 1])
     rays = np.stack([across.ravel(), down.ravel(), np.ones(GRID * GRID)], axis=1) @ views.enu_from_camera[i].T
     height = max(float(views.centres_m[i, 2] - views.ground_m[i]), MIN_HEIGHT_M)
-    reach = FURTHEST * (height if np.isnan(crossing_m) else max(height, crossing_m))
+    reach = MAX_DISTANCE_RATIO * (height if np.isnan(crossing_m) else max(height, crossing_m))
     with np.errstate(divide="ignore"):
         to_ground = np.where(rays[:, 2] < 0.0, height / np.maximum(-rays[:, 2], 1e-9), np.inf)
     depths = to_ground[to_ground <= reach]

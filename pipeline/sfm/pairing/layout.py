@@ -18,7 +18,7 @@ from splatpipe.pipeline.sfm.pairing.pairs import LOCATED_SHARE, Layout
 
 LEVELLING_SIGMA_M = 1.0  # altitudes this accurate determine the relative take-off heights of flights
 TAKEN_BY = ("latitude", "yaw_deg", "pitch_deg", "relative_altitude_m")  # fields required for a stated pose
-WITHIN_FLIGHT = 0.5  # of a position's standard deviation: most of the error is common to a flight
+RELATIVE_NOISE_SHARE = 0.5  # relative over stated position noise: most of the error is common to a flight
 EARTH_RADIUS_M = 6_371_000.0  # spherical Earth: accurate enough for choosing neighbours
 
 
@@ -87,7 +87,7 @@ def make_views(
     centres[index, 2] = ground[index] + height
     rotations = np.full((len(photos), 3, 3), np.nan)
     rotations[index] = enu_from_gimbal(angles[0], angles[1], angles[2]) @ turns
-    noise = float(np.median([entry["sigma_horizontal_m"] for entry in entries])) * WITHIN_FLIGHT
+    noise = float(np.median([entry["sigma_horizontal_m"] for entry in entries])) * RELATIVE_NOISE_SHARE
     return StatedPoses(centres, rotations, half_size, ground, noise)
 
 

@@ -20,15 +20,16 @@ Pair = tuple[int, int]
 Costs = Callable[[int], Float64[np.ndarray, " n"]]
 """Costs of all photos as partners of photo i, lower for likelier overlap; infinite where nothing is known."""
 
-LOCATED_SHARE = 0.8  # of the photos must have positions for spatial pairing
+LOCATED_SHARE = 0.8  # share of the photos that must have positions for spatial pairing
 SPREAD_OVER_SIGMA = 2.0  # positions that spread less than this times their sigma say nothing about neighbours
 SAME_PLACE_M = 0.1
 MIN_FACING = 0.01  # minimum of cos² of half the angle between views, by which distances are divided
 SEQUENCE_LENGTH = 8  # photos per folder; shorter folders do not count as sequences
-MIN_OVERLAP = 0.01  # of two photos' footprints; pairs with less yield one point in several hundred
-FLOOR = 6  # nearest photos that are always partners, since the stated angles may be wrong
-TILTED = -0.87  # up component of the viewing direction: 60° down; views of walls diverge more and need more partners
-WIDER = 1.5  # times the partners of a nadir photo
+MIN_OVERLAP = 0.01  # shared part of two photos' footprints; pairs with less yield one point in several hundred
+MIN_PARTNERS = 6  # nearest photos that are always partners, since the stated angles may be wrong
+# up component of the viewing direction: 60° down; views of walls diverge more and need more partners
+OBLIQUE_UP = -0.87
+OBLIQUE_PARTNER_FACTOR = 1.5  # times the partners of a nadir photo
 CANDIDATES_OVER_PARTNERS = 6  # candidates per partner, nearest first: on an orbit nearer photos may look elsewhere
 LOOP_SHARE = 4  # one of this many neighbours in a sequence is used for loop closure
 
@@ -152,7 +153,7 @@ def _spatial(layout: Layout, neighbours: int, look_alike: Callable[[], Costs]) -
     known = layout.views.known() if layout.views is not None else np.zeros_like(located)
     pairs = nearest(np.flatnonzero(located & ~known).tolist(), costs, neighbours)
     if layout.views is not None:
-        pairs |= nearest(np.flatnonzero(known).tolist(), costs, FLOOR) | _overlapping(layout.views, neighbours)
+        pairs |= nearest(np.flatnonzero(known).tolist(), costs, MIN_PARTNERS) | _overlapping(layout.views, neighbours)
     if located.all():
         return connect(pairs, len(layout), costs)
     alike = look_alike()
@@ -162,17 +163,17 @@ def _spatial(layout: Layout, neighbours: int, look_alike: Callable[[], Costs]) -
 
 def _overlapping(views: StatedPoses, neighbours: int) -> set[Pair]:
     """Pair each photo with those whose footprints overlap its own most; views of walls get more partners."""
-    wide = math.ceil(WIDER * neighbours)
+    wide = math.ceil(OBLIQUE_PARTNER_FACTOR * neighbours)
     partners: dict[int, list[tuple[float, Pair]]] = {}
     for pair, share in overlaps(views, CANDIDATES_OVER_PARTNERS * wide).items():
         if share >= MIN_OVERLAP:
             for photo in pair:
                 partners.setdefault(photo, []).append((-share, pair))
-    tilted = views.axes[:, 2] > TILTED
+    tilted = views.axes[:, 2] > OBLIQUE_UP
     return {
         pair
-        for photo, ranked in partners.items()
-        for _, pair in sorted(ranked)[: wide if tilted[photo] else neighbours]
+        for photo, candidates in partners.items()
+        for _, pair in sorted(candidates)[: wide if tilted[photo] else neighbours]
     }
 
 

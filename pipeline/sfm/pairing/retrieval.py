@@ -14,10 +14,10 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from splatpipe.pipeline.sfm.pairing.pairs import Costs
 
 WORDS = 64
-ROUNDS = 12  # of k-means; it need not converge
+ROUNDS = 12  # k-means iterations for the codebook; they need not converge
 SAMPLES = 60_000  # descriptors that the codebook is learnt from
 PER_PHOTO = 2048  # descriptors of a photo that are aggregated: the largest keypoints
-AGGREGATE_NORM = 2048.0  # of a photo's vector before rounding: products stay below 2**24, exact in float32
+AGGREGATE_NORM = 2048.0  # length of a photo's vector before rounding: products stay below 2**24, exact in float32
 
 
 def look_alike_costs(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Costs:

@@ -19,13 +19,14 @@ MIN_VIEWS = 3  # photos of a point: fewer are not found again reliably
 SAMPLE = 300  # points per photo
 NEAREST = 24  # photos that each photo is compared with: those whose points lie nearest
 ALIKE_DEG = 30.0  # angle between the two views: SIFT finds many points again
-BINS = 6  # of that angle: fewer points are found again from other directions
-ALIKE_SCALE = 0.7  # ratio of the distances to a point, likewise
-HIDDEN = 0.9  # of its distance: a point is hidden if the photo sees one that near, or nearer, beside it
-BESIDE = 0.04  # of the longer side
-BESIDE_COUNT = 6
+ANGLE_BINS = 6  # angle bins up to ALIKE_DEG: fewer points are found again from other directions
+ALIKE_SCALE = 0.7  # ratio of the distances to a point: SIFT finds many points again
+MIN_OCCLUSION_DEPTH_RATIO = 0.9  # depth of points seen beside a point, over its own, below which they hide it
+# distance in the image, over the longer side, within which points are compared for occlusion
+OCCLUSION_RADIUS_SHARE = 0.04
+MAX_OCCLUDERS = 6  # points near a point in the image that may hide it
 FAR = np.full(3, 1e12)  # where photos without points are
-MARGIN = 0.02  # of the longer side: points near an image's edge may be outside
+MARGIN = 0.02  # border of an image over its longer side: points in it may be outside
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class PhotoView:
         lacking = ~shared[rows]
         return ViewOverlap(
             pair,
-            min(int(BINS * angle / ALIKE_DEG), BINS - 1),
+            min(int(ANGLE_BINS * angle / ALIKE_DEG), ANGLE_BINS - 1),
             np.bincount(cells[~lacking], minlength=size),
             np.bincount(cells[lacking], minlength=size),
             np.bincount(own, minlength=size),
@@ -138,11 +139,11 @@ class PhotoView:
         alike &= np.minimum(*lengths) >= ALIKE_SCALE * np.maximum(*lengths)
         rows = np.flatnonzero(inside & alike & (depths > 0.0))
         if len(rows) and self.tree is not None:
-            beside = min(BESIDE_COUNT, len(self.places))
-            _, near = self.tree.query(places[rows], beside, distance_upper_bound=BESIDE * self.longer)
+            beside = min(MAX_OCCLUDERS, len(self.places))
+            _, near = self.tree.query(places[rows], beside, distance_upper_bound=OCCLUSION_RADIUS_SHARE * self.longer)
             near = near.reshape(len(rows), -1)
             nearest = np.append(self.depths, np.inf)[near].min(axis=1)
-            rows = rows[shared[rows] | (nearest >= HIDDEN * depths[rows])]
+            rows = rows[shared[rows] | (nearest >= MIN_OCCLUSION_DEPTH_RATIO * depths[rows])]
         return rows, places[rows], float(angles[rows].mean()) if len(rows) else 0.0
 
     def _cells(self, places: Float64[np.ndarray, "k 2"]) -> Int64[np.ndarray, " k"]:

@@ -34,17 +34,17 @@ from splatpipe.pipeline.sfm.recovery.ladder_growth import MIN_OBSERVATIONS, Mode
 from splatpipe.pipeline.sfm.recovery.ladder_joins import join
 from splatpipe.pipeline.sfm.recovery.ladder_keypoints import reextract
 from splatpipe.pipeline.sfm.recovery.ladder_pairs import match_more, tried_pairs
-from splatpipe.pipeline.sfm.recovery.ladder_partners import Ranked, choose_pairs, rank_partners
+from splatpipe.pipeline.sfm.recovery.ladder_partners import PartnersByPhoto, choose_pairs, rank_partners
 from splatpipe.pipeline.sfm.recovery.ladder_poses import LARGE_SHARE, MIN_PARTNERS, PoseEstimate, place, sightings
 
 Model: TypeAlias = pycolmap.Reconstruction
 
 PAIRS_A_PHOTO = 20  # as many as `matches` tries per photo
-ROUNDS = 4  # of registration: newly placed photos add points for the next ones
+ROUNDS = 4  # registration rounds: newly placed photos add points for the next ones
 PARTNERS = 3  # placed photos that also get stronger keypoints, per leftover photo
 MAX_STRONGER = 12  # photos extracted again, or the share of all below: costs no more than mapping
 MAX_STRONGER_SHARE = 0.125
-WEAK_SHARE = 0.5  # of the placed photos' median keypoint count; photos with fewer are worth extracting again
+WEAK_SHARE = 0.5  # keypoints over the placed photos' median, below which a photo is worth extracting again
 MIN_KEYPOINTS = 16  # a photo with fewer is blank, blurred or masked
 KEPT_OBSERVATIONS = 0.98  # share the old photos must keep: a correctly placed photo takes none away
 WORSE_ERROR = 1.05  # the mean reprojection error may grow to this multiple,
@@ -145,9 +145,11 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
     """Extract new keypoints in leftover photos and their likely partners, then place them."""
     left = unplaced(found)
     work.report_progress(0, len(left), "looking for matches of the remaining photos")
-    ranked = rank_partners(work.capture, found, left, work.options.seed)
-    photos = _worth_another_look(found, ranked, max(MAX_STRONGER, int(MAX_STRONGER_SHARE * len(work.capture.photos))))
-    pairs = _among(found, ranked, photos)
+    partners_by_photo = rank_partners(work.capture, found, left, work.options.seed)
+    photos = _choose_reextraction(
+        found, partners_by_photo, max(MAX_STRONGER, int(MAX_STRONGER_SHARE * len(work.capture.photos)))
+    )
+    pairs = _pairs_among(found, partners_by_photo, photos)
     if not pairs:
         return found
     stronger = reextract(work.capture, found, photos, pairs, work.options.seed, work.report)
@@ -161,7 +163,7 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
     return grown if len(unplaced(grown)) < len(left) else found
 
 
-def _worth_another_look(found: MappingResult, ranked: Ranked, most: int) -> list[int]:
+def _choose_reextraction(found: MappingResult, partners_by_photo: PartnersByPhoto, most: int) -> list[int]:
     """Choose leftover photos and their likeliest partners, at most ``most``; those with the most matches first.
 
     A photo with many keypoints but no match with a placed photo is left out: it shows something else.
@@ -169,25 +171,25 @@ def _worth_another_look(found: MappingResult, ranked: Ranked, most: int) -> list
     placed = set(found.model.reg_image_ids())
     counts = {number: len(places) for number, places in found.verified.keypoints.items()}
     weak = WEAK_SHARE * float(np.median([counts[number] for number in sorted(placed)]))
-    matches = {number: 0 for number in ranked if MIN_KEYPOINTS <= counts[number] < weak}
+    matches = {number: 0 for number in partners_by_photo if MIN_KEYPOINTS <= counts[number] < weak}
     for (i, j), rows in found.verified.matches.items():
         for number, other in ((i, j), (j, i)):
-            if number in ranked and other in placed:
+            if number in partners_by_photo and other in placed:
                 matches[number] = matches.get(number, 0) + len(rows)
     chosen: dict[int, None] = {}
     for photo in sorted(matches, key=lambda number: (-matches[number], number)):
-        wanted = [photo, *ranked[photo][:PARTNERS]]
+        wanted = [photo, *partners_by_photo[photo][:PARTNERS]]
         if len(wanted) > 1 and len(chosen.keys() | set(wanted)) <= most:
             chosen.update(dict.fromkeys(wanted))
     return sorted(chosen)
 
 
-def _among(found: MappingResult, ranked: Ranked, photos: Collection[int]) -> list[Pair]:
+def _pairs_among(found: MappingResult, partners_by_photo: PartnersByPhoto, photos: Collection[int]) -> list[Pair]:
     """Return pairs among photos: each leftover photo with its partners, and pairs that already have matches."""
     chosen = set(photos)
     pairs = {pair for pair in found.verified.matches if chosen.issuperset(pair)}
-    for photo in chosen & ranked.keys():
-        for partner in ranked[photo][:PARTNERS]:
+    for photo in chosen & partners_by_photo.keys():
+        for partner in partners_by_photo[photo][:PARTNERS]:
             if partner in chosen:
                 pairs.add((min(photo, partner), max(photo, partner)))
     return sorted(pairs)

@@ -12,7 +12,7 @@ from splatpipe.pipeline.sfm.mapping.completion import MIN_MATCHES, adjustment_op
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 
-MIN_OBSERVATIONS = 15  # of an added photo, after the adjustment
+MIN_OBSERVATIONS = 15  # points that an added photo must still observe after the adjustment
 
 
 class ModelMapper:

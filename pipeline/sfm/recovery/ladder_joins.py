@@ -18,17 +18,17 @@ from splatpipe.pipeline.sfm.model.structure import Structure, Track, cameras_of,
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.recovery.ladder_poses import (
     CELLS,
-    ERROR,
     HELD_OUT,
     LARGE_SHARE,
     MANY_INLIERS,
+    MAX_ERROR_SHARE,
     MIN_CELLS,
     MIN_ERROR_PX,
     MIN_INLIERS,
     MIN_SHARE,
 )
 
-SLACK = 3.0  # times a pose's tolerance: both models have errors, and neither was adjusted to the other
+TOLERANCE_FACTOR = 3.0  # times a pose's tolerance: both models have errors, and neither was adjusted to the other
 TRIALS = 2000  # draws three correct ties with 99.9 % probability if a sixth of all are correct
 SCORED = 1000  # ties that score a trial: enough to find the best, whatever the models' size
 REFITS = 5  # rounds of refitting to the inliers
@@ -89,7 +89,7 @@ def join(
     if fitted is None:
         return None
     similarity, inliers = fitted
-    if not _sure(ties, inliers) or not _cross_validates(ties, seed):
+    if not _is_certain(ties, inliers) or not _cross_validates(ties, seed):
         return None
     return _united(model, here, other, there, verified, similarity, ties.rows[inliers])
 
@@ -141,7 +141,7 @@ def _tied(
             poses[mine] = of.images[number].cam_from_world().matrix()
             places[mine] = camera.cam_from_img(spots)
             pixels[mine] = camera.mean_focal_length()
-            limits[mine] = SLACK * max(MIN_ERROR_PX, ERROR * max(camera.width, camera.height))
+            limits[mine] = TOLERANCE_FACTOR * max(MIN_ERROR_PX, MAX_ERROR_SHARE * max(camera.width, camera.height))
             part = np.clip((spots / [camera.width, camera.height] * CELLS).astype(int), 0, CELLS - 1)
             cells[mine] = part[:, 0] * CELLS + part[:, 1]
         sides.append((structure.points[rows[:, side]], poses, places, pixels, limits, cells))
@@ -209,7 +209,7 @@ def agree(ties: TiePoints, similarity: Similarity) -> Bool[np.ndarray, " k"]:
     return good
 
 
-def _sure(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
+def _is_certain(ties: TiePoints, inliers: Bool[np.ndarray, " k"]) -> bool:
     """Whether the inliers are numerous enough, a large enough share, and spread over the images and photo pairs."""
     held = min(len(np.unique(ties.rows[inliers, side])) for side in (0, 1))
     share = held / max(1, min(len(np.unique(ties.rows[:, side])) for side in (0, 1)))

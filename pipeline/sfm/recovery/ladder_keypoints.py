@@ -27,7 +27,7 @@ STRONGER = FeaturesConfig(extractor="opencv-sift", max_image_size=2400, max_feat
 """Larger images and one and a half times the keypoints of `standard`. COLMAP's SIFT placed the same photos on two
 captures (docs/measurements/mapping.md) and took 1.6 and twice the time."""
 FAINT = 0.015  # contrast: some three times the keypoints of OpenCV's default
-THREAD_SHARE = 0.5  # of the threads: a photo takes up to twice the memory that it did in `features`
+THREAD_SHARE = 0.5  # share of the threads used: a photo takes up to twice the memory that it did in `features`
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def reextract(
     starts = {number: len(found.verified.keypoints[number]) for number in ordered}
     ends = np.cumsum([len(found.verified.keypoints[number]) for number in sorted(found.verified.keypoints)])
     parts = np.split(found.colours, ends[:-1])
-    look = partial(
+    extract_photo = partial(
         extract,
         config=STRONGER,
         part=capture.photos_part,
@@ -91,8 +91,8 @@ def reextract(
         copy_photos(source, database)
         kind = pycolmap.FeatureExtractorType.SIFT
         threads = max(1, int(THREAD_SHARE * capture.threads))
-        looks = ordered_map(look, [capture.photos.photos[number - 1] for number in ordered], threads)
-        for done, (number, features) in enumerate(zip(ordered, looks, strict=True), start=1):
+        extracted = ordered_map(extract_photo, [capture.photos.photos[number - 1] for number in ordered], threads)
+        for done, (number, features) in enumerate(zip(ordered, extracted, strict=True), start=1):
             database.update_keypoints(number, features.keypoints)
             database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, features.descriptors))
             before = np.asarray(source.read_keypoints(number), np.float32).reshape(-1, features.keypoints.shape[1])

@@ -23,10 +23,10 @@ from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.pairing.pairs import Pair
 
 SAMPLE = 64  # points of a photo that are projected into the others
-MIN_POINTS = 8  # of a photo; fewer say nothing about what it shows
+MIN_POINTS = 8  # points projected from a photo; fewer say nothing about what it shows
 ALIKE_COS = float(np.cos(np.radians(40.0)))  # beyond it SIFT matches little, and other sides of objects are visible
 MIN_SCALE = 0.4  # ratio of the distances to a point: beyond a factor of 2.5 the keypoint scales differ
-MIN_SHARE = 0.2  # of a photo's points that must lie in the other image
+MIN_SHARE = 0.2  # share of a photo's points that must lie in the other image
 NEAREST = 60  # candidate photos per photo, nearest by the points they observe: the cost grows linearly with the photos
 
 
@@ -61,13 +61,13 @@ def propose_pairs(
         if i in place and j in place:
             open_[place[i], place[j]] = False
     first, second = np.nonzero(np.triu(open_, 1))
-    ranked = sorted(
+    candidates = sorted(
         (bool(common[i, j]), -float(shares[i, j]), int(i), int(j)) for i, j in zip(first, second, strict=True)
     )
     most = max(1, -(-2 * count // max(len(numbers), 1)))
     taken = np.zeros(len(numbers), int)
     chosen, later = [], []
-    for _, _, i, j in ranked:
+    for _, _, i, j in candidates:
         if taken[i] < most and taken[j] < most:
             taken[[i, j]] += 1
             chosen.append((i, j))
@@ -162,10 +162,10 @@ def match_more(capture: MappingInput, base: Path, pairs: Sequence[Pair], seed: i
     folder = Path(tempfile.mkdtemp(prefix="pairs-", dir=capture.scratch))
     target = folder / "database.db"
     work = folder / "work.db"
-    counted = sorted({(min(i, j) - 1, max(i, j) - 1) for i, j in pairs})
+    zero_based = sorted({(min(i, j) - 1, max(i, j) - 1) for i, j in pairs})
     shutil.copyfile(base, target)
-    if counted:
-        match_pairs(capture.features, work, counted, seed, capture.threads, report)
+    if zero_based:
+        match_pairs(capture.features, work, zero_based, seed, capture.threads, report)
         take_verified(work, target)
     work.unlink(missing_ok=True)
     return target

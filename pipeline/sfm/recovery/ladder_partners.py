@@ -15,13 +15,13 @@ from splatpipe.pipeline.sfm.pairing.layout import make_layout
 from splatpipe.pipeline.sfm.pairing.pairs import Costs, Pair, has_informative_positions, spatial_costs
 from splatpipe.pipeline.sfm.recovery.ladder_poses import partners_of
 
-Ranked = dict[int, list[int]]
+PartnersByPhoto = dict[int, list[int]]
 """For each leftover photo, others that may show the same thing, most likely first."""
 
-LOOKED_AT = 100  # entries of a ranking that are kept; callers never need more
+MAX_PARTNERS = 100  # entries of a ranking that are kept; callers never need more
 
 
-def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[int], seed: int) -> Ranked:
+def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[int], seed: int) -> PartnersByPhoto:
     """Interleave the rankings of all hints; candidates are placed photos and photos of other sub-models.
 
     Args:
@@ -37,46 +37,46 @@ def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[
     if has_informative_positions(layout):
         hints.append(_by_costs(left, spatial_costs(layout)))
     hints.append(_by_costs(left, look_alike(capture.features, seed)))
-    ranked: Ranked = {}
+    partners_by_photo: PartnersByPhoto = {}
     for photo in sorted(left):
         own = {member for group in groups if photo in group for member in group}
         wanted = placed.union(*groups) - own - {photo}
         turns = zip_longest(*(hint.get(photo, []) for hint in hints))
-        ranked[photo] = list(dict.fromkeys(other for turn in turns for other in turn if other in wanted))
-    return ranked
+        partners_by_photo[photo] = list(dict.fromkeys(other for turn in turns for other in turn if other in wanted))
+    return partners_by_photo
 
 
-def by_matches(found: MappingResult, left: Collection[int], placed: Collection[int]) -> Ranked:
+def by_matches(found: MappingResult, left: Collection[int], placed: Collection[int]) -> PartnersByPhoto:
     """Rank placed photos by the number of verified matches with each leftover photo."""
-    ranked = {}
+    partners_by_photo = {}
     for photo in sorted(left):
         shared = [(-len(mine), partner) for partner, mine, _ in partners_of(found.verified, photo) if partner in placed]
-        ranked[photo] = [partner for _, partner in sorted(shared)]
-    return ranked
+        partners_by_photo[photo] = [partner for _, partner in sorted(shared)]
+    return partners_by_photo
 
 
-def by_model(found: MappingResult, left: Collection[int], placed: Collection[int]) -> Ranked:
+def by_model(found: MappingResult, left: Collection[int], placed: Collection[int]) -> PartnersByPhoto:
     """Rank photos by the points they share with placed photos that have verified matches with the leftover photo."""
     tracks = read_structure(found.model).tracks
     rows: dict[int, list[int]] = {}
     for row, track in enumerate(tracks):
         for member, _ in track:
             rows.setdefault(member, []).append(row)
-    ranked = {}
+    partners_by_photo = {}
     for photo in sorted(left):
         counts: Counter[int] = Counter()
         for partner, _, _ in partners_of(found.verified, photo):
             if partner in placed:
                 counts.update(member for row in rows.get(partner, []) for member, _ in tracks[row])
-        ranked[photo] = sorted(counts, key=lambda member: (-counts[member], member))[:LOOKED_AT]
-    return ranked
+        partners_by_photo[photo] = sorted(counts, key=lambda member: (-counts[member], member))[:MAX_PARTNERS]
+    return partners_by_photo
 
 
-def choose_pairs(ranked: Ranked, avoided: Collection[Pair], most: int) -> list[Pair]:
+def choose_pairs(partners_by_photo: PartnersByPhoto, avoided: Collection[Pair], most: int) -> list[Pair]:
     """Pair each photo with its most likely partners.
 
     Args:
-        ranked: Partners by photo.
+        partners_by_photo: Partners by photo.
         avoided: (i, j), i < j, pairs to exclude.
         most: Maximum number of pairs per photo.
 
@@ -84,18 +84,18 @@ def choose_pairs(ranked: Ranked, avoided: Collection[Pair], most: int) -> list[P
         The pairs (i, j), i < j, sorted.
     """
     chosen: set[Pair] = set()
-    for photo, partners in ranked.items():
+    for photo, partners in partners_by_photo.items():
         pairs = [(min(photo, partner), max(photo, partner)) for partner in partners]
         chosen |= set([pair for pair in pairs if pair not in avoided][:most])
     return sorted(chosen)
 
 
-def _by_costs(left: Collection[int], costs: Costs) -> Ranked:
+def _by_costs(left: Collection[int], costs: Costs) -> PartnersByPhoto:
     """Rank other photos by cost, lowest first, where it is known."""
-    ranked = {}
+    partners_by_photo = {}
     for photo in sorted(left):
         row = costs(photo - 1).copy()
         row[photo - 1] = np.inf
-        order: Sequence[int] = np.argsort(row, kind="stable")[:LOOKED_AT].tolist()
-        ranked[photo] = [other + 1 for other in order if np.isfinite(row[other])]
-    return ranked
+        order: Sequence[int] = np.argsort(row, kind="stable")[:MAX_PARTNERS].tolist()
+        partners_by_photo[photo] = [other + 1 for other in order if np.isfinite(row[other])]
+    return partners_by_photo

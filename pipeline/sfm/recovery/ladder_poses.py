@@ -17,14 +17,14 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
-ERROR = 0.003  # reprojection tolerance as a share of the longer side: COLMAP's 12 pixels in a photo of 4,000
+MAX_ERROR_SHARE = 0.003  # reprojection tolerance as a share of the longer side: COLMAP's 12 pixels in a photo of 4,000
 MIN_ERROR_PX = 4.0  # minimum tolerance for small photos: coarse-scale keypoints are off by pixels
 MIN_INLIERS = 15  # keypoints; COLMAP's minimum for a pair
 MANY_INLIERS = 30  # COLMAP's minimum for a pose
-MIN_SHARE = 0.25  # of the keypoints that lead to a point; COLMAP's minimum for a pose
+MIN_SHARE = 0.25  # inliers over the keypoints that lead to a point; COLMAP's minimum for a pose
 LARGE_SHARE = 0.5  # required where inliers are few: most matches must agree
 CELLS = 4  # grid cells along each side of the image
-MIN_CELLS = 4  # of the 16: a pose from one corner alone can pivot about it
+MIN_CELLS = 4  # grid cells with inliers, out of 16: a pose from one corner alone can pivot about it
 HELD_OUT = 0.6  # a pose from half of the keypoints must explain this fraction of its own inlier share in the other half
 MIN_PARTNERS = 2  # placed photos: a single one may show a look-alike of the place
 
@@ -114,7 +114,7 @@ def place(
     if total < MIN_INLIERS:
         return None
     places, spots = keypoints[seen.keypoints].astype(np.float64), points[seen.rows]
-    limit = max(MIN_ERROR_PX, ERROR * max(camera.width, camera.height))
+    limit = max(MIN_ERROR_PX, MAX_ERROR_SHARE * max(camera.width, camera.height))
     camera = copy.deepcopy(camera)
     answer = _estimate(places, spots, camera, calibrated, limit, seed)
     if answer is None:
@@ -194,6 +194,6 @@ def _explained(
     limit_px: float,
 ) -> Bool[np.ndarray, " k"]:
     """Return the mask of points whose reprojection error under a pose is within the limit."""
-    shown, _ = project_through_lens(camera, pose.matrix(), spots)
+    projected, _ = project_through_lens(camera, pose.matrix(), spots)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.linalg.norm(shown - places, axis=1) <= limit_px)
+        return np.asarray(np.linalg.norm(projected - places, axis=1) <= limit_px)

@@ -17,9 +17,10 @@ from splatpipe.pipeline.sfm.judging.agreement import compare, contradicting
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.recovery.ladder_pairs import match_more, propose_pairs, tried_pairs
 
-PROBES = 24  # pairs: a few seconds' work, and enough for a meaningful share
-THIN = 8.0  # verified pairs per photo; drone captures with overlap have 15 or more, chains and trees 2 to 5
-FILL = 6  # new pairs per photo for a sparse graph
+PROBE_PAIRS = 24  # pairs: a few seconds' work, and enough for a meaningful share
+# verified pairs per photo; drone captures with overlap have 15 or more, chains and trees 2 to 5
+SPARSE_PAIRS_PER_PHOTO = 8.0
+FILL_PAIRS_PER_PHOTO = 6  # new pairs per photo for a sparse graph
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ _ENTRIES_A_CELL = 128
 _CANDIDATES = 1024  # entries that a vector is compared with, at least
 _BLOCK = 1 << 20  # numbers in a block of distances: 4 MB, which fit into the cache
 _ROWS_AT_ONCE = 1 << 16
-_MIN_SHARE = 1e-6  # of the mean error: lets rows without error be chosen, too
+_MIN_SHARE = 1e-6  # added share of the mean error: lets rows without error be chosen, too
 _HALVINGS = 100  # bisections of a factor's range, which may be wide
 _MAX_FITTED = 1 << 20  # vectors that a palette is fitted to: an evenly spaced subset of more
 

@@ -35,12 +35,13 @@ RECORD_FIELD = b"sp"
 POSITION_STEPS = 2**23 - 1
 MIN_FRACTIONAL_BITS, MAX_FRACTIONAL_BITS = 12, 20  # the reference's: a quarter of a millimetre in metres
 FINEST_QUANTILE, STEPS_PER_SIZE = 0.05, 16.0  # nearly all Gaussians are as many steps large: finer ones are noise
-RANGE_PER_SCENE = 16.0  # of the distances of nearly all Gaussians: kept even if steps become coarser
+RANGE_PER_SCENE = 16.0  # coordinate range over the distance of nearly all Gaussians: kept even if steps become coarser
 SCENE_QUANTILE = 0.99
 COLOUR_SCALE = 0.15
 MIN_LOG_SCALE, LOG_SCALE_STEPS = -10.0, 16.0
 MAX_LOG_SCALE = MIN_LOG_SCALE + 255.0 / LOG_SCALE_STEPS
-TOLD_SHARE = 0.001  # of Gaussians whose scales are cut: single huge ones are haze
+# share of Gaussians with cut scales above which the user is warned: single huge ones are haze
+MIN_REPORTED_SHARE = 0.001
 ROTATION_STEPS = 511
 SH_STEPS = 128.0
 SH_STEP = 10.0
@@ -126,7 +127,7 @@ def position_cost(gaussians: Gaussians) -> PositionCost:
         (int((largest > MAX_LOG_SCALE).sum()), "largest", MAX_LOG_SCALE),
         (int((np.log(np.maximum(sizes[:, 0], 1e-300)) < MIN_LOG_SCALE).sum()), "smallest", MIN_LOG_SCALE),
     ):
-        if count > TOLD_SHARE * len(gaussians):
+        if count > MIN_REPORTED_SHARE * len(gaussians):
             notes.append(
                 f"Given SPZ's {what} size, {two_digits(math.exp(limit))}: {count:,} of {len(gaussians):,} Gaussians."
             )

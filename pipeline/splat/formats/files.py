@@ -14,7 +14,7 @@ from splatpipe.pipeline.splat.model.position_cost import PositionCost, two_digit
 from splatpipe.pipeline.splat.model.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 16
-_MAX_HEADER_BYTES = 65_536  # of a PLY, in which it says whether it is compressed
+_MAX_HEADER_BYTES = 65_536  # bytes of a PLY read for its header, which says whether it is compressed
 _MAGIC = ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK", "sog"), (b"glTF", "glb"))
 _HINT = "Give a splat as PLY, compressed PLY, SPZ, SOG or GLB, or the folder of a 3DGS model."
 
@@ -116,13 +116,13 @@ def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> Po
             raise UsageError(f"{path} is an existing folder.", hint="Name a new file or folder.")
         with beside(path) as aside:
             cost = kind.write(aside, scene if kind.exact else in_unit_quats(scene))
-            _refuse_ruin(path, scene, cost)
+            _refuse_position_loss(path, scene, cost)
             return cost
     except OSError as error:
         raise MachineError(f"Cannot write {path}: {error.strerror or error}.", hint="Check the free space.") from error
 
 
-def _refuse_ruin(path: Path, scene: Scene, cost: PositionCost) -> None:
+def _refuse_position_loss(path: Path, scene: Scene, cost: PositionCost) -> None:
     """Refuse a file that would not show the splat.
 
     Raises:

@@ -17,7 +17,7 @@ from splatpipe.pipeline.splat.model.position_cost import PositionCost
 from splatpipe.pipeline.splat.model.scene import Scene
 
 POINT_CLOUD, PLY = "point_cloud", "point_cloud.ply"
-ITERATION = 30_000  # of the reference's trainings: some viewers look nowhere else
+ITERATION = 30_000  # iteration of the reference's trainings: some viewers look nowhere else
 _ITERATION = re.compile(r"iteration_([0-9]{1,9})", re.ASCII)
 _SETTINGS = (
     "Namespace(sh_degree={degree}, source_path='', model_path='', images='images', depths='', resolution=-1, "

@@ -20,15 +20,16 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.position_cost import sizes_of, two_digits
 from splatpipe.pipeline.splat.model.scene import MAX_OFFSET, Scene, SceneFacts
 
-STEPS_PER_SIZE = 16.0  # of float32 in a Gaussian: finer ones are not seen
-STEPS_ACROSS = 4096.0  # of float32 in the extent of a splat whose Gaussians' sizes are in another unit
+STEPS_PER_SIZE = 16.0  # float32 steps in a Gaussian's size: finer ones are not seen
+STEPS_ACROSS = 4096.0  # float32 steps in a splat's extent, if its Gaussians' sizes are in another unit
 ROUNDED_STEPS = 0.5  # Gaussians' sizes in a step that has visibly displaced them
 EXTENT = (0.05, 0.95)  # quantiles that bound a splat's main extent
 SAMPLE = 200_000  # Gaussians that this is estimated from
 MIXED_UNITS = 2.0  # extents of the splat along two axes in its median Gaussian: its scales are in another unit
-TORN = 0.05  # share of Gaussians that float32 displaces by more than their largest size: parts of the splat are lost
+# share of Gaussians that float32 displaces by more than their largest size: parts of the splat are lost
+MIN_TORN_SHARE = 0.05
 FEW = 10  # Gaussians that may well be larger than the distances between them
-MAX_LOG = 700.0  # of what float64 holds
+MAX_LOG = 700.0  # largest natural logarithm whose exponential float64 holds
 
 
 def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Scene:
@@ -46,7 +47,7 @@ def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Sc
         SplatpipeError: if float32 is too coarse for positions that a record places on the earth.
     """
     stored_as_float32 = gaussians.means.dtype == torch.float32
-    lying = _Lying.of(gaussians)
+    lying = _Placement.of(gaussians)
     notes = () if lying is None else lying.notes(path)
     if stored_as_float32 and lying is not None and lying.too_far:
         notes += lying.rounding(path)
@@ -70,7 +71,7 @@ def scene_near_origin(path: Path, gaussians: Gaussians, facts: SceneFacts) -> Sc
     return Scene(gaussians, replace(facts, axes=axes, offset=(x, y, z)), notes)
 
 
-class _Lying:
+class _Placement:
     """Where a splat lies in its coordinates, and how large it and its Gaussians are."""
 
     def __init__(self, means: Float64[np.ndarray, "n 3"], log_scales: Float64[np.ndarray, "n 3"]) -> None:
@@ -85,12 +86,12 @@ class _Lying:
         self.step = float(np.spacing(np.float32(np.abs(self.middle).max())))
 
     @staticmethod
-    def of(gaussians: Gaussians) -> _Lying | None:
+    def of(gaussians: Gaussians) -> _Placement | None:
         """Of an even sample; None if no Gaussian has usable values."""
         every = max(1, -(-len(gaussians) // SAMPLE))
         sample = gaussians.select(torch.arange(0, len(gaussians), every))
         sample = sample.select(usable(sample))
-        return _Lying(sample.means.double().numpy(), sample.log_scales.double().numpy()) if len(sample) else None
+        return _Placement(sample.means.double().numpy(), sample.log_scales.double().numpy()) if len(sample) else None
 
     @property
     def too_far(self) -> bool:
@@ -138,7 +139,7 @@ def _to_float32(path: Path, gaussians: Gaussians) -> None:
     for piece in gaussians.pieces():
         moved = (piece.means - piece.means.float()).abs().amax(1).numpy()
         lost += int((moved > sizes_of(piece.log_scales)[:, 1]).sum())
-    if lost > TORN * count:
+    if lost > MIN_TORN_SHARE * count:
         raise SplatpipeError(
             f"{path}: it extends so far that 32-bit coordinates would displace {lost:,} of {count:,} Gaussians by more "
             "than their size.",

@@ -17,7 +17,7 @@ RECORD = "splatpipe "
 """Prefix of the comment with the record."""
 _OFFSET = re.compile("shift|offset|origin|translat|georef", re.IGNORECASE)
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]+)?")
-_MIN_NUMBERS = 2  # of a place
+_MIN_NUMBERS = 2  # numbers in a comment that may state an offset
 _MAX_SHOWN, _MAX_NOTES = 120, 3
 _AXES: dict[Axes, str] = {"z up": "z up", "y up": "y up", "y down": "y down (−y is up)"}
 

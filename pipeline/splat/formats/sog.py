@@ -28,11 +28,11 @@ from splatpipe.pipeline.splat.model.scene import Axes, Scene, SceneFacts, facts_
 __all__ = ["AXES", "SogImages", "encode_sog", "read", "write"]
 
 AXES: Axes = "y down"
-_FIRST_DAY = (1980, 1, 1, 0, 0, 0)  # of a ZIP's calendar: the same bytes on any day
+_FIRST_DAY = (1980, 1, 1, 0, 0, 0)  # earliest date a ZIP can state, in every file: the same bytes on any day
 _MAX_META_BYTES = 1 << 20  # three codebooks and a record are 80 kB
-_MAX_DIRECTORY_BYTES = 1 << 16  # of a ZIP: a SOG has 9 files
+_MAX_DIRECTORY_BYTES = 1 << 16  # largest ZIP directory read: a SOG has 9 files
 _END, _END_OF_LARGE = b"PK\5\6", b"PK\6\7"  # begin a ZIP's last record, and the one before it in a ZIP of ≥ 4 GB
-_END_BYTES, _MAX_COMMENT_BYTES = 22, 65_535  # of that record
+_END_BYTES, _MAX_COMMENT_BYTES = 22, 65_535  # sizes of a ZIP's last record and of the comment after it
 _HINT = "Give a .sog file, or the meta.json beside its pictures."
 _AGAIN = "Copy or export it again."
 

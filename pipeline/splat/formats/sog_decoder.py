@@ -23,9 +23,9 @@ from splatpipe.pipeline.splat.model.sh import MAX_DEGREE, coefficient_count
 MAX_EXPANSION = 40.0
 """With SH of degree 3 a Gaussian takes 15 of 236 bytes, in simple scenes half as many."""
 _SPARE_PIXELS = 1 << 16  # allowed beyond four times the pixels needed
-_HEADER_BYTES = 1 << 12  # of a picture
-_PIXEL_BYTES = 5  # of a picture that does not compress, and some more
-_MAX_LOG = 1e3  # of a coordinate: larger values are caught after decoding
+_HEADER_BYTES = 1 << 12  # allowed for a picture's header
+_PIXEL_BYTES = 5  # allowed per pixel: a picture that does not compress, and some more
+_MAX_LOG = 1e3  # largest logarithm of a coordinate: larger values are caught after decoding
 _MIN_OPACITY = 1e-6  # a byte of 0 or 255 is read as this far from 0 or 1, as PlayCanvas does
 _ROWS_AT_ONCE = 1 << 16
 _AGAIN = "Copy or export it again."

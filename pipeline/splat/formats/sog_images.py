@@ -25,14 +25,14 @@ VERSION = 2
 META = "meta.json"
 RECORD = "splatpipe"
 """The name of our record in meta.json."""
-LEVELS = 65_535  # of a coordinate
-FIRST_MODE = 252  # of a quaternion: 252 + which of w, x, y, z is the largest
-ENTRIES_A_ROW = 64  # of the picture of the palette
+LEVELS = 65_535  # steps of a coordinate, 16 bits
+FIRST_MODE = 252  # a quaternion's alpha value is 252 + which of w, x, y, z is the largest
+ENTRIES_A_ROW = 64  # palette entries in a row of its picture
 MAX_ENTRIES = 65_536
-_HARMONIC_LEVELS = 64  # of the palette's numbers: as good as 256 beside the palette's own error, and a quarter smaller
-_MAX_LOG_AREA = 80.0  # of natural logarithms
-_SHOWN_QUANTILE = 0.99
-_MIN_SHOWN = 1e-3  # of the mean: what is hardly seen from afar is seen from near
+_HARMONIC_LEVELS = 64  # codebook size for the palette: as good as 256 beside the palette's own error, a quarter smaller
+_MAX_LOG_AREA = 80.0  # bound on the natural logarithm of a Gaussian's area
+_MAX_WEIGHT_QUANTILE = 0.99
+_MIN_WEIGHT = 1e-3  # least weight relative to the mean: what is hardly seen from afar is seen from near
 _ROWS_AT_ONCE = 1 << 16
 _SIDES = 4  # a picture's sides are multiples of this: what a GPU's textures like
 
@@ -106,19 +106,19 @@ _Part = tuple[dict[str, Any], dict[str, UInt8[np.ndarray, "h w c"]]]
 
 
 def _parts(gaussians: Gaussians) -> dict[str, _Part]:
-    shown = _shown(gaussians)
+    weights = _area_weights(gaussians)
     parts = {
         "means": _means(gaussians.means),
-        "scales": _scales(gaussians.log_scales, shown),
+        "scales": _scales(gaussians.log_scales, weights),
         "quats": _quats(gaussians.quats),
-        "sh0": _colours(gaussians.sh[:, 0], gaussians.opacity_logits, shown),
+        "sh0": _colours(gaussians.sh[:, 0], gaussians.opacity_logits, weights),
     }
     if gaussians.sh_degree:
-        parts["shN"] = _harmonics(gaussians.sh[:, 1:], shown)
+        parts["shN"] = _harmonics(gaussians.sh[:, 1:], weights)
     return parts
 
 
-def _shown(gaussians: Gaussians) -> Float[Tensor, " n"]:
+def _area_weights(gaussians: Gaussians) -> Float[Tensor, " n"]:
     """Approximate image share of each Gaussian relative to the mean: opacity times area, clipped at a high quantile.
 
     It weights errors, because an image's error is the sum over the pixels that each Gaussian covers.
@@ -127,9 +127,9 @@ def _shown(gaussians: Gaussians) -> Float[Tensor, " n"]:
         return torch.zeros(0)
     sides = gaussians.log_scales.sort(1).values[:, 1:].sum(1).clamp(-_MAX_LOG_AREA, _MAX_LOG_AREA)
     areas = torch.sigmoid(gaussians.opacity_logits).double() * torch.exp(sides.double())
-    most = areas.sort().values[int(_SHOWN_QUANTILE * (len(areas) - 1))]  # the largest are hidden behind others
+    most = areas.sort().values[int(_MAX_WEIGHT_QUANTILE * (len(areas) - 1))]  # the largest are hidden behind others
     areas = areas.clamp_max(most)
-    return (areas / areas.mean().clamp_min(1e-300)).clamp_min(_MIN_SHOWN).float()
+    return (areas / areas.mean().clamp_min(1e-300)).clamp_min(_MIN_WEIGHT).float()
 
 
 def _means(means: Float[Tensor, "n 3"]) -> _Part:
@@ -158,8 +158,8 @@ def _signed_log(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return np.asarray(np.sign(values) * np.log1p(np.abs(values)))
 
 
-def _scales(log_scales: Float[Tensor, "n 3"], shown: Float[Tensor, " n"]) -> _Part:
-    codebook = fit_codebook(log_scales.numpy().ravel(), shown.repeat_interleave(3).numpy())
+def _scales(log_scales: Float[Tensor, "n 3"], weights: Float[Tensor, " n"]) -> _Part:
+    codebook = fit_codebook(log_scales.numpy().ravel(), weights.repeat_interleave(3).numpy())
     pictures = {"scales": _picture(nearest_codes(log_scales.numpy(), codebook))}
     return {"codebook": _numbers(codebook)}, pictures
 
@@ -177,19 +177,19 @@ def _quats(quats: Float[Tensor, "n 4"]) -> _Part:
     return {}, {"quats": _picture(pixels)}
 
 
-def _colours(dc: Float[Tensor, "n 3"], opacity_logits: Float[Tensor, " n"], shown: Float[Tensor, " n"]) -> _Part:
-    codebook = fit_codebook(dc.numpy().ravel(), shown.repeat_interleave(3).numpy())
+def _colours(dc: Float[Tensor, "n 3"], opacity_logits: Float[Tensor, " n"], weights: Float[Tensor, " n"]) -> _Part:
+    codebook = fit_codebook(dc.numpy().ravel(), weights.repeat_interleave(3).numpy())
     opacities = torch.sigmoid(opacity_logits).mul(255.0).round().to(torch.uint8).numpy()
     pixels = np.concatenate((nearest_codes(dc.numpy(), codebook), opacities[:, None]), axis=1)
     return {"codebook": _numbers(codebook)}, {"sh0": _picture(pixels)}
 
 
-def _harmonics(sh: Float[Tensor, "n k 3"], shown: Float[Tensor, " n"]) -> _Part:
+def _harmonics(sh: Float[Tensor, "n k 3"], weights: Float[Tensor, " n"]) -> _Part:
     """A palette of vectors of all higher SH coefficients, and the index of each Gaussian's entry."""
     rows = sh.flatten(1)
     palette, fitted = torch.zeros(1, rows.shape[1]), torch.zeros(0, dtype=torch.int64)
     if len(rows):
-        palette, fitted = fit_palette(rows, palette_size(len(rows)), shown)
+        palette, fitted = fit_palette(rows, palette_size(len(rows)), weights)
     codebook = fit_codebook(palette.numpy().ravel(), size=_HARMONIC_LEVELS)
     codes = nearest_codes(palette.numpy(), codebook)
     labels = nearest_entries(rows, torch.from_numpy(codebook[codes]), fitted).numpy()

@@ -125,7 +125,7 @@ def _branch(
     if len(part) > most:
         return _joined(_branches(gaussians, means, part, most), most, LARGE_POWER)
     own = gaussians.select(torch.from_numpy(np.sort(part)))
-    return _Branch(LevelNode(_box(own), 0.0, own, ()), Reduction.none_yet(own))
+    return _Branch(LevelNode(_box(own), 0.0, own, ()), Reduction.unmerged(own))
 
 
 def _branches(

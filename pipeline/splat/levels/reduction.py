@@ -28,8 +28,8 @@ fill whole images, while the many that are only large because they are far away 
 PIECE = 200_000
 """Gaussians processed together: bounds the memory."""
 _ROWS_AT_ONCE = 1 << 15
-_CROWD = 1e-9  # of the extent: separates coincident points in the k-d tree, which would be slow with many
-_CROWD_SEED = 1
+_JITTER_SHARE = 1e-9  # jitter over the extent: parts coincident points in the k-d tree, which would be slow with many
+_JITTER_SEED = 1
 _FLAT = 1e-3  # standard deviation of what is flat, as a share of the median of the largest ones
 _MIN_LOG_SCALE = -30.0
 
@@ -50,7 +50,7 @@ class Reduction:
     counts: Int64[np.ndarray, " n"]
 
     @classmethod
-    def none_yet(cls, gaussians: Gaussians) -> Reduction:
+    def unmerged(cls, gaussians: Gaussians) -> Reduction:
         """All Gaussians, unmerged."""
         return cls(gaussians, np.zeros(len(gaussians)), np.ones(len(gaussians), dtype=np.int64))
 
@@ -79,7 +79,7 @@ def reduce_to(gaussians: Gaussians, count: int) -> Gaussians:
     """
     if 1 <= count < len(gaussians):
         gaussians = gaussians.clone()
-    return reduce_further(Reduction.none_yet(gaussians), count).gaussians
+    return reduce_further(Reduction.unmerged(gaussians), count).gaussians
 
 
 def reduce_further(start: Reduction, count: int, large_power: float = LARGE_POWER) -> Reduction:
@@ -194,8 +194,8 @@ def _neighbours(means: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "e 2"]:
     """Sorted pairs of neighbours, lower index first; includes a chain through all, so a matching always exists."""
     count = len(means)
     extent = float(np.ptp(means, axis=0).max()) or 1.0
-    noise = np.random.default_rng(_CROWD_SEED).uniform(-1.0, 1.0, means.shape)
-    apart = means + _CROWD * extent * noise
+    noise = np.random.default_rng(_JITTER_SEED).uniform(-1.0, 1.0, means.shape)
+    apart = means + _JITTER_SHARE * extent * noise
     _, nearest = cKDTree(apart).query(apart, k=min(NEIGHBOURS + 1, count))
     nearest = nearest.reshape(count, -1)
     own = np.repeat(np.arange(count), nearest.shape[1])

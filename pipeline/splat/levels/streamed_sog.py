@@ -33,7 +33,7 @@ LOD_META = "lod-meta.json"
 VERSION = 1
 FULL_FILE = 100_000
 """Gaussians after which a level's next leaf starts a new file: keeps downloads to a few megabytes."""
-_DIGITS = 7  # of a number in the tree: a float32's
+_DIGITS = 7  # significant digits of a number in the tree: a float32's
 _LEVEL = re.compile(r"[0-9]+_[0-9]+", re.ASCII)  # level and number, as folders are called
 
 

@@ -33,7 +33,7 @@ TILESET = "tileset.json"
 TILES = "tiles"
 GLTF_CONTENT = "3DTILES_content_gltf"
 ESRI_CRS = "ESRI_crs"
-_STEP_M = 0.001  # to which boxes are rounded outwards
+_STEP_M = 0.001  # step to which boxes are rounded outwards
 _MIN_HALF_M = 0.001  # half side of a box: a zero one has no inverse
 _TILE = re.compile(r"[0-9]+\.glb", re.ASCII)  # names of tiles
 _EXTENSIONS = [EXTENSION, SPZ_EXTENSION]
@@ -80,7 +80,7 @@ def write_tiles(
         ValueError: if a value is not finite.
         OSError: if a file cannot be written.
     """
-    refuse_nowhere(scene.facts)
+    require_georeference(scene.facts)
     own_folder(folder, TILES)
     names: dict[LevelNode, str] = {}
     for number, node in enumerate(root.nodes()):
@@ -104,7 +104,7 @@ def _drop_earlier(folder: Path, named: Set[str]) -> None:
             path.unlink()
 
 
-def refuse_nowhere(facts: SceneFacts) -> None:
+def require_georeference(facts: SceneFacts) -> None:
     """Check that a scene is georeferenced, as tiles require.
 
     Raises:

@@ -13,7 +13,7 @@ from scipy.special import expit, logit
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 _MAX_LOG_SCALE = 40.0  # the fourth power of e^40 still fits a float64, and no scene is this large
-_MIN_OPACITY, _MAX_OPACITY = 1e-7, 1.0 - 1e-6  # of a merged Gaussian: their logits are finite in float32
+_MIN_OPACITY, _MAX_OPACITY = 1e-7, 1.0 - 1e-6  # bounds on a merged Gaussian's opacity: its logit is finite in float32
 _AREA_POWER = 1.6075
 """Exponent of Knud Thomsen's formula for an ellipsoid's surface area (2004), accurate to 1.061 %."""
 GROWTH = 0.45

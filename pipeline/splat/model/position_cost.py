@@ -12,8 +12,8 @@ from torch import Tensor
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import NO_OFFSET, SceneFacts
 
-WORTH_TELLING = 0.05  # share of Gaussians smaller than a step: fewer are not seen
-LOST_STEPS = 4.0  # of a Gaussian's largest size in a step that displaces it by more than that (a step / √12)
+MIN_REPORTED_SHARE = 0.05  # share of Gaussians smaller than a step: fewer are not seen
+LOST_STEPS = 4.0  # a Gaussian's largest sizes in a step that displaces it by more than one (a step / √12)
 FEW = 10  # Gaussians that may well lie nearer to each other than a step
 SAMPLE, EXTENT = 200_000, (0.05, 0.95)  # Gaussians and quantiles that bound a splat's main extent
 DESTROYED = 0.2  # share of such Gaussians beyond which the splat falls apart
@@ -76,7 +76,7 @@ class PositionCost:
 
     def warnings(self) -> tuple[str, ...]:
         """What the user has to know about the file, a sentence each; nothing about most files."""
-        if not self.rounded or self.smaller <= WORTH_TELLING * self.count:
+        if not self.rounded or self.smaller <= MIN_REPORTED_SHARE * self.count:
             return self.notes
         few = (
             f"{self.smaller:,} of {self.count:,} Gaussians are smaller than the steps of their positions in this file "

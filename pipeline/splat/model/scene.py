@@ -19,9 +19,9 @@ Axes = Literal["z up", "y up", "y down"]
 viewers assume for a 3DGS PLY (a COLMAP camera's axes)."""
 
 FORMAT = 1
-MAX_RECORD_BYTES = 60_000  # of the record in a file: gzip's extra field holds 65,535
+MAX_RECORD_BYTES = 60_000  # largest record in a file: gzip's extra field holds 65,535
 MAX_EDITS = 200
-MAX_OFFSET = 1e12  # of a coordinate, in any unit a place on the earth has
+MAX_OFFSET = 1e12  # largest coordinate of an offset, in any unit a place on the earth has
 _MAX_TEXT_LENGTH = 4000  # characters of a CRS in WKT, the longest text
 NO_OFFSET = (0.0, 0.0, 0.0)
 _Z_UP_FROM: Mapping[Axes, tuple[tuple[float, ...], ...]] = {

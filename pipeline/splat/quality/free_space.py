@@ -36,13 +36,13 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.model.gaussians import Gaussians, multiply_quats
 
 CELLS = 24  # along the longer side: about 30 pixels at half a megapixel, 4 % of the depth
-OWN_POINTS = 2  # that a cell needs for a bound: a single one may lie past the edge of a foreground object
-POINTS_AROUND = 6  # including its eight neighbours
-MARGIN = 0.1  # of the depth: points accurate to a tenth of a pixel are much better, but surfaces between them curve
-VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin object
+OWN_POINTS = 2  # points that a cell needs for a bound: a single one may lie past the edge of a foreground object
+POINTS_AROUND = 6  # points needed in a cell and its eight neighbours
+MARGIN = 0.1  # share of the depth kept free before a surface: it curves between points accurate to a tenth of a pixel
+MIN_VIEWS = 2  # photos that have to see through a Gaussian: one may have a wrong point, or miss a thin object
 SUPPORT_TRACK = 3  # least track length of a point that overrules: two-view points themselves hang in free space
-SUPPORT_SHARE = 0.04  # of the distance to the nearest camera (one cell): nearer than this is on the point's surface
-NEAR_SHARE = 0.2  # of the depth where a photo's points begin
+SUPPORT_SHARE = 0.04  # distance to a point over that to the nearest camera (one cell): nearer is on its surface
+NEAR_SHARE = 0.2  # nearest depth tested over the depth where a photo's points begin
 NEAR_PERCENTILE = 5  # percentile of its points' depths where they begin
 CHUNK = 65_536  # Gaussians at a time: a few megabytes
 
@@ -79,7 +79,7 @@ class FreeSpace:
     @property
     def known(self) -> bool:
         """Whether enough photos have enough points to identify free space."""
-        return sum(bool(photo.depth.any()) for photo in self.photos) >= VIEWS
+        return sum(bool(photo.depth.any()) for photo in self.photos) >= MIN_VIEWS
 
 
 def free_space(
@@ -99,7 +99,7 @@ def free_space(
     return FreeSpace(tuple(bounds), xyz[photos >= SUPPORT_TRACK])
 
 
-def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = VIEWS) -> Bool[Tensor, " n"]:
+def near_or_free(gaussians: Gaussians, space: FreeSpace, views: int = MIN_VIEWS) -> Bool[Tensor, " n"]:
     """Which Gaussians are floaters: in free space, or right in front of a camera.
 
     Args:
@@ -134,7 +134,7 @@ def _bounds(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> PhotoBounds:
     rows, columns = _grid(camera)
     own = np.zeros((rows, columns), np.int64)
     around = np.zeros((rows + 2, columns + 2), np.int64)  # padded, so that every cell has eight neighbours
-    least = np.full((5, rows + 2, columns + 2), np.inf)  # of depth, x, y, -x, -y
+    least = np.full((5, rows + 2, columns + 2), np.inf)  # minima by cell: depth, x, y, -x, -y
     _, pixels, cells, depths = _cells(camera, points)
     values = np.stack((depths, pixels[:, 0], pixels[:, 1], -pixels[:, 0], -pixels[:, 1]))
     np.add.at(own, (cells[:, 0], cells[:, 1]), 1)

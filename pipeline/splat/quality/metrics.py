@@ -162,7 +162,7 @@ def _colour_maps(x: Tensor, y: Tensor, halves: tuple[Tensor, Tensor]) -> list[Fl
     solutions = []
     for half in halves:
         _require_pixels(half)
-        sums = torch.zeros(4, 7, dtype=torch.float64)  # of the products of (x, 1) with (x, 1, y)
+        sums = torch.zeros(4, 7, dtype=torch.float64)  # products of (x, 1) with (x, 1, y), summed
         for source, target in _chosen_strips(x, y, half):
             every = torch.cat([source, torch.ones_like(source[:1]), target])  # (7, n)
             sums += torch.stack([(one * every).sum(dim=1) for one in every[:4]])
@@ -267,7 +267,7 @@ def sharpness(pair: ImagePair) -> float:
     edges = max(1, math.ceil(_EDGE_SHARE * gy.numel()))
     least = float(np.partition(gy.numpy(), gy.numel() - edges)[gy.numel() - edges])
     above, level = torch.nonzero(gy > least)[:, 0], torch.nonzero(gy == least)[:, 0]
-    chosen = torch.cat([above, level[: edges - above.numel()]])  # of equal ones, the first
+    chosen = torch.cat([above, level[: edges - above.numel()]])  # among equal ones, the first
     rms = [math.sqrt(math.fsum(g[chosen].square().tolist()) / edges) for g in (gx, gy)]
     return (rms[0] + _SHARPNESS_FLOOR) / (rms[1] + _SHARPNESS_FLOOR)
 
@@ -323,8 +323,8 @@ def _window_sums(
         strip = slice(top, top + _STRIP_ROWS + SSIM_WINDOW - 1)
         similarity, structure = _similarity(x[strip], y[strip])
         values = [similarity] * (len(counts) - 1) + [structure]
-        for found, one, counted in zip(rows, values, counts, strict=True):
-            found += torch.where(counted[top : top + _STRIP_ROWS], one, 0.0).sum(dim=1).tolist()
+        for found, one, valid in zip(rows, values, counts, strict=True):
+            found += torch.where(valid[top : top + _STRIP_ROWS], one, 0.0).sum(dim=1).tolist()
     return [math.fsum(found) for found in rows]
 
 

@@ -16,7 +16,7 @@ from splatpipe.pipeline.splat.sky.sky_mask import horizontal_axes
 SPACING_RAD = 2.0 * math.pi / COLUMNS / 4.0  # a quarter of a cell: neighbours differ by about one 8-bit step at most
 SIGMA_PER_SPACING = 0.8  # the smallest without gaps between the Gaussians; larger values blur
 OPACITY_LOGIT = 6.0  # above the rasterizers' cap of 0.99
-SCENE_QUANTILE = 0.999  # of the Gaussians' distances: a few stray ones lie anywhere
+SCENE_QUANTILE = 0.999  # quantile of the Gaussians' distances that is the scene's size: a few stray ones lie anywhere
 RADIUS_PER_SCENE = 2.0  # the dome lies well outside the scene and hides none of it
 RADIUS_PER_CAMERAS = 10.0  # limits the sky's parallax between the cameras to 6°, one cell
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))

@@ -19,7 +19,7 @@ from splatpipe.pipeline.splat.containers.archives import read_archive
 from splatpipe.pipeline.splat.model.upload import rgb_beside, upload
 from splatpipe.pipeline.splat.sky.sky_mask import directions, horizontal_axes
 
-ROWS = 32  # from straight down to straight up, cells of 5.6°: gradients and large clouds, no buildings
+ROWS = 32  # rows from straight down to straight up, cells of 5.6°: gradients and large clouds, no buildings
 COLUMNS = 2 * ROWS
 FULL_FROM_DEG = -2.0  # elevation from which the panorama covers fully, the lowest that the sky search allows
 NOTHING_UP_TO_DEG = -6.0  # elevation up to which it covers nothing: holes in the ground stay holes

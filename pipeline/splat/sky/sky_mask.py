@@ -22,31 +22,31 @@ from splatpipe.pipeline.geometry.upright import up_without_orientation
 
 WORK_MEGAPIXELS = 0.1  # resolution of the search: noise and distant texture are averaged out, edges stay
 SMOOTH_SLOPE = 0.03  # change of a channel over a pixel, of 1: haze and soft clouds are below, edges and leaves above
-BLUE_STEP = 0.03  # by which a bluish sky's blue is at least above its red and at most below its green
+BLUE_STEP = 0.03  # least blue minus red, and most green minus blue, of a bluish sky
 CLEARLY_BLUE = 0.1  # blue minus red from which it is not just grey made bluish by shade or haze
-MIN_BLUE_LIGHT = 0.3  # of the blue of a sky, of 1
-MIN_GREY_LIGHT = 0.75  # of the darkest channel of a grey one: clouds, haze, overexposed
+MIN_BLUE_LIGHT = 0.3  # blue channel of a bluish sky, 0 to 1
+MIN_GREY_LIGHT = 0.75  # darkest channel of a grey sky, 0 to 1: clouds, haze, overexposed
 GREY_OUTSHINES = 0.7  # share of the rest of the picture: walls in the sun stand beside shade
 BLUE_OUTSHINES = 0.4  # a deep blue sky is darker than that wall; bluish haze and shadows are darker still
 HORIZON_MARGIN_DEG = 2.0  # below the horizon: error of the estimated up, dip of the horizon for a drone
 ZENITH_DEG = 85.0
 TOP_COSINE = 0.5  # between up and the way out of the picture over its top border: a corner up has two top borders
 POINT_CLEARANCE_PX = 3  # around a triangulated point nothing is sky
-CORE_PX = 5  # from a region's edge on, points are no longer those of the roof under it
-MAX_SPREAD = 0.2  # of a region's core near points, over the share of the rest: spires, outliers, birds, clouds
-MIN_SHARE = 0.002  # of the picture: smaller patches are not worth the risk
-MIN_CONTACT = 0.5  # of a region's width at the top over the root of its area: a sky is open, a road or a wall narrow
+CORE_PX = 5  # depth inside a region from which points are not those of the roof under it
+MAX_SPREAD = 0.2  # share of a region's core near points over that of the rest: spires, outliers, birds, clouds
+MIN_SHARE = 0.002  # area of a region over the picture: smaller patches are not worth the risk
+MIN_CONTACT = 0.5  # region's width at the top over the root of its area: a sky is open, a road or a wall narrow
 GROW_STEPS = 3  # pixels by which the slope's window keeps regions from edges
 GROW_COLOUR = 0.06  # most distance, in any channel, from the mean of the sky close by
 GROW_WINDOW = 7
-DIRECTION_ROWS = 64  # of the grid of directions, elevation by azimuth: cells of 2.8°
+DIRECTION_ROWS = 64  # rows of the grid of directions, elevation by azimuth: cells of 2.8°
 MIN_WITNESSES = 2  # other photos that look the same way, before their word counts
-MIN_AGREEMENT = 0.15  # of what they see that way: buildings rightly hide much of one's sky from another
+MIN_AGREEMENT = 0.15  # agreeing share of the witnesses: buildings rightly hide much of one's sky from another
 ROOF_COLUMNS = 72  # sectors of azimuth, 5° each, tested for something above a region
-ROOF_REACH_DEG = 5.0  # of azimuth around a point above: ceilings and lintels are smooth, their points far apart
-ROOF_MARGIN_DEG = 3.0  # from a region's top to such a point: a roof's edge does not cover the sky beside it
+ROOF_REACH_DEG = 5.0  # azimuth on either side that a point above covers: points of smooth ceilings are far apart
+ROOF_MARGIN_DEG = 3.0  # elevation of such a point above a region's top: a roof's edge does not cover the sky beside it
 ROOF_POINTS = 3  # points needed: a single one may be wrong, or a bird
-MAX_ROOFED_SHARE = 0.5  # of a region's pixels: a branch or a wire over the sky does not make it a wall
+MAX_ROOFED_SHARE = 0.5  # covered share of a region's pixels: a branch or a wire over the sky does not make it a wall
 OPEN_FROM_DEG = 5.0  # rays above this elevation pass over low walls and furniture
 MIN_OPEN_SHARE = 0.05  # sky's share of all that the photos see above it: most of it outdoors, a few patches in a room
 
@@ -159,7 +159,7 @@ def below_structure(
     above = points - camera.centre()
     around, over = azimuths_elevations_deg(above[above @ up > 0.0], up)
     column = (azimuth * (ROOF_COLUMNS / 360.0)).astype(np.int64) % ROOF_COLUMNS
-    roofs = np.full(ROOF_COLUMNS, -np.inf)  # of the lowest of the ROOF_POINTS highest points around
+    roofs = np.full(ROOF_COLUMNS, -np.inf)  # elevations in degrees: the lowest of the ROOF_POINTS highest points around
     for each in np.unique(column[sky]):  # one by one: a table of points by columns is hundreds of megabytes
         middle = (each + 0.5) * (360.0 / ROOF_COLUMNS)
         reached = over[np.abs((around - middle + 180.0) % 360.0 - 180.0) < ROOF_REACH_DEG]
@@ -281,7 +281,7 @@ def direction_cells(camera: Camera, up: Float64[np.ndarray, " 3"]) -> Int64[np.n
     rays = directions(camera)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     east, north = horizontal_axes(up)
-    azimuth = np.arctan2(rays @ north, rays @ east) / (2.0 * math.pi) + 0.5  # of a turn
+    azimuth = np.arctan2(rays @ north, rays @ east) / (2.0 * math.pi) + 0.5  # turns, 0 to 1
     height = np.arcsin(np.clip(rays @ up, -1.0, 1.0)) / math.pi + 0.5
     columns = 2 * DIRECTION_ROWS
     row = np.minimum((height * DIRECTION_ROWS).astype(np.int64), DIRECTION_ROWS - 1)

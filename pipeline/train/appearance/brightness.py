@@ -21,10 +21,10 @@ from splatpipe.pipeline.photos.pixels.dataset import View, load_points_and_track
 from splatpipe.pipeline.photos.pixels.small_views import small_view
 from splatpipe.pipeline.train.options import TrainConfig
 
-MEGAPIXELS = 0.3  # of the photos whose colours are sampled: each pixel averages many, which removes noise
+MEGAPIXELS = 0.3  # photo size at which colours are sampled: each pixel averages many, which removes noise
 WINDOW_PX = 5  # side of the mean around a point: points are off by a fraction of it
-DARKEST, BRIGHTEST = 8.0, 247.0  # of 255, of a channel that is not clipped
-ROUNDS = 10  # of fitting; a gain changes by less than a thousandth in the last
+DARKEST, BRIGHTEST = 8.0, 247.0  # bounds of a channel that is not clipped, of 255
+ROUNDS = 10  # rounds of fitting gains; they change by less than a thousandth in the last
 MIN_SEEN = 20  # minimum number of points to estimate a photo's gain
 DIFFERING = 0.06  # spread above which exposures differ. Measured: 0.027 to 0.034 in three captures whose light or
 # exposure hardly changes (0.1 stops, known, are 0.034), 0.097 to 0.18 in five with automatic exposure
@@ -42,8 +42,8 @@ def exposure_spread(views: Sequence[View], dataset: Path, threads: int) -> float
         StageError: if a photo or the model is broken.
     """
     points, tracks = load_points_and_tracks(dataset)
-    look = partial(_colours, xyz=points.xyz, tracks=tracks)
-    seen = list(ordered_map(look, views, threads))
+    sample_colours = partial(_colours, xyz=points.xyz, tracks=tracks)
+    seen = list(ordered_map(sample_colours, views, threads))
     rows = np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in seen)])
     logs = np.concatenate([np.zeros((0, 3)), *(logs for _, logs in seen)])
     photo = np.repeat(np.arange(len(seen)), [len(rows) for rows, _ in seen])
@@ -88,7 +88,7 @@ def log_gains(
     photo, number, logs = photo[shared], number[shared], logs[shared]
     rows = [np.flatnonzero(photo == each) for each in range(photos)]
     rows = [own for own in rows if len(own) >= MIN_SEEN]
-    gains, applied = np.zeros((len(rows), 3)), np.zeros_like(logs)  # of each photo, and of each observation
+    gains, applied = np.zeros((len(rows), 3)), np.zeros_like(logs)  # by photo, and by observation
     for _ in range(ROUNDS):
         surface = np.stack([np.bincount(number, channel, len(count)) for channel in (logs - applied).T], axis=1)
         apart = logs - surface[number] / count[number, None]

@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.appearance.auxiliary_model import AuxiliaryModel
 from splatpipe.pipeline.train.hooks import RenderedView, Technique
 
 FIRST_RATE = 1e-3  # learning rate: a photo has about a hundred visits, which change its exposure by at most a tenth
-LAST_RATE = 0.1  # of the first; exponential in between
+LAST_RATE = 0.1  # last over first learning rate; exponential in between
 DECAY = 1e-3  # weight decay towards the identity: unconstrained coefficients stay there
 _NAME = "deviations"
 
@@ -49,9 +49,9 @@ class Exposure(AuxiliaryModel, Technique):
         deviations = self._deviations()
         return torch.eye(3, 4, device=deviations.device) + deviations[self._row[name]].view(3, 4)
 
-    def apply_appearance(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, picture: Float[Tensor, "h w 3"], rendered_view: RenderedView) -> Float[Tensor, "h w 3"]:
         """A render as the photo's exposure would show it."""
-        return self.applied(picture, shot.photo.camera.name)
+        return self.applied(picture, rendered_view.photo.camera.name)
 
     def applied(self, picture: Float[Tensor, "h w 3"], name: str) -> Float[Tensor, "h w 3"]:
         """An image with a photo's map applied; differentiable."""
@@ -71,11 +71,11 @@ class Exposure(AuxiliaryModel, Technique):
         found.give()
         return found
 
-    def after_step(self, shot: RenderedView) -> None:
+    def after_step(self, rendered_view: RenderedView) -> None:
         """Step the photo's map."""
         if self.is_given:
             return
-        self.step(shot.photo.camera.name, shot.now.share)
+        self.step(rendered_view.photo.camera.name, rendered_view.now.share)
 
     @torch.no_grad()
     def step(self, name: str, share: float) -> None:

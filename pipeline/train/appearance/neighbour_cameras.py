@@ -53,9 +53,11 @@ class NeighbourCameras:
         """The same on a device."""
         return NeighbourCameras(*(each.to(device) for each in (self.rotations, self.shifts, self.lenses, self.nearest)))
 
-    def places(self, row: int, shown: Float64[Tensor, "m 2"], depths: Float64[Tensor, " m"]) -> Float64[Tensor, "m 3"]:
+    def places(
+        self, row: int, image_points: Float64[Tensor, "m 2"], depths: Float64[Tensor, " m"]
+    ) -> Float64[Tensor, "m 3"]:
         """World points at image positions, in fractions of width and height, and depths along the viewing axis."""
-        rays = (shown - self.lenses[row, 2:]) / self.lenses[row, :2]
+        rays = (image_points - self.lenses[row, 2:]) / self.lenses[row, :2]
         in_camera = torch.cat((rays * depths[:, None], depths[:, None]), dim=1) - self.shifts[row]
         return in_camera @ self.rotations[row]
 
@@ -74,8 +76,8 @@ class NeighbourCameras:
         in_camera = self.rotations[others] @ places.T + self.shifts[others][:, :, None]  # (k, 3, m)
         lenses = self.lenses[others][:, :, None]
         pixels = in_camera[:, :2] / in_camera[:, 2:] * lenses[:, :2] + lenses[:, 2:]
-        shown = (in_camera[:, 2] > 0.0) & in_camera[:, 2].isfinite() & ((pixels >= 0.0) & (pixels < 1.0)).all(dim=1)
-        cells = (torch.where(shown[:, None], pixels, 0.0) * grid).long().clamp(max=grid - 1)
+        visible = (in_camera[:, 2] > 0.0) & in_camera[:, 2].isfinite() & ((pixels >= 0.0) & (pixels < 1.0)).all(dim=1)
+        cells = (torch.where(visible[:, None], pixels, 0.0) * grid).long().clamp(max=grid - 1)
         found = scores.flatten()[(others[:, None] * grid + cells[:, 1]) * grid + cells[:, 0]]
-        seen = shown & (found >= 0.0)
+        seen = visible & (found >= 0.0)
         return 2 * (seen & (found <= limit)).sum(dim=0) > seen.sum(dim=0)

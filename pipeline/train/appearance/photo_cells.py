@@ -11,7 +11,8 @@ from torch.nn import functional
 
 from splatpipe.pipeline.geometry.camera import Camera
 
-MIN_SHOWN = 0.25  # of a cell to be judged in a window: where four windows meet, at least one shows as much
+# visible share by which a window judges a cell: where four windows meet, at least one has as much
+MIN_VISIBLE_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class PhotoCells:
         tall = _belongs(range(whole.height), whole.height, self.rows, like).sum(dim=1)[rows]
         wide = _belongs(range(whole.width), whole.width, self.columns, like).sum(dim=1)[columns]
         found[rows, columns] = (down.sum(dim=1) / tall)[:, None] * (across.sum(dim=1) / wide)
-        return found >= MIN_SHOWN
+        return found >= MIN_VISIBLE_SHARE
 
     def spread(self, cells: Bool[Tensor, "rows columns"]) -> Bool[Tensor, "h w"]:
         """Each pixel's cell value."""

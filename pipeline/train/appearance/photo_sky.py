@@ -72,7 +72,7 @@ def photo_sky_on_cpu(found: SkyMask, camera: Camera) -> PhotoSky:
     if camera.window is not None and camera.uncropped().height >= share.shape[0]:
         return _seen_in_window(share, camera)
     wider = _widened(share)
-    return PhotoSky(_surely(share, camera), _surely(wider, camera))
+    return PhotoSky(_certain_sky(share, camera), _certain_sky(wider, camera))
 
 
 def _widened(share: Bool[np.ndarray, "_ _"]) -> Bool[np.ndarray, "_ _"]:
@@ -128,7 +128,7 @@ def _sides(camera: Camera) -> tuple[tuple[int, slice], tuple[int, slice]]:
     return (whole.height, slice(top, top + camera.height)), (whole.width, slice(left, left + camera.width))
 
 
-def _surely(sky: Bool[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
+def _certain_sky(sky: Bool[np.ndarray, "_ _"], camera: Camera) -> Bool[Tensor, "h w"]:
     (height, rows), (width, columns) = _sides(camera)
     share = sky.astype(np.float32)
     if share.shape != (height, width):

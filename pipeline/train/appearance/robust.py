@@ -35,15 +35,15 @@ from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 
 GRID = 64  # cells along either side of a photo, whatever its size: a car in a drone photo spans two
 MIN_CELL_PX = 4  # smaller photos have fewer cells: a cell has to average out detail
-MEMORY = 0.5  # weight of earlier visits in a cell's residual
-NEARBY = 1  # cells: the model may show this far away what the photo shows here
-MIN_RESIDUAL = 0.05  # of a left-out cell, colours in 0..1: anything less is shading, not another object
-VOTES = 4  # minimum among a cell and its eight neighbours: two by two are an object, a single one is noise
-RIM = 0.5  # of the threshold: neighbours of a left-out cell above this are left out too
+RESIDUAL_MOMENTUM = 0.5  # weight of earlier visits in a cell's residual
+SEARCH_RADIUS_CELLS = 1  # cells: the model may show this far away what the photo shows here
+MIN_RESIDUAL = 0.05  # residual of a left-out cell, colours in 0..1: anything less is shading, not another object
+MIN_VOTES = 4  # minimum among a cell and its eight neighbours: two by two are an object, a single one is noise
+RIM_THRESHOLD_SHARE = 0.5  # residual over the threshold above which neighbours of a left-out cell are left out too
 MAX_SHARE_OF_PHOTO = 0.25  # may be left out: more than that is a wrong model, not a passer-by
 MAX_WITNESSES = 24  # nearest photos that are compared at a place
-MIN_ALPHA = 0.8  # of a judged pixel: below it the model has a hole rather than a contradiction
-SURFACE_ALPHA = 0.5  # of a cell with a valid depth
+MIN_ALPHA = 0.8  # opacity of a judged pixel: below it the model has a hole rather than a contradiction
+SURFACE_ALPHA = 0.5  # opacity of a cell with a valid depth
 UNKNOWN = -1.0  # residual of a cell that no visit has shown
 
 
@@ -107,9 +107,11 @@ class RobustMask(Technique):
             self.scores[row], self.left_out[row] = scores, left_out
             self._before = None
 
-    def mask_pixels(self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> TrainingPhoto:
+    def mask_pixels(
+        self, photo: TrainingPhoto, picture: Float[Tensor, "h w 3"], rendered_view: RenderedView
+    ) -> TrainingPhoto:
         """The photo without what the other photos contradict."""
-        return self.leave_out_contradicted(photo, shot.rendered, picture)
+        return self.leave_out_contradicted(photo, rendered_view.rendered, picture)
 
     def after_epoch(self, iteration: int) -> None:
         """Set the threshold for the next epoch."""
@@ -120,7 +122,7 @@ class RobustMask(Technique):
         return {"robust_left_out": round(self.share_left_out(), 5)}
 
     def leave_out_contradicted(
-        self, photo: TrainingPhoto, rendered: Render, shown: Float[Tensor, "h w 3"]
+        self, photo: TrainingPhoto, rendered: Render, rendered_colour: Float[Tensor, "h w 3"]
     ) -> TrainingPhoto:
         """Record a photo's residuals and return it without what the other photos contradict, or unchanged.
 
@@ -134,7 +136,7 @@ class RobustMask(Technique):
             self._before = row, self.scores[row].clone(), self.left_out[row].clone()
             opaque = rendered.alpha >= MIN_ALPHA
             counts = opaque if photo.mask is None else photo.mask & opaque
-            self._remember(row, *cell_residuals(shown, photo.colour, counts, photo.camera))
+            self._remember(row, *cell_residuals(rendered_colour, photo.colour, counts, photo.camera))
             cells = PhotoCells(photo.camera, GRID, GRID)
             out = cells.spread(self._left_out_cells(row, rendered, cells))
             self.left_out[row] = out.float().mean()
@@ -145,16 +147,17 @@ class RobustMask(Technique):
     def _remember(self, row: int, now: Float[Tensor, "g g"], judged: Bool[Tensor, "g g"] | None) -> None:
         """Blend a visit's residuals into the stored ones; cells that its window does not show stay unchanged."""
         before = self.scores[row]
-        mixed = torch.where(before < 0.0, now, MEMORY * before + (1.0 - MEMORY) * now)
-        faded = torch.where(before < 0.0, before, MEMORY * before)  # nothing to compare: the old residual fades
+        mixed = torch.where(before < 0.0, now, RESIDUAL_MOMENTUM * before + (1.0 - RESIDUAL_MOMENTUM) * now)
+        # nothing to compare: the old residual fades
+        faded = torch.where(before < 0.0, before, RESIDUAL_MOMENTUM * before)
         after = torch.where(now < 0.0, faded, mixed)
         self.scores[row] = after if judged is None else torch.where(judged, after, before)
 
     def _left_out_cells(self, row: int, rendered: Render, cells: PhotoCells) -> Bool[Tensor, "g g"]:
         scores, threshold = self.scores[row], self.threshold
         most = torch.quantile(scores, 1.0 - MAX_SHARE_OF_PHOTO)
-        high, low = torch.maximum(threshold, most), torch.maximum(RIM * threshold, most)
-        core = _voted(scores > high)
+        high, low = torch.maximum(threshold, most), torch.maximum(RIM_THRESHOLD_SHARE * threshold, most)
+        core = _majority(scores > high)
         core &= self._contradicted(row, core, rendered, cells)
         return (_near(core) & (scores > low)) | core
 
@@ -166,7 +169,7 @@ class RobustMask(Technique):
             return torch.zeros_like(core)
         alpha, depth_sum = cells.means(torch.stack((rendered.alpha, rendered.depth_sum))).double()
         asked = (core & (alpha >= SURFACE_ALPHA)).flatten()
-        numbers = _worth_asking(asked)
+        numbers = _cell_indices(asked)
         middles = (torch.stack((numbers % GRID, numbers // GRID), dim=1) + 0.5) / GRID
         depths = (depth_sum / alpha).flatten()[numbers]
         places = self.witnesses.places(row, middles.double(), depths)
@@ -211,12 +214,12 @@ class RobustMask(Technique):
 
 
 def cell_residuals(
-    shown: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"], camera: Camera
+    rendered_colour: Float[Tensor, "h w 3"], colour: Float[Tensor, "h w 3"], counts: Bool[Tensor, "h w"], camera: Camera
 ) -> tuple[Float[Tensor, "g g"], Bool[Tensor, "g g"] | None]:
     """Difference between each cell's mean colour and the closest one of the model there and nearby, mean of channels.
 
     Args:
-        shown: The model's render.
+        rendered_colour: The model's render.
         colour: The photo's colours.
         counts: The pixels to compare.
         camera: The photo's camera, or its window's.
@@ -228,11 +231,11 @@ def cell_residuals(
     whole = camera.uncropped()
     size = (min(GRID, max(1, whole.height // MIN_CELL_PX)), min(GRID, max(1, whole.width // MIN_CELL_PX)))
     cells = PhotoCells(camera, *size)
-    weight, judged = cells.means(counts[None].float()), cells.judged(shown)
-    known = weight[0] >= 0.5  # of the visible part: the rim of a neighbouring cell is evidence too
+    weight, judged = cells.means(counts[None].float()), cells.judged(rendered_colour)
+    known = weight[0] >= 0.5  # half of the visible part: the rim of a neighbouring cell is evidence too
     chosen = known if judged is None else known & judged
     model, picture = (
-        cells.means(picture.permute(2, 0, 1) * counts) / weight.clamp(min=1e-6) for picture in (shown, colour)
+        cells.means(picture.permute(2, 0, 1) * counts) / weight.clamp(min=1e-6) for picture in (rendered_colour, colour)
     )
     model = model - _medians(model - picture, chosen)[:, None, None]
     usable = _nearby(known[None].float())[0] > 0.0
@@ -252,7 +255,7 @@ def _medians(planes: Float[Tensor, "c gh gw"], known: Bool[Tensor, "gh gw"]) -> 
     return ordered.index_select(1, middle[None])[:, 0]
 
 
-def _worth_asking(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
+def _cell_indices(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
     """Indices of the cells to work on: the requested ones, or all on a device, where counting would synchronize."""
     if asked.device.type == "cpu":
         return torch.nonzero(asked).flatten()
@@ -260,15 +263,17 @@ def _worth_asking(asked: Bool[Tensor, " cells"]) -> Int64[Tensor, " k"]:
 
 
 def _nearby(planes: Float[Tensor, "c gh gw"]) -> Float[Tensor, "c k gh gw"]:
-    """The values up to ``NEARBY`` cells around each cell; zeros beyond the border."""
-    side = 2 * NEARBY + 1
-    return functional.unfold(planes[None], side, padding=NEARBY).view(len(planes), side * side, *planes.shape[1:])
+    """The values up to ``SEARCH_RADIUS_CELLS`` cells around each cell; zeros beyond the border."""
+    side = 2 * SEARCH_RADIUS_CELLS + 1
+    return functional.unfold(planes[None], side, padding=SEARCH_RADIUS_CELLS).view(
+        len(planes), side * side, *planes.shape[1:]
+    )
 
 
-def _voted(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
+def _majority(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:
     """The cells that have enough of their neighbourhood with them."""
     votes = 9.0 * functional.avg_pool2d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0]
-    return cells & (votes > VOTES - 0.5)
+    return cells & (votes > MIN_VOTES - 0.5)
 
 
 def _near(cells: Bool[Tensor, "g g"]) -> Bool[Tensor, "g g"]:

@@ -36,11 +36,11 @@ from splatpipe.pipeline.train.random_numbers import ELSEWHERE
 
 MIN_TRACK = 3  # minimum track length of points used in sky detection
 MAX_ERROR_PX = 2.0
-OPACITY_WEIGHT = 0.1  # of the mean opacity in front of the sky in the loss; judgement
+OPACITY_WEIGHT = 0.1  # loss weight for the mean opacity in front of the sky; judgement
 SMOOTHNESS = 1.0  # weight of the mean squared difference between neighbouring cells: fills areas no photo covers
 FIRST_RATE, LAST_RATE = 5e-3, 5e-4  # learning rates of the colours at the start and end of the schedule
 EPSILON = 1e-8  # Adam's: cells with hardly any gradient stay where they are
-FILL_ROUNDS = ROWS * ROWS // 2  # of averaging neighbours: unseen cells above the horizon are smooth by then
+FILL_ROUNDS = ROWS * ROWS // 2  # rounds of averaging neighbours: unseen cells above the horizon are smooth by then
 MIN_EVIDENCE = 4.0  # pixels of ``WORK_MEGAPIXELS`` that a cell's first colour must at least average
 
 RGB = tuple[float, float, float]
@@ -70,7 +70,7 @@ class SkyModel(AuxiliaryModel, Technique):
         super().__init__({_COLOURS: torch.from_numpy(colours)}, EPSILON)
         self.panorama = Panorama(up, self.tensors[_COLOURS])
         self._skies = PhotoSkies(masks)
-        self._seen: PhotoSky | None = None  # of the current photo
+        self._seen: PhotoSky | None = None  # the current photo's sky
 
     def copied(self) -> SkyModel:
         """A copy with its own tensors; the immutable masks are shared."""
@@ -122,26 +122,26 @@ class SkyModel(AuxiliaryModel, Technique):
 
         up = up_of(cameras, photo, believed, threads)
         masks = find_skies(cameras, photo, believed, up, threads)
-        shown = [index for index, mask in enumerate(masks) if mask.any()]
-        if not shown:
+        with_sky = [index for index, mask in enumerate(masks) if mask.any()]
+        if not with_sky:
             return None
-        colours = first_colours(((photo(index), masks[index].unpacked()) for index in shown), up)
+        colours = first_colours(((photo(index), masks[index].unpacked()) for index in with_sky), up)
         return SkyModel(up, colours, {camera.name: mask for camera, mask in zip(cameras, masks, strict=True)})
 
-    def apply_appearance(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, picture: Float[Tensor, "h w 3"], rendered_view: RenderedView) -> Float[Tensor, "h w 3"]:
         """The render over the sky, or over another colour where the photo shows none."""
-        camera, behind = shot.photo.camera, shot.settings.background
+        camera, behind = rendered_view.photo.camera, rendered_view.settings.background
         self._seen = self.seen(camera)
-        return self.composite(shot.rendered, camera, self._seen, behind, shot.now.colour(ELSEWHERE))
+        return self.composite(rendered_view.rendered, camera, self._seen, behind, rendered_view.now.colour(ELSEWHERE))
 
-    def penalty(self, shot: RenderedView) -> Float[Tensor, ""]:
+    def penalty(self, rendered_view: RenderedView) -> Float[Tensor, ""]:
         """Opacity in front of the sky, and the sky's roughness."""
-        return self.loss(shot.rendered.alpha, self._seen, shot.photo.inside)
+        return self.loss(rendered_view.rendered.alpha, self._seen, rendered_view.photo.inside)
 
-    def after_step(self, shot: RenderedView) -> None:
+    def after_step(self, rendered_view: RenderedView) -> None:
         """Step the colours."""
         if not self.is_given:
-            self.step(shot.now.share)
+            self.step(rendered_view.now.share)
 
     def summary(self) -> dict[str, int | float]:
         """Number of photos that show sky."""
@@ -161,10 +161,10 @@ class SkyModel(AuxiliaryModel, Technique):
             background: Stays behind everything below the horizon.
             elsewhere: A different colour each time, so that only an opaque wall can match the photo.
         """
-        look = self.panorama.view_from(camera)
-        nodes, how = look.at_nodes(self.panorama.colours, background), SkyLayer(background)
+        panorama_view = self.panorama.view_from(camera)
+        nodes, how = panorama_view.at_nodes(self.panorama.colours, background), SkyLayer(background)
         if seen is not None:
-            how = SkyLayer(background, look.flat_at_nodes(elsewhere, background), seen.around, seen.mask)
+            how = SkyLayer(background, panorama_view.flat_at_nodes(elsewhere, background), seen.around, seen.mask)
         return laid_over_nodes(rendered.colour, rendered.alpha, nodes, how)
 
     def loss(
@@ -215,9 +215,9 @@ def first_colours(
     """
     total = np.zeros((ROWS * COLUMNS, 4))
     for photo, mask in skies:
-        shown = mask if photo.ignored is None else mask & ~photo.ignored
-        cells, weights = cells_of(directions(photo.camera)[shown], up)
-        colour = photo.pixels[shown] / 255.0
+        usable = mask if photo.ignored is None else mask & ~photo.ignored
+        cells, weights = cells_of(directions(photo.camera)[usable], up)
+        colour = photo.pixels[usable] / 255.0
         for channel in range(3):
             total[:, channel] += _sums(cells, weights * colour[:, channel, None])
         total[:, 3] += _sums(cells, weights)

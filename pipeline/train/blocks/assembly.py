@@ -17,7 +17,7 @@ from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, read_splat, write_splat_parts
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.blocks.cells.site_plan import SitePlan, load_site_plan
-from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
+from splatpipe.pipeline.train.blocks.merging import count_and_degree, own_pieces
 
 OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # copied from the coarse pass, which covers the whole scene
 FROM_COARSE = ("sky_photos", "device", "instruction_set", "mode")
@@ -37,7 +37,7 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
     site, coarse = load_site_plan(inputs["blocks.plan"]), inputs["blocks.coarse"]
     read = _BlockReader(inputs.shards, report)
     _require_all(site, inputs.shards)
-    count, sh_degree = counted(site.partition, read)
+    count, sh_degree = count_and_degree(site.partition, read)
     comments = [MIP_COMMENT] if load_rendering(coarse / "rendering.json").antialias else []
     write_splat_parts(out / "model.ply", own_pieces(site.partition, read), count, sh_degree, comments)
     for name in OF_ALL:

@@ -115,23 +115,23 @@ def visible_windows(
     found = {}
     for level in cut.levels:
         windows = cut.windows(coverage.camera, level)
-        shown = np.zeros((len(partition.cells), len(windows)), np.bool_)
+        visible = np.zeros((len(partition.cells), len(windows)), np.bool_)
         for block, views in enumerate(block_views(partition, [coverage], xyz, lambda _, cut=windows: cut)):  # type: ignore[misc]
             for photo in views.photos:
-                shown[block] = photo.windows
-        found[level] = shown
+                visible[block] = photo.windows
+        found[level] = visible
     return found
 
 
-def parts_of(shown: Iterable[Mapping[int, Bool[np.ndarray, "cells w"]]], block: int) -> Parts:
+def parts_of(visible: Iterable[Mapping[int, Bool[np.ndarray, "cells w"]]], block: int) -> Parts:
     """The windows that a block trains on.
 
     Args:
-        shown: For each photo, the result of ``visible_windows``.
+        visible: For each photo, the result of ``visible_windows``.
         block: The block's number.
     """
     found: dict[int, list[tuple[int, int]]] = {}
-    for row, by_level in enumerate(shown):
+    for row, by_level in enumerate(visible):
         for level, cells in by_level.items():
             found.setdefault(level, []).extend((row, int(window)) for window in np.flatnonzero(cells[block]))
     return {level: np.array(pairs, np.int64).reshape(-1, 2) for level, pairs in found.items()}
@@ -157,8 +157,8 @@ def block_forecasts(
     """
     footage, most = footage_on(config, [view.camera for view in views], window_pixels)
     cut = WindowScheme.of(config, footage, most)
-    shown = [visible_windows(partition, coverage, xyz, cut) for coverage in seen]
-    return [_forecast(config, footage, cut, views, parts_of(shown, block)) for block in range(len(partition.cells))]
+    visible = [visible_windows(partition, coverage, xyz, cut) for coverage in seen]
+    return [_forecast(config, footage, cut, views, parts_of(visible, block)) for block in range(len(partition.cells))]
 
 
 def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> tuple[PhotoSizes, float | None]:
@@ -231,11 +231,11 @@ def iterate_coverages(
     options = load_rendering(coarse / "rendering.json").options(gaussians)
     drawn = gaussians.to(device.tensors)
     for view, rows in zip(views, observed, strict=True):
-        counted = partial(_counted, view)
-        yield from photo_coverages([view.camera], [rows], lambda camera: render_depth(drawn, camera, options), counted)
+        mask_at = partial(_grid_mask, view)
+        yield from photo_coverages([view.camera], [rows], lambda camera: render_depth(drawn, camera, options), mask_at)
 
 
-def _counted(view: View, grid: Camera) -> Mask | None:
+def _grid_mask(view: View, grid: Camera) -> Mask | None:
     """Which pixels of a photo's grid count by its mask; None if all do."""
     mask = load_mask(view)
     return None if mask is None else reduced_mask(mask, (grid.width, grid.height))

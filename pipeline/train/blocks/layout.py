@@ -66,9 +66,9 @@ def lay_out(
         gaussians = read_splat(coarse / "model.ply")
         means = gaussians.means.double().numpy()
         weights = shares(work, partition).mean(axis=0).tolist()
-        counted = [(weight, *_counted(partition, k, means)) for k, weight in enumerate(weights)]
+        block_counts = [(weight, *_count_gaussians(partition, k, means)) for k, weight in enumerate(weights)]
         forecasts = block_forecasts(train, views, seen, xyz, partition, division.window_pixels)
-        limits = block_limits(division, train.sh_degree, counted)
+        limits = block_limits(division, train.sh_degree, block_counts)
         cameras = [view.camera for view in views]
         parts = WindowScheme.of(train, *footage_on(train, cameras, division.window_pixels))
         scene = (gaussians, seen, xyz)
@@ -82,7 +82,7 @@ def lay_out(
         "iterations": [forecast.iterations for forecast in forecasts],
         "gaussians": [limit.share for limit in limits],
         "trained": [limit.trained for limit in limits],
-        "start": [min(limit.trained, inside) for limit, (_, _, inside) in zip(limits, counted, strict=True)],
+        "start": [min(limit.trained, inside) for limit, (_, _, inside) in zip(limits, block_counts, strict=True)],
         "steps": [forecast.steps for forecast in forecasts],
         "frozen": [min(limit.frozen, count) for limit, count in zip(limits, around, strict=True)],
         "disk_bytes": [forecast.disk_bytes for forecast in forecasts],
@@ -133,6 +133,6 @@ def upward(views: Sequence[View], xyz: Float64[np.ndarray, "p 3"], threads: int)
     return up_of([view.camera for view in views], photo, xyz[np.isfinite(xyz).all(axis=1)], threads)
 
 
-def _counted(partition: Partition, block: int, means: Float64[np.ndarray, "n 3"]) -> tuple[int, int]:
+def _count_gaussians(partition: Partition, block: int, means: Float64[np.ndarray, "n 3"]) -> tuple[int, int]:
     """Number of Gaussians in a block's cell, and in its cell and margin."""
     return int((partition.owners(means) == block).sum()), int(partition.trained_by(block, means).sum())

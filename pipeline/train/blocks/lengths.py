@@ -11,7 +11,7 @@ import math
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.lengths import Length, PhotoSizes, lengths_of
 
-COARSE_PART = 0.5  # of the iterations if there is only one size
+COARSE_PART = 0.5  # share of the iterations for the coarse pass if there is only one size
 
 
 def coarse_lengths(config: TrainConfig, footage: PhotoSizes) -> list[Length]:

@@ -28,7 +28,7 @@ def owned(partition: Partition, block: int, gaussians: Gaussians) -> Gaussians:
     return gaussians.select(torch.from_numpy(np.flatnonzero(owners == block)))
 
 
-def counted(partition: Partition, read: Callable[[int], Gaussians]) -> tuple[int, int]:
+def count_and_degree(partition: Partition, read: Callable[[int], Gaussians]) -> tuple[int, int]:
     """The number of Gaussians of the whole scene, and their SH degree.
 
     Args:

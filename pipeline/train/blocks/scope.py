@@ -34,7 +34,7 @@ from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
 FROZEN = "frozen.ply"
 FREE = "free_space.npz"
 _LEVEL = "level_"
-_COUNTED = "counted_"
+_SAMPLE_MASK = "counted_"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,12 @@ class BlockScope:
 
     Attributes:
         windows: The windows that it trains on.
-        counted: The part of each photo that counts.
+        sample_masks: The part of each photo that counts.
         around: What the windows see of the coarse model besides the block.
     """
 
     windows: Parts
-    counted: dict[int, SampleMask]
+    sample_masks: dict[int, SampleMask]
     around: BlockSurroundings
 
     @staticmethod
@@ -80,13 +80,13 @@ class BlockScope:
             photos.append(BlockPhoto(place, np.concatenate(chosen), 0, 0.0, 0.0))
             frames.append(np.concatenate(each))
         view = (BlockViews(tuple(photos)), [seen[row] for row in rows], frames)
-        counted = {row: counted_samples(partition, block, seen[row], xyz) for row in rows}
-        return BlockScope(windows, counted, visible_around(partition, block, coarse, view))
+        sample_masks = {row: counted_samples(partition, block, seen[row], xyz) for row in rows}
+        return BlockScope(windows, sample_masks, visible_around(partition, block, coarse, view))
 
     def write(self, folder: Path, block: int) -> None:
         """Write the scope to a folder shared by all blocks."""
         arrays: dict[str, npt.NDArray[Any]] = {f"{_LEVEL}{level}": pairs for level, pairs in self.windows.items()}
-        arrays |= {f"{_COUNTED}{row}": grid for row, grid in self.counted.items()}
+        arrays |= {f"{_SAMPLE_MASK}{row}": grid for row, grid in self.sample_masks.items()}
         arrays |= {"rows": self.around.rows.astype(np.int32), "units": self.around.units}
 
         def write(file: IO[bytes]) -> None:
@@ -105,10 +105,12 @@ class BlockScope:
         try:
             arrays = read_archive(path)
             windows = {int(level): pairs for level, pairs in _named(arrays, _LEVEL)}
-            counted = {int(row): grid for row, grid in _named(arrays, _COUNTED)}
-            if sorted(counted) != rows_of(windows):
+            sample_masks = {int(row): grid for row, grid in _named(arrays, _SAMPLE_MASK)}
+            if sorted(sample_masks) != rows_of(windows):
                 raise ValueError("other photos count than are looked at")
-            return BlockScope(windows, counted, BlockSurroundings(arrays["rows"].astype(np.int64), arrays["units"]))
+            return BlockScope(
+                windows, sample_masks, BlockSurroundings(arrays["rows"].astype(np.int64), arrays["units"])
+            )
         except (OSError, ValueError, KeyError, IndexError) as error:
             raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
 

@@ -29,7 +29,7 @@ from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
 from splatpipe.pipeline.train.blocks.schedules import block_schedule
 from splatpipe.pipeline.train.blocks.scope import BlockScope, ScopeReader, read_free_space, rows_of
 from splatpipe.pipeline.train.hooks import Technique
-from splatpipe.pipeline.train.loop import TrainingSetup, go_through, summary_of
+from splatpipe.pipeline.train.loop import TrainingSetup, run_training, summary_of
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of, load_or_write_plan, make_plan, sizes_of
 from splatpipe.pipeline.train.plan.training_order import TrainingOrder, WindowOrder
@@ -107,7 +107,7 @@ def train_block(
             report.note("there is nothing to train")
             return _leave(block, plan, out, (block.start(), History())) | device.facts()
         report.note(f"{len(plan.train_views)} photos, {plan.described()}")
-        state = go_through(block.setup(plan, scope, out), out, report)
+        state = run_training(block.setup(plan, scope, out), out, report)
         left = _leave(block, plan, out, (state.finished(), state.whole_history()))
     return summary_of(state, plan) | left | device.facts()
 
@@ -197,7 +197,7 @@ class Block:
         windows = scope.windows
         views, place = self.views(windows), {row: place for place, row in enumerate(rows_of(windows))}
         cut, every = self.scope_reader.cut, self.scope_reader.views
-        cells = {place[row]: grid for row, grid in scope.counted.items()}
+        cells = {place[row]: grid for row, grid in scope.sample_masks.items()}
         pieces = {
             level: [(place[row], cut.frames(every[row].camera, level)[window]) for row, window in pairs.tolist()]
             for level, pairs in windows.items()

@@ -27,7 +27,7 @@ class _CachedPhoto:
     offset: int
     camera: Camera
     has_mask: bool
-    counted: int
+    valid_pixels: int
 
 
 def stored_bytes(camera: Camera, has_mask: bool) -> int:
@@ -76,8 +76,8 @@ class PhotoCache:
         Raises:
             MachineError: if the disk is full nevertheless, or fails.
         """
-        counted = camera.width * camera.height if mask is None else int(np.count_nonzero(mask))
-        slot = _CachedPhoto(self._end, camera, mask is not None, counted)
+        valid_pixels = camera.width * camera.height if mask is None else int(np.count_nonzero(mask))
+        slot = _CachedPhoto(self._end, camera, mask is not None, valid_pixels)
         if not self.has_room(camera, slot.has_mask):
             return
         with self._explained():
@@ -95,9 +95,9 @@ class PhotoCache:
         """Whether a photo is stored."""
         return key in self._slots
 
-    def counted(self, key: tuple[int, int]) -> int:
+    def valid_pixels(self, key: tuple[int, int]) -> int:
         """How many pixels of a stored photo count."""
-        return self._slots[key].counted
+        return self._slots[key].valid_pixels
 
     def get(self, key: tuple[int, int], frame: PixelRectangle) -> tuple[Pixels, Mask | None]:
         """A window of a stored photo.

@@ -101,9 +101,9 @@ class PhotoStream:
         self._pending: deque[Future[_PendingPhoto]] = deque()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
-        self.go_on(order, first)
+        self.switch_order(order, first)
 
-    def go_on(self, order: TrainingOrder, first: int) -> None:
+    def switch_order(self, order: TrainingOrder, first: int) -> None:
         """Switch to another order, as if the stream had started with it; photos read ahead are dropped.
 
         Args:
@@ -202,7 +202,7 @@ class PhotoStream:
         window, whole = crop.window, crop.camera
         cut = window.grown(whole.width, whole.height)
         pixels, mask, of_whole = self._decoded(crop, cut)
-        mask = crop.counted(mask, cut)
+        mask = crop.valid_mask(mask, cut)
         left, top, right, bottom = inner = window.within(cut)
         here = window.pixels if mask is None else int(np.count_nonzero(mask[top:bottom, left:right]))
         return _PendingPhoto(
@@ -220,7 +220,7 @@ class PhotoStream:
             self._store(crop.view)
         key = (crop.view, crop.level)
         if key in self._cache:
-            return *self._cache.get(key, cut), self._cache.counted(key)
+            return *self._cache.get(key, cut), self._cache.valid_pixels(key)
         _, pixels, mask = reduced_view(self._views[crop.view], self._order.max_megapixels, crop.level)
         part = (slice(cut.top, cut.bottom), slice(cut.left, cut.right))
         if mask is None:

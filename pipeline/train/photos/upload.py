@@ -14,7 +14,7 @@ from torch import Tensor
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
 
 QUEUED = 3  # most iterations queued on the device: enough to keep it busy, with few photos held in memory
-STEP = float(np.float32(1.0 / 255.0))  # of 8-bit values: the same float32 on every device
+STEP = float(np.float32(1.0 / 255.0))  # step of 8-bit values, colours in 0..1: the same float32 on every device
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Uploader:
         colour, counts = _pinned(pixels), None if mask is None else _pinned(mask)
         try:
             with torch.cuda.stream(self._stream):
-                there = self._sent(colour, counts)
+                there = self._uploaded(colour, counts)
                 sent = torch.cuda.Event()  # type: ignore[no-untyped-call]
                 sent.record(self._stream)
         except torch.OutOfMemoryError:  # during an iteration; between iterations more memory is free
@@ -78,7 +78,7 @@ class Uploader:
         begun.record(torch.cuda.current_stream(self._device))  # reached when the previous iterations are done
         self._lead.add(begun)
         if upload.sent is None:
-            colour, mask = self._sent(upload.colour, upload.mask)
+            colour, mask = self._uploaded(upload.colour, upload.mask)
             return colours_of(colour), mask
         current = torch.cuda.current_stream(self._device)
         current.wait_event(upload.sent)
@@ -87,7 +87,7 @@ class Uploader:
                 tensor.record_stream(current)  # its memory is the other stream's and must not be reused before then
         return colours_of(upload.colour), upload.mask
 
-    def _sent(self, colour: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def _uploaded(self, colour: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Copies on the device, in order of the current stream."""
         there = colour.to(self._device, non_blocking=True)
         return there, None if mask is None else mask.to(self._device, non_blocking=True)

@@ -26,17 +26,17 @@ from splatpipe.pipeline.train.plan.windows import TrainingSize
 # None of the values up to COARSEST_MEGAPIXELS was tuned on held-out quality: they are judgement, for the given reasons.
 SMALLEST_MEGAPIXELS = 0.1  # below it a photo of a building has too few pixels for its edges
 SIZE_STEP = 1.5  # ratio of the sizes tried: fine enough to use the time, coarse enough for a short list
-FULL_SHARE = 0.9  # of the dataset's size is as good as all of it, so resampling is skipped
+FULL_SHARE = 0.9  # size over the dataset's that is as good as all of it, so resampling is skipped
 
 FIRST_GROWTH = 1.5  # times the sparse points' Gaussians must fit in every plan before it uses larger photos
-FEWEST_GAUSSIANS = 1000  # fewer cannot represent a building; the initial ones are thinned no further
+MIN_GAUSSIANS = 1000  # fewer cannot represent a building; the initial ones are thinned no further
 COARSEST_MEGAPIXELS = 0.05  # photos are halved no further at the start of a training
 
-EXPORT_GAUSSIAN_S = 8e-6  # to move, write twice and hash a Gaussian of the model
-AGEING = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
+EXPORT_GAUSSIAN_S = 8e-6  # seconds to move, write twice and hash a Gaussian of the model
+COST_GROWTH = 1.1  # times the cost in the pilot: Gaussians spread in training; 1.0 to 1.2 on three captures, CPU time
 SAMPLES = 60  # points at which a forecast samples a training: its schedules are linear or stepped
-SCHEDULE_SHARE = 0.95  # of the time for the planned schedule; the rest continues at its final learning rates
-POLISH = 1.5  # times the planned iterations at most, if the forecast was too high
+SCHEDULE_SHARE = 0.95  # share of the time for the planned schedule; the rest continues at its final learning rates
+MAX_EXTRA_ITERATIONS_FACTOR = 1.5  # times the planned iterations at most, if the forecast was too high
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class BudgetTask:
     def takes(self, options: TrainConfig, megapixels: float) -> float:
         """Forecast time of a training, including the decoding of its photos, seconds."""
         initial, footage = started(self.sparse, self.dense, options.max_gaussians), self.footage(megapixels)
-        return self.prepare_s + AGEING * forecast(self.speed, resolve_schedule(options, footage), initial, footage)
+        return self.prepare_s + COST_GROWTH * forecast(self.speed, resolve_schedule(options, footage), initial, footage)
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,9 @@ class BudgetChoice:
     @property
     def last_iteration(self) -> int:
         """Maximum iterations: beyond the schedule until the time is up, unless the schedule has ``MAX_ITERATIONS``."""
-        return self.iterations if self.iterations >= MAX_ITERATIONS else int(POLISH * self.iterations)
+        return (
+            self.iterations if self.iterations >= MAX_ITERATIONS else int(MAX_EXTRA_ITERATIONS_FACTOR * self.iterations)
+        )
 
 
 def choose(task: BudgetTask) -> BudgetChoice:
@@ -200,7 +202,7 @@ def choose(task: BudgetTask) -> BudgetChoice:
     otherwise it ends a photo size, and larger photos come earlier.
     """
     most = task.config.max_gaussians
-    first = min(most, max(FEWEST_GAUSSIANS, int(FIRST_GROWTH * task.sparse)))
+    first = min(most, max(MIN_GAUSSIANS, int(FIRST_GROWTH * task.sparse)))
     size, cap = SMALLEST_MEGAPIXELS, first
     for size in reversed(sizes(task.megapixels)):
         if _fits(task, size, first, wanted_iterations(task, size)):
@@ -211,7 +213,7 @@ def choose(task: BudgetTask) -> BudgetChoice:
         if size >= task.megapixels:
             cap = _largest(first, most, lambda gaussians: _fits(task, size, gaussians, iterations))
     else:  # too little time for even that: fewer iterations, then fewer Gaussians
-        least = min(first, FEWEST_GAUSSIANS)
+        least = min(first, MIN_GAUSSIANS)
         cap = _largest(least, first, lambda gaussians: _fits(task, size, gaussians, MIN_ITERATIONS))
     iterations = _largest(MIN_ITERATIONS, max(MAX_ITERATIONS, iterations), lambda count: _fits(task, size, cap, count))
     options = planned_options(task, size, cap, iterations)

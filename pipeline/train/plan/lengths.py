@@ -19,12 +19,10 @@ from splatpipe.pipeline.train.plan.windows import TrainingSize, windows_of
 # Judgement, except where docs/measurements/training.md reports comparisons.
 WHOLE_VISITS = 20  # minimum per photo at the size at which it fits whole
 PART_VISITS = 16  # minimum per part of every photo at each finer size; 8 was worse, see docs/measurements/training.md
-FIRST_SHARE = 0.5  # of the minimum iterations are at the first size,
-MAX_FIRST_ITERATIONS = 3500  # but no more than these if 20 visits are fewer: the finest size is worth more
-FEWEST_VISITS = (
-    10.0  # of a part, below which a run that was given its length stays with the size before: it learns more
-)
-COARSE_SHARE = 0.5  # of the iterations at the first size use photos halved further by `coarse_levels`
+FIRST_SHARE = 0.5  # share of the minimum iterations at the first size, but for MAX_FIRST_ITERATIONS
+MAX_FIRST_ITERATIONS = 3500  # cap on FIRST_SHARE where WHOLE_VISITS are fewer: the finest size is worth more
+MIN_PART_VISITS = 10.0  # visits per part below which a run of a given length stays with the size before: it learns more
+COARSE_SHARE = 0.5  # share of the first size's iterations that use photos halved further by `coarse_levels`
 
 UNTIL = 0.5  # end of density control, as a share of the run (published), or of the finest size's part of it
 
@@ -94,18 +92,18 @@ class PhotoSizes:
         """Most pixels of a window at a level; 0 if all photos fit whole."""
         return 0 if self.parts(level) == self.photos else self.window_pixels
 
-    def pixels(self, look: TrainingSize) -> float:
+    def pixels(self, size: TrainingSize) -> float:
         """Mean number of pixels that an iteration uses."""
-        whole = sum(width * height * count for width, height, count in self.sizes) / 4.0**look.level
-        return whole / (self.parts(look.level) if look.window_pixels else self.photos)
+        whole = sum(width * height * count for width, height, count in self.sizes) / 4.0**size.level
+        return whole / (self.parts(size.level) if size.window_pixels else self.photos)
 
-    def share(self, look: TrainingSize) -> float:
+    def share(self, size: TrainingSize) -> float:
         """Share of a photo's pixels at that level that an iteration uses."""
-        return self.photos / self.parts(look.level) if look.window_pixels else 1.0
+        return self.photos / self.parts(size.level) if size.window_pixels else 1.0
 
-    def largest(self, look: TrainingSize) -> int:
+    def largest(self, size: TrainingSize) -> int:
         """Pixels of the largest window, without its margins."""
-        return max(_cut(w >> look.level, h >> look.level, look.window_pixels)[1] for w, h, _count in self.sizes)
+        return max(_cut(w >> size.level, h >> size.level, size.window_pixels)[1] for w, h, _count in self.sizes)
 
 
 @cache
@@ -148,7 +146,7 @@ def divided(footage: PhotoSizes, least: int, iterations: int) -> list[Length]:
     for finest in range(footage.first_level + 1):
         wanted = lengths(footage, least, finest)
         share = min(1.0, iterations / sum(count for _level, count in wanted))
-        if len(wanted) == 1 or share * wanted[-1][1] >= FEWEST_VISITS * footage.parts(finest):
+        if len(wanted) == 1 or share * wanted[-1][1] >= MIN_PART_VISITS * footage.parts(finest):
             break
     ends, done = [], 0
     for _level, count in wanted:

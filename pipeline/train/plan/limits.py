@@ -30,22 +30,22 @@ from __future__ import annotations
 import math
 
 FLOAT_BYTES = 4
-SHAPE_NUMBERS = 11  # of a Gaussian besides its colour: position, scales, rotation, opacity
+SHAPE_NUMBERS = 11  # parameters of a Gaussian besides its colour: position, scales, rotation, opacity
 STATE_COPIES = 3  # a parameter and its two moments
 STATISTICS_BYTES = 12
-PEAK_SHARE = 0.8  # of the state: a frame of all, or density control's copies; measured: 0.6 to 0.76, with waste
+PEAK_SHARE = 0.8  # extra over the state: a frame of all, or density control's copies; measured: 0.6 to 0.76, with waste
 PIXEL_BYTES = 300  # per pixel of an iteration: three photos read ahead, render and loss, with gradients
-FRAME_BYTES = 201  # of a CUDA device's frame
+FRAME_BYTES = 201  # CUDA frame, per Gaussian
 DEVICE_PASSING_BYTES = 320  # transient: the larger of a frame and density control
 FIXED_BYTES = 120_000_000  # buffers of the kernels, torch and decoders, whatever the size
 
 LIBRARIES_BYTES = 576_000_000  # base of a training process: interpreter, torch and its dependencies
-MACHINE_SHARE = 0.8  # of the machine's memory that a training may use without a given limit: leaves room for others
+MACHINE_SHARE = 0.8  # share of the machine's memory for a training without a given limit: leaves room for others
 
 SMALLEST_WINDOW = 60_000  # pixels: below it the 5-pixel margins and the per-Gaussian cost dominate
 WINDOW_SHARE = 0.25  # largest share of the memory for pixels and Gaussians that a window may take
 
-FIRST_ITERATIONS = 1500  # wanted within FIRST_SECONDS: with fewer the colours have not settled
+FIRST_ITERATIONS = 1500  # iterations wanted within FIRST_SECONDS: with fewer the colours have not settled
 FIRST_SECONDS = 30.0
 MAX_ITERATIONS = 30_000  # iterations, as published: little is gained beyond
 MIN_ITERATIONS = 300  # iterations, however short the time: with fewer the model stays as blurred as it began

@@ -26,7 +26,7 @@ from splatpipe.pipeline.train.plan.windows import TrainingSize
 
 PLAN_FORMAT = 4
 MAX_PLAN_BYTES = 64 << 20
-EXTENT_MARGIN = 1.1  # of 3D Gaussian splatting's NeRF++ normalisation
+EXTENT_MARGIN = 1.1  # extent over the cameras' radius, as in 3D Gaussian splatting's NeRF++ normalisation
 NEAR_PER_EXTENT = 0.01  # 3DGS uses 0.2 world units at extents of about 5; drones see nothing that near
 
 
@@ -120,7 +120,7 @@ class TrainingPlan:
         """
         schedule, footage = self.schedule, self.footage
         for iteration in sizes_ended:
-            pixels = footage.pixels(schedule.look_at(iteration))
+            pixels = footage.pixels(schedule.training_size_at(iteration))
             schedule = schedule.without_rest(iteration, min(1.0, pixels / footage.pixels(schedule.finest)))
         spared = self.schedule.iterations - schedule.iterations
         return replace(self, schedule=schedule, last_iteration=self.last_iteration - spared) if sizes_ended else self
@@ -202,8 +202,8 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 
 def sizes_of(cameras: Sequence[Camera]) -> tuple[tuple[int, int, int], ...]:
     """Width, height and count of photos of each size, sorted."""
-    counted = Counter((camera.width, camera.height) for camera in cameras)
-    return tuple((*size, counted[size]) for size in sorted(counted))
+    count_by_size = Counter((camera.width, camera.height) for camera in cameras)
+    return tuple((*size, count_by_size[size]) for size in sorted(count_by_size))
 
 
 def footage_of(sizes: Sequence[tuple[int, int, int]], most: float | None, window_pixels: int) -> PhotoSizes:

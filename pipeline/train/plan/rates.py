@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 PUBLISHED_RUN = 30_000  # iterations that the published lengths and rates are for
-LARGEST_BOOST = 4.0  # of learning rates: best in measurements at 1,500 iterations; beyond it Gaussians overshoot
+MAX_BOOST = 4.0  # largest factor on learning rates: best at 1,500 iterations; beyond it Gaussians overshoot
 
 PUBLISHED_OPACITY_RATE = 0.05
 OPACITY_RATE = 0.15  # at the published rate surfaces become opaque too late
@@ -57,4 +57,4 @@ PUBLISHED = Rates(opacity=PUBLISHED_OPACITY_RATE, sparse=False, by_distance=Fals
 
 def rates_of(iterations: int) -> Rates:
     """Learning rates of a run: a short one takes longer steps, by the square root of the ratio of lengths."""
-    return Rates(boost=round(min(LARGEST_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / iterations))), 4))
+    return Rates(boost=round(min(MAX_BOOST, max(1.0, math.sqrt(PUBLISHED_RUN / iterations))), 4))

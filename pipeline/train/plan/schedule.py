@@ -25,9 +25,9 @@ FEW_PHOTOS, MANY_PHOTOS = 16, 32  # training photos: overfitting to single photo
 FEW_DROPOUT = 0.2
 RESET_EVERY = 3000  # iterations, published: opacities need them to recover from a reset
 GRADIENT = 1.2e-3  # image-plane magnitudes (NDC) above which Gaussians are densified
-PUBLISHED_GRADIENT = 2e-4  # the same for the signed sum
-BUDGET_SHARE = 0.5  # of the threshold under a time budget: Gaussians follow the forecast, but not into noise
-RESET_VISITS = 15  # of every photo between two resets, at least: what RESET_EVERY is on the published captures
+PUBLISHED_GRADIENT = 2e-4  # norm of the signed sum of image-plane gradients (NDC) above which Gaussians are densified
+BUDGET_SHARE = 0.5  # factor on the threshold under a time budget: Gaussians follow the forecast, but not into noise
+RESET_VISITS = 15  # visits to every photo between resets, at least: what RESET_EVERY is on the published captures
 TAIL_SHARE = 0.1  # length of the tail after a flat loss, as a share of the iterations done by then
 
 UNKNOWN = PhotoSizes(((1, 1, MANY_PHOTOS),))
@@ -134,7 +134,7 @@ class Schedule:
         """The degree trained at an iteration (from 1): one more every ``sh_every``."""
         return min(self.sh_degree, iteration // self.sh_every)
 
-    def look_at(self, iteration: int) -> TrainingSize:
+    def training_size_at(self, iteration: int) -> TrainingSize:
         """The training size of an iteration (from 1)."""
         return self.stretches[self.stretch_at(iteration)].training_size
 
@@ -167,8 +167,8 @@ class Schedule:
         return replace(self, iterations=total, stretches=tuple(changed), density=density)
 
     def training_sizes_until(self, last: int) -> list[TrainingSize]:
-        """``look_at`` for every iteration from 1 to ``last``."""
-        return [self.look_at(iteration) for iteration in range(1, last + 1)]
+        """``training_size_at`` for every iteration from 1 to ``last``."""
+        return [self.training_size_at(iteration) for iteration in range(1, last + 1)]
 
     @property
     def finest(self) -> TrainingSize:

@@ -11,7 +11,7 @@ from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_heade
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sparse_count import sparse_count
 
-START_SHARE = 0.5  # of the cap that the start may fill with dense points: the rest is for detail
+START_SHARE = 0.5  # share of the cap that the start may fill with dense points: the rest is for detail
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ class TrainingCrop:
     cells: Bool[np.ndarray, "rows columns"] | None = field(default=None, compare=False)
     round: int = field(default=0, compare=False)
 
-    def counted(self, mask: Mask | None, cut: PixelRectangle) -> Mask | None:
+    def valid_mask(self, mask: Mask | None, cut: PixelRectangle) -> Mask | None:
         """Mask of the pixels that count in a part of the photo; None if all do.
 
         Args:
@@ -54,8 +54,8 @@ class TrainingCrop:
         columns = np.arange(cut.left, cut.right) * width // self.camera.width
         if self.cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
             return mask
-        counted: Mask = self.cells[rows][:, columns]
-        return counted if mask is None else counted & mask
+        cells_mask: Mask = self.cells[rows][:, columns]
+        return cells_mask if mask is None else cells_mask & mask
 
 
 @runtime_checkable
@@ -90,7 +90,7 @@ class PhotoOrder(TrainingOrder):
 
     Args:
         cameras: The photos' cameras.
-        looks: Training size of each iteration, ``looks[i]`` for iteration ``i`` + 1.
+        sizes: Training size of each iteration, ``sizes[i]`` for iteration ``i`` + 1.
         seed: Seed of the random order.
         max_megapixels: The photos are first reduced to this size; None keeps the dataset's size.
     """
@@ -104,14 +104,14 @@ class PhotoOrder(TrainingOrder):
         self._views = np.concatenate(epochs)[: len(sizes)] if epochs else np.zeros(0, np.int64)
         self._turns = np.zeros(len(sizes), np.int64)  # earlier visits of the same photo at the same size
         pixel_sizes = {
-            (camera.width, camera.height, look.window_pixels)
-            for look in set(sizes)
-            for camera in (self.camera(view, look.level) for view in range(photos))
+            (camera.width, camera.height, size.window_pixels)
+            for size in set(sizes)
+            for camera in (self.camera(view, size.level) for view in range(photos))
         }
-        self._windows = {size: windows_of(*size) for size in pixel_sizes}
+        self._windows = {pixel_size: windows_of(*pixel_size) for pixel_size in pixel_sizes}
         self._given = np.full(len(sizes), -1, np.int64)  # windows that do not follow from the turn; -1: they do
-        for look in sorted(set(sizes), key=lambda look: (look.level, look.window_pixels)):
-            self._mix(look)
+        for size in sorted(set(sizes), key=lambda size: (size.level, size.window_pixels)):
+            self._mix(size)
         before: Counter[tuple[int, TrainingSize]] = Counter()
         for place, key in enumerate(zip(self._views.tolist(), sizes, strict=True)):
             self._turns[place] = before[key]
@@ -121,28 +121,28 @@ class PhotoOrder(TrainingOrder):
     def _ends(self) -> Iterable[int]:
         """The iterations that end rounds: of photos, or of their windows if they have several."""
         photos = max(1, len(self._cameras))
-        for look, begun, until in runs(self._sizes):
-            counts = {len(self._windows_at(view, look)) for view in range(len(self._cameras))}
+        for size, begun, until in runs(self._sizes):
+            counts = {len(self._windows_at(view, size)) for view in range(len(self._cameras))}
             if len(counts) == 1:  # epochs of photos, which a change of size does not restart
                 begun = photos * -(-begun // photos)
-            yield from range(begun, until + 1, self._count(look))
+            yield from range(begun, until + 1, self._count(size))
 
-    def _count(self, look: TrainingSize) -> int:
-        return max(1, sum(len(self._windows_at(view, look)) for view in range(len(self._cameras))))
+    def _count(self, size: TrainingSize) -> int:
+        return max(1, sum(len(self._windows_at(view, size)) for view in range(len(self._cameras))))
 
-    def _mix(self, look: TrainingSize) -> None:
+    def _mix(self, size: TrainingSize) -> None:
         """Run rounds over the windows of all photos, if photos have different numbers of them."""
-        counts = [len(self._windows_at(view, look)) for view in range(len(self._cameras))]
+        counts = [len(self._windows_at(view, size)) for view in range(len(self._cameras))]
         if len(set(counts)) < 2:
             return
         pairs = np.array([(view, window) for view, count in enumerate(counts) for window in range(count)])
-        places = np.array([place for place, each in enumerate(self._sizes) if each == look])
+        places = np.array([place for place, each in enumerate(self._sizes) if each == size])
         rows = in_rounds(self._seed, len(pairs), len(places))
         self._views[places], self._given[places] = pairs[rows].T
 
-    def _windows_at(self, view: int, look: TrainingSize) -> list[PixelRectangle]:
-        camera = self.camera(view, look.level)
-        return self._windows[camera.width, camera.height, look.window_pixels]
+    def _windows_at(self, view: int, size: TrainingSize) -> list[PixelRectangle]:
+        camera = self.camera(view, size.level)
+        return self._windows[camera.width, camera.height, size.window_pixels]
 
     def __len__(self) -> int:
         """How many iterations there are."""
@@ -150,15 +150,15 @@ class PhotoOrder(TrainingOrder):
 
     def at(self, iteration: int) -> TrainingCrop:
         """What an iteration, from 1, trains on."""
-        view, look = int(self._views[iteration - 1]), self._sizes[iteration - 1]
-        camera, ended = self.camera(view, look.level), int(self._rounds[iteration - 1])
-        windows, given = self._windows_at(view, look), int(self._given[iteration - 1])
+        view, size = int(self._views[iteration - 1]), self._sizes[iteration - 1]
+        camera, ended = self.camera(view, size.level), int(self._rounds[iteration - 1])
+        windows, given = self._windows_at(view, size), int(self._given[iteration - 1])
         if len(windows) == 1 or given >= 0:
-            return TrainingCrop(view, look.level, camera, windows[max(0, given)], round=ended)
+            return TrainingCrop(view, size.level, camera, windows[max(0, given)], round=ended)
         past, place = divmod(int(self._turns[iteration - 1]), len(windows))
         drawn = random_bits(self._seed, past, WINDOW_ORDER, view * MAX_WINDOWS + np.arange(len(windows)))
         return TrainingCrop(
-            view, look.level, camera, windows[int(np.argsort(drawn, kind="stable")[place])], round=ended
+            view, size.level, camera, windows[int(np.argsort(drawn, kind="stable")[place])], round=ended
         )
 
     def camera(self, view: int, level: int) -> Camera:
@@ -167,7 +167,7 @@ class PhotoOrder(TrainingOrder):
 
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
-        return _wanted_again(self._views[first - 1 :].tolist(), self._sizes[first - 1 :])
+        return _revisited_photos(self._views[first - 1 :].tolist(), self._sizes[first - 1 :])
 
 
 class WindowOrder(TrainingOrder):
@@ -177,7 +177,7 @@ class WindowOrder(TrainingOrder):
 
     Args:
         cameras: The photos' cameras.
-        looks: Training size of each iteration, ``looks[i]`` for iteration ``i`` + 1.
+        sizes: Training size of each iteration, ``sizes[i]`` for iteration ``i`` + 1.
         seed: Seed of the random order.
         max_megapixels: As for ``PhotoOrder``.
         parts: By level: pairs of a photo's index and a window at that level; at least one for each level in ``sizes``.
@@ -195,12 +195,12 @@ class WindowOrder(TrainingOrder):
     ) -> None:
         self._cameras, self._sizes, self.max_megapixels, self._parts = cameras, sizes, max_megapixels, parts
         self._cells = cells or {}
-        levels = np.array([look.level for look in sizes], np.int64)
+        levels = np.array([size.level for size in sizes], np.int64)
         self._rows = np.zeros(len(sizes), np.int64)  # rows of the level's parts
         for level in np.unique(levels).tolist():
             wanted, count = np.flatnonzero(levels == level), len(parts[level])
             self._rows[wanted] = in_rounds(seed, count, len(wanted))
-        ends = (range(begun, until + 1, len(parts[look.level])) for look, begun, until in runs(sizes))
+        ends = (range(begun, until + 1, len(parts[size.level])) for size, begun, until in runs(sizes))
         self._rounds = rounds_ended((end for each in ends for end in each), len(sizes))
 
     def __len__(self) -> int:
@@ -221,7 +221,9 @@ class WindowOrder(TrainingOrder):
     def levels_wanted(self, first: int) -> dict[int, list[int]]:
         """The levels of each photo visited more than once from an iteration onward, finest first."""
         sizes, rows = self._sizes[first - 1 :], self._rows[first - 1 :].tolist()
-        return _wanted_again([self._parts[look.level][row][0] for look, row in zip(sizes, rows, strict=True)], sizes)
+        return _revisited_photos(
+            [self._parts[size.level][row][0] for size, row in zip(sizes, rows, strict=True)], sizes
+        )
 
 
 def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"]:
@@ -233,9 +235,9 @@ def in_rounds(seed: int, count: int, visits: int) -> Int64[np.ndarray, " visits"
 def runs(sizes: Sequence[TrainingSize]) -> Iterable[tuple[TrainingSize, int, int]]:
     """Runs of equal training sizes, each with the number of iterations done before it and by its end."""
     done = 0
-    for look, same in groupby(sizes):
+    for size, same in groupby(sizes):
         begun, done = done, done + sum(1 for _ in same)
-        yield look, begun, done
+        yield size, begun, done
 
 
 def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits"]:
@@ -251,11 +253,11 @@ def rounds_ended(ends: Iterable[int], visits: int) -> Int64[np.ndarray, " visits
     return found
 
 
-def _wanted_again(views: Sequence[int], sizes: Sequence[TrainingSize]) -> dict[int, list[int]]:
+def _revisited_photos(views: Sequence[int], sizes: Sequence[TrainingSize]) -> dict[int, list[int]]:
     """The photos visited more than once in these iterations, with their levels."""
     times: Counter[int] = Counter()
     levels: defaultdict[int, set[int]] = defaultdict(set)
-    for view, look in zip(views, sizes, strict=True):
+    for view, size in zip(views, sizes, strict=True):
         times[view] += 1
-        levels[view].add(look.level)
+        levels[view].add(size.level)
     return {view: sorted(levels[view]) for view in sorted(times) if times[view] > 1}

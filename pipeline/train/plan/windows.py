@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-REACH_PX = 5  # of SSIM: half its window, which reaches this far over a border
+REACH_PX = 5  # half of SSIM's window, which reaches this far over a border
 NODES_PX = 8  # node spacing: the panorama's `STEP_PX`
-MIN_SIDE_PX = 2 * NODES_PX  # of a cell: borders move by at most half the node spacing
+MIN_SIDE_PX = 2 * NODES_PX  # side of a cell: borders move by at most half the node spacing
 MAX_OBLONG = 2.5  # aspect ratio of a cell: the borders of strips cost more than a few extra cells
 
 

@@ -32,8 +32,8 @@ WARM_UP_ITERATIONS = 100  # until opacities, which step by a twentieth of a logi
 WARM_UP_SHARE = 0.5  # largest share of the measuring time
 PILOT_ITERATION = 10  # iteration that the pilot's state claims, so that all SH degrees take part
 WINDOW_SIDE = 2  # divisor of the sides of the timed windows
-SPLIT_SHRINK = 0.25  # of the logarithm of growth: between clones, which keep their size, and a split surface (0.5)
-STREAM = 7  # of the jitter's random numbers; the pilot is thrown away, so nothing depends on them
+SPLIT_SHRINK = 0.25  # fall of log scales per log of growth: between clones, which keep their size, and splits (0.5)
+STREAM = 7  # added to the seed for the jitter's random numbers; the pilot is thrown away, nothing depends on them
 
 Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 
@@ -199,15 +199,15 @@ def _evaluation_seconds(gaussians: Gaussians, photo: TrainingPhoto, plan: Traini
             gaussians.sh_degree, antialias=plan.options.antialias, near=plan.near, depth=False
         )
         colour = rasterizer.render(gaussians, photo.camera, options).colour.clamp(0.0, 1.0)
-    shown = photo.colour.cpu()
+    photo_colour = photo.colour.cpu()
     mask = None if photo.mask is None else photo.mask.cpu()
-    pair = metrics.pair_of(colour.cpu(), shown, mask)
+    pair = metrics.pair_of(colour.cpu(), photo_colour, mask)
     for metric in metrics.METRICS.values():
         try:
             metric.of_pair(pair)
         except ValueError:
             continue  # too few pixels for this metric: `evaluate` leaves it out too
-    pixels = (shown * 255.0).to(torch.uint8).numpy()
+    pixels = (photo_colour * 255.0).to(torch.uint8).numpy()
     for _ in range(PICTURES):
         cv2.imencode(".png", pixels)
     return (time.monotonic() - began) / (1e-6 * photo.camera.width * photo.camera.height)

@@ -15,7 +15,7 @@ from splatpipe.pipeline.raster.device import Device, cpu, free_bytes
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
-from splatpipe.pipeline.train.plan.budget import FEWEST_GAUSSIANS, FIRST_GROWTH, BudgetTask, choose
+from splatpipe.pipeline.train.plan.budget import FIRST_GROWTH, MIN_GAUSSIANS, BudgetTask, choose
 from splatpipe.pipeline.train.plan.limits import FIRST_ITERATIONS, device_bytes_per_gaussian, worthwhile_iterations
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of
 from splatpipe.pipeline.train.plan.start import InitialGaussians, started
@@ -24,13 +24,13 @@ from splatpipe.pipeline.train.planning.measure import MachineSpeed, MeasuringBud
 from splatpipe.pipeline.train.planning.shortage import HINT
 from splatpipe.pipeline.train.state.memory import within_memory
 
-MEASURE_SHARE = 0.05  # of the budget at most is spent on measuring,
-MEASURE_SECONDS = 10.0  # and no more than this: by then the noise of a shared machine is averaged out
+MEASURE_SHARE = 0.05  # share of the budget spent on measuring at most
+MEASURE_SECONDS = 10.0  # spent on measuring at most: by then the noise of a shared machine is averaged out
 PILOT_GROWTH_A_SECOND = {"cpu": 150.0, "cuda": 15_000.0}
 """Approximate number of Gaussians that a second of budget pays for: where the forecast has to be accurate. Measured on
 CPUs; for CUDA a judgement, two orders of magnitude more: with fewer Gaussians an iteration there is all fixed cost,
 which says nothing about the cost per Gaussian."""
-MIN_SHARE = 0.1  # of the budget for the training, even if nothing is left: the overall tolerance
+MIN_SHARE = 0.1  # share of the budget for the training, even if nothing is left: the overall tolerance
 FILM_VIEWS = 40  # held-out views that take as long to evaluate as a ten-second film takes to render
 EXPORT_SECONDS = 5.5  # fixed cost of the last stages: digests, the report with its images, process exit
 
@@ -58,7 +58,7 @@ class PlanningInput:
     sky: SkyModel | None = None
 
 
-def under_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
+def plan_within_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
     """Fit a plan to the budgets of its options, and its initial Gaussians to the cap.
 
     Args:
@@ -126,7 +126,7 @@ def pilot(plan: TrainingPlan, scene: PlanningInput) -> TrainingPlan:
     free = free_bytes(scene.device.tensors)
     if free is not None:  # a smaller model exists at the same time; both are discarded
         paid_for = min(paid_for, free / (2 * device_bytes_per_gaussian(plan.options.sh_degree)))
-    wanted = max(FIRST_GROWTH * scene.start.sparse, paid_for, FEWEST_GAUSSIANS)
+    wanted = max(FIRST_GROWTH * scene.start.sparse, paid_for, MIN_GAUSSIANS)
     short = {"iterations": FIRST_ITERATIONS, "max_gaussians": min(plan.options.max_gaussians, int(wanted))}
     return plan.of(scene.config.model_copy(update=short))
 

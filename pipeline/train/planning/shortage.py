@@ -15,11 +15,11 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
-from splatpipe.pipeline.train.plan.budget import FEWEST_GAUSSIANS
+from splatpipe.pipeline.train.plan.budget import MIN_GAUSSIANS
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.state.state import TrainState
 
-KEPT_SHARE = 0.9  # of the Gaussians are kept each time, the most opaque: those lost are the least visible
+KEPT_SHARE = 0.9  # share of the Gaussians kept each time, the most opaque: those lost are the least visible
 HINT = "Lower train.max_megapixels or train.max_gaussians, or close other programs that use the graphics card."
 
 Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
@@ -47,7 +47,7 @@ def iterate_within_memory(
         state.roll_back()
         if state.gaussians.means.device.type == "cuda":
             torch.cuda.empty_cache()  # torch's cached blocks may be too fragmented for the next request
-        _take_less(state, kernels, report)
+        _reduce_memory(state, kernels, report)
     if kernels is not None and kernels.forecast.most_pairs < pairs:  # once, however often they were halved
         report.warning(
             f"The graphics card's memory is short in iteration {now:,}: each picture is processed in smaller parts, "
@@ -68,12 +68,12 @@ def _fits(step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhot
     return True
 
 
-def _take_less(state: TrainState, kernels: CudaKernels | None, report: Reporter) -> None:
+def _reduce_memory(state: TrainState, kernels: CudaKernels | None, report: Reporter) -> None:
     """Reduce the next thing: chunks of pairs first, then the model."""
     count, now = len(state.gaussians), state.iteration + 1
     if kernels is not None and kernels.forecast.shrink():
         return
-    fewer = max(int(KEPT_SHARE * count), FEWEST_GAUSSIANS)
+    fewer = max(int(KEPT_SHARE * count), MIN_GAUSSIANS)
     if fewer >= count:
         raise MachineError(f"The graphics card's memory does not hold even {count:,} Gaussians.", hint=HINT)
     state.history.growth_ended = state.history.growth_ended or max(1, state.iteration)

@@ -35,7 +35,7 @@ class DensityStep:
         limit: Maximum number of Gaussians after the step, if any are added.
         iteration: The iteration that ends.
         prune_mask: (n,) Gaussians to remove, whatever their size and opacity.
-        ranked: How techniques modify the score; None for unmodified.
+        score_adjustment: How techniques modify the score; None for unmodified.
     """
 
     schedule: DensitySchedule
@@ -43,7 +43,7 @@ class DensityStep:
     limit: int
     iteration: int
     prune_mask: Bool[Tensor, " n"]
-    ranked: Callable[[Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
+    score_adjustment: Callable[[Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
 
 
 class Density:
@@ -102,7 +102,7 @@ class Density:
             gone |= step.prune_mask
         pruned = int(gone.sum())
         score = torch.where(gone, 0.0, self.statistics.score())
-        score = score if step.ranked is None else step.ranked(score)
+        score = score if step.score_adjustment is None else step.score_adjustment(score)
         growth, counts = grow(gaussians, score, step.limit - len(gaussians) + pruned, schedule, extent, iteration)
         return growth.select(~gone[growth.source]), {**counts, "pruned": pruned}
 

@@ -9,7 +9,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.raster.device import free_bytes
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.options import TrainConfig
-from splatpipe.pipeline.train.plan.budget import FEWEST_GAUSSIANS
+from splatpipe.pipeline.train.plan.budget import MIN_GAUSSIANS
 from splatpipe.pipeline.train.plan.limits import (
     DEVICE_PASSING_BYTES,
     FIXED_BYTES,
@@ -22,7 +22,8 @@ from splatpipe.pipeline.train.plan.limits import (
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 
 RESIDENT_STEP = 16_000_000  # resident memory is rounded up to it: a few pages more or less change no plan
-GROWTH_STOPS_AT = 0.97  # of the limit, at rest after a density-control step: above it the next step may exceed it
+# share of the limit in use at rest, after density control: above it the next step may exceed it
+MAX_GROWTH_MEMORY_SHARE = 0.97
 
 
 def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bool = False) -> TrainingPlan:
@@ -46,8 +47,8 @@ def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bo
     plan = plan.within_windows(window_within(room, plan.window_pixels))
     pixels = max(plan.footage.largest(stretch.training_size) for stretch in plan.schedule.stretches)
     most = (room - PIXEL_BYTES * pixels) // of_one
-    if most < min(FEWEST_GAUSSIANS, sparse):
-        least = limit - room + PIXEL_BYTES * pixels + FEWEST_GAUSSIANS * of_one
+    if most < min(MIN_GAUSSIANS, sparse):
+        least = limit - room + PIXEL_BYTES * pixels + MIN_GAUSSIANS * of_one
         raise MachineError(
             f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB already, "
             f"and {pixels / 1e6:.2f} megapixels of a photo need memory as well.",
@@ -89,7 +90,7 @@ def over_memory(options: TrainConfig) -> bool:
     that is reported: besides the deadline this is the only thing that a machine may change in a planned training.
     """
     limit = options.max_memory_bytes
-    if limit == 0 or resident_bytes() <= GROWTH_STOPS_AT * limit:
+    if limit == 0 or resident_bytes() <= MAX_GROWTH_MEMORY_SHARE * limit:
         return False
     return_free_heap()
-    return resident_bytes() > GROWTH_STOPS_AT * limit
+    return resident_bytes() > MAX_GROWTH_MEMORY_SHARE * limit

@@ -35,7 +35,7 @@ from splatpipe.pipeline.train.state.history import History
 from splatpipe.pipeline.train.state.memory import within_room
 from splatpipe.pipeline.train.techniques.techniques import Techniques
 
-SMALLEST_SCALE = 1e-6  # of a Gaussian, relative to the scene's extent: float32 covariances stay non-singular
+SMALLEST_SCALE = 1e-6  # smallest scale over the scene's extent: float32 covariances stay non-singular
 LARGEST_SCALE = 1e2  # the sky is no farther than that
 
 _ADAM = "adam."
@@ -204,10 +204,10 @@ class TrainState:
         free_frames()  # they change size in this step, and memory is tight until then
         try:
             growth, counts = self._growth(plan, limit, iteration)
-        except torch.OutOfMemoryError:  # of a device: not even room to select what to grow
+        except torch.OutOfMemoryError:  # the device has not even room to select what to grow
             self.history.growth_ended = self.history.growth_ended or iteration
             return
-        self._become(growth)
+        self._adopt_growth(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
 
     def _growth(self, plan: TrainingPlan, limit: int, iteration: int) -> tuple[DensifiedGaussians, dict[str, int]]:
@@ -217,8 +217,8 @@ class TrainState:
         if gone is None:
             gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         schedule = plan.schedule.density
-        ranked = partial(self.techniques.adjust_scores, gaussians=gaussians, schedule=schedule)
-        step = DensityStep(schedule, plan.extent, limit, iteration, gone, ranked)
+        score_adjustment = partial(self.techniques.adjust_scores, gaussians=gaussians, schedule=schedule)
+        step = DensityStep(schedule, plan.extent, limit, iteration, gone, score_adjustment)
         growth, counts = self.density.control(gaussians, step)
         return along_curve(growth), counts
 
@@ -226,7 +226,7 @@ class TrainState:
         """Remove the Gaussians that a technique rejects; this goes on after the last step of density control."""
         try:
             gone = self.techniques.prune_mask(self.gaussians.detach(), iteration)
-        except torch.OutOfMemoryError:  # of a device: the next check finds them
+        except torch.OutOfMemoryError:  # on a device; the next check finds the floaters
             return
         if gone is not None and bool(gone.any()) and not bool(gone.all()):
             self._remove(gone, iteration)
@@ -240,10 +240,10 @@ class TrainState:
             self._remove(gone.to(self.gaussians.means.device), self.iteration)
 
     def _remove(self, gone: Bool[Tensor, " n"], iteration: int) -> None:
-        self._become(unchanged(self.gaussians.detach(), ~gone))
+        self._adopt_growth(unchanged(self.gaussians.detach(), ~gone))
         self.history.add_density(DensityEvent(iteration, 0, 0, int(gone.sum()), 0, gaussians=len(self.gaussians)))
 
-    def _become(self, growth: DensifiedGaussians) -> None:
+    def _adopt_growth(self, growth: DensifiedGaussians) -> None:
         """Adopt the rows of a growth with their moments, one tensor after the other because memory is tight."""
         self.buffers = GradientBuffers()
         frozen = None if self.whole is None else self.whole.detach().after(len(self.gaussians)).clone()

@@ -22,7 +22,7 @@ from splatpipe.pipeline.train.hooks import RenderedView, Technique
 from splatpipe.pipeline.train.photos.stream import EVERYWHERE
 from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 
-FIRST_SHARE = 0.2  # of a run from sparse points, without this loss: the surface has to form first
+FIRST_SHARE = 0.2  # first share of a run from sparse points, without this loss: the surface has to form first
 MIN_ALPHA = 0.5  # below it a pixel shows more background than surface
 FREE_PX = 0.5  # standard deviation without penalty, in GSD
 HALF_PX = 10.0  # excess in GSD at which half of the maximum penalty is reached
@@ -52,11 +52,11 @@ class DistortionLoss(Technique):
         """Turn on depths, with an origin at which float32 is most precise."""
         if not self.is_counted(now.place):
             return settings
-        if self._is_worn(model, now):
+        if self._is_stale(model, now):
             self._centre = model.means.detach().mean(dim=0).double().cpu()
         return replace(settings, depth=True, depth_origin=depth_along(self._centre, camera))
 
-    def _is_worn(self, model: Gaussians, now: ScheduleStep) -> bool:
+    def _is_stale(self, model: Gaussians, now: ScheduleStep) -> bool:
         """Whether to recompute the model's centre: rarely on a device, because that synchronizes."""
         if model.means.device.type == "cpu":
             return True
@@ -71,12 +71,14 @@ class DistortionLoss(Technique):
         if "centre" in arrays:
             self._centre = arrays["centre"].clone()
 
-    def penalty(self, shot: RenderedView) -> Float[Tensor, ""] | None:
+    def penalty(self, rendered_view: RenderedView) -> Float[Tensor, ""] | None:
         """The spread of depths along the photo's rays, weighted."""
-        if not self.is_counted(shot.now.place):
+        if not self.is_counted(rendered_view.now.place):
             return None
-        photo, origin = shot.photo, shot.settings.depth_origin
-        return self._weight * spread_loss(shot.rendered, origin, photo.camera, photo.inside, self._about_median)
+        photo, origin = rendered_view.photo, rendered_view.settings.depth_origin
+        return self._weight * spread_loss(
+            rendered_view.rendered, origin, photo.camera, photo.inside, self._about_median
+        )
 
 
 def depth_origin(means: Float[Tensor, "n 3"], camera: Camera) -> float:

@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.plan.schedule import Schedule, ScheduleStep
 from splatpipe.pipeline.train.random_numbers import DROPOUT, uniform
 
 DROPPED_LOGIT = -30.0  # an opacity of 1e-13: the projection culls it, so it costs nothing and learns nothing
-LARGEST_OPACITY = 0.999  # of scaled opacities, so that the logit stays finite; blending caps alpha at 0.99
+LARGEST_OPACITY = 0.999  # cap on scaled opacities, so that the logit stays finite; blending caps alpha at 0.99
 
 
 def share_at(schedule: Schedule, iteration: int) -> float:

@@ -19,7 +19,7 @@ from splatpipe.pipeline.train.hooks import Technique
 from splatpipe.pipeline.train.plan.schedule import Schedule
 
 STEPS_BETWEEN = 5  # steps of density control between checks: a check takes as long as several iterations
-LAST_LOOK = 0.9  # of the run: the rest closes the holes
+LAST_CHECK_SHARE = 0.9  # share of the run after which no floaters are pruned: the rest closes the holes
 
 
 def free_space_of(views: Sequence[View], dataset: Path) -> FreeSpace:
@@ -57,7 +57,10 @@ class FloaterPruning(Technique):
         front of the surface, above all where there are few photos.
         """
         density = self._schedule.density
-        due = iteration % (STEPS_BETWEEN * density.every) == 0 and iteration <= LAST_LOOK * self._schedule.iterations
+        due = (
+            iteration % (STEPS_BETWEEN * density.every) == 0
+            and iteration <= LAST_CHECK_SHARE * self._schedule.iterations
+        )
         return density.on and due and density.first <= iteration
 
     def prune_mask(self, gaussians: Gaussians, iteration: int) -> Bool[Tensor, " n"] | None:

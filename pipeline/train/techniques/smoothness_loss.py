@@ -36,9 +36,9 @@ class SmoothnessLoss(Technique):
     def __init__(self, weight: float) -> None:
         self._weight = weight
 
-    def penalty(self, shot: RenderedView) -> Float[Tensor, ""] | None:
+    def penalty(self, rendered_view: RenderedView) -> Float[Tensor, ""] | None:
         """The unevenness of the photo's depths, weighted."""
-        return self._weight * unevenness(shot.rendered, shot.photo.camera, shot.photo.inside)
+        return self._weight * unevenness(rendered_view.rendered, rendered_view.photo.camera, rendered_view.photo.inside)
 
 
 def unevenness(

@@ -126,24 +126,24 @@ class Techniques:
             model = technique.before_render(model, now)
         return model
 
-    def apply_appearance(self, shot: RenderedView) -> Float[Tensor, "h w 3"]:
+    def apply_appearance(self, rendered_view: RenderedView) -> Float[Tensor, "h w 3"]:
         """The render as the photo would show it."""
-        picture = shot.rendered.colour
+        picture = rendered_view.rendered.colour
         for technique in self.each:
-            picture = technique.apply_appearance(picture, shot)
+            picture = technique.apply_appearance(picture, rendered_view)
         return picture
 
-    def mask_pixels(self, picture: Float[Tensor, "h w 3"], shot: RenderedView) -> TrainingPhoto:
+    def mask_pixels(self, picture: Float[Tensor, "h w 3"], rendered_view: RenderedView) -> TrainingPhoto:
         """The photo, masked to the pixels that count."""
-        photo = shot.photo
+        photo = rendered_view.photo
         for technique in self.each:
-            photo = technique.mask_pixels(photo, picture, shot)
+            photo = technique.mask_pixels(photo, picture, rendered_view)
         return photo
 
-    def with_penalties(self, loss: Float[Tensor, ""], shot: RenderedView) -> Float[Tensor, ""]:
+    def with_penalties(self, loss: Float[Tensor, ""], rendered_view: RenderedView) -> Float[Tensor, ""]:
         """The photo's loss plus the penalties."""
         for technique in self.each:
-            penalty = technique.penalty(shot)
+            penalty = technique.penalty(rendered_view)
             loss = loss if penalty is None else loss + penalty
         return loss
 
@@ -152,10 +152,10 @@ class Techniques:
         for technique in self.each:
             technique.roll_back()
 
-    def after_step(self, shot: RenderedView) -> None:
+    def after_step(self, rendered_view: RenderedView) -> None:
         """Step the techniques' own parameters."""
         for technique in self.each:
-            technique.after_step(shot)
+            technique.after_step(rendered_view)
 
     def after_epoch(self, iteration: int) -> None:
         """Called when every photo has been trained on once more."""

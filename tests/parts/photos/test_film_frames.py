@@ -72,8 +72,8 @@ def test_frames_are_photos_with_positions_and_times(flown: Path, tmp_path: Path)
         assert position["altitude_m"] == pytest.approx(545.0 + 10.0 * time_s, abs=0.02)
         assert position["relative_altitude_m"] == 30.0
         assert decode(photo, folder / "photos", flown / "flight.mp4").shape == (HEIGHT, WIDTH, 3)
-    told = " ".join(event.data.get("message", "") for event in events)
-    assert "frames in 3.0 s are used" in told and "are from flight.SRT" in told
+    messages = " ".join(event.data.get("message", "") for event in events)
+    assert "frames in 3.0 s are used" in messages and "are from flight.SRT" in messages
     camera = json.loads((folder / "cameras.json").read_text())
     assert "35mm-equivalent" in json.dumps(camera)
 
@@ -131,8 +131,8 @@ def test_frames_are_turned_by_exif_alone_and_a_film_without_positions_says_so(fl
     with Image.open(next((tmp_path / "frames").iterdir())) as picture:
         assert picture.size == (WIDTH, HEIGHT) and read_exif(picture).orientation == 6
         assert read_exif(picture).gps is None
-    told = " ".join(issue.message for issue in issues)
-    assert "turned by 90°" in told and "No positions come with turned.mov" in told
+    messages = " ".join(issue.message for issue in issues)
+    assert "turned by 90°" in messages and "No positions come with turned.mov" in messages
 
 
 def test_what_is_no_film_of_a_flight_is_refused_in_a_sentence(flown: Path, tmp_path: Path) -> None:

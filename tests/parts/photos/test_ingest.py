@@ -768,7 +768,7 @@ def test_a_file_in_another_zone_is_reported(folder: Path, tmp_path: Path) -> Non
     for seed, name in enumerate("cde"):
         save(folder / f"{name}.jpg", seed + 3, exif=drone_exif(gps_of(46.5, -91.5, 198.5)))
     geo = tmp_path / "geo.txt"
-    rows = "".join(f"{name}.jpg 615097.16 5150696.35 199\n" for name in "cde")  # of zone 15, by PROJ
+    rows = "".join(f"{name}.jpg 615097.16 5150696.35 199\n" for name in "cde")  # coordinates of UTM zone 15, by PROJ
     for zone, is_reported in ((15, False), (16, True)):
         geo.write_text(f"EPSG:326{zone}\n{rows}")
         warnings = ingest(folder, geo=geo, out=f"out{zone}").warnings
@@ -970,7 +970,7 @@ def test_photos_with_odd_tags_are_accepted(folder: Path) -> None:
 def test_masks_beside_their_photos_are_used_and_are_no_photos(folder: Path) -> None:
     """As OpenDroneMap wants them."""
     half_black(WIDTH, HEIGHT).convert("RGB").save(folder / "a_mask.JPG", quality=90)
-    half_black(WIDTH, HEIGHT).save(folder / "b.png")  # of the photo's name
+    half_black(WIDTH, HEIGHT).save(folder / "b.png")  # a mask by the photo's own name
     half_black(300, 300).save(folder / "b_mask.png")
     result = ingest(folder)
     assert list(result.photos) == ["a.jpg", "b.jpg"]

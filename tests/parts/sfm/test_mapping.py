@@ -90,7 +90,7 @@ def test_the_best_keypoints_are_spread_and_bring_their_partners() -> None:
     cells = np.bincount((places[chosen[1]] // 5).astype(int) @ [1, 8], minlength=64)
     assert cells.min() == 2
     assert chosen[1][700:720].all()
-    assert chosen[1].sum() < 200  # of 1600; more than requested, since photo 2 has its own cells
+    assert chosen[1].sum() < 200  # out of 1600; more than requested, since photo 2 has its own cells
     with_partner = chosen[2][::-1] >= chosen[1]
     with_partner[700:720] = True  # photo 3 brought some of these in
     assert with_partner.all()

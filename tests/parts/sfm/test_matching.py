@@ -33,7 +33,7 @@ def write_features(path: Path) -> None:
     """Write a database of photos of the same points from a row of places, but for the last photo."""
     rng = np.random.default_rng(0)
     points = np.stack([rng.uniform(-3, 3, POINTS), rng.uniform(-2, 2, POINTS), rng.uniform(6, 12, POINTS)], axis=1)
-    looks = rng.gamma(0.7, size=(POINTS, 128))
+    descriptors = rng.gamma(0.7, size=(POINTS, 128))
     with pycolmap.Database.open(path) as database:
         database.write_camera(CAMERA, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
@@ -52,7 +52,7 @@ def write_features(path: Path) -> None:
             of = (
                 rng.gamma(0.7, size=(POINTS, 128))
                 if number == PHOTOS
-                else looks + 0.15 * rng.gamma(0.7, size=(POINTS, 128))
+                else descriptors + 0.15 * rng.gamma(0.7, size=(POINTS, 128))
             )
             order = rng.permutation(POINTS)
             values = np.rint(512.0 * of / np.linalg.norm(of, axis=1, keepdims=True))[order].astype(np.uint8)

@@ -18,7 +18,7 @@ from splatpipe.pipeline.photos.pixels.dataset import load_points, load_views
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.render.view_measures import shows_inside
 from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header, write_splat
-from splatpipe.pipeline.splat.sky import backdrop as counted
+from splatpipe.pipeline.splat.sky import backdrop as backdrop_module
 from splatpipe.pipeline.splat.sky.backdrop import backdrop_limit, coarse_start
 from splatpipe.pipeline.splat.sky.panorama import write_panorama
 from splatpipe.pipeline.train.options import TrainConfig
@@ -42,7 +42,7 @@ AREA = PlanArea(AXES, ((HALF,),))
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tiny scene's backdrop is also part of its inside."""
-    monkeypatch.setattr(counted, "MIN_OUTSIDE", 5)
+    monkeypatch.setattr(backdrop_module, "MIN_OUTSIDE", 5)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_initial_points_include_all_of_the_inside_and_an_even_sample_of_the_rest
     assert set(range(100, 400)) <= set(rows.tolist())
     others = np.setdiff1d(rows, np.arange(100, 400))
     assert len(others) == backdrop_limit(300) == 150
-    assert np.diff(np.searchsorted(np.flatnonzero(~inside), others)).max() <= 5  # of 700, every 4.7th is taken
+    assert np.diff(np.searchsorted(np.flatnonzero(~inside), others)).max() <= 5  # every 4.7th of 700 is taken
     np.testing.assert_array_equal(coarse_start(np.ones(7, np.bool_)), np.arange(7))
     assert len(coarse_start(np.zeros(70, np.bool_))) == 5  # no inside, but still a backdrop
 
@@ -154,11 +154,11 @@ def test_pixels_are_inside_or_outside_by_their_surface() -> None:
     camera = tiny_scene.cameras()[4]
     depth = np.full((camera.height, camera.width), 4.0, np.float32)
     depth[:5] = 0.0
-    shown = shows_inside(AREA, camera, depth)
+    visible = shows_inside(AREA, camera, depth)
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
     left = camera.unproject(pixels.reshape(-1, 2), np.full(depth.size, 4.0))[:, 0].reshape(depth.shape) < 0.0
-    np.testing.assert_array_equal(shown[5:], left[5:])
-    assert not shown[:5].any() and 0.3 < shown.mean() < 0.6
+    np.testing.assert_array_equal(visible[5:], left[5:])
+    assert not visible[:5].any() and 0.3 < visible.mean() < 0.6
 
 
 def test_figures_are_of_the_inside_and_those_of_the_whole_image_are_given_too(inputs: Inputs, tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def test_frozen_gaussians_stay_bit_identical_and_have_no_moments(
     frozen = read_splat(undisturbed / "frozen.ply")
     assert 0 < len(frozen) <= TASK.frozen
 
-    def look(state: TrainState, photo: TrainingPhoto) -> None:
+    def observe(state: TrainState, photo: TrainingPhoto) -> None:
         assert len(state.drawn) == len(state.gaussians) + len(frozen)
         around.append(state.drawn.detach().after(len(state.gaussians)))
         moments = (*state.adam.mean.values(), *state.adam.square.values(), *state.density.to_arrays().values())
@@ -121,7 +121,7 @@ def test_frozen_gaussians_stay_bit_identical_and_have_no_moments(
         tensors = (*state.drawn.tensors().values(), *moments)
         held.append(sum(tensor.numel() * tensor.element_size() for tensor in tensors))
 
-    step_with(monkeypatch, look)
+    step_with(monkeypatch, observe)
     trained(site, tmp_path, threads=2)
     for name in PARAMETERS:
         assert all(torch.equal(getattr(drawn, name), getattr(frozen, name)) for drawn in (around[0], around[-1]))
@@ -158,14 +158,14 @@ def test_windows_that_show_the_cell_are_each_used_as_often_as_without_blocks(sit
 def test_killed_block_resumes_with_other_threads_and_ends_with_the_same_bits(
     site: SiteParts, undisturbed: Path, tmp_path: Path
 ) -> None:
-    def look(state: TrainState, photo: TrainingPhoto) -> None:
+    def observe(state: TrainState, photo: TrainingPhoto) -> None:
         if state.iteration == 31:
             raise Kill
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        step_with(patch, look)
+        step_with(patch, observe)
         trained(site, tmp_path)
     assert (tmp_path / loop.CHECKPOINT).exists()
     assert digest(trained(site, tmp_path, threads=2)) == digest(undisturbed)
@@ -195,7 +195,7 @@ def test_a_blocks_views_read_back_and_a_missing_file_is_reported(site: SiteParts
     read_back = BlockScope.read(site.prospects, 0)
     read_back.write(tmp_path, 0)
     assert (tmp_path / "block_1.npz").read_bytes() == (site.prospects / "block_1.npz").read_bytes()
-    assert sorted(read_back.counted) == rows_of(read_back.windows) and len(read_back.around.rows) > 0
+    assert sorted(read_back.sample_masks) == rows_of(read_back.windows) and len(read_back.around.rows) > 0
     for read_missing in (lambda: BlockScope.read(tmp_path, 1), lambda: read_free_space(tmp_path, cameras)):
         with pytest.raises(StageError, match="cannot be read") as raised:
             read_missing()
@@ -203,12 +203,12 @@ def test_a_blocks_views_read_back_and_a_missing_file_is_reported(site: SiteParts
 
 
 def test_interrupt_leaves_a_checkpoint(site: SiteParts, tmp_path: Path) -> None:
-    def look(state: TrainState, photo: TrainingPhoto) -> None:
+    def observe(state: TrainState, photo: TrainingPhoto) -> None:
         if state.iteration == 9:
             os.kill(os.getpid(), signal.SIGTERM)
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        step_with(patch, look)
+        step_with(patch, observe)
         trained(site, tmp_path)
     plan = TrainingPlan.from_json((tmp_path / "plan.json").read_text())
     assert load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest()).facts["iteration"] == 10
@@ -249,12 +249,12 @@ def test_photos_come_with_their_counting_pixels_and_share_of_the_whole(
 ) -> None:
     photos: list[TrainingPhoto] = []
 
-    def look(state: TrainState, photo: TrainingPhoto) -> None:
+    def observe(state: TrainState, photo: TrainingPhoto) -> None:
         photos.append(photo)
         if len(photos) == 60:
             raise Kill
 
-    step_with(monkeypatch, look)
+    step_with(monkeypatch, observe)
     for name in ("plan.json", "frozen.ply"):
         (tmp_path / name).write_bytes((undisturbed / name).read_bytes())
     with pytest.raises(Kill):

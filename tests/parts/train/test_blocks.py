@@ -27,12 +27,12 @@ from splatpipe.pipeline.train.blocks.cells.needs import (
     shared_cap,
     with_margin,
 )
-from splatpipe.pipeline.train.blocks.cells.partition import NOBODY, Cell, Partition
+from splatpipe.pipeline.train.blocks.cells.partition import NO_OWNER, Cell, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.cells.surroundings import visible_around
 from splatpipe.pipeline.train.blocks.cells.thinning import thinned
 from splatpipe.pipeline.train.blocks.cells.visibility import block_views, windows
-from splatpipe.pipeline.train.blocks.merging import counted, own_pieces, owned
+from splatpipe.pipeline.train.blocks.merging import count_and_degree, own_pieces, owned
 from splatpipe.pipeline.train.plan.limits import FIXED_BYTES
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -41,7 +41,7 @@ UP = np.array([0.0, 0.0, 1.0])
 PLAN = GroundPlan.across(UP)
 
 
-EVERY = 7  # of the surface's points is a sparse one
+EVERY = 7  # stride: every seventh point of the surface is a sparse one
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_places_beyond_the_site_belong_to_the_nearest_cell(
     for block in range(len(partition.cells)):
         assert partition.trained_by(block, beyond)[owners == block].all()
     broken = np.array([[math.nan] * 3, [math.inf, 0.0, 0.0], [0.0, -math.inf, 0.0]])
-    assert partition.owners(broken).tolist() == 3 * [NOBODY]
+    assert partition.owners(broken).tolist() == 3 * [NO_OWNER]
     assert not partition.trained_by(0, broken).any()
 
 
@@ -211,8 +211,8 @@ def test_a_blocks_photos_show_all_of_its_cell(seen: list[PhotoCoverage], sparse:
         others = [k for k in range(len(seen)) if seen[k].camera.name not in names]
         for number in others:  # no part of the cell that a photo shows is lost
             samples = seen[number].samples(sparse)
-            shown = samples.weights[partition.owners(samples.places) == block].sum()
-            assert shown <= 0.08 * seen[number].pixels
+            visible = samples.weights[partition.owners(samples.places) == block].sum()
+            assert visible <= 0.08 * seen[number].pixels
 
 
 def test_work_of_a_block_is_forecast_before_anything_is_divided(
@@ -233,11 +233,11 @@ def test_windows_are_those_of_training(seen: list[PhotoCoverage]) -> None:
     camera = seen[0].camera
     assert windows(camera, 0).tolist() == [[0, 0, camera.width, camera.height]]
     parts = windows(camera, 5000)
-    shown = np.zeros((camera.height, camera.width), np.int64)
+    visible = np.zeros((camera.height, camera.width), np.int64)
     for left, top, right, bottom in parts.tolist():
-        shown[top:bottom, left:right] += 1
+        visible[top:bottom, left:right] += 1
         assert (right - left) * (bottom - top) <= 5000
-    assert len(parts) > 1 and (shown == 1).all()
+    assert len(parts) > 1 and (visible == 1).all()
 
 
 def test_a_building_hides_the_ground_behind_it(coarse: Gaussians, sparse: Float64[np.ndarray, "p 3"]) -> None:
@@ -271,11 +271,11 @@ def test_masked_pixels_do_not_count_as_work(coarse: Gaussians, sparse: Float64[n
     rows = building_site.observed(sparse, [view], coarse)
     half = np.zeros((86, 115), np.bool_)
 
-    def counted(grid: object) -> np.ndarray:
+    def left_half(grid: object) -> np.ndarray:
         half[:, : half.shape[1] // 2] = True
         return half
 
-    (coverage,) = photo_coverages([view], rows, lambda grid: np.full((86, 115), 20.0, np.float32), counted)
+    (coverage,) = photo_coverages([view], rows, lambda grid: np.full((86, 115), 20.0, np.float32), left_half)
     samples = coverage.samples(sparse)
     assert abs(samples.weights.sum() / (view.width * view.height) - 57 / 115) < 0.01
     assert samples.pixels[:, 0].max() <= view.width / 2 and math.isclose(
@@ -310,8 +310,8 @@ def test_surroundings_leave_a_blocks_photos_unchanged(
 def _likeness(whole: Gaussians, drawn: Gaussians, coverage: PhotoCoverage, parts: np.ndarray) -> float:
     pictures = [render(model, coverage.camera, building_site.OPTIONS).colour for model in (whole, drawn)]
     square = np.square((pictures[0] - pictures[1]).numpy())
-    shown = [square[top:bottom, left:right].ravel() for left, top, right, bottom in parts.tolist()]
-    return -10.0 * math.log10(max(float(np.concatenate(shown).mean()), 1e-12))
+    visible = [square[top:bottom, left:right].ravel() for left, top, right, bottom in parts.tolist()]
+    return -10.0 * math.log10(max(float(np.concatenate(visible).mean()), 1e-12))
 
 
 def test_thinning_keeps_moments_and_isolated_gaussians() -> None:
@@ -350,7 +350,7 @@ def _covariance(gaussians: Gaussians, row: int) -> torch.Tensor:
 
 
 def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:
-    count, degree = counted(partition, trained.__getitem__)
+    count, degree = count_and_degree(partition, trained.__getitem__)
     whole = Gaussians.concat(list(own_pieces(partition, trained.__getitem__)))
     assert (len(whole), whole.sh_degree) == (count, degree)
     return whole
@@ -402,7 +402,7 @@ def test_blocks_merged_one_at_a_time_give_the_same_bytes_as_all_at_once(
     means = coarse.means.double().numpy()
     trained = {n: coarse.select(torch.from_numpy(partition.trained_by(n, means))) for n in range(4)}
     read = ModelSource(trained)
-    count, degree = counted(partition, read)
+    count, degree = count_and_degree(partition, read)
     write_splat_parts(tmp_path / "merged.ply", own_pieces(partition, read), count, degree, ["a comment"])
     assert read.order == 2 * [0, 1, 2, 3] and read.alive == 0
     whole = Gaussians.concat([owned(partition, block, read.models[block]) for block in range(4)])
@@ -411,7 +411,7 @@ def test_blocks_merged_one_at_a_time_give_the_same_bytes_as_all_at_once(
     held = read(0)
     assert read(1) is not held and read.alive == len(held.tensors())  # it would have been noticed
     with pytest.raises(ValueError, match="degrees"):
-        counted(partition, {**trained, 3: Gaussians.empty(3, 0 if degree else 1)}.__getitem__)
+        count_and_degree(partition, {**trained, 3: Gaussians.empty(3, 0 if degree else 1)}.__getitem__)
 
 
 def test_gaussians_that_move_into_a_neighbours_cell_are_dropped(coarse: Gaussians) -> None:

@@ -105,8 +105,8 @@ def test_shares_add_up_to_the_cap_and_no_block_has_more_than_fits() -> None:
     assert capped_shares(100, [1.0, 1.0, 8.0], [90, 90, 40]) == [30, 30, 40]
     assert capped_shares(100, [1.0, 1.0], [10, 10]) == [10, 10]
     division = divided(SITE, 1_500_000_000)
-    counted = [(1.0, 1000, 1400), (3.0, 2000, 2300), (1.0, 0, 0), *[(1.0, 1000, 1400)] * (division.blocks - 3)]
-    limits = block_limits(division, SITE.sh_degree, counted)
+    block_counts = [(1.0, 1000, 1400), (3.0, 2000, 2300), (1.0, 0, 0), *[(1.0, 1000, 1400)] * (division.blocks - 3)]
+    limits = block_limits(division, SITE.sh_degree, block_counts)
     assert sum(each.share for each in limits) == SITE.cap
     for each in limits:
         assert 0 < each.share <= each.trained <= division.need.trained and each.frozen > 0
@@ -173,8 +173,8 @@ def test_blocks_model_the_sky_and_exclude_moving_objects(tmp_path: Path) -> None
     assert panorama is not None
     for view in load_views(folder / "dataset"):
         photo, sky = skies.trace(view.camera)
-        shown = rasterizer.render(model, view.camera, rasterizer.RenderOptions(0))
-        assert float(shown.alpha[torch.from_numpy(sky)].mean()) < 0.05  # no block has added Gaussians there
+        sky_render = rasterizer.render(model, view.camera, rasterizer.RenderOptions(0))
+        assert float(sky_render.alpha[torch.from_numpy(sky)].mean()) < 0.05  # no block has added Gaussians there
         behind = panorama.behind(view.camera, (0.0, 0.0, 0.0)).numpy()
         assert np.abs(behind - photo.pixels / 255.0)[sky].mean() < 0.03
 

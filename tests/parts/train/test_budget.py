@@ -28,7 +28,7 @@ from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan import plan as planning_of_schedule
 from splatpipe.pipeline.train.plan.budget import (
-    FEWEST_GAUSSIANS,
+    MIN_GAUSSIANS,
     SCHEDULE_SHARE,
     SMALLEST_MEGAPIXELS,
     BudgetChoice,
@@ -144,11 +144,11 @@ def test_a_speed_separates_costs_that_windows_avoid() -> None:
 def test_a_forecast_counts_windows_as_they_are_cut() -> None:
     footage = PhotoSizes(((2304, 1728, 50),), 500_000)
     schedule = resolve_schedule(TrainConfig(least_iterations=1000, max_gaussians=50_000), footage)
-    speed, looks = replace(SPEED, seen_s=5e-7), schedule.training_sizes_until(schedule.iterations)
-    assert len(set(looks)) == 3
-    rooms = [room_at(schedule.density, 8_000, number) for number in range(1, len(looks) + 1)]
+    speed, sizes = replace(SPEED, seen_s=5e-7), schedule.training_sizes_until(schedule.iterations)
+    assert len(set(sizes)) == 3
+    rooms = [room_at(schedule.density, 8_000, number) for number in range(1, len(sizes) + 1)]
     each = [
-        speed.seconds(room, footage.pixels(look), footage.share(look)) for room, look in zip(rooms, looks, strict=True)
+        speed.seconds(room, footage.pixels(size), footage.share(size)) for room, size in zip(rooms, sizes, strict=True)
     ]
     assert forecast(speed, schedule, 8_000, footage) == pytest.approx(math.fsum(each), rel=0.01)
 
@@ -188,7 +188,7 @@ def test_no_cost_is_below_zero_whatever_was_measured() -> None:
 
 def test_forecast_is_the_sum_over_the_iterations() -> None:
     schedule = resolve_schedule(tiny_scene.plain(iterations=2400, max_gaussians=50_000, coarse_levels=2))
-    levels = [look.level for look in schedule.training_sizes_until(2400)]
+    levels = [size.level for size in schedule.training_sizes_until(2400)]
     each = [SPEED.seconds(room_at(schedule.density, 8_000, i + 1), 4e5 / 4**level) for i, level in enumerate(levels)]
     assert forecast(SPEED, schedule, 8_000, PhotoSizes(((800, 500, 32),))) == pytest.approx(math.fsum(each), rel=0.01)
 
@@ -226,7 +226,7 @@ def test_no_limit_is_exceeded_however_much_time_there_is() -> None:
 
 def test_too_little_time_still_plans_the_smallest_training() -> None:
     choice = choose(replace(task_of(0.01, size=2.0), sparse=500_000))
-    assert choice.options.iterations == MIN_ITERATIONS and choice.options.max_gaussians == FEWEST_GAUSSIANS
+    assert choice.options.iterations == MIN_ITERATIONS and choice.options.max_gaussians == MIN_GAUSSIANS
     assert choice.options.max_megapixels == SMALLEST_MEGAPIXELS
 
 
@@ -388,7 +388,7 @@ def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused
         train.run(config, make_inputs(scene), tmp_path, tiny_scene.Recorder())
     assert "--max-memory at least" in raised.value.hint
     assert not (tmp_path / "plan.json").exists()
-    assert count < FEWEST_GAUSSIANS
+    assert count < MIN_GAUSSIANS
 
 
 def test_memory_that_holds_the_sparse_points_takes_dense_ones_without_a_warning(
@@ -417,7 +417,7 @@ def test_little_memory_takes_smaller_windows_before_it_refuses(monkeypatch: pyte
     assert (
         fitted.options.max_gaussians * of_one >= 0.74 * room and fitted.schedule.iterations > plan.schedule.iterations
     )
-    least = FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + FEWEST_GAUSSIANS * of_one
+    least = FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + MIN_GAUSSIANS * of_one
     tight = limited.of(plan.options.model_copy(update={"max_memory_bytes": least}))
     assert memory.within_memory(tight, 5000, tiny_scene.Recorder()).window_pixels == SMALLEST_WINDOW
     refused = limited.of(plan.options.model_copy(update={"max_memory_bytes": FIXED_BYTES + of_one}))

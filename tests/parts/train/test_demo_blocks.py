@@ -15,11 +15,11 @@ from splatpipe.pipeline.train.blocks.cells.cutting import cut, shares, site, wor
 from splatpipe.pipeline.train.blocks.cells.partition import Border, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import photo_coverages
 from splatpipe.pipeline.train.blocks.cells.visibility import block_views, windows
-from splatpipe.pipeline.train.blocks.merging import counted, own_pieces
+from splatpipe.pipeline.train.blocks.merging import count_and_degree, own_pieces
 
 
 def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:
-    count, degree = counted(partition, trained.__getitem__)
+    count, degree = count_and_degree(partition, trained.__getitem__)
     whole = Gaussians.concat(list(own_pieces(partition, trained.__getitem__)))
     assert (len(whole), whole.sh_degree) == (count, degree)
     return whole

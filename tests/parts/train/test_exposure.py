@@ -24,7 +24,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.techniques import techniques
 from splatpipe.stages import initialize, train
 
-GAINS = np.linspace(0.7, 1.0, tiny_scene.CAMERAS)  # of the photos in the arc's order: every other one is turned round
+GAINS = np.linspace(0.7, 1.0, tiny_scene.CAMERAS)  # by photo, in the arc's order: every other one is turned round
 GAINS[::2] = GAINS[::2][::-1]
 
 
@@ -120,7 +120,7 @@ def test_maps_are_the_photos_gains_and_the_splat_is_neutral(scene: Path, tmp_pat
     assert sorted(found["views"]) == [view.camera.name for view in load_views(scene / "dataset")]
     maps = np.array([found["views"][name] for name in sorted(found["views"])])
     assert np.abs(maps.mean(axis=0) - np.eye(3, 4)).max() < 1e-6
-    grey = maps[:, :, :3].sum(axis=2).mean(axis=1) + 2.0 * maps[:, :, 3].mean(axis=1)  # of a grey of 0.5, relative
+    grey = maps[:, :, :3].sum(axis=2).mean(axis=1) + 2.0 * maps[:, :, 3].mean(axis=1)  # relative to a grey of 0.5
     assert np.corrcoef(grey, GAINS)[0, 1] > 0.95
     assert neutral_error(scene, modelled / "model.ply") < 0.8 * neutral_error(scene, plain / "model.ply")
     assert json.loads((plain / "exposures.json").read_text()) == {"model": "off", "views": {}}

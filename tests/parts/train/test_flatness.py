@@ -56,19 +56,19 @@ def test_noise_raises_the_expected_gain_and_does_not_end_a_training() -> None:
 def test_a_falling_curve_few_epochs_and_the_schedules_end_are_not_flat() -> None:
     plan = make_plan(7000, 0.05)
     assert not flatness.is_flat(power_law(-0.5), plan, 5000)
-    assert not flatness.is_flat(power_law(0.0)[: flatness.FEWEST_EPOCHS - 1], plan, 4200)
+    assert not flatness.is_flat(power_law(0.0)[: flatness.MIN_EPOCHS - 1], plan, 4200)
     assert not flatness.is_flat(power_law(0.0, until=6500), plan, 6500)  # a tail would end after the schedule
     assert not flatness.is_flat([(middle, 0.0) for middle, _ in power_law(0.0)], plan, 5000)
 
 
 def test_nothing_is_judged_before_density_control_all_degrees_and_full_size() -> None:
     schedule = make_plan(1000, 0.1).schedule
-    assert flatness.settled_from(schedule) == 3 * schedule.sh_every == 600
+    assert flatness.final_phase_from(schedule) == 3 * schedule.sh_every == 600
     longer = replace(schedule, density=replace(schedule.density, last=700))
-    assert flatness.settled_from(longer) == 700
+    assert flatness.final_phase_from(longer) == 700
     unchanging = replace(schedule, sh_degree=1, density=replace(longer.density, on=False))
-    assert flatness.settled_from(unchanging) == 200
-    assert flatness.settled_from(replace(schedule, stretches=(Stretch(1, 0, 900), Stretch(0, 0, 1000)))) == 900
+    assert flatness.final_phase_from(unchanging) == 200
+    assert flatness.final_phase_from(replace(schedule, stretches=(Stretch(1, 0, 900), Stretch(0, 0, 1000)))) == 900
 
 
 def test_before_the_finest_size_losses_count_since_growth_begins_and_opacities_were_reset() -> None:
@@ -77,7 +77,7 @@ def test_before_the_finest_size_losses_count_since_growth_begins_and_opacities_w
     assert flatness.judged_from(schedule, 650, [300, 500]) == 500
     three = replace(schedule, stretches=(Stretch(2, 0, 600), *schedule.stretches))
     assert flatness.judged_from(three, 650, [300]) == 600
-    assert flatness.judged_from(three, 701, [300]) == flatness.settled_from(three)
+    assert flatness.judged_from(three, 701, [300]) == flatness.final_phase_from(three)
 
 
 def test_a_size_is_flat_where_all_iterations_that_are_left_would_gain_too_little() -> None:
@@ -147,7 +147,7 @@ def trained(scene: Path, out: Path, config: TrainConfig) -> tuple[dict[str, obje
 def test_a_flat_training_ends_early_and_says_so(scene: Path, tmp_path: Path) -> None:
     summary, recorder = trained(scene, tmp_path, FLAT)
     flat_at = summary["flat_at"]
-    assert isinstance(flat_at, int) and flat_at % 6 == 0 and flat_at >= 15 + 6 * flatness.FEWEST_EPOCHS
+    assert isinstance(flat_at, int) and flat_at % 6 == 0 and flat_at >= 15 + 6 * flatness.MIN_EPOCHS
     end = flat_at + round(0.1 * flat_at)
     assert summary["iterations"] == end < summary["planned_iterations"] == 200
     assert recorder.steps[-1] == (end, end)
@@ -166,7 +166,7 @@ def test_a_training_that_still_improves_runs_to_its_end_with_the_same_bits(scene
 
 def test_a_size_whose_loss_is_flat_is_followed_by_larger_photos_at_once(scene: Path, tmp_path: Path) -> None:
     summary, recorder = trained(scene, tmp_path, SIZES)
-    assert summary["sizes_ended"] == [6 * flatness.FEWEST_EPOCHS]
+    assert summary["sizes_ended"] == [6 * flatness.MIN_EPOCHS]
     assert any("flat after 48 iterations: continuing with larger photos, to 161" in note for note in recorder.notes)
     history = json.loads((tmp_path / "history.json").read_text())
     assert {point["width"] for point in history["curve"]} == {tiny_scene.WIDTH}  # from iteration 50 on

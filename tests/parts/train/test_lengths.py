@@ -12,8 +12,8 @@ import tiny_scene
 
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.lengths import (
-    FEWEST_VISITS,
     MAX_FIRST_ITERATIONS,
+    MIN_PART_VISITS,
     PART_VISITS,
     WHOLE_VISITS,
     PhotoSizes,
@@ -51,8 +51,10 @@ def test_every_window_of_every_photo_is_visited_often_enough_at_every_size(
     assert footage.parts(first) == photos and whole >= WHOLE_VISITS * photos
     assert all(count >= PART_VISITS * footage.parts(level) for level, count in finer)
     assert least <= sum(count for _, count in found)
-    shown = [TrainingSize(level, footage.window_at(level)) for level, _ in found]
-    assert all(0.0 < footage.pixels(look) <= WINDOW and footage.largest(look) <= WINDOW for look in shown)
+    sizes = [TrainingSize(level, footage.window_at(level)) for level, _ in found]
+    assert all(
+        0.0 < footage.pixels(each_size) <= WINDOW and footage.largest(each_size) <= WINDOW for each_size in sizes
+    )
     assert growth_until(found) == sum(count for _, count in found[:-1]) + found[-1][1] // 2
 
 
@@ -88,7 +90,7 @@ def test_a_size_that_a_short_run_would_hardly_use_is_left_out() -> None:
     footage = footage_of(50, 4.0)
     last = [divided(footage, 7000, iterations)[-1] for iterations in (300, 2000, 4000, 15_000)]
     assert [level for level, _ in last] == [2, 2, 1, 0]
-    assert all(count >= FEWEST_VISITS * footage.parts(level) for level, count in last[2:])
+    assert all(count >= MIN_PART_VISITS * footage.parts(level) for level, count in last[2:])
 
 
 def test_photos_of_several_sizes_begin_where_half_of_them_fit_in_whole() -> None:
@@ -115,9 +117,9 @@ def test_a_schedule_grows_gaussians_into_the_finest_size_and_resets_none_there()
     assert schedule.finest_from < schedule.density.last < schedule.iterations
     resets = [iteration for iteration in range(1, schedule.iterations + 1) if schedule.density.is_reset(iteration)]
     assert resets and max(resets) < each[0][1]
-    assert schedule.look_at(1) == TrainingSize(2) and schedule.look_at(schedule.iterations + 5) == TrainingSize(
-        0, WINDOW
-    )
+    assert schedule.training_size_at(1) == TrainingSize(2) and schedule.training_size_at(
+        schedule.iterations + 5
+    ) == TrainingSize(0, WINDOW)
     assert [schedule.training_sizes_until(each[0][1] + 1)[index] for index in (0, -2, -1)] == [
         TrainingSize(2),
         TrainingSize(2),

@@ -31,7 +31,7 @@ from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
 
-SCALE = 2  # of the tiny photos: so that cells of four pixels average something
+SCALE = 2  # times the tiny photos' sides: so that cells of four pixels average something
 HELD_OUT = (1, 3, 5)  # between the others: a test of what was learnt, not of extrapolation
 CARS = {2: (20, 30, 40, 60), 4: (60, 90, 85, 125)}  # top, left, bottom, right in a photo, pixels
 YELLOW = (0.9, 0.86, 0.12)
@@ -262,8 +262,8 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
         summary = dict(train.run(config, inputs, out, tiny_scene.Recorder()))
     model = read_splat(out / "model.ply")
     views = [cameras()[number] for number in HELD_OUT]
-    shown = [torch.from_numpy(tiny_scene.photograph(model, view)).float() / 255.0 for view in views]
-    psnr = [float(metrics.psnr(one, true_photo(view))) for one, view in zip(shown, views, strict=True)]
+    renders = [torch.from_numpy(tiny_scene.photograph(model, view)).float() / 255.0 for view in views]
+    psnr = [float(metrics.psnr(one, true_photo(view))) for one, view in zip(renders, views, strict=True)]
     return TrainedRun(summary, float(np.mean(psnr)), kept[0], out)
 
 

@@ -175,7 +175,9 @@ def test_a_stream_continued_with_another_sequence_equals_one_begun_with_it(
     with PhotoStream.over(views, [TrainingSize(level) for level in planned], 0, begun, cache) as photos:
         photos.fill(tiny_scene.Recorder())
         seen = [next(photos) for _ in range(begun, 13)]
-        photos.go_on(PhotoOrder([view.camera for view in views], [TrainingSize(level) for level in later], 0), 13)
+        photos.switch_order(
+            PhotoOrder([view.camera for view in views], [TrainingSize(level) for level in later], 0), 13
+        )
         seen += photos
     assert len(seen) == len(expected[begun - 1 :])
     assert all(same(one, other) for one, other in zip(seen, expected[begun - 1 :], strict=True))

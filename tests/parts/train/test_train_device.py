@@ -117,12 +117,12 @@ def test_a_checkpoint_fetches_one_array_at_a_time_with_the_same_bytes(
 
 def test_memory_that_runs_out_while_rows_are_moved_is_not_handled_as_a_shortage() -> None:
     class Tight(Tensor):
-        looks, is_cuda = 0, True
+        calls, is_cuda = 0, True
 
         def __getitem__(self, rows: object) -> Tensor:
             if isinstance(rows, Tensor):
-                Tight.looks += 1
-                if Tight.looks == 3:
+                Tight.calls += 1
+                if Tight.calls == 3:
                     raise torch.OutOfMemoryError("out of memory")
             return super().__getitem__(rows)
 
@@ -132,15 +132,15 @@ def test_memory_that_runs_out_while_rows_are_moved_is_not_handled_as_a_shortage(
         taken_in_place(tensor, rows)
     assert not isinstance(failure.value, torch.OutOfMemoryError)
     assert torch.equal(tensor.as_subclass(Tensor)[:, :16], values[rows, :16])  # two of six times
-    Tight.looks = 2
+    Tight.calls = 2
     tensor = values.clone().as_subclass(Tight)
     with pytest.raises(torch.OutOfMemoryError):  # before anything was moved
         taken_in_place(tensor, rows)
     assert torch.equal(tensor.as_subclass(Tensor), values)
-    Tight.looks = 2
+    Tight.calls = 2
     take_rows(tensors := {"sh": tensor}, rows)  # so the host's memory helps
-    assert Tight.looks > 3 and torch.equal(tensors["sh"].as_subclass(Tensor), values[rows])
-    Tight.looks = 0
+    assert Tight.calls > 3 and torch.equal(tensors["sh"].as_subclass(Tensor), values[rows])
+    Tight.calls = 0
     with pytest.raises(MachineError, match="40 Gaussians"):
         take_rows({"sh": values.clone().as_subclass(Tight)}, rows)
 
@@ -178,13 +178,13 @@ FAULTS = [
 @pytest.mark.parametrize("kind", [RuntimeError, getattr(torch, "AcceleratorError", RuntimeError)])
 def test_a_fault_of_the_card_says_what_to_do(kind: type[RuntimeError], text: str) -> None:
     """Torch raises it where it waits next; the error of our own calls reads the same."""
-    for shown in (as_splatpipe_error("train", kind(text)), for_the_user(kind(text))):
-        assert type(shown) is MachineError and exit_code(shown) == EXIT_MACHINE
-        assert shown.message in (
+    for raised in (as_splatpipe_error("train", kind(text)), for_the_user(kind(text))):
+        assert type(raised) is MachineError and exit_code(raised) == EXIT_MACHINE
+        assert raised.message in (
             "The graphics card failed: an illegal memory access was encountered.",
             "The graphics card failed: unspecified launch failure.",
         )
-        assert "resumes from its last checkpoint" in shown.hint and "--device cpu" in shown.hint
+        assert "resumes from its last checkpoint" in raised.hint and "--device cpu" in raised.hint
 
 
 def test_other_errors_are_not_faults_of_the_card() -> None:

@@ -87,7 +87,7 @@ def trained(scene: Path, out: Path, config: TrainConfig = QUICK, threads: int = 
 def test_sky_begins_with_the_colours_that_the_photos_show(scene: Path) -> None:
     sky = SkyModel.begin(load_views(scene / "dataset"), scene / "dataset", 2)
     assert sky is not None and sky.photos == len(skies.HEADINGS)
-    camera = skies.look(heading_deg=3.0, pitch_deg=8.0)
+    camera = skies.aimed_camera(heading_deg=3.0, pitch_deg=8.0)
     photo, truth = skies.trace(camera)
     with torch.no_grad():
         seen = sky.panorama.behind(camera, (0.0, 0.0, 0.0)).numpy()
@@ -128,7 +128,7 @@ def empty_render(camera: Camera) -> Render:
 
 
 def test_constant_sky_is_learnt_in_a_few_steps_and_only_from_pixels_of_the_sky() -> None:
-    camera = skies.look(pitch_deg=30.0).scaled(80, 60)
+    camera = skies.aimed_camera(pitch_deg=30.0).scaled(80, 60)
     mask = np.zeros((60, 80), bool)
     mask[:30] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
@@ -146,7 +146,7 @@ def test_constant_sky_is_learnt_in_a_few_steps_and_only_from_pixels_of_the_sky()
 
 
 def test_a_sky_trained_elsewhere_is_rendered_and_unchanged() -> None:
-    camera = skies.look(pitch_deg=30.0).scaled(80, 60)
+    camera = skies.aimed_camera(pitch_deg=30.0).scaled(80, 60)
     mask = np.zeros((60, 80), bool)
     mask[:30] = True
     colours = np.random.default_rng(1).random((CELLS, 3), np.float32)
@@ -154,8 +154,8 @@ def test_a_sky_trained_elsewhere_is_rendered_and_unchanged() -> None:
     given = SkyModel.given(trained.panorama, trained.masks).copied()
     alpha = torch.full((60, 80), 0.5).requires_grad_()
     for sky in (trained, given):
-        shown = sky.composite(replace(empty_render(camera), alpha=alpha), camera, sky.seen(camera), BLACK, BLACK)
-        (shown.mean() + sky.loss(alpha, sky.seen(camera))).backward()
+        composited = sky.composite(replace(empty_render(camera), alpha=alpha), camera, sky.seen(camera), BLACK, BLACK)
+        (composited.mean() + sky.loss(alpha, sky.seen(camera))).backward()
     assert alpha.grad is not None and trained.panorama.colours.grad is not None
     assert given.is_given and given.panorama.colours.grad is None
     np.testing.assert_array_equal(given.panorama.colours.numpy(), colours)
@@ -178,21 +178,21 @@ def test_skies_are_returned_for_the_requested_photos(tmp_path: Path) -> None:
 
 
 def test_away_from_the_sky_only_the_given_colour_shines_through() -> None:
-    camera = skies.look(pitch_deg=30.0)
+    camera = skies.aimed_camera(pitch_deg=30.0)
     mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     mask[:60] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
     rendered = replace(empty_render(camera), alpha=torch.full(mask.shape, 0.75))
     with torch.no_grad():
-        shown = sky.composite(rendered, camera, sky.seen(camera), BLACK, (1.0, 0.0, 0.2))
+        composited = sky.composite(rendered, camera, sky.seen(camera), BLACK, (1.0, 0.0, 0.2))
         unknown = sky.composite(rendered, camera, None, BLACK, (1.0, 0.0, 0.2))
-    torch.testing.assert_close(shown[:63], torch.full((63, skies.WIDTH, 3), 0.125))
-    torch.testing.assert_close(shown[64:120], torch.tensor([0.25, 0.0, 0.05]).expand_as(shown[64:120]))
+    torch.testing.assert_close(composited[:63], torch.full((63, skies.WIDTH, 3), 0.125))
+    torch.testing.assert_close(composited[64:120], torch.tensor([0.25, 0.0, 0.05]).expand_as(composited[64:120]))
     torch.testing.assert_close(unknown[:120], torch.full((120, skies.WIDTH, 3), 0.125))  # nothing is known of it
 
 
 def test_penalty_is_the_mean_opacity_in_front_of_the_sky() -> None:
-    camera = skies.look()
+    camera = skies.aimed_camera()
     mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     mask[:60] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
@@ -203,7 +203,7 @@ def test_penalty_is_the_mean_opacity_in_front_of_the_sky() -> None:
     assert alpha.grad is not None and torch.equal(alpha.grad != 0.0, torch.from_numpy(mask))
     small = sky.seen(camera.scaled(80, 60))
     assert small is not None and small.mask[:15].all() and not small.mask[15:].any()
-    assert sky.seen(skies.look(heading_deg=77.0)) is None
+    assert sky.seen(skies.aimed_camera(heading_deg=77.0)) is None
 
 
 def opacity_in_sky(scene: Path, model: Path) -> float:

@@ -36,14 +36,14 @@ TECHNIQUES: dict[str, object] = {
 }
 
 
-def look_at(schedule: Schedule, iteration: int) -> TrainingSize:
+def training_size_at(schedule: Schedule, iteration: int) -> TrainingSize:
     """Half the size in whole photos, then windows of the full size."""
     return TrainingSize(1) if iteration <= COARSE else TrainingSize(0, WINDOW_PIXELS)
 
 
 @pytest.fixture(autouse=True)
 def in_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Schedule, "look_at", look_at)
+    monkeypatch.setattr(Schedule, "training_size_at", training_size_at)
     assert len(windows_of(tiny_scene.WIDTH, tiny_scene.HEIGHT, WINDOW_PIXELS)) == 4
 
 
@@ -108,5 +108,7 @@ def test_killed_training_on_windows_ends_with_the_same_bits_on_any_number_of_thr
     assert (tmp_path / "killed" / loop.CHECKPOINT).exists()
     assert digests(trained(scene, tmp_path / "killed", config, threads=3)) == digests(whole)
     assert digests(trained(scene, tmp_path / "seed", config.model_copy(update={"seed": 1}))) != digests(whole)
-    monkeypatch.setattr(Schedule, "look_at", lambda schedule, iteration: TrainingSize(int(iteration <= COARSE)))
+    monkeypatch.setattr(
+        Schedule, "training_size_at", lambda schedule, iteration: TrainingSize(int(iteration <= COARSE))
+    )
     assert digests(trained(scene, tmp_path / "in whole photos", config)) != digests(whole)

@@ -21,7 +21,7 @@ from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrd
 from splatpipe.pipeline.train.plan.windows import PixelRectangle, TrainingSize, windows_of
 
 MASKED = "flight 1/photo_5.png"
-PIXELS = 800  # of a window: six in a tiny photo
+PIXELS = 800  # size of a window: six in a tiny photo
 SIZES = [(5472, 3648, 500_000), (5472, 3648, 1_000_000), (2300, 1740, 500_000), (3000, 4000, 700_000), (72, 54, 800)]
 
 
@@ -31,9 +31,9 @@ def views(tmp_path: Path) -> list[View]:
 
 
 def streamed(
-    views: list[View], cache: Path, looks: list[TrainingSize], first: int = 1, fill: bool = False
+    views: list[View], cache: Path, sizes: list[TrainingSize], first: int = 1, fill: bool = False
 ) -> list[TrainingPhoto]:
-    with PhotoStream.over(views, looks, 0, first, cache) as photos:
+    with PhotoStream.over(views, sizes, 0, first, cache) as photos:
         if fill:
             photos.fill(tiny_scene.Recorder())
         return list(photos)
@@ -94,14 +94,14 @@ def test_every_round_shows_every_window_of_a_photo_once_in_an_order_of_its_own()
 def test_windows_of_photos_of_several_sizes_are_seen_equally_often() -> None:
     small, large = tiny_scene.cameras()[:2]
     cameras = [small.scaled(640, 480), large.scaled(2000, 1500), small.scaled(600, 500)]
-    look = TrainingSize(0, 100_000)
-    cells = [len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras]
+    size = TrainingSize(0, 100_000)
+    cells = [len(windows_of(camera.width, camera.height, size.window_pixels)) for camera in cameras]
     assert len(set(cells)) > 1
-    order = PhotoOrder(cameras, [TrainingSize(2)] * 6 + [look] * (3 * sum(cells) + 1), 0)
+    order = PhotoOrder(cameras, [TrainingSize(2)] * 6 + [size] * (3 * sum(cells) + 1), 0)
     seen = [order.at(iteration) for iteration in range(1, len(order) + 1)]
     rounds = [seen[6 + start : 6 + start + sum(cells)] for start in range(0, 3 * sum(cells), sum(cells))]
-    shown = [[(crop.view, crop.window) for crop in each] for each in rounds]
-    assert all(len(set(each)) == sum(cells) for each in shown) and len({tuple(each) for each in shown}) == 3
+    crops = [[(crop.view, crop.window) for crop in each] for each in rounds]
+    assert all(len(set(each)) == sum(cells) for each in crops) and len({tuple(each) for each in crops}) == 3
 
 
 def rounds_of(order: TrainingOrder) -> dict[int, int]:
@@ -112,12 +112,12 @@ def rounds_of(order: TrainingOrder) -> dict[int, int]:
 
 def test_a_round_ends_when_every_photo_has_been_seen_and_of_larger_ones_every_window() -> None:
     cameras = [camera.scaled(720, 540) for camera in tiny_scene.cameras()]
-    look, windows = TrainingSize(0, 70_000), len(windows_of(720, 540, 70_000))
+    size, windows = TrainingSize(0, 70_000), len(windows_of(720, 540, 70_000))
     whole = PhotoOrder(
         cameras, [TrainingSize(2)] * 12 + [TrainingSize(1)] * 17, 0
     )  # epochs of photos, whatever their size
     assert rounds_of(whole) == {9: 9, 18: 9, 27: 9}
-    order = PhotoOrder(cameras, [TrainingSize(1)] * 12 + [look] * (18 * windows + 10), 0)
+    order = PhotoOrder(cameras, [TrainingSize(1)] * 12 + [size] * (18 * windows + 10), 0)
     ends = [9, 18, 18 + 9 * windows, 18 + 18 * windows]
     assert rounds_of(order) == dict(zip(ends, (9, 9, 9 * windows, 9 * windows), strict=True))
     seen = Counter(order.at(iteration).view for iteration in range(ends[1] + 1, ends[2] + 1))
@@ -126,12 +126,12 @@ def test_a_round_ends_when_every_photo_has_been_seen_and_of_larger_ones_every_wi
 
 def test_rounds_of_windows_that_are_mixed_or_chosen_begin_with_their_size() -> None:
     small, large = tiny_scene.cameras()[:2]
-    cameras, look = [small.scaled(640, 480), large.scaled(2000, 1500)], TrainingSize(0, 100_000)
-    count = sum(len(windows_of(camera.width, camera.height, look.window_pixels)) for camera in cameras)
-    mixed = PhotoOrder(cameras, [TrainingSize(2)] * 5 + [look] * (2 * count + 1), 0)
+    cameras, size = [small.scaled(640, 480), large.scaled(2000, 1500)], TrainingSize(0, 100_000)
+    count = sum(len(windows_of(camera.width, camera.height, size.window_pixels)) for camera in cameras)
+    mixed = PhotoOrder(cameras, [TrainingSize(2)] * 5 + [size] * (2 * count + 1), 0)
     assert rounds_of(mixed) == {2: 2, 4: 2, 5: 1, 5 + count: count, 5 + 2 * count: count}
     parts = {1: [(0, PixelRectangle(0, 0, 9, 9))], 0: [(view, PixelRectangle(0, 0, 9, 9)) for view in (0, 1, 1)]}
-    chosen = WindowOrder(cameras, [TrainingSize(1)] * 2 + [look] * 7, 0, None, parts)
+    chosen = WindowOrder(cameras, [TrainingSize(1)] * 2 + [size] * 7, 0, None, parts)
     assert rounds_of(chosen) == {1: 1, 2: 1, 5: 3, 8: 3}
 
 

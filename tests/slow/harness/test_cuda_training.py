@@ -235,7 +235,7 @@ def make_small_plan(config: TrainConfig) -> TrainingPlan:
 def test_short_memory_makes_chunks_then_the_model_smaller_and_then_is_reported(
     scene: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shortage, "FEWEST_GAUSSIANS", 120)
+    monkeypatch.setattr(shortage, "MIN_GAUSSIANS", 120)
     most = read_splat(whole / "model.ply")
     shot = shot_of(tiny_scene.cameras()[0], RenderOptions(3, depth=False), 16)
 
@@ -282,7 +282,7 @@ def test_a_budgets_trial_also_uses_smaller_chunks_if_memory_is_short(
         assert trial.iteration == 1 and len(trial.gaussians) == len(begun)
         return plan
 
-    monkeypatch.setattr(loop, "under_budgets", tried)
+    monkeypatch.setattr(loop, "plan_within_budgets", tried)
     _, recorder = trained(scene, tmp_path, ALL.model_copy(update={"iterations": 1}), kernels=kernels)
     assert recorder.warnings and all("smaller parts" in warning for warning in recorder.warnings)
 
@@ -308,7 +308,7 @@ def test_memory_that_ends_while_the_model_changes_ends_the_training_at_the_check
         plan = TrainingPlan.from_json((tmp_path / "plan.json").read_text())
         left = load_checkpoint(tmp_path / loop.CHECKPOINT, plan.digest())
         assert left.facts["iteration"] == plan.schedule.density.first - 1
-        patch.setattr(shortage, "FEWEST_GAUSSIANS", 10)
+        patch.setattr(shortage, "MIN_GAUSSIANS", 10)
         kernels.most_bytes = 1000
         with pytest.raises(MachineError, match="does not hold even"):
             trained(scene, tmp_path, ALL, kernels=kernels)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.photos.pixels.covering import COVERED, covering_photos
+from splatpipe.pipeline.photos.pixels.covering import MIN_COVERED_SHARE, covering_photos
 
 FEW = 12
 
@@ -29,7 +29,7 @@ def test_chosen_photos_show_nearly_every_point_several_times(photos: int) -> Non
     seen = flight(photos)
     chosen = covering_photos(seen, 4000, FEW)
     assert np.sqrt(FEW * photos) <= len(chosen) <= photos
-    assert (counts(seen, chosen) > 0).sum() >= COVERED * (counts(seen, range(photos)) > 0).sum()
+    assert (counts(seen, chosen) > 0).sum() >= MIN_COVERED_SHARE * (counts(seen, range(photos)) > 0).sum()
     assert np.median(counts(seen, chosen)) >= (1 if photos == 300 else 2)
 
 
@@ -53,13 +53,14 @@ def test_the_choice_does_not_depend_on_the_order() -> None:
 
 
 def test_the_choice_is_the_best_at_each_step() -> None:
-    seen, shown, expected = flight(40, seed=5), np.zeros(4000), []
+    seen, view_counts, expected = flight(40, seed=5), np.zeros(4000), []
     for _ in range(len(covering_photos(seen, 4000, FEW))):
         gains = [
-            0.0 if photo in expected else (1.0 / (1.0 + shown[rows]) ** 2).sum() for photo, rows in enumerate(seen)
+            0.0 if photo in expected else (1.0 / (1.0 + view_counts[rows]) ** 2).sum()
+            for photo, rows in enumerate(seen)
         ]
         expected.append(int(np.argmax(gains)))
-        shown[seen[expected[-1]]] += 1
+        view_counts[seen[expected[-1]]] += 1
     assert covering_photos(seen, 4000, FEW) == sorted(expected)
 
 

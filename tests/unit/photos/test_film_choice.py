@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.photos.video.choice import choose, overlaps_with
-from splatpipe.pipeline.photos.video.motion import LOST, Measures, joined, measure, motion, sharpness
+from splatpipe.pipeline.photos.video.motion import MAX_LOST_FRAMES, Measures, joined, measure, motion, sharpness
 
 FPS = 15.0
 
@@ -111,5 +111,5 @@ def test_a_flash_is_no_cut_and_another_scene_is_one() -> None:
     assert np.isnan(flash.steps[:, 0, 0]).sum() == 1 and flash.sharpness[10] == 0.0
     assert np.prod([step[0, 0] for step in flash.steps[1:]]) == pytest.approx(1.0, abs=0.02)
     assert flash.steps[1:, 0, 2].sum() * 960 == pytest.approx(-95.0, abs=2.0)
-    scenes = [*pan, *(other[100:640, 5 * k : 5 * k + 960] for k in range(LOST + 10))]
+    scenes = [*pan, *(other[100:640, 5 * k : 5 * k + 960] for k in range(MAX_LOST_FRAMES + 10))]
     assert np.isnan(joined(measure(frames_of(scenes))).steps[:, 0, 0]).sum() == 2

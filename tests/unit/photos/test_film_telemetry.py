@@ -123,20 +123,20 @@ def test_across_the_date_line_and_with_few_decimals() -> None:
     path = FlightPath([Fix(0.0, -17.0, 179.9998, decimals=4), Fix(1.0, -17.0, -179.9998, decimals=4)])
     middle = path.at(0.5)
     assert middle is not None and abs(middle.longitude) == pytest.approx(180.0)
-    assert middle.sigma_m == pytest.approx(4.39, abs=0.01)  # of 11 m steps and a receiver's 3 m
+    assert middle.sigma_m == pytest.approx(4.39, abs=0.01)  # combines rounding to 11 m and a receiver's 3 m
 
 
 def test_hostile_subtitles_take_little_time_and_memory(tmp_path: Path) -> None:
     rng = random.Random(0)
-    shown = "00:00:00,000 --> 00:00:01,000\n"
+    cue_times = "00:00:00,000 --> 00:00:01,000\n"
     attacks = [
         b"\xff" * 3_000_000,
         b"9" * 3_000_000,
-        (shown + "[latitude: " + " " * 2_000_000).encode(),
-        (shown + "GPS(" * 500_000).encode(),
-        (shown + "[latitude: 1" + "." * 1_000_000).encode(),
-        (shown + "47.0\n" * 300_000).encode(),
-        (shown * 100_000).encode(),
+        (cue_times + "[latitude: " + " " * 2_000_000).encode(),
+        (cue_times + "GPS(" * 500_000).encode(),
+        (cue_times + "[latitude: 1" + "." * 1_000_000).encode(),
+        (cue_times + "47.0\n" * 300_000).encode(),
+        (cue_times * 100_000).encode(),
         ("00:00:00,000 -->" * 100_000).encode(),
         bytes(rng.randrange(256) for _ in range(100_000)),
     ]

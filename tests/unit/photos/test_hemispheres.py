@@ -65,11 +65,11 @@ def test_numbers_that_are_no_degrees_minutes_and_seconds_give_no_position(latitu
     assert math.isnan(gps_of(PLACE | {1: "N", 2: latitude, 3: "E"}).latitude)
 
 
-@pytest.mark.parametrize(("south", "told"), [("S", True), ("", True)])
-def test_a_sign_of_the_degrees_is_that_of_the_angle(south: str, told: bool) -> None:
+@pytest.mark.parametrize(("south", "is_stated"), [("S", True), ("", True)])
+def test_a_sign_of_the_degrees_is_that_of_the_angle(south: str, is_stated: bool) -> None:
     """Pillow has no signed rationals in GPS tags: other writers do."""
     latitude, stated = _degrees((-33.0, 51.0, 36.0), south, LATITUDE_SIGNS)
-    assert (latitude, stated) == (pytest.approx(-33.86), told)
+    assert (latitude, stated) == (pytest.approx(-33.86), is_stated)
 
 
 @pytest.mark.parametrize(

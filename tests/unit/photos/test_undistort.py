@@ -292,7 +292,7 @@ def test_missing_or_mismatched_photos_are_named(tmp_path: Path) -> None:
     write_model(tmp_path / "model", source, ["a.png", "b.png", "c.png", "gone.png"])
     summary, recorder = run(inputs, tmp_path / "model", tmp_path / "out")
     assert summary["photos"] == 2
-    assert "c.png" in recorder.warnings[0]  # of gone.png, georef has told
+    assert "c.png" in recorder.warnings[0]  # georef has already warned about gone.png
     write_model(tmp_path / "elsewhere", source, ["x.png", "y.png"])
     with pytest.raises(SplatpipeError, match="0 can be used"):
         run(inputs, tmp_path / "elsewhere", tmp_path / "none")

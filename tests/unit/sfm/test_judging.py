@@ -136,7 +136,7 @@ def test_positions_distinguish_a_bend_from_noise(ring: Ring) -> None:
 
 def test_matches_that_are_the_models_own_observations_are_distinguished_from_others(ring: Ring) -> None:
     model = model_of(ring)
-    rows = {number: {int(point): row for row, point in enumerate(shown)} for number, shown in ring.rows.items()}
+    rows = {number: {int(point): row for row, point in enumerate(point_ids)} for number, point_ids in ring.rows.items()}
     point = int(np.intersect1d(ring.rows[1], ring.rows[2])[0])
     track = pycolmap.Track([pycolmap.TrackElement(number, rows[number][point]) for number in (1, 2)])
     model.add_point3D(ring.points[point], track, np.zeros(3, np.uint8))

@@ -28,7 +28,7 @@ def allowed(monkeypatch: pytest.MonkeyPatch, total: int, free: int) -> None:
 
 def test_memory_follows_the_photo_and_the_reduced_image() -> None:
     small, large = (extraction_bytes(PREVIEW, 3 * side * side // 4, side) for side in (1600, 16_000))
-    assert 466e6 < small < 520e6  # of one photo of sceaux: 466 MB at 1.9 megapixels
+    assert 466e6 < small < 520e6  # one photo of sceaux takes 466 MB at 1.9 megapixels
     assert large - small == pytest.approx(8 * 0.75 * (16_000**2 - 1600**2))  # only decoding grows
     standard = FeaturesConfig(extractor="sift", max_image_size=1600)
     assert extraction_bytes(standard, 1600 * 1200, 1600) > small

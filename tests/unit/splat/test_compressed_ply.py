@@ -217,7 +217,7 @@ def test_invalid_ranges_are_an_error(tmp_path: Path, value: float) -> None:
     compressed_ply.write(tmp_path / "a.ply", Scene(some_gaussians(300), FACTS))
     data = bytearray((tmp_path / "a.ply").read_bytes())
     number = struct.pack("<f", value) if value else b"\x01\x00\x80\x7f"  # a signalling NaN: casting it warns
-    for field in range(12):  # of positions and scales
+    for field in range(12):  # the first chunk's bounds of positions and scales
         at = data.index(b"end_header\n") + len(b"end_header\n") + 4 * field
         broken = data[:at] + number + data[at + 4 :]
         (tmp_path / "b.ply").write_bytes(broken)

@@ -47,8 +47,8 @@ def test_steps_are_told_from_a_share_of_the_gaussians_on():
     sizes[:40] = 0.01
     assert PositionCost.of(0.02, sizes).warnings() == ()
     sizes[:60] = 0.01
-    (told,) = PositionCost.of(0.02, sizes).warnings()
-    assert "60 of 1,000 Gaussians are smaller" in told
+    (warning,) = PositionCost.of(0.02, sizes).warnings()
+    assert "60 of 1,000 Gaussians are smaller" in warning
     assert not PositionCost.of(0.02, sizes).destroys
     assert PositionCost.of(0.5, sizes).destroys
     assert not PositionCost.of(0.5, sizes, rounded=False).destroys  # float32, as it was given

@@ -14,7 +14,7 @@ from splatpipe.pipeline.train.appearance.sky import SkyModel
 
 TILTED = np.array([0.36, -0.48, 0.8])
 BACKGROUND = (0.1, 0.7, 0.3)
-PICTURE_ATOL = 2e-5  # of colours up to 1 in float32: the place between two cells is rounded to it
+PICTURE_ATOL = 2e-5  # colours up to 1 in float32: the place between two cells is rounded to it
 EXACT_ATOL = 1e-9  # in float64, but for the CPU's weights, which are float32 there, too
 WEIGHTS_ATOL = 1e-6
 
@@ -24,17 +24,17 @@ def cells(dtype: torch.dtype) -> Tensor:
     return torch.rand(ROWS * COLUMNS, 3, generator=generator, dtype=dtype).requires_grad_()
 
 
-def seen_and_gradient(look: PanoramaView, colours: Tensor) -> tuple[Tensor, Tensor]:
-    seen = look.behind(colours, BACKGROUND)
+def seen_and_gradient(view: PanoramaView, colours: Tensor) -> tuple[Tensor, Tensor]:
+    seen = view.behind(colours, BACKGROUND)
     weight = torch.rand(seen.shape, generator=torch.Generator().manual_seed(2), dtype=seen.dtype)
     (gradient,) = torch.autograd.grad((weight * seen).sum(), colours)
     return seen.detach(), gradient
 
 
 VIEWS = [
-    skies.look(heading_deg=170.0, pitch_deg=20.0).scaled(83, 61),  # over the seam of the azimuth
-    skies.look(heading_deg=20.0, pitch_deg=5.0, roll_deg=50.0).scaled(80, 57),
-    skies.look(pitch_deg=88.0).scaled(64, 48),  # with the pole in the picture
+    skies.view(heading_deg=170.0, pitch_deg=20.0).scaled(83, 61),  # over the seam of the azimuth
+    skies.view(heading_deg=20.0, pitch_deg=5.0, roll_deg=50.0).scaled(80, 57),
+    skies.view(pitch_deg=88.0).scaled(64, 48),  # with the pole in the picture
 ]
 
 
@@ -50,8 +50,8 @@ def test_panorama_and_its_gradient_are_those_of_the_cpu(camera: Camera, up: np.n
 
 
 def test_weights_of_a_direction_sum_to_one() -> None:
-    look = matrix_view(VIEWS[2], TILTED, torch.zeros(0, dtype=torch.float64))
-    ones = look.cells.mixed(torch.ones(ROWS * COLUMNS, 3, dtype=torch.float64))
+    view = matrix_view(VIEWS[2], TILTED, torch.zeros(0, dtype=torch.float64))
+    ones = view.cells.mixed(torch.ones(ROWS * COLUMNS, 3, dtype=torch.float64))
     torch.testing.assert_close(ones, torch.ones_like(ones), rtol=0, atol=EXACT_ATOL)
 
 
@@ -63,7 +63,7 @@ def test_masks_are_those_of_the_cpu_at_every_size(size: tuple[int, int]) -> None
     mask[60:90, 40:130] = False
     mask[rng.integers(0, 90, 30), rng.integers(0, 320, 30)] = False
     found = SkyMask.packed(mask)
-    camera = skies.look().scaled(*size)
+    camera = skies.view().scaled(*size)
     cpu, device = (
         photo_sky_on_cpu(found, camera),
         photo_sky_on_device(torch.from_numpy(found.bits), found.shape, camera),
@@ -75,7 +75,7 @@ def test_masks_are_those_of_the_cpu_at_every_size(size: tuple[int, int]) -> None
 
 
 def test_photos_without_sky_have_none_and_moving_to_a_device_keeps_it() -> None:
-    camera = skies.look()
+    camera = skies.view()
     mask = np.ones((60, 80), bool)
     masks = PhotoSkies({camera.name: SkyMask.packed(mask), "other": SkyMask.packed(~mask)})
     sky = SkyModel(skies.UP, np.full((ROWS * COLUMNS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
@@ -83,4 +83,4 @@ def test_photos_without_sky_have_none_and_moving_to_a_device_keeps_it() -> None:
     assert sky.panorama.colours is sky.tensors["colours"] and sky.panorama.colours.requires_grad
     assert len(masks) == len(masks.on(torch.device("cpu"))) == sky.photos == 1
     moved = masks.on(torch.device("meta"))
-    assert moved.seen(skies.look(heading_deg=77.0)) is None
+    assert moved.seen(skies.view(heading_deg=77.0)) is None

@@ -28,7 +28,9 @@ from splatpipe.pipeline.train.techniques.distortion_loss import CENTRE_EVERY, Di
 from splatpipe.pipeline.train.techniques.dropout import Dropout
 
 META = torch.device("meta")
-CAMERAS = [replace(skies.look(heading_deg=10.0 * number).scaled(160, 120), name=f"{number}.jpg") for number in range(3)]
+CAMERAS = [
+    replace(skies.aimed_camera(heading_deg=10.0 * number).scaled(160, 120), name=f"{number}.jpg") for number in range(3)
+]
 NAMES = [camera.name for camera in CAMERAS]
 
 
@@ -36,7 +38,7 @@ def a_moment(iteration: int = CENTRE_EVERY - 1) -> ScheduleStep:
     return resolve_schedule(TrainConfig(iterations=2 * CENTRE_EVERY, dropout=0.3)).at(iteration, 0)
 
 
-def a_shot() -> RenderedView:
+def a_rendered_view() -> RenderedView:
     camera = CAMERAS[1]
     height, width = camera.height, camera.width
     colour = torch.empty(height, width, 3, device=META, requires_grad=True)
@@ -67,15 +69,15 @@ def distortion() -> Technique:
 
 @pytest.mark.parametrize("make", [sky, robust, distortion, lambda: Exposure(NAMES)], ids=lambda make: make.__name__)
 def test_iteration_of_a_technique_reads_nothing_from_the_device(make: Callable[[], Technique]) -> None:
-    technique, shot = make(), a_shot()
+    technique, rendered_view = make(), a_rendered_view()
     technique.move_to(META)
     model = Gaussians.empty(7, 0)
     model.means = torch.empty(7, 3, device=META)
-    technique.settings(shot.settings, model, shot.photo.camera, shot.now)
-    picture = technique.apply_appearance(shot.rendered.colour, shot)
-    counted = technique.mask_pixels(shot.photo, picture, shot)
-    penalty = technique.penalty(shot)
-    loss = (picture - counted.colour).abs().mean()
+    technique.settings(rendered_view.settings, model, rendered_view.photo.camera, rendered_view.now)
+    picture = technique.apply_appearance(rendered_view.rendered.colour, rendered_view)
+    masked = technique.mask_pixels(rendered_view.photo, picture, rendered_view)
+    penalty = technique.penalty(rendered_view)
+    loss = (picture - masked.colour).abs().mean()
     (loss if penalty is None else loss + penalty).backward()
     assert all(tensor.device == META for name, tensor in technique.to_arrays().items() if name not in KEPT_HERE)
 

@@ -40,19 +40,19 @@ class Tint(Technique):
         self.calls.append("before_render")
         return model
 
-    def apply_appearance(self, picture: Tensor, shot: RenderedView) -> Tensor:
+    def apply_appearance(self, picture: Tensor, rendered_view: RenderedView) -> Tensor:
         self.calls.append("shown")
         return picture + self.red * torch.tensor([1.0, 0.0, 0.0])
 
-    def mask_pixels(self, photo: TrainingPhoto, picture: Tensor, shot: RenderedView) -> TrainingPhoto:
+    def mask_pixels(self, photo: TrainingPhoto, picture: Tensor, rendered_view: RenderedView) -> TrainingPhoto:
         self.calls.append("counted")
         return photo
 
-    def penalty(self, shot: RenderedView) -> Tensor:
+    def penalty(self, rendered_view: RenderedView) -> Tensor:
         self.calls.append("penalty")
-        return 0.1 * shot.rendered.alpha.mean()
+        return 0.1 * rendered_view.rendered.alpha.mean()
 
-    def after_step(self, shot: RenderedView) -> None:
+    def after_step(self, rendered_view: RenderedView) -> None:
         self.calls.append("after_step")
         self.red += 0.25
 

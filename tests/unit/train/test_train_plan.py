@@ -144,7 +144,7 @@ def test_how_to_render_follows_from_the_plan_and_survives_its_file(
 
 def test_coarse_photos_come_first_in_equal_shares() -> None:
     schedule = resolve_schedule(TrainConfig(iterations=12, coarse_levels=2))
-    assert [look.level for look in schedule.training_sizes_until(10)] == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
+    assert [size.level for size in schedule.training_sizes_until(10)] == [2, 2, 2, 1, 1, 1, 0, 0, 0, 0]
     assert resolve_schedule(TrainConfig(iterations=3)).training_sizes_until(3) == [TrainingSize()] * 3
 
 

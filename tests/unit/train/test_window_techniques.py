@@ -31,10 +31,10 @@ from splatpipe.pipeline.train.state.density import Density
 from splatpipe.pipeline.train.techniques.distortion_loss import DistortionLoss
 from splatpipe.pipeline.train.techniques.techniques import Techniques
 
-LOOK = skies.look(12.0, roll_deg=4.0)
+LOOK = skies.aimed_camera(12.0, roll_deg=4.0)
 CAMERA = LOOK.scaled(331, 247)
 WINDOW_PIXELS = 16_000  # six windows of it
-FLOAT32 = 2e-4  # of a sum over a picture, added up in another order
+FLOAT32 = 2e-4  # relative error of a sum over a picture, added up in another order
 LATE = resolve_schedule(TrainConfig(iterations=100)).at(60)  # every technique takes part
 
 
@@ -91,9 +91,11 @@ def said(photos: list[TrainingPhoto], weights: list[float], penalties: bool) -> 
         given = RenderOptions(0, background=LATE.background, near=0.5, depth=False)
         settings = techniques.settings(given, model, photo.camera, LATE)
         rendered = rasterizer.render(model, photo.camera, settings)
-        shot = RenderedView(photo, rendered, settings, LATE)
-        loss = photo_loss(techniques.apply_appearance(shot), photo.colour, SSIM_WEIGHT, photo.mask, photo.inner)
-        total = total + weight * techniques.with_penalties(loss, shot)
+        rendered_view = RenderedView(photo, rendered, settings, LATE)
+        loss = photo_loss(
+            techniques.apply_appearance(rendered_view), photo.colour, SSIM_WEIGHT, photo.mask, photo.inner
+        )
+        total = total + weight * techniques.with_penalties(loss, rendered_view)
     total.backward()  # type: ignore[no-untyped-call]
     found = {name: tensor.grad for name, tensor in model.tensors().items()}
     found |= {"exposure": exposure.tensors["deviations"].grad, "loss": total.detach()}
@@ -130,8 +132,8 @@ def test_the_background_of_a_window_is_that_of_the_whole_there() -> None:
 
 @pytest.mark.parametrize("size", [(331, 247), (320, 240), (900, 680), (201, 150)])
 def test_the_sky_of_a_window_is_the_whole_photos_there(size: tuple[int, int]) -> None:
-    _, sky = skies.trace(skies.look())
-    found, camera = SkyMask.packed(sky), skies.look().scaled(*size)
+    _, sky = skies.trace(skies.aimed_camera())
+    found, camera = SkyMask.packed(sky), skies.aimed_camera().scaled(*size)
     bits = torch.from_numpy(found.bits)
     wholes = photo_sky_on_cpu(found, camera), photo_sky_on_device(bits, found.shape, camera)
     for window in windows_of(*size, size[0] * size[1] // 5):
@@ -194,11 +196,11 @@ def test_cells_of_windows_are_those_of_the_whole_photo() -> None:
         ours = PhotoCells(camera, 61, GRID)
         expected = PhotoCells(CAMERA, GRID, GRID).spread(cells)[rows, columns]
         assert torch.equal(PhotoCells(camera, GRID, GRID).spread(cells), expected)
-        shown = ours.means(torch.ones(1, camera.height, camera.width))[0]
+        visible_share = ours.means(torch.ones(1, camera.height, camera.width))[0]
         inside = torch.zeros(1, CAMERA.height, CAMERA.width)
         inside[0, rows, columns] = 1.0
         of_whole = whole.means(inside)[0]  # how much of each cell the window shows
-        assert torch.equal(shown > 0.0, of_whole > 0.0)
+        assert torch.equal(visible_share > 0.0, of_whole > 0.0)
         full = of_whole > 0.999
         torch.testing.assert_close(ours.means(planes[:, rows, columns])[:, full], whole.means(planes)[:, full])
         found = ours.judged(planes)
@@ -208,7 +210,7 @@ def test_cells_of_windows_are_those_of_the_whole_photo() -> None:
 
 
 CAR = (40, 60, 80, 120)  # top, left, bottom, right in the photo that shows it, pixels
-CAR_PIXELS = 11_000  # of a window: their borders go through the car
+CAR_PIXELS = 11_000  # size of a window: their borders go through the car
 
 
 def cameras() -> list[Camera]:

@@ -21,9 +21,9 @@ from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
 
 BINS = 1024  # along the longer side of the site: 256 blocks are still cut to a few percent of a cell
 NEAR = 4.0  # times the median GSD: anything seen more coarsely is background
-SITE_PERCENTILES = (0.5, 99.5)  # of the visible places, along each axis: the few wrong depths lie outside
+SITE_PERCENTILES = (0.5, 99.5)  # percentiles of visible places, by axis, that bound the site: without wrong depths
 MAX_SAMPLES = 1_000_000  # used to locate the site: 24 MB
-MARGIN_SHARE = 0.1  # of a cell's side (of a square of equal area)
+MARGIN_SHARE = 0.1  # margin over a cell's side (of a square of equal area)
 
 
 @dataclass(frozen=True, eq=False)

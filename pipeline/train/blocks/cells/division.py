@@ -27,7 +27,7 @@ from splatpipe.pipeline.train.plan.limits import (
 )
 
 PHOTOS_A_BLOCK = 8  # at least: each photo shows many smaller blocks and would be trained on in each
-FEWEST_GAUSSIANS = 1000  # of a block: fewer are not a useful model
+MIN_BLOCK_GAUSSIANS = 1000  # Gaussians of a block: fewer are not a useful model
 MAX_LIKELY_GROWTH = 2.0  # times the expected size is hardly ever exceeded: forecasts are off by up to this factor
 
 
@@ -124,7 +124,7 @@ def divided(scene: SceneSize, limit_bytes: int, least: int = 0) -> Division:
     blocks, cap = max(wanted, least), scene.cap
     if blocks > most:
         blocks, cap = most, _most_gaussians(most, room, window, scene.sh_degree)
-        if cap < FEWEST_GAUSSIANS * blocks:  # the whole training reports that memory is too small
+        if cap < MIN_BLOCK_GAUSSIANS * blocks:  # the whole training reports that memory is too small
             blocks, cap = 1, _most_gaussians(1, room, window, scene.sh_degree)
     return replace(_of(scene, blocks, min(cap, scene.cap), limit_bytes, window), is_near=blocks == 1)
 

@@ -21,11 +21,12 @@ from splatpipe.pipeline.train.plan.limits import (
 
 MARGIN_GROWTH = 1.44  # (1 + 2 × 0.1)²: a square cell with its margin, over the cell
 FROZEN_SHARE = 1.0  # frozen per trained Gaussian: more of the coarse model than that is thinned
-FROZEN_COPIES = 2  # of a frozen Gaussian's parameters: density control copies them with the others
+FROZEN_COPIES = 2  # copies of a frozen Gaussian's parameters: density control copies them with the others
 SPLAT_BYTES = 249  # per Gaussian in a file
 CHECKPOINT_BYTES = 2 * 720  # per trained Gaussian: parameters and moments, the new checkpoint beside the old
-GROWTH_A_STEP = 1.25  # of a block's Gaussians per density-control step: 1.2 in the tiled demo, 1.8 initially if the
-# coarse pass ended at smaller photos
+# Growth of a block's Gaussians per density-control step: 1.2 in the tiled demo, 1.8 initially if the coarse pass ended
+# at smaller photos.
+GROWTH_A_STEP = 1.25
 MAX_BLOCKS = 4096  # beyond it a block is not larger than its margin
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine, PlanPoints
 
-NOBODY = -1  # owner of a non-finite point
+NO_OWNER = -1  # owner of a non-finite point
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,13 @@ class Partition:
         return np.asarray(np.clip(places, low, high))
 
     def owners(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-        """Index of the cell that owns each point, `NOBODY` for a non-finite one.
+        """Index of the cell that owns each point, `NO_OWNER` for a non-finite one.
 
         Args:
             points: In the model's frame.
         """
         places = self.places(points)
-        owners = np.full(len(points), NOBODY, np.int64)
+        owners = np.full(len(points), NO_OWNER, np.int64)
         for number, cell in enumerate(self.cells):
             owners[cell.contains(places)] = number
         return owners

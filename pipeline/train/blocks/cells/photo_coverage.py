@@ -45,20 +45,20 @@ class PhotoCoverage:
         camera: The dataset's camera.
         grid: The same camera at the size of the samples.
         depth: The coarse model's depth along the view axis, 0 where it has none; None without such a model.
-        counted: Which samples count; None if all do.
+        mask: Which samples count; None if all do.
         observed: Rows of the sparse points that the photo observes, ascending.
     """
 
     camera: Camera
     grid: Camera
     depth: Float32[np.ndarray, "h w"] | None
-    counted: Bool[np.ndarray, "h w"] | None
+    mask: Bool[np.ndarray, "h w"] | None
     observed: Int64[np.ndarray, " _"]
 
     @property
     def pixels(self) -> float:
         """Number of the dataset photo's pixels that count."""
-        share = 1.0 if self.counted is None else float(self.counted.mean())
+        share = 1.0 if self.mask is None else float(self.mask.mean())
         return share * self.camera.width * self.camera.height
 
     def samples(self, xyz: Float64[np.ndarray, "p 3"]) -> Samples:
@@ -77,8 +77,8 @@ class PhotoCoverage:
 
     def _of_depth(self, depth: Float32[np.ndarray, "h w"]) -> Samples:
         there = (depth > 0.0) & np.isfinite(depth)
-        if self.counted is not None:
-            there &= self.counted
+        if self.mask is not None:
+            there &= self.mask
         rows, columns = np.nonzero(there)
         pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
         distances = depth[rows, columns].astype(np.float64)
@@ -91,7 +91,7 @@ def photo_coverages(
     cameras: Sequence[Camera],
     observed: Sequence[Int64[np.ndarray, " _"]],
     depth_of: Callable[[Camera], Float32[np.ndarray, "h w"]] | None,
-    counted_of: Callable[[Camera], Bool[np.ndarray, "h w"] | None] | None = None,
+    mask_of: Callable[[Camera], Bool[np.ndarray, "h w"] | None] | None = None,
 ) -> list[PhotoCoverage]:
     """The coverage of each photo.
 
@@ -99,11 +99,11 @@ def photo_coverages(
         cameras: The dataset's cameras.
         observed: Rows of the sparse points that each photo observes.
         depth_of: Renders a camera's median depth of the coarse model; None before there is one.
-        counted_of: Which pixels of a camera count, in its grid; None if all do.
+        mask_of: Which pixels of a camera count, in its grid; None if all do.
     """
     found = []
     for camera, rows in zip(cameras, observed, strict=True):
         grid = reduced_camera(camera, MEGAPIXELS)
         depth = None if depth_of is None else depth_of(grid)
-        found.append(PhotoCoverage(camera, grid, depth, None if counted_of is None else counted_of(grid), rows))
+        found.append(PhotoCoverage(camera, grid, depth, None if mask_of is None else mask_of(grid), rows))
     return found

@@ -20,7 +20,8 @@ from splatpipe.pipeline.train.blocks.cells.needs import (
 from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.plan.limits import FIXED_BYTES, LIBRARIES_BYTES, PIXEL_BYTES, bytes_per_gaussian
 
-MAX_GROWTH = 2.0 * MARGIN_GROWTH  # of a cell with its margin over the cell: beyond it, the neighbours are what is full
+# growth of a cell with its margin over the cell: beyond it, the neighbours are what is full
+MAX_GROWTH = 2.0 * MARGIN_GROWTH
 
 
 @dataclass(frozen=True)
@@ -122,20 +123,22 @@ def load_site_plan(path: Path) -> SitePlan:
         raise StageError(f"{path.name} cannot be read.", hint="Run again with --rerun-from blocks.") from error
 
 
-def block_limits(division: Division, sh_degree: int, counted: Sequence[tuple[float, int, int]]) -> list[BlockLimits]:
+def block_limits(
+    division: Division, sh_degree: int, block_counts: Sequence[tuple[float, int, int]]
+) -> list[BlockLimits]:
     """Share the cap among blocks, so that each keeps within the memory limit.
 
     Args:
         division: How the scene is divided.
         sh_degree: SH degree of the model.
-        counted: For each block its weight, and the number of the coarse model's Gaussians in its cell and in cell and
-            margin.
+        block_counts: For each block its weight, and the number of the coarse model's Gaussians in its cell and in cell
+            and margin.
     """
     cap, most = division.cap, _most(division, sh_degree)
     top = max(1, int(most / MARGIN_GROWTH)) if division.limit_bytes else cap
     found = []
-    shares = capped_shares(cap, [weight for weight, _, _ in counted], [top] * len(counted))
-    for share, (_, in_cell, in_block) in zip(shares, counted, strict=True):
+    shares = capped_shares(cap, [weight for weight, _, _ in block_counts], [top] * len(block_counts))
+    for share, (_, in_cell, in_block) in zip(shares, block_counts, strict=True):
         wanted = max(share, min(with_margin(share, in_cell, in_block), int(MAX_GROWTH * share)))
         trained = max(share, min(wanted, most)) if division.limit_bytes else wanted
         found.append(BlockLimits(share, trained, _frozen(division, trained, sh_degree)))

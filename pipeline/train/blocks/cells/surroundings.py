@@ -23,9 +23,10 @@ from splatpipe.pipeline.train.blocks.cells.thinning import thinned
 from splatpipe.pipeline.train.blocks.cells.visibility import BlockViews, Windows
 
 SIGMAS = 3.0  # reach of a Gaussian in standard deviations, as in the rasterizer's radii
-BEHIND = 1.1  # times the depth of the coarse surface: farther back is hidden, allowing for errors of that depth
-COARSER = math.sqrt(2.0)  # growth of voxels per attempt; each one's size is a power of two, so not all change
-COARSEST = 64.0  # pixels of a voxel at the cell's edge: beyond it the least opaque are dropped instead
+# times the depth of the coarse surface: farther back is hidden, allowing for errors of that depth
+MAX_DEPTH_RATIO = 1.1
+VOXEL_GROWTH = math.sqrt(2.0)  # growth of voxels per attempt; each one's size is a power of two, so not all change
+MAX_VOXEL_PX = 64.0  # pixels of a voxel at the cell's edge: beyond it the least opaque are dropped instead
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +75,9 @@ def visible_around(
 def _within(gaussians: Gaussians, unit: Float64[np.ndarray, " n"], most: int) -> Gaussians:
     """At most ``most`` Gaussians: merged by voxels of growing size, then by dropping the least opaque."""
     found, side = gaussians, 1.0
-    while len(found) > most and side <= COARSEST:
+    while len(found) > most and side <= MAX_VOXEL_PX:
         found = thinned(gaussians, side * unit)
-        side *= COARSER
+        side *= VOXEL_GROWTH
     if len(found) > most:
         order = torch.argsort(found.opacity_logits, descending=True, stable=True)[:most]
         found = found.select(torch.sort(order).values)
@@ -123,4 +124,4 @@ def _hidden(
     step = coverage.camera.width / coverage.grid.width
     places = np.clip(pixels / step, 0.0, [coverage.grid.width - 1, coverage.grid.height - 1])
     columns, rows = np.nan_to_num(places).astype(np.int64).T
-    return np.asarray((depths - reach > BEHIND * farthest[rows, columns]) & (radius < step))
+    return np.asarray((depths - reach > MAX_DEPTH_RATIO * farthest[rows, columns]) & (radius < step))

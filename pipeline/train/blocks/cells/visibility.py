@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.train.blocks.cells.partition import NOBODY, Partition
+from splatpipe.pipeline.train.blocks.cells.partition import NO_OWNER, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, Samples
 from splatpipe.pipeline.train.plan.windows import windows_of
 
-MIN_SHARE = 0.02  # of a window's pixels that see the cell: less is a corner that neighbouring windows show whole
+MIN_SHARE = 0.02  # share of a window's pixels that see the cell: less is a corner that neighbouring windows show whole
 MIN_POINTS = 4  # observed points in the cell and the window: thin objects that a coarse depth misses
 
 Windows = Int64[np.ndarray, "w 4"]  # left, top, right and bottom of each in the dataset's photo, the last two exclusive
@@ -94,10 +94,10 @@ def block_views(
     found: list[list[BlockPhoto]] = [[] for _ in partition.cells]
     for number, coverage in enumerate(seen):
         parts = cut(coverage.camera)
-        weights = _counted(partition, coverage.samples(xyz), parts)
+        weights = _sum_weights(partition, coverage.samples(xyz), parts)
         points = coverage.of_points(xyz)
         points = Samples(points.pixels, points.places, np.ones(len(points.places)), points.distances)
-        observed = _counted(partition, points, parts)
+        observed = _sum_weights(partition, points, parts)
         sizes = (parts[:, 2] - parts[:, 0]) * (parts[:, 3] - parts[:, 1])
         chosen = (weights >= MIN_SHARE * sizes) | (observed >= MIN_POINTS)
         for block in np.flatnonzero(chosen.any(axis=1)).tolist():
@@ -108,11 +108,11 @@ def block_views(
     return [BlockViews(tuple(photos)) for photos in found]
 
 
-def _counted(partition: Partition, samples: Samples, parts: Windows) -> Float64[np.ndarray, "cells w"]:
+def _sum_weights(partition: Partition, samples: Samples, parts: Windows) -> Float64[np.ndarray, "cells w"]:
     """Total weight of the samples in each cell and window."""
     owners = partition.owners(samples.places)
     inside = _window_of(samples.pixels, parts)
-    rows = (owners != NOBODY) & (inside >= 0)
+    rows = (owners != NO_OWNER) & (inside >= 0)
     flat = owners[rows] * len(parts) + inside[rows]
     size = len(partition.cells) * len(parts)
     return np.bincount(flat, samples.weights[rows], minlength=size).reshape(-1, len(parts))
