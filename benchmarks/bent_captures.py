@@ -46,12 +46,12 @@ from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.recovery.ladder import run_ladder
 from splatpipe.stages.line import LINE, MATCHES
 
-GUESS = 1.2  # of the longer side: COLMAP's guess if nothing is known
+GUESS = 1.2  # focal length over the longer side that COLMAP assumes if nothing is known
 PLACED = 0.9  # share of the photos
 TIMES, SOUND_M = 3.0, 3.6e-3  # times the demo's sound error, metres
-EXTENT = 0.005  # of the RMS distance of the cameras from their mean, for captures without truth
+EXTENT = 0.005  # error over the RMS distance of the cameras from their mean, for captures without truth
 FOLDED = (0.3, 0.5)  # shares of a scene that look alike
-MIN_MATCHES = 15  # of a pair that is kept
+MIN_MATCHES = 15  # fewest matches with which a pair is kept
 
 Pair = tuple[int, int]
 Truth = Mapping[str, np.ndarray]

@@ -30,7 +30,7 @@ from splatpipe.pipeline.photos.pixels.images import reduced_view
 from splatpipe.pipeline.raster.threads import same_bits
 
 MARGIN_M = 1.0  # around the house, as if drawn by hand on a map
-CORNER_STEPS = 16  # of the circle that the outline is grown with
+CORNER_STEPS = 16  # corners of the polygon that stands for the circle by which the outline is grown
 COLUMNS = {
     "view": "view:",
     "inside": "inside:.3f",

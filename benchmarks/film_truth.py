@@ -38,10 +38,10 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 LATITUDE, LONGITUDE, HEIGHT_M = 47.84119, 13.51269, 515.0  # the demo's origin
 METRES_PER_DEGREE = 111_320.0
 RADIUS_M, LOW_M, HIGH_M, TARGET_M = 24.0, 7.0, 14.0, (0.0, 0.0, 2.5)
-FOCAL = 0.72  # of the width
+FOCAL = 0.72  # focal length over the image width
 RECEIVER_M = 1.0  # standard deviation of the SRT's positions
 GAMMA = 2.2
-BANDS = 18  # of rows with moments of their own under a rolling shutter
+BANDS = 18  # bands of rows that are exposed at different moments under a rolling shutter
 MOST_TIMES, MOST_DB = 2.0, 1.0
 
 COLUMNS = {

@@ -16,7 +16,7 @@ from splatpipe.pipeline.raster.reference import project
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 KINDS = ("single", "cluster", "near a surface", "haze", "oversized")
-SHARES = (1.0, 1.0, 1.0, 0.5, 0.2)  # of each kind: large floaters are rare
+SHARES = (1.0, 1.0, 1.0, 0.5, 0.2)  # planted floaters over the number asked for, by kind: large ones are rare
 CLUSTER = 40  # Gaussians per cluster
 NEAREST = 0.06  # share of the depth: anything nearer to a camera is haze
 SIGMAS = 2.0  # clearance between a floater's extent and the surface

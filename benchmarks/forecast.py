@@ -27,7 +27,7 @@ TABLE = Path(__file__).with_name("forecast.json")
 FITTED_TO = "preview"  # runs of other presets are reported, not fitted
 MEMORY_WITHIN = 0.3
 CPU_WITHIN = 1.5
-ROUNDING = 0.01  # of the costs in `stages/costs.py`, which have three digits
+ROUNDING = 0.01  # relative rounding error of the costs in `stages/costs.py`, which have three digits
 SHOWN = ("features", "matches", "sparse", "initialize", "train")
 
 

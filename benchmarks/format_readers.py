@@ -32,7 +32,7 @@ SURE_DB = 100.0  # above this, differences are rounding
 LIKE_OURS_DB = 30.0  # spark renders differently
 WORSE_DB = 0.5  # than the format's loss and spark's difference on the PLY together
 ACCESSORS = 1e-5
-PIXELS = 200_000  # of an image in the browser
+PIXELS = 200_000  # largest image that the browser renders
 EXPECTED = "MESH_PRIMITIVE_INVALID_ATTRIBUTE"  # gltf-validator does not know the extension's names
 
 COLUMNS = {"reader": "reader:", "of": "format:", "what": "what:", "figure": "figure:", "bars": "bars:"}

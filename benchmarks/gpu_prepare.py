@@ -29,9 +29,9 @@ from splatpipe.pipeline.photos.pixels.dataset import IMAGES, Split, split_views
 
 ROOT = Path(__file__).resolve().parents[1]
 DATASET, POINTS = "bench_sceaux", "sparse"
-DENSE_POINTS = "sparse_100k"  # of the trained scene, which has no more Gaussians: 24 MB
-QUALITY = 90  # of the transferred JPEGs: a third of PNG's size, and both devices train on the same
-TRAINED_ITERATIONS, MOST_TRAINED = 1500, 100_000  # of the trained scene
+DENSE_POINTS = "sparse_100k"  # initial points of the trained scene, which gets no more Gaussians: 24 MB
+QUALITY = 90  # JPEG quality of the transferred photos: a third of PNG's size, and both devices train on them
+TRAINED_ITERATIONS, MOST_TRAINED = 1500, 100_000  # training length and Gaussians of the trained scene
 MEBIBYTE = 1 << 20
 MAX_MEBIBYTES = 64  # limit for the tree and everything carried
 LONGEST_COMMAND = 2000  # characters

@@ -17,10 +17,10 @@ from pathlib import Path
 
 from gpu_parts import Row, read_lines
 
-MIN_DB, MAX_RELATIVE = 60.0, 1e-3  # of a render and of a gradient, beside the CPU's
+MIN_DB, MAX_RELATIVE = 60.0, 1e-3  # agreement with the CPU: PSNR of a render, relative error of a gradient
 GOALS = {"gsplat": 2.0, "faster-gs": 1.0}  # iterations a second against the peer's, at least
-GOAL_MEMORY = 0.6  # of gsplat's, at most
-MOST_APART_DB, STANDARD_ERRORS = 0.1, 2.0  # of the trainings' psnr_cc from the CPU's
+GOAL_MEMORY = 0.6  # largest memory use over gsplat's
+MOST_APART_DB, STANDARD_ERRORS = 0.1, 2.0  # by which a training's psnr_cc may differ from the CPU's
 CHECKS = ("memcheck", "racecheck", "synccheck", "initcheck")
 HOLDS, FAILS, MISSED, UNKNOWN = "holds", "**does not hold**", "missed (a finding)", "not measured"
 

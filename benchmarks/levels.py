@@ -38,7 +38,7 @@ from splatpipe.pipeline.splat.model.scene import Scene
 SHARES = (50, 25, 10, 5)  # percent
 ERROR_PX = 16.0
 GREY = (0.5, 0.5, 0.5)
-SIDE, FOCAL = 384, 800.0  # of the nodes' images, pixels
+SIDE, FOCAL = 384, 800.0  # image side and focal length of a node's view, pixels
 FINER = 4  # times as many pixels along each side: nearly the true scene
 MIN_COVERED = 60  # pixels: fewer say nothing
 FRAMES = 48

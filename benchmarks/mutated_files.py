@@ -31,7 +31,7 @@ from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
-SLOW_S = 5.0  # of CPU time
+SLOW_S = 5.0  # CPU time above which reading a file counts as slow
 WORKER = Path(__file__).with_name("read_worker.py")
 HANG_S = 60.0  # wall-clock time, on a shared machine
 MAX_BYTES = 500_000_000

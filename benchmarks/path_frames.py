@@ -50,7 +50,7 @@ from splatpipe.pipeline.render.consistency import AGREEMENT
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, of coded values
 EVERY_PX = 3  # spacing of the pixels that are followed into the next frame, both ways
 NEAREST = 0.02  # quantile of the sparse points' depths: a few points are wrong
-IN_THE_AIR = 0.5  # of the nearest points' depth: the sparse cloud has holes, but none so deep
+IN_THE_AIR = 0.5  # share of the nearest points' depth: the sparse cloud has holes, but none so deep
 LARGEST_IN_THE_AIR = 0.01  # share of a frame: more counts as a crossing floater
 MUCH_NEARER = 0.7  # times the smaller median depth of the two neighbouring photos
 SHEET_COLUMNS, SHEET_FRAMES, SHEET_WIDTH = 6, 48, 300

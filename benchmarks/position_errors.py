@@ -20,7 +20,7 @@ from splatpipe.pipeline.splat.model.scene import Scene
 SITE_M = 3000.0
 MAX_POINTS = 30_000  # number that are matched
 BESIDE = 20.0  # steps: a larger distance means another Gaussian, or an error of the format
-HALF = 0.5 + 1e-3  # of a step: rounding to nearest, plus float32 along the way
+HALF = 0.5 + 1e-3  # largest error in steps of the format: rounding to nearest, plus float32 along the way
 
 Points = Float64[np.ndarray, "n 3"]
 

@@ -36,8 +36,8 @@ from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
 CONTROL_M = np.array([0.02, 0.02, 0.03])
 MARK_PX = 0.5
-ONE_AT, THREE_AT = ((0.0, 0.0),), ((-0.6, -0.6), (0.6, -0.4), (0.0, 0.6))  # of half the ground's extent
-WEAK_M = 100.0  # of positions that only hold the frame
+ONE_AT, THREE_AT = ((0.0, 0.0),), ((-0.6, -0.6), (0.6, -0.4), (0.0, 0.6))  # control, in half extents of the ground
+WEAK_M = 100.0  # standard deviation of positions that only hold the frame
 FAULTY = ("flat", "alternating")
 AXES = "ENU"
 

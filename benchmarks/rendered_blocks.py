@@ -40,9 +40,9 @@ from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
 BLOCKS = ("flat", "alternating")
-HALF_M, TEXEL_M = 62.0, 0.0165  # of the painted ground
+HALF_M, TEXEL_M = 62.0, 0.0165  # half side of the painted ground, and size of its texels
 PATHS = 6  # a pixel
-BYTES = 900_000  # of a photo
+BYTES = 900_000  # mean size of a photo's file
 PAUSE_S = 3
 SENSOR_MM, FULL_FRAME_MM = 17.3, 43.27  # width of the camera model's sensor, and diagonal of 35 mm film
 AGREED_GSDS = 3.0

@@ -67,7 +67,7 @@ COLUMNS = {
 CALIBRATED = 0.02  # tolerance, relative to the target pairs per pixel
 CALIBRATIONS = 8  # iterations at most: the blur prevents a million Gaussians from covering less of a small image
 LONGEST_STEP = 1.5
-MEMORY_START = 0.9  # of the cap: density control then grows to it
+MEMORY_START = 0.9  # initial Gaussians over their cap: density control then grows to it
 MEMORY_ITERATIONS = 4
 
 

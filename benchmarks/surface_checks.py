@@ -24,7 +24,7 @@ from splatpipe.demo.visibility import MIN_VIEWS, photos_that_see
 from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
 
 TOLERANCE_GSD = 2.0  # for clouds and meshes
-SAMPLES = 100_000  # of the true surface and of a product: the standard deviation of a share is below 0.002
+SAMPLES = 100_000  # points on the true surface and on a product: the standard deviation of a share is below 0.002
 SPACING_M = 0.05  # between samples on the true surface
 SEED = 18
 TARGET_REACH_PX = 32  # half-size of the search window; a target is some 18 px

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64, UInt8
 from tables import Row
 
 NMAD_OF_MAD = 1.4826  # MAD to standard deviation for normal errors (Höhle and Höhle, 2009)
-LARGEST = 255.0  # of a colour channel
+LARGEST = 255.0  # largest value of a colour channel
 MOVED_LIMIT = 1e3  # dB: for identical images
 
 

@@ -30,7 +30,7 @@ TEXTURES = {"bricks": BRICK, "tiles": TILES, "slates": SLATE}
 BANDS = {"1-2 px": (0.5, 1.0), "2-4 px": (1.0, 2.0), "4-8 px": (2.0, 4.0), "all": (0.0, 4.0)}
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 EDGE_PX = 6  # from the border of a surface: blurs reach across it
-FEWEST_PIXELS = 500  # of a texture in a view
+FEWEST_PIXELS = 500  # fewest pixels of a texture in a view that is judged
 SAME_DEPTH = 1e-4  # relative: a few millimetres, less than targets stand out from walls
 COLUMNS = {"run": "run:", "texture": "texture:", "pixels": "pixels:,"} | {
     f"{band} {what}": f"{band} {what}:.2f" for band in BANDS for what in ("contrast", "slope")

@@ -88,7 +88,7 @@ P1_CORNER, P1_RADIAL, P1_TANGENTIAL = 0.6007, (-0.047957, 0.0205183, -0.0972836)
 BROWN_TIMES = (
     2.0  # SIMPLE_RADIAL then errs by 3.8 px RMS and 14 px at most at the demo's size, as for the P1 at its own
 )
-BROWN_OFFSET_PX = (16.0, -12.0)  # of the principal point: 20 px
+BROWN_OFFSET_PX = (16.0, -12.0)  # principal point from the image's centre: 20 px
 
 
 def brown_lens(simple: BrownLens | None = None) -> BrownLens:

@@ -35,7 +35,7 @@ from splatpipe.stages.work import FEWEST_GAUSSIANS, MEGA, MIN_SHARE, CaptureSize
 
 SPEED_NUMBERS = 20_000  # in the text, without repeats, whose compression is timed
 SPEED_S = 0.008  # seconds of that compression on the reference machine of `costs.py`, otherwise idle
-SPEED_LEVEL = 6  # of compression
+SPEED_LEVEL = 6  # zlib's compression level when the machine's speed is measured
 SPEED_TRIES = 5  # the fastest counts: the others were slowed by other processes
 SPEED_RANGE = (0.25, 4.0)  # measurements are clamped to it
 

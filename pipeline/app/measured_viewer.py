@@ -22,7 +22,7 @@ SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
 PLACES = ("x", "y", "z")
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
-LARGEST = 1e9  # of a coordinate, metres: larger ones are not on the earth, and a chart's steps are lost in rounding
+LARGEST = 1e9  # metres: larger coordinates are not on the earth, and a chart's steps are lost in rounding
 
 
 def update_viewer(out: Path) -> str:

@@ -183,7 +183,7 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
     surface = _open_surface(out)
     measured: dict[str, Any] = {}
     aside = out / UNFINISHED
-    shutil.rmtree(aside, ignore_errors=True)  # of a killed command
+    shutil.rmtree(aside, ignore_errors=True)  # a killed command may have left it
     try:
         aside.mkdir()
         sections = _sections(surface, wanted.lines, aside, threads)

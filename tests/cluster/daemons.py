@@ -30,7 +30,7 @@ CONFIGURATION = Path("/etc/slurm")
 GROUPS = Path("/sys/fs/cgroup")
 CLUSTER = "splatpipe"
 PATIENCE_S = 60.0
-CONTROLLERS = ("memory", "cpuset", "freezer")  # of control groups version 1, as far as Slurm uses them
+CONTROLLERS = ("memory", "cpuset", "freezer")  # control groups of version 1 that Slurm uses
 PORTS = {"mariadb": 0, "slurmdbd": 1, "slurmctld": 2, "one": 3, "two": 4}
 
 

@@ -34,7 +34,7 @@ PLUGINS = (
 )
 PRESET = ("--preset", "preview", "--set", "train.iterations=100")
 PHOTOS = 6
-BROKEN_BYTES = 9000  # of a photo that ends before its last pixel
+BROKEN_BYTES = 9000  # length of a damaged photo, which ends before its last pixel
 PATIENCE_S = 1500.0
 LOOK_S = 0.5
 MOST_OVERHEAD_S = 180.0  # a capture; what else passes between stages is the start of processes

@@ -19,7 +19,7 @@ SUITE = "bookworm"  # Debian 12, as in the base's name
 DOCKERFILE = Path("docker") / "Dockerfile"
 DRIVERS = ("overlay", "vfs")  # the second works everywhere, but copies all files for every layer
 TOOLS = ("buildah", "debootstrap", "runc")
-# Of Debian's packages, the slim images have neither documentation (but licences) nor translations; apt keeps no caches.
+# Folders that Debian's slim images leave out: documentation (but licences) and translations; apt keeps no caches.
 UNWANTED = ("usr/share/doc", "usr/share/info", "usr/share/lintian", "usr/share/locale", "usr/share/man")
 DPKG_SLIM = "".join(f"path-exclude /{folder}/*\n" for folder in UNWANTED) + "path-include /usr/share/doc/*/copyright\n"
 APT_CLEAN = """\

@@ -20,7 +20,7 @@ DOCKER_KILLS_S = 10.0
 PATIENCE_S = 3600.0  # for a busy machine; a hanging container fails the test
 LOOK_S = 0.1
 MEMORY = 4 << 30  # memory limit of its control group, bytes
-PERIOD_US = 100_000  # of the control group that limits processors
+PERIOD_US = 100_000  # period of the control group that limits processors
 DEVICES = ["nosuid", "noexec"]
 
 

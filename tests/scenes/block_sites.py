@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.state.state import TrainState
 
-WINDOW = 1000  # of 72 × 54 pixels: four windows a photo, and one at half the size
+WINDOW = 1000  # pixels of a window: four windows in a photo of 72 × 54, and one at half the size
 
 CELLS = (Cell((-3.0, -1.5), (0.0, 3.0)), Cell((0.0, -1.5), (3.0, 3.0)))
 

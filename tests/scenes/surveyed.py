@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
 PLACE = Origin(**TRUTH["frame"]["origin"])
 WIDTH, HEIGHT = TRUTH["camera"]["width"], TRUTH["camera"]["height"]
-LENS = tuple(TRUTH["camera"]["params"])  # of SIMPLE_RADIAL: f, cx, cy, k
+LENS = tuple(TRUTH["camera"]["params"])  # SIMPLE_RADIAL's parameters: f, cx, cy in pixels, k
 POINTS = {point["name"]: point for point in TRUTH["points"]}
 MODEL_FROM_WORLD = Similarity(0.137, rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([0.3, -0.2, 1.4]))
 NADIR = tuple(f"DJI_00{number}.JPG" for number in range(32, 41))

@@ -37,7 +37,7 @@ from splatpipe.stages.line import LINE
 
 SPLATPIPE = tuple(python_module("splatpipe.pipeline.app.cli.main"))
 FOLLOW_S = 0.5
-RESERVE_BYTES = 256 << 20  # of the disk, reserved for what other captures' stages write at the same time
+RESERVE_BYTES = 256 << 20  # disk space kept free for what other captures' stages write meanwhile
 
 
 def main() -> None:

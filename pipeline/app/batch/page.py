@@ -21,7 +21,7 @@ REFRESH_S = 10  # the page's reload interval; the batch rewrites the page somewh
 PICTURE_SIDE = 480  # pixels, of a card on a good display
 SMALL_SIDE = 240  # if there are so many that the page would load slowly
 MANY = 60  # captures
-MAX_LINES = 50  # of a reason; the full text is in the report
+MAX_LINES = 50  # lines shown of a reason; the full text is in the report
 GROUPS: Sequence[tuple[State, str]] = (  # those that need attention first
     ("failed", "Failed"),
     ("running", "Running"),

@@ -71,7 +71,7 @@ def _render(out: Path) -> tuple[Path, int] | None:
         photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
         turned = {photo["name"]: int(photo.get("orientation") or 1) for photo in photos}
         return path, turned.get(view["name"], 1)
-    except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # of an incomplete run
+    except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # the run is incomplete
         return None
 
 

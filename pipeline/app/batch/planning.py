@@ -42,7 +42,7 @@ from splatpipe.pipeline.engine.stage import Shard, stage_name
 from splatpipe.stages.forecast import forecast, machine_speed
 from splatpipe.stages.line import LINE
 
-CLUSTER_THREADS = 8  # of a job on another machine at most; a profile's set-threads overrides it
+CLUSTER_THREADS = 8  # most threads of a job on another machine; a profile's set-threads overrides it
 LIGHT_S = 300.0  # a shorter stage shares its job with its neighbours: an engine's queue costs some 30 s a job
 LONGEST_SLUG = 40
 NOT_RETRIED = "Nothing has changed since, so it was not retried; use --retry-failed to do so."

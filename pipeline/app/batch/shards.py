@@ -16,7 +16,8 @@ NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000) 
 # Where a job's memory is enforced, these are part of it: two processes of Snakemake, job.py, and the command that waits
 # for the stage's process. Measured with Slurm: 340 MB, and some for the files that they read.
 CLUSTER_BYTES = 450_000_000
-LEAST_EFFICIENCY = 0.5  # of the processors that a stage requests on a cluster, where others could use them
+# Least busy share of the processors that a stage requests on a cluster, where others could use them.
+LEAST_EFFICIENCY = 0.5
 
 
 def stage_job(name: str, need: Need, threads: int, *, local: bool = True) -> StageJob:

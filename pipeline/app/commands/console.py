@@ -34,7 +34,7 @@ from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 PLAIN_INTERVAL_S = 10.0  # between progress lines in a log file
 PLAIN_WIDTH = 120  # columns of a table in a log file
-MIN_OFFSET_M = 0.01  # of a flight's positions; smaller offsets are not shown
+MIN_OFFSET_M = 0.01  # smallest offset of a flight's positions that is shown
 POINTS_SHOWN = 40  # more are only in metrics.json
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 MARKS = {"good": ("✓", "green"), "doubt": ("!", "yellow"), "bad": ("✗", "red")}

@@ -16,9 +16,9 @@ SIDE = 260  # pixels of a thumbnail's longer side
 CUT = (260, 195)  # photo pixels of a crop: blur of a pixel or two is invisible in a thumbnail
 MAX_PER_FINDING = 8
 MAX_PICTURES = 40  # on the page: below a megabyte, and a second or two of decoding
-MAX_CROPS = 8  # of these crops, for which a photo is decoded completely
+MAX_CROPS = 8  # crops on the page, each of which takes decoding a whole photo
 CLOSE = ("blurred",)  # findings whose photos are shown as crops
-EXAMPLES = 3  # of photos that are dull throughout
+EXAMPLES = 3  # photos that are shown of a capture that is dull throughout
 SHARP = 0.9  # least relative sharpness of a neighbour shown for comparison
 
 

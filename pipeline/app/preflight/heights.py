@@ -46,7 +46,7 @@ def predict_heights(
     try:
         with threadpool_limits(limits=1):  # BLAS sums in another order on several threads
             return predict_accuracy(intake.positions.positions, cameras, times)
-    except np.linalg.LinAlgError:  # of metadata that make no block
+    except np.linalg.LinAlgError:  # singular: the metadata make no block
         return None
 
 

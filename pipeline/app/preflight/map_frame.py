@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from splatpipe.pipeline.app.preflight.findings import Place, Preflight
 
-WIDTH = 2000  # of the drawing, in its own units: integers are precise enough, and short
+WIDTH = 2000  # width of the drawing, in its own units: integers are precise enough, and short
 NARROWEST, HIGHEST = 0.4, 1.0  # height over width
-MARGIN = 0.06  # of the longer side, around what is shown
-REACH = 0.3  # of the photos' extent: footprints of oblique views and points farther out are cut off
+MARGIN = 0.06  # border around the content, as a share of its longer side
+REACH = 0.3  # farthest content, in extents of the photos: footprints of oblique views and points beyond are cut off
 MIN_SPAN_M = 10.0  # a capture from one spot still has a map
-SCALE_SHARE = 0.25  # of the width, the most that the scale bar occupies
+SCALE_SHARE = 0.25  # largest share of the width that the scale bar occupies
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ CLEAR_PAIRS = 120  # lines drawn opaque; more of them are fainter, so that what 
 FAINTEST = 0.25
 MANY = 400  # photos, whose dots are smaller
 MAX_NAMED = 40  # control points with their names on the map
-RADIUS, MIDDLE = 880, 1000  # of the ring
+RADIUS, MIDDLE = 880, 1000  # radius and centre of the ring of photos, in the drawing's units
 LETTERS = {"wide": 34, "everywhere": 60}  # letter height in the drawing's units: as in the style sheet, and on a phone
 LONGEST_TITLE = 120  # characters of a name in a tooltip
 

@@ -16,7 +16,7 @@ from splatpipe.pipeline.sfm.recovery.refusal import texture_hint
 DULL = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
 DULL_SPREADS = 4.0  # times the usual deviation between photos, if a whole capture is blurred
 MANY = 0.08  # share of the photos above which it is reported once, for the whole capture
-MAD_TO_SIGMA = 1.4826  # of Gaussian noise
+MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation, for Gaussian noise
 JUMP_EV = 1.1  # relative to the neighbours; light and automatic exposure vary by 1.0 in good captures
 CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of clipped pixels, and its excess over most photos
 DARK_LEVEL, BRIGHT_LEVEL = 14.0, 244.0  # mean grey levels of a photo that shows nothing

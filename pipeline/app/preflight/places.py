@@ -21,7 +21,7 @@ from splatpipe.pipeline.survey.files.control_file import ControlFile, read_contr
 from splatpipe.pipeline.survey.files.scale_bars import read_scale_bars
 from splatpipe.pipeline.survey.points.surveyed_points import eaten_zeros, missing_photos
 
-OUTSIDE_SHARE = 0.3  # of the marks outside their photos: they were made in photos of another size, which ends a run
+OUTSIDE_SHARE = 0.3  # share of marks outside their photos above which these had another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
 REACH_SPACINGS, MIN_REACH_M = 3.0, 60.0  # around photos whose viewing direction is unknown
 

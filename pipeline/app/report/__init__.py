@@ -20,7 +20,7 @@ from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.small_file import open_regular
 
 REPORT_FILE = "report.html"
-HEAD_BYTES = 4096  # of the page, with the digest of its results
+HEAD_BYTES = 4096  # beginning of the page, which contains the digest of its results
 PATIENCE_S = 600.0  # far more than hundreds of photos take
 MIN_S = 2.0  # minimum time granted: enough for the report without images, even on a busy machine
 POLL_S = 0.02

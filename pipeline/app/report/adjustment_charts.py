@@ -36,7 +36,7 @@ SCALE_MARGIN = 0.95  # inches for a colour scale
 MANY = 300  # dots from which they are drawn as an image: smaller than as shapes
 NORMAL_95 = 1.959964
 SPREAD = (2.0, 98.0)  # percentiles of the heights' accuracy between which colours run
-MIN_SPREAD = 0.1  # of their middle: smaller differences do not deserve the whole range of colours
+MIN_SPREAD = 0.1  # least range of the colours over its middle: smaller differences do not deserve all colours
 TURN_DEG = 45.0  # change of direction from which a strip ends
 MIN_STRIP = 3  # photos
 

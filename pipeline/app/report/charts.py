@@ -30,7 +30,7 @@ from splatpipe.pipeline.app.report.drawing import (
 )
 from splatpipe.pipeline.app.report.geometry import Geometry, OverlapGrid, ResidualField
 
-POINTS_DRAWN = 20_000  # of a point cloud: more would add nothing at this size
+POINTS_DRAWN = 20_000  # most points drawn of a cloud: more would add nothing at this size
 PAIRS_DRAWN = 3_000  # lines, for the strongest pairs
 OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # numbers of photos at which a new colour begins
 OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa564", "#1a6b3c")

@@ -17,7 +17,7 @@ MEASURES = {  # metrics of a held-out photo: title with the unit, digits
     "gmsd": ("GMSD", 3),
     "sharpness": ("sharpness", 3),
 }
-MAX_ROWS = 200  # of the table of held-out photos
+MAX_ROWS = 200  # held-out photos in the table
 
 
 def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
@@ -194,7 +194,7 @@ def _last(curve: Mapping[float, float]) -> float | None:
 
 
 def _why_earlier(summary: Mapping[str, Any]) -> str:
-    if parts := summary.get("flat"):  # of a training in blocks
+    if parts := summary.get("flat"):  # this key exists for a training in blocks
         blocks = len(parts.keys() - {"coarse"})
         where = ["in the coarse pass"] * ("coarse" in parts)
         where += [f"in {count(blocks)} of {count(summary.get('blocks'))} blocks"] * bool(blocks)

@@ -35,11 +35,11 @@ from splatpipe.pipeline.web.viewer_scene import SPLAT, viewer_rendering, viewer_
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a running training
 COARSE_SUMMARY = "coarse.json"  # in the folder of blocks not laid out yet: the coarse pass is done
 FROZEN = "frozen.ply"  # beside a block's checkpoint: the fixed Gaussians rendered around it
-COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # of a scene in blocks
+COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # files of the coarse pass of a scene in blocks
 JPEG_QUALITY = 92
 SKY = "sky.colours"  # array of a checkpoint
-RENDER_BYTES = 1000  # of GPU memory per Gaussian: 236 for parameters, 201 for a frame, 8 pairs of 64
-LEFT_SHARE = 0.25  # of GPU memory kept free for training, which permanently reduces its use if it ever runs short
+RENDER_BYTES = 1000  # GPU memory per Gaussian: 236 for parameters, 201 for a frame, 8 pairs of 64
+LEFT_SHARE = 0.25  # GPU memory kept free for training, which permanently reduces its use if it ever runs short
 
 
 @dataclass(frozen=True)

@@ -28,17 +28,17 @@ from splatpipe.pipeline.survey.points.located_points import Sighting, SurveyPoin
 from splatpipe.pipeline.survey.points.surveyed_points import Survey, with_roles
 
 Marks = Mapping[str, Mapping[str, tuple[float, float]]]
-UNKNOWN_HEIGHT_M = 5.0  # of a point without a height, or while the vertical datum is unknown
+UNKNOWN_HEIGHT_M = 5.0  # standard deviation of an unknown height, or while the vertical datum is unknown
 MIN_RADIUS_PX = 6.0
 SURFACE_RADIUS_M = 8.0  # around a point: its height is taken from the sparse points within
 MIN_NEAR = 3  # sparse points needed for a height
-RAY_TOLERANCE = 1e-3  # of x/z; beyond it, the lens model has folded a ray outside the image back into it
+RAY_TOLERANCE = 1e-3  # error in x/z beyond which the lens model has folded a ray outside the image back into it
 # Times a photo's nearest and farthest sparse point depths: the range in which a mark's ray is followed.
 BEYOND = np.array([0.5, 2.0])
 LINE_STEPS = 48  # along the ray: lens distortion bends its image
 NEIGHBOURS = 30  # sparse points around a place: in a photo that shows none of them, the place is most likely occluded
 MAX_WITNESSES = 50_000  # sparse points searched for them
-HELPFUL_MARKS = 4  # of a point: further marks add little
+HELPFUL_MARKS = 4  # marks of a point beyond which further ones add little
 
 
 @dataclass

@@ -17,7 +17,7 @@ from splatpipe.stages.options import LineConfig
 
 LONGEST_LINE = 1 << 18
 READ_AT_ONCE = 8 << 20
-MAX_POINTS = 2000  # of a curve: twice the width of a screen
+MAX_POINTS = 2000  # points in a curve: twice the width of a screen
 MAX_NOTES = 200
 RATE_WINDOW_S = 60.0  # for the estimate of the time left: iterations slow down as the model grows
 

@@ -31,9 +31,10 @@ from splatpipe.pipeline.survey.files.control_file import SurveyedPoint
 
 MAX_UNDO = 10_000
 WIDE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing
-HELPFUL_PHOTOS = 20  # of a point, ordered by how much they help; the rest follow by distance
+HELPFUL_PHOTOS = 20  # photos of a point ordered by how much they help; the rest follow by distance
 DIGITS = 2  # decimal places of pixel coordinates in the file
-State = tuple[float, float] | Literal["hidden"] | None  # of a point in a photo: its mark, or not visible, or neither
+# A point in a photo: its mark in pixels, or not visible, or neither.
+State = tuple[float, float] | Literal["hidden"] | None
 
 
 class WrongRequestError(Exception):

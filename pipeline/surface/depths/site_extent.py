@@ -23,12 +23,12 @@ from splatpipe.pipeline.surface.depths.sources import MIN_CONFIRMED, DepthSource
 
 SAMPLES = 3000  # evenly spaced depths per photo
 CELL_GSD = 100.0  # plan cell size in GSDs, such that each cell that a photo sees has several of its samples
-MAX_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
+MAX_CELLS = 1 << 24  # largest plan: 60 km² at a GSD of 2 cm, and 0.5 GB
 MIN_PHOTOS = 3  # photos that have to see a cell
 DISTANT = 4.0  # pixels more than this many times as large on the ground as usual show distant land, not the site
-MIN_PART = 0.02  # of the area seen: smaller isolated parts are left out
+MIN_PART = 0.02  # share of the area seen below which an isolated part is left out
 NOISE = 0.001  # share of the lowest and of the highest samples that may be wrong
-MARGIN = 0.1  # of the relief, below and above, for what the samples missed,
+MARGIN = 0.1  # share of the relief added below and above, for what the samples missed,
 MIN_MARGIN_M = 3.0  # but at least this: a mast or a well
 
 

@@ -27,9 +27,9 @@ from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.sheets.raster_plane import RasterPlane
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # extent of a wall's details: reveals and doors, sills and cornices, but not balconies
-MAX_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
+MAX_CELLS = 100_000_000  # largest elevation: 300 m by 20 m at 8 mm; it takes 2 GB
 STRIP = 256  # rows that are filtered at a time
-CACHE_BYTES = 256 << 20  # of photos, and as many of depths
+CACHE_BYTES = 256 << 20  # memory for photos, and as much for depths
 
 Progress = Callable[[int, int], None]
 

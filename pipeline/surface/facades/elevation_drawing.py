@@ -23,7 +23,7 @@ from splatpipe.pipeline.surface.facades.elevation import Elevation
 from splatpipe.pipeline.surface.facades.openings import outlines, projections, recesses
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 
-TICK_MM = 4.0  # of a level's mark
+TICK_MM = 4.0  # length of a level's mark on paper
 
 
 def elevation_drawing(elevation: Elevation, crs: MapCrs, zero_m: float, picture: str) -> Drawing:

@@ -25,7 +25,7 @@ from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 from splatpipe.pipeline.surface.rasters.whole_file import whole_file, write_whole_text
 
 FORMAT = 1
-METRE_DIGITS = 4  # of lengths and coordinates in the JSON: a tenth of a millimetre
+METRE_DIGITS = 4  # decimals of lengths and coordinates in the JSON: a tenth of a millimetre
 LIKELY = 0.95  # the higher of the two quantiles of standard deviations that are reported
 
 

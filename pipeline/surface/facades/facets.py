@@ -15,12 +15,12 @@ from splatpipe.pipeline.surface.depths.sources import MIN_CONFIRMED, DepthSource
 
 BLOCKS_PER_PHOTO = 20_000  # blocks of pixels, each fitted with a plane: 20 cm of a wall in photos with a GSD of 3 cm
 MIN_BLOCK = 6  # pixels per side: a smaller block's slope is noise
-MIN_SHARE = 0.6  # of a block's pixels that count
+MIN_SHARE = 0.6  # share of a block's pixels that need a confirmed depth
 ROUGH_PX = 3.0  # pixel widths by which a block's depths may scatter about its plane: more means two surfaces
 UPRIGHT = 0.35  # largest vertical component of a normal: 20°, three standard deviations for a small block
 COARSEST = 2.0  # times the median pixel: coarser pixels show houses beyond the survey area
 STRIP_PIXELS = 1 << 20  # fitted at a time: about 100 MB
-MAX_FACETS = 1_000_000  # of all photos; more are thinned evenly
+MAX_FACETS = 1_000_000  # kept in all photos together; more are thinned evenly
 
 
 @dataclass(frozen=True)

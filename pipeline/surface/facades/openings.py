@@ -10,7 +10,7 @@ from splatpipe.pipeline.surface.sheets.raster_plane import RasterPlane
 
 RECESS_M, JUT_M = 0.05, 0.12  # behind the plane: window frames; in front of it: canopies, not shutters and plinths
 STEP_GSD = 2.0  # and at least this many pixels: depths of coarse photos scatter more
-MIN_AREA_M2 = 0.15  # of an opening; smaller ones are vents and noise
+MIN_AREA_M2 = 0.15  # smallest opening; smaller ones are vents and noise
 SOFT_M = 0.06  # narrower notches and spots of a mask are removed
 BRIDGED_M = 1.2  # narrower notches in the wall's outline, e.g. by bushes in front of it, are closed
 STRAIGHT_CELLS = 1.5  # tolerance of a simplified outline

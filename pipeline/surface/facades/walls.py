@@ -20,27 +20,28 @@ from splatpipe.pipeline.survey.boundary import DIRECTIONS
 SEED_M, SEED_SECTORS = 1.0, 24  # bins of plan and of direction whose facets seed the search for walls
 SEED_M2 = 2.0  # least area of a seed's facets, of all photos together
 SEED_HEIGHT_M = 1.2  # least height of the facets in a seed's plane; half a wall's
-SAME_WAY = math.cos(math.radians(30.0))  # of a facet's and its wall's direction: three times a facet's noise
+SAME_WAY = math.cos(math.radians(30.0))  # cosine between a facet's and its wall's normal: three times a facet's noise
 REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # lengths to which a wall grows step by step, each with a new fit of its plane
 BAND_M = 0.12  # on either side of a plane: includes plinths and shutters, but not window panes
-BAND_PIXELS = 4.0  # the same for coarse depths
+BAND_PIXELS = 4.0  # least half width of the band, in pixels on the wall, for coarse depths
 CLAIM_BANDS = 4.0  # about a wall, within which no other wall is searched for...
 CLAIM_COSINE = 0.5  # ...in nearly the same direction: noise turns some of its own facets by more than ``SAME_WAY``
 BIN_M = 0.5  # along a wall
 GAP_M = 3.0  # between pieces of one wall: a tree in front of it, a gate
-CELL_M = 0.25  # of a wall's face, occupied if it has three facets
+CELL_M = 0.25  # side of a cell of a wall's face, occupied if it has three facets
 CELL_FACETS = 3
 CLOSED_CELLS = 5  # openings up to this size are bridged
-MIN_HEIGHT_M, MIN_LENGTH_M, MIN_AREA_M2 = 2.1, 2.0, 6.0  # of a wall that meets others: garden walls are lower
-FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
-LOW_FLAT = 0.22  # of the band, within which half of the facets of a wall lower than that have to lie: on the demo, half
+# Least size of a wall that meets others: garden walls are lower.
+MIN_HEIGHT_M, MIN_LENGTH_M, MIN_AREA_M2 = 2.1, 2.0, 6.0
+FREE_HEIGHT_M = 2.8  # least height of a wall that meets no other: vans are lower
+LOW_FLAT = 0.22  # share of the band in which half of a low wall's facets have to lie: on the demo, half
 # lie within 0.04 for low walls, 0.18 for walls with a plinth, and 0.3 to 0.4 for hedges clipped as high as garages
 MIN_FLAT = 0.6  # share of the facets around a wall's plane that lie within its band: in hedges and trees they scatter
 CORNER_M = 0.4  # from where a wall's facets end to the plane of the next one, at most: two facets
 CORNER_COSINE = math.cos(math.radians(30.0))  # planes that meet at less than this angle make no corner
 TOP_M = 0.4  # above the last facets, which end two of them below the eaves
-END_SHARE = 0.4  # of a wall's usual height that has to be seen at its ends: anything lower is a bush or a fence
-ROUNDS = 5  # of a plane's robust fit
+END_SHARE = 0.4  # least height seen at a wall's end over its usual height: anything lower is a bush or a fence
+ROUNDS = 5  # iterations of a plane's robust fit
 
 Plan = Float64[np.ndarray, " 2"]
 

@@ -28,7 +28,8 @@ MAX_AUTO_LEVELS = 100  # over the relief, with an automatic interval
 MAX_LEVELS = 10_000  # with a given interval
 MAX_VERTICES = 3_000_000  # 300 MB until they are written
 WINDOW = 1024  # cells
-TOLERANCE_CELLS = 0.3  # of simplified lines: less than half a cell, the uncertainty of where a height applies
+# Largest shift of a simplified line: less than half a cell, the uncertainty of where a height applies.
+TOLERANCE_CELLS = 0.3
 MIN_LOOP_CELLS = 12.0  # length of a closed line: shorter ones are noise of single cells
 SAME_PLACE_CELLS = 1e-6  # two windows round the same crossing differently
 

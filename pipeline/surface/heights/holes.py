@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float64
 
-SIDES = 3  # of the four directions, in which there has to be a height within reach
+SIDES = 3  # fewest of the four directions with a height within reach
 STEP_CELLS = 3.0  # heights this many cells above the lowest one nearby are another surface: a hole at a wall is ground
 
 

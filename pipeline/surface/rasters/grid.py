@@ -30,7 +30,7 @@ MAX_CELLS_PER_SIDE = 1_000_000
 MAX_CELLS = 20_000_000_000  # 8 km² at 2 cm, a file of 80 GB of heights before compression
 ROUNDING = 1e-6  # cells: an extent that ends on a grid line gets no cell beyond it
 EDGE_STEPS = 9  # samples along each side of the scene's box
-HEIGHT_MARGIN_M = 10.0  # of the lattice beyond the scene: heights are interpolated linearly in it
+HEIGHT_MARGIN_M = 10.0  # by which the lattice exceeds the scene: heights are interpolated linearly in it
 
 
 Exact = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]

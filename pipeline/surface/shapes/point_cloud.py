@@ -25,7 +25,7 @@ from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 from splatpipe.pipeline.surface.rasters.whole_file import whole_file
 
-SCALE = 0.001  # of coordinates: a millimetre, or a thousandth of a foot
+SCALE = 0.001  # step of coordinates: a millimetre, or a thousandth of a foot
 NORMAL_STEPS = 127.0
 NORMAL_FIELDS = ("NormalX", "NormalY", "NormalZ")
 CONFIDENCE_FIELD = "Confidence"

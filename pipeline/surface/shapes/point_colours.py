@@ -20,7 +20,7 @@ from splatpipe.pipeline.surface.depths.sources import LruCache, PosedDepthMap
 COARSE = 4  # a photo's weight falls with this power of its footprint: with pixels twice as large, it is a sixteenth
 MIXED = 0.01  # weight where an adjacent pixel of the depths shows a nearer surface: its colour may be mixed in
 BATCH = 1 << 17  # points at a time
-CACHE_BYTES = 300 << 20  # of depths in memory
+CACHE_BYTES = 300 << 20  # depths in memory
 
 
 def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> PhotoSet:

@@ -101,7 +101,7 @@ def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_
 )
 def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, part: str) -> None:
     path = read_report_inputs(copy_of_run).part(part)
-    write_apart(path, "[" + " " * (path.stat().st_size - 2) + "]")  # of the same length, with other content
+    write_apart(path, "[" + " " * (path.stat().st_size - 2) + "]")  # other content of unchanged length
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert page.count("This part could not be read") == 1
     assert "Processing</h2>" in page

@@ -373,7 +373,7 @@ def test_every_response_has_restrictive_headers(served: Served) -> None:
         policy = headers["content-security-policy"]
         assert "default-src 'none'" in policy and "http" not in policy and "*" not in policy
         assert "server" not in headers and served.key not in str(headers)
-        if path in of_run:  # of an origin of its own, which may load what lies beside it
+        if path in of_run:  # a page with an opaque origin of its own, which may load what lies beside it
             assert policy.endswith("; sandbox allow-scripts allow-downloads")
             assert headers["access-control-allow-origin"] == "null"
         else:

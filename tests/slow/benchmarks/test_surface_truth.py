@@ -128,7 +128,7 @@ def test_the_truth_is_perfect_and_all_of_it_counts(perfect: tuple[Raster, TruthG
         assert rows[what]["p95"] == 0.0 and rows[what]["cells"] > 100
     both = rows["roofs"]["cells"] + rows["ground"]["cells"]
     assert rows["roofs and ground"]["cells"] == both
-    assert both * CELL_M**2 > 500.0  # of the 1,500 m² flown over
+    assert both * CELL_M**2 > 500.0  # in the 1,500 m² flown over
 
 
 def test_a_model_one_gsd_too_high_is_noticed(perfect: tuple[Raster, TruthGrid]) -> None:

@@ -54,7 +54,7 @@ def wait(page: Page, until: Callable[[Any], bool]) -> Any:
 def wait_for_losses(out: Path) -> None:
     """Until the training has begun; its first checkpoint comes 20 seconds later."""
     log = out / "events.jsonl"
-    before = len(log.read_bytes())  # of the run that it was copied from
+    before = len(log.read_bytes())  # written by the run that it was copied from
     wait_until(lambda: b'"loss"' in log.read_bytes()[before:], "the training")
 
 

@@ -169,7 +169,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     progress = [event["data"]["done"] for event in events if event["data"].get("what") == "training"]
     steps = [event["data"]["step"] for event in events if event["kind"] == "metric"]
     assert iteration == max(*progress, *steps)
-    assert "30 trained on, 10 held out" in words(watched)  # of the plan that it had
+    assert "30 trained on, 10 held out" in words(watched)  # as planned for this training
     assert state_of(watched, "train") == "stopped" and state_of(watched, "sparse") == "earlier run"
     assert watched.page.locator("#training .chart").count() == 2
     assert watched.page.locator("#views").count() == 0 and "PSNR" not in watched.page.locator(".cards").inner_text()

@@ -34,7 +34,8 @@ from splatpipe.pipeline.web.viewer_scene import ViewerRendering, upright, viewer
 
 LIKE_OURS_DB = 25.0
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up
-RIDGE_M = np.array([[-6.35, 0.0, 9.12], [6.35, 0.0, 9.12]])  # of the demo's roof, in its plot, 10 cm from its ends
+# Ends of the demo's ridge, in its plot, 10 cm from the roof's edges.
+RIDGE_M = np.array([[-6.35, 0.0, 9.12], [6.35, 0.0, 9.12]])
 FROM_ABOVE = "DJI_0023.JPG"
 BREAKOUT = "</script><script>document.title = 'broken'</script>"
 Opened = Callable[..., "Page"]

@@ -34,7 +34,7 @@ COUNT = 20_000
 WIDTH, HEIGHT = 403, 299  # no whole tiles
 WHOLE = (0, 0, WIDTH, HEIGHT)
 MIN_DB = 60.0  # between renders: single pixels lie on a threshold of alpha
-MAX_RELATIVE = 1e-3  # of a gradient's norm: the same, and other orders of sums
+MAX_RELATIVE = 1e-3  # error over a gradient's norm: equal terms in other orders of sums
 SSIM_WEIGHT = 0.2
 
 

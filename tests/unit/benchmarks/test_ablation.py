@@ -56,7 +56,7 @@ def test_the_variants_beside_the_script_are_all_valid() -> None:
     whole = {each.name: variants.config_of((*base, *each.sets), 0) for each in chosen}
     assert len({config.model_dump_json() for config in whole.values()}) == len(whole)  # each changes something
     assert all(each.what for each in chosen)
-    # the same in every variant
+    # Options that every variant sets alike.
     unlike_presets = {"iterations": 7, "least_iterations": 7, "max_megapixels": 0.5, "stop_when_flat": 0.0}
     alone = whole["defaults"].train.model_copy(update=unlike_presets)
     assert alone == TrainConfig().model_copy(update=unlike_presets)

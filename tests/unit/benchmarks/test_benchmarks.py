@@ -70,6 +70,6 @@ def test_window_speed_compares_windows_with_whole_photos_of_their_size(dataset: 
     assert whole["counted_megapixels"] == whole["rendered_megapixels"] == pytest.approx(MEGAPIXELS)
     assert 0.5 * MEGAPIXELS < parts["counted_megapixels"] <= window_speed.ROUNDING * MEGAPIXELS
     assert parts["counted_megapixels"] < parts["rendered_megapixels"]
-    assert parts["pairs_per_pixel"] == pytest.approx(whole["pairs_per_pixel"], rel=0.35)  # the same scene, nearer
+    assert parts["pairs_per_pixel"] == pytest.approx(whole["pairs_per_pixel"], rel=0.35)  # one scene, nearer
     assert whole["ratio"] == whole["mean_ratio"] == whole["ratio_per_counted"] == 1.0
     assert math.isclose(parts["mean_ratio"], parts["cpu_mean_s"] / whole["cpu_mean_s"])

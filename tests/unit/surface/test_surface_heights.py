@@ -112,7 +112,7 @@ def test_tiles_threads_and_memory_change_no_bit() -> None:
 
 
 def test_large_rasters_are_made_in_parts() -> None:
-    whole, parts = made_noisy(), tile_heights(capture(noisy()), WHOLE, most=60_000)  # of 180,000
+    whole, parts = made_noisy(), tile_heights(capture(noisy()), WHOLE, most=60_000)  # a third of the 180,000 cells
     assert np.array_equal(parts.height, whole.height, equal_nan=True)
     assert np.array_equal(parts.sigma, whole.sigma, equal_nan=True)
     assert np.array_equal(parts.photos, whole.photos)
