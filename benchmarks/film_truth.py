@@ -38,11 +38,11 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 LATITUDE, LONGITUDE, HEIGHT_M = 47.84119, 13.51269, 515.0  # the demo's origin
 METRES_PER_DEGREE = 111_320.0
 RADIUS_M, LOW_M, HIGH_M, TARGET_M = 24.0, 7.0, 14.0, (0.0, 0.0, 2.5)
-FOCAL = 0.72  # focal length over the image width
+RELATIVE_FOCAL = 0.72  # focal length over the image width
 RECEIVER_M = 1.0  # standard deviation of the SRT's positions
 GAMMA = 2.2
 BANDS = 18  # bands of rows that are exposed at different moments under a rolling shutter
-MOST_TIMES, MOST_DB = 2.0, 1.0
+MAX_TIMES, MAX_LOSS_DB = 2.0, 1.0
 
 COLUMNS = {
     "run": "run:",
@@ -90,7 +90,7 @@ class Flight:
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
         pose[:3, 3] = -pose[:3, :3] @ centre
-        focal = FOCAL * self.width
+        focal = RELATIVE_FOCAL * self.width
         return Camera("", self.width, self.height, focal, focal, self.width / 2.0, self.height / 2.0, pose)
 
 
@@ -232,9 +232,9 @@ def _run(name: str, photos: Path, out: Path, flight: Flight, options: argparse.N
 
 def _with_bars(rows: Sequence[Row]) -> list[Row]:
     film, still = rows
-    met = film["placed"] == film["frames"] and film["rms_mm"] <= MOST_TIMES * still["rms_mm"]
+    met = film["placed"] == film["frames"] and film["rms_mm"] <= MAX_TIMES * still["rms_mm"]
     if film["psnr_cc"] is not None and still["psnr_cc"] is not None:
-        met = met and film["psnr_cc"] >= still["psnr_cc"] - MOST_DB
+        met = met and film["psnr_cc"] >= still["psnr_cc"] - MAX_LOSS_DB
     return [{**film, "bars": "met" if met else "NOT MET"}, {**still, "bars": ""}]
 
 

@@ -24,7 +24,7 @@ from typing import Any
 Row = dict[str, Any]
 
 MIN_S = 4.0  # a part with less time left is not started
-LONGEST_ERROR = 1200  # characters of a failed part's last output
+MAX_ERROR_LETTERS = 1200  # characters of a failed part's last output
 GRACE_S = 1.5  # from SIGTERM to SIGKILL, and from there until a process that cannot be killed is left alone
 POLL_S = 0.02
 REFUSED = 77  # exit code of a part that the machine does not permit
@@ -164,7 +164,7 @@ class PartProcess:
         """Return the end of what it printed."""
         with contextlib.suppress(FileNotFoundError), self._log.open("rb") as file:
             file.seek(self._log_from)
-            return file.read().decode(errors="replace").strip()[-LONGEST_ERROR:]
+            return file.read().decode(errors="replace").strip()[-MAX_ERROR_LETTERS:]
         return ""
 
     def _wait(self, until: float) -> int | None:

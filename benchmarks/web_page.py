@@ -31,7 +31,7 @@ from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
 SITE, PAGE = "web", "viewer.html"
-PATIENCE_S = 420.0
+TIMEOUT_S = 420.0
 
 
 def main() -> None:
@@ -129,7 +129,7 @@ class PageVisit:
         width, height = (int(side) for side in size.split("x"))
         phone = width <= 640
         context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
-        context.set_default_timeout(1e3 * PATIENCE_S)
+        context.set_default_timeout(1e3 * TIMEOUT_S)
         self._page = context.new_page()
         self._traffic = Traffic()
 

@@ -44,8 +44,8 @@ NEIGHBOURS = 20  # per photo, behind `Costs.pairs`
 PHOTOS_OF_ONE_COST = 50  # up to this many photos, mapping costs the constant per photo; with more photos it costs more
 MAPPING_GROWTH = 0.75  # exponent of the number of photos in the mapping cost per photo: seneca's 167, a room's 292
 WITHOUT_POSITIONS = 2.5  # times the mapping cost: pairs that only look alike, doubts, second mappings
-STRONGER_MEGAPIXELS = 4.3  # size of an image in which unplaced photos get further keypoints
-STRONGER_BYTES = 250.0  # memory per pixel for these keypoints, on half of the threads
+REEXTRACTION_MEGAPIXELS = 4.3  # size of an image in which unplaced photos get further keypoints
+REEXTRACTION_BYTES = 250.0  # memory per pixel for these keypoints, on half of the threads
 JUDGED_ONE_IN = 8  # photos, behind the cost of `evaluate`
 PREVIEW_STEPS = 5  # density-control steps behind `Costs.gaussians`
 STEPS_POWER = 1.3  # exponent of Gaussians over steps: 1.5 on brighton (946,000 at `standard`), 0.9 on the demo
@@ -58,7 +58,7 @@ PYRAMID = 4.0 / 3.0  # pixels of a photo's whole image pyramid over its own
 TARGETS_TILE = 2.4  # megapixels of a tile in which targets are searched
 START_SHARE = 0.2  # initial over final number of Gaussians
 MIN_SHARE = 0.1  # least share of a time budget that training gets
-FEWEST_GAUSSIANS = 1000  # however short the time
+MIN_GAUSSIANS = 1000  # however short the time
 PHOTO_BYTES = 3  # per decoded pixel
 PARALLEL = {
     "ingest": 0.8,
@@ -216,7 +216,7 @@ class CaptureWork:
         cpu = seconds / Need(0, 1.0, 0, parallel=PARALLEL["train"]).seconds(self.threads)
         bare = replace(longer, gaussians=0.0).training
         room = cpu * speed / self.costs.stages["train"].cpu - bare
-        fitting = max(FEWEST_GAUSSIANS, room / (replace(longer, gaussians=1.0).training - bare))
+        fitting = max(MIN_GAUSSIANS, room / (replace(longer, gaussians=1.0).training - bare))
         return replace(longer, gaussians=min(self.most_gaussians, longer.grown, fitting))
 
     @property
@@ -244,7 +244,9 @@ class CaptureWork:
     @property
     def stronger_bytes(self) -> float:
         """Memory for further keypoints in photos that mapping could not place, which may be none."""
-        return STRONGER_BYTES * MEGA * min(self.size.megapixels, STRONGER_MEGAPIXELS) * max(1, self.threads // 2)
+        return (
+            REEXTRACTION_BYTES * MEGA * min(self.size.megapixels, REEXTRACTION_MEGAPIXELS) * max(1, self.threads // 2)
+        )
 
     @property
     def judged_photos(self) -> int:

@@ -22,7 +22,7 @@ SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
 PLACES = ("x", "y", "z")
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
-LARGEST = 1e9  # metres: larger coordinates are not on the earth, and a chart's steps are lost in rounding
+MAX_COORDINATE_M = 1e9  # metres: larger coordinates are not on the earth, and a chart's steps are lost in rounding
 
 
 def update_viewer(out: Path) -> str:
@@ -117,7 +117,9 @@ def _has_columns(trace: Any, names: Sequence[str]) -> bool:
     if not isinstance(trace, dict) or not all(isinstance(trace.get(name), list) for name in names):
         return False
     if not all(
-        value is None or (is_number(value) and abs(value) <= LARGEST) for name in names for value in trace[name]
+        value is None or (is_number(value) and abs(value) <= MAX_COORDINATE_M)
+        for name in names
+        for value in trace[name]
     ):
         return False
     return len({len(trace[name]) for name in names}) == 1

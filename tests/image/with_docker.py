@@ -27,7 +27,7 @@ PROGRAMS = {"docker": "docker.io", "dockerd": "docker.io", "debootstrap": "deboo
 TAG = "splatpipe:cpu"
 PHOTOS = 6
 USER = "54321:54321"
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 SHORT = ("--preset", "preview", "--set", "train.iterations=100")
 
 
@@ -67,7 +67,7 @@ def daemon() -> Iterator[None]:
         process = subprocess.Popen([*map(str, command)], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
     os.environ["DOCKER_HOST"] = f"unix://{socket}"
     try:
-        until_s = time.monotonic() + PATIENCE_S
+        until_s = time.monotonic() + TIMEOUT_S
         while docker("version", "--format", "{{.Server.Version}}").returncode:
             if process.poll() is not None or time.monotonic() > until_s:
                 raise Problem(f"dockerd does not start; its output is in {WORK / 'dockerd.txt'}.")
@@ -78,7 +78,7 @@ def daemon() -> Iterator[None]:
         for container in docker("ps", "-q").stdout.split():
             docker("kill", container)
         process.terminate()
-        process.wait(PATIENCE_S)
+        process.wait(TIMEOUT_S)
 
 
 def docker(*arguments: object, buildkit: bool = True) -> subprocess.CompletedProcess[str]:

@@ -44,7 +44,7 @@ from splatpipe.stages.line import LINE
 
 CLUSTER_THREADS = 8  # most threads of a job on another machine; a profile's set-threads overrides it
 LIGHT_S = 300.0  # a shorter stage shares its job with its neighbours: an engine's queue costs some 30 s a job
-LONGEST_SLUG = 40
+MAX_SLUG_LETTERS = 40
 NOT_RETRIED = "Nothing has changed since, so it was not retried; use --retry-failed to do so."
 
 
@@ -131,7 +131,7 @@ def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings)
 
 
 def _slug(name: str) -> str:
-    return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-")[:LONGEST_SLUG]
+    return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-")[:MAX_SLUG_LETTERS]
 
 
 def _draft_capture(capture: ListedCapture, key: str, call: Call, settings: Settings) -> _CaptureDraft:

@@ -35,7 +35,7 @@ from splatpipe.pipeline.engine.stage import JSON, stage_name
 PLAIN_INTERVAL_S = 10.0  # between progress lines in a log file
 PLAIN_WIDTH = 120  # columns of a table in a log file
 MIN_OFFSET_M = 0.01  # smallest offset of a flight's positions that is shown
-POINTS_SHOWN = 40  # more are only in metrics.json
+MAX_POINTS = 40  # more are only in metrics.json
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 MARKS = {"good": ("✓", "green"), "doubt": ("!", "yellow"), "bad": ("✗", "red")}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
@@ -334,7 +334,7 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
     console.print(shown)
     for line in _offsets([flight for _, table in groups for flight in table.get("flights", [])]):
         console.print(line, soft_wrap=True)
-    if 0 < len(points) <= POINTS_SHOWN:
+    if 0 < len(points) <= MAX_POINTS:
         console.print(_points_table(points, {point["name"]: point for point in splat["points"]}))
         for point in points:
             if point.get("why"):

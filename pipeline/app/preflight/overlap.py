@@ -28,7 +28,7 @@ from splatpipe.pipeline.survey.positions.swapped_positions import PositionEviden
 
 EXHAUSTIVE_UP_TO = 40  # photos: 780 pairs, five seconds
 NEIGHBOURS = 8  # partners per photo by position or sequence; a run uses 20
-LOOK_ALIKES = 4  # further partners by appearance, since positions may be wrong
+SIMILAR_PARTNERS = 4  # further partners by appearance, since positions may be wrong
 AGAIN = 16  # partners tried for photos without a match
 THIN_PARTNERS = 2.5  # least median number of matched photos: with fewer, a run loses photos
 WELL_CONNECTED = 0.9  # least share of the photos in the largest component; else the capture is fragmented
@@ -76,7 +76,7 @@ def match_quickly(layout: Layout, all_features: Sequence[QuickFeatures], threads
     report.progress(0, 1, "matching quickly", "rounds")
     pairs = set(select_pairs(layout, pairing, NEIGHBOURS, alike))
     if pairing != "exhaustive":
-        pairs |= nearest(range(count), alike(), LOOK_ALIKES)
+        pairs |= nearest(range(count), alike(), SIMILAR_PARTNERS)
     found = match_quick_features(all_features, pairs, threads)
     unmatched = [k for piece in pieces_of(found, count)[1:] for k in piece]
     if unmatched and pairing != "exhaustive":

@@ -34,7 +34,7 @@ SURFACE_RADIUS_M = 8.0  # around a point: its height is taken from the sparse po
 MIN_NEAR = 3  # sparse points needed for a height
 RAY_TOLERANCE = 1e-3  # error in x/z beyond which the lens model has folded a ray outside the image back into it
 # Times a photo's nearest and farthest sparse point depths: the range in which a mark's ray is followed.
-BEYOND = np.array([0.5, 2.0])
+DEPTH_RANGE_FACTORS = np.array([0.5, 2.0])
 LINE_STEPS = 48  # along the ray: lens distortion bends its image
 NEIGHBOURS = 30  # sparse points around a place: in a photo that shows none of them, the place is most likely occluded
 MAX_WITNESSES = 50_000  # sparse points searched for them
@@ -301,7 +301,7 @@ class Projector:
         view = self._job.model.view(sighting.index, self._job.photos[sighting.photo].width)
         pose = view.cam_from_model
         depths = self._cloud[self._shows[:, sighting.index]] @ pose[2, :3] + pose[2, 3]
-        reach = np.percentile(depths, [5.0, 95.0]) * BEYOND if len(depths) else np.array([0.1, 10.0])
+        reach = np.percentile(depths, [5.0, 95.0]) * DEPTH_RANGE_FACTORS if len(depths) else np.array([0.1, 10.0])
         ray = np.append(view.ray(np.array(sighting.pixel)), 1.0)
         near, far = np.maximum(reach, 1e-9).tolist()
         places = (np.geomspace(near, far, LINE_STEPS)[:, None] * ray - pose[:, 3]) @ pose[:, :3]

@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.depths.point_visibility import PointVisibility, classify_points
 from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache, PosedDepthMap, photos_seeing
 from splatpipe.pipeline.surface.heights.holes import fill_holes
-from splatpipe.pipeline.surface.heights.votes import HALF, HeightVotes, Layer, needs_check
+from splatpipe.pipeline.surface.heights.votes import MIN_COVER_SHARE, HeightVotes, Layer, needs_check
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
@@ -200,7 +200,7 @@ def _choose_surface(
     heights = np.stack([layer.height[candidates] for layer in found])
     balance = _balance(capture, tile, candidates, heights, numbers)
     good = np.isfinite(heights) & (balance >= 0)
-    covering = good & (np.stack([layer.cover[candidates] for layer in found]) >= HALF)
+    covering = good & (np.stack([layer.cover[candidates] for layer in found]) >= MIN_COVER_SHARE)
     good = np.where(covering.any(axis=0), covering, good)
     highest = np.where(good.any(axis=0), np.argmax(good, axis=0), -1)
     start = found[0].height.copy()

@@ -26,7 +26,7 @@ from splatpipe.pipeline.surface.depths.sources import HeightRange
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
-FINER = 0.9  # share of a point's footprint below which another photo's takes over the point; else both may keep it
+MAX_FOOTPRINT_SHARE = 0.9  # a photo with less of a point's footprint takes it over; else both may keep it
 MIN_PHOTOS = 3  # photos that have to see a point, including its own
 REACH = 2.5  # standard deviations from the mean within which a photo counts (Tukey's biweight; Beaton and Tukey 1974)
 SIGMA_PX = 0.7  # standard deviation of a depth, in pixel footprints on the surface
@@ -126,7 +126,7 @@ def _drop_coarser(points: DepthPoints, others: Sequence[DepthPart]) -> DepthPoin
         if lost.mean() > COMPACT_SHARE:
             points, lost = points.select(~lost), np.zeros(int((~lost).sum()), np.bool_)
         view = view_pieces(other.camera, points.pieces)
-        candidates = np.flatnonzero((view.footprint < FINER * points.footprint) & ~lost)
+        candidates = np.flatnonzero((view.footprint < MAX_FOOTPRINT_SHARE * points.footprint) & ~lost)
         visibility = view.classify(other, candidates)
         lost[candidates] = visibility.seen & ~visibility.mixed
     return points.select(~lost)

@@ -25,7 +25,7 @@ from splatpipe.pipeline.app.report import is_current, make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
-from splatpipe.pipeline.app.report.pictures import CHIP_SIDE, MAX_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.app.report.pictures import CROP_SIDE_PX, MAX_CROPS, chosen_views, cut_chips
 from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.verdict import judge
 
@@ -56,9 +56,9 @@ def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
     chip = chips[0, 0]
     code = str(chip.picture).split(",")[1]
     cut = Image.open(io.BytesIO(base64.b64decode(code))).convert("RGB")
-    left, top = (math.floor(value - CHIP_SIDE / 2) for value in seen["pixel"])
+    left, top = (math.floor(value - CROP_SIDE_PX / 2) for value in seen["pixel"])
     with Image.open(capture_path() / seen["photo"]) as photo:
-        true = photo.convert("RGB").crop((left, top, left + CHIP_SIDE, top + CHIP_SIDE))
+        true = photo.convert("RGB").crop((left, top, left + CROP_SIDE_PX, top + CROP_SIDE_PX))
     differences = [abs(a - b) for a, b in zip(cut.tobytes(), true.tobytes(), strict=True)]
     assert sum(differences) / len(differences) < 6.0  # JPEG's
 
@@ -256,7 +256,7 @@ def test_hundreds_of_photos_keep_the_report_small() -> None:
     seen = [{"photo": f"{i}.jpg", "pixel": [10.0, 10.0], "residual_px": [i / 100.0, 0.0]} for i in range(400)]
     points = [{"observations": seen}, {"observations": seen}, {"observations": seen[:3]}]
     chips = cut_chips(points, None, None)
-    assert len(chips) == MAX_CHIPS
+    assert len(chips) == MAX_CROPS
     assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(chips) and (0, 0) not in chips
 
 

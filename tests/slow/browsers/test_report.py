@@ -18,7 +18,7 @@ from timeouts import TIMEOUT_S, wait_until
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.report import write_report
-from splatpipe.pipeline.app.report.pictures import CHIP_SIDE
+from splatpipe.pipeline.app.report.pictures import CROP_SIDE_PX
 from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.stages.line import LINE
 
@@ -142,7 +142,7 @@ def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_positions(
     circle = chip.locator(".found")
     apart = (float(circle.get_attribute("cx")) - x, float(circle.get_attribute("cy")) - y - 12.0)
     for drawn, true in zip(apart, worst["residual_px"], strict=True):
-        assert math.isclose(drawn * CHIP_SIDE / 100.0, true, abs_tol=0.02)
+        assert math.isclose(drawn * CROP_SIDE_PX / 100.0, true, abs_tol=0.02)
 
 
 def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open_page: Callable[..., object]) -> None:

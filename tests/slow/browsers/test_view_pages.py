@@ -14,7 +14,7 @@ from served import Served, serving
 from view_home import SECRET, WEB, refused
 
 # Not by wait_for_function: it evaluates text in the page, which the page's policy forbids.
-SHOWN = """new Promise(done => {
+WAIT_FOR_IMAGE = """new Promise(done => {
   const video = document.querySelector('video');
   video.readyState >= 2 ? done() : video.addEventListener('loadeddata', () => done());
 })"""
@@ -191,6 +191,6 @@ def test_report_film_files_and_web_viewer_work_in_their_sandbox(
             page.locator("a[href='splat.ply']").first.click()
         assert Path(saved.value.path()).read_bytes() == (out / "splat.ply").read_bytes()
         page.goto(server.file("flythrough.webm"))
-        page.evaluate(SHOWN)
+        page.evaluate(WAIT_FOR_IMAGE)
         page.goto(server.file("metrics.json"))
         assert "psnr" in page.content()
